@@ -5,7 +5,7 @@ import os
 import warnings
 from functools import partial
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from isa_nrsfm._compat.scikit_learn import (
     StrOptions,
     fit_context,
 )
-from isa_nrsfm._diagnostics import Diagnostics, diagnose
 from isa_nrsfm._fit import (
     STEPWISE,
     FitSettings,
@@ -41,7 +40,6 @@ from isa_nrsfm._fit import (
 )
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
-from isa_nrsfm._frames.dynamics import smoothed_frames
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
@@ -56,7 +54,6 @@ from isa_nrsfm._parameters.choices import (
 )
 from isa_nrsfm._prepare.checks import check_table, validated_table
 from isa_nrsfm._prepare.point_weights import weighted_table
-from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
 from isa_nrsfm._tables.sources import (
@@ -76,38 +73,15 @@ from isa_nrsfm._tables.tracks import (
     table_to_tracks,
     tracks_to_table,
 )
+from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose
+from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
+from isa_nrsfm.analysis._summary import summary_html
 from isa_nrsfm.isa import PooledFastICA
 
 _NEEDS_CALIBRATED = (
     "needs a model with calibrated cameras; got camera='affine'. Fit with "
     "camera='weak_perspective' or camera='orthographic'"
 )
-
-
-class SmoothedCoefficients(NamedTuple):
-    """
-    Coefficients and cameras of frames, given all frames of their sequence.
-
-    Attributes
-    ----------
-    alpha : ndarray of shape (n_frames, n_components)
-        Posterior means. Without dynamics they are those of `AffineNRSfM.transform`.
-        With dynamics, rows with too few visible points are filled in.
-    alpha_std : ndarray of shape (n_frames, n_components)
-        Posterior standard deviations.
-    time_scales : ndarray of shape (n_components,) or (0,)
-        Time scales T of directions of the coefficients, the longest first, in the units
-        of `time`: the correlation after a time t is ``(1 + t / T) exp(-t / T)``.
-        Infinite for 1000 steps or more. Empty if the coefficients show no dynamics.
-    decomposition : Decomposition
-        Smoothed cameras, positions and coefficients, for `AffineNRSfM.reconstruct` and
-        exports. Cameras are filled in, positions are NaN if too few points are visible.
-    """
-
-    alpha: NDArray
-    alpha_std: NDArray
-    time_scales: NDArray
-    decomposition: Decomposition
 
 
 class AffineNRSfM(
@@ -792,22 +766,9 @@ class AffineNRSfM(
         table, weights = self._weighted(X, point_weight)
         frames = self._jointly_fitted("smooth")
         alone = table.joined(self._model.linearised, *weights)
-        found = smoothed_frames(
-            alone,
-            CAMERAS[self.camera_],
-            time,
-            groups,
-            max_gap=max_gap,
-            max_iter=max_iter,
-            tol=tol,
-        )
-        given, scales = (alone, np.empty(0)) if found is None else (found, found[-1])
-        motion, alpha, deviation = frames.gauge.apply(
-            given.motion, given.alpha, given.covariance
-        )
-        fit = Decomposition(motion, given.translation, alpha, deviation)
-        fit = Decomposition(*(each.astype(table.empty.dtype) for each in fit))
-        return SmoothedCoefficients(fit.alpha, fit.alpha_std, scales, fit)
+        camera, limits = CAMERAS[self.camera_], (max_gap, max_iter, tol)
+        dtype = table.empty.dtype
+        return smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """

@@ -29,7 +29,6 @@ from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
-from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import nearest_calibrated, reference_camera
 from isa_nrsfm._frames.depth import leverages
@@ -56,8 +55,10 @@ from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.sample_posterior import (
+    LEAST_RELIABILITY,
     posterior_blocks,
     posterior_moments,
+    reliabilities,
     shape_uncertainty,
     shown_frames,
 )

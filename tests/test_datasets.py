@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
-from isa_nrsfm._tables.column_names import names_layout
 from isa_nrsfm._tables.tracks import table_to_tracks
 from isa_nrsfm.datasets import (
     make_body_tracks,
@@ -22,6 +21,7 @@ from isa_nrsfm.datasets._face_model import (
     neutral_shape,
 )
 from isa_nrsfm.skeletons import get_skeleton
+from isa_nrsfm.skeletons._column_names import names_layout
 
 BODIES = {
     "hand-21": make_hand_tracks,

@@ -5,11 +5,15 @@ import pytest
 from landmark_files import openface_names
 from refusals import refused
 
-from isa_nrsfm._tables.column_names import names_layout, parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import (
     MIN_POINTS,
     find_landmark_columns,
     landmark_sets,
+)
+from isa_nrsfm.skeletons._column_names import (
+    names_layout,
+    parse_coordinate,
+    point_names,
 )
 
 N_POINTS = 9

@@ -11,7 +11,6 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.column_names import names_layout, parse_coordinate
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
@@ -22,6 +21,7 @@ from isa_nrsfm._tables.tracks import (
     seen_points,
     table_to_tracks,
 )
+from isa_nrsfm.skeletons._column_names import names_layout, parse_coordinate
 
 # With fewer frames or points than this the layouts are not compared.
 FEWEST_COMPARED = 10

@@ -20,7 +20,11 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._tables.frame_columns import checked_column, checked_times, group_numbers
+from isa_nrsfm.analysis._frame_columns import (
+    checked_column,
+    checked_times,
+    group_numbers,
+)
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.analysis._permutations import (
     FrameOrder,

@@ -9,7 +9,7 @@ from sklearn.utils import check_array
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.frame_columns import checked_column, group_numbers
+from isa_nrsfm.analysis._frame_columns import checked_column, group_numbers
 
 CHECKS: dict[str, Any] = {"ensure_all_finite": "allow-nan"}
 

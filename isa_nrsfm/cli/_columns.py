@@ -13,17 +13,17 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._tables.frame_columns import (
-    checked_times,
-    group_numbers,
-    sequences_of,
-)
 from isa_nrsfm.analysis import (
     AlignedFrames,
     WithinGroups,
     association,
     between_share,
     predictability,
+)
+from isa_nrsfm.analysis._frame_columns import (
+    checked_times,
+    group_numbers,
+    sequences_of,
 )
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage

@@ -4,7 +4,6 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
 from isa_nrsfm.cli._outputs import missing_values_of_fit, read_model, refuse_overwriting
 from isa_nrsfm.cli._reading import (
@@ -23,6 +22,7 @@ from isa_nrsfm.export import (
     write_shapes,
     write_viewer,
 )
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # The options of each content, besides those of the table.
 _POSE = ("camera", "origin", "mirrored")

@@ -17,11 +17,11 @@ from isa_nrsfm import AffineNRSfM, SmoothedCoefficients, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 PAGE = "report.html"
 REPORT = "report.json"

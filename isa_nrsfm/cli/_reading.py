@@ -14,7 +14,6 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
-from isa_nrsfm._tables.column_names import names_of_points, parse_coordinate
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
@@ -43,6 +42,7 @@ from isa_nrsfm.skeletons import (
     get_skeleton,
     read_skeleton,
 )
+from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 
 # Options of one format, and that format.
 _OF_FORMATS = {"image_size": "mediapipe", "part": "openpose"}

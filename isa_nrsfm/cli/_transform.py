@@ -9,7 +9,6 @@ import numpy as np
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._outputs import (
     missing_values_of_fit,
     read_model,
@@ -26,6 +25,7 @@ from isa_nrsfm.cli._reading import (
 from isa_nrsfm.cli._report import quality_report, table_report
 from isa_nrsfm.cli._sections import quality_section, table_section, text_of
 from isa_nrsfm.io._tables import table_suffix
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 
 def run(args: Namespace, warned: list[str]) -> str:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.export._drawing import (
     Links,
     choose_drawing,
@@ -22,6 +21,7 @@ from isa_nrsfm.export._names import names_of_components, suffix_of
 from isa_nrsfm.export._upright import Camera, upright_basis, upright_space
 from isa_nrsfm.plotting._axes import is_dense
 from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
+from isa_nrsfm.skeletons._column_names import names_of_points
 from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
 
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.

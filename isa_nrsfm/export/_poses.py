@@ -11,7 +11,6 @@ from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._names import frames_of_table
 from isa_nrsfm.export._upright import (
@@ -21,6 +20,7 @@ from isa_nrsfm.export._upright import (
     upright_space,
 )
 from isa_nrsfm.plotting._edges import Origin
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 
 class FramePoses(NamedTuple):

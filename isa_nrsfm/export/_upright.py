@@ -24,7 +24,6 @@ from isa_nrsfm._metric_upgrade.deforming import (
 )
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.plotting._edges import (
     UPSIDE_DOWN,
     Origin,
@@ -38,6 +37,7 @@ from isa_nrsfm.plotting._views import (
     viewing_transform,
 )
 from isa_nrsfm.skeletons import Skeleton
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 Camera = Literal["weak_perspective"] | None
 

@@ -16,8 +16,7 @@ from sklearn.utils import check_array
 from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._estimator import frames_of
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._tables.frame_columns import checked_times, is_missing
+from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
 from isa_nrsfm.export._drawing import Links, choose_drawing, edges_of
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
@@ -27,6 +26,7 @@ from isa_nrsfm.export._upright import (
     upright_space,
 )
 from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # The colours of more labels than this look alike.
 MOST_LABELS = 30

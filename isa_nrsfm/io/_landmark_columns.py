@@ -10,7 +10,7 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.column_names import parse_coordinate, point_names
+from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
 
 # What stands for the axis letter in the names of confidences: nose_conf, conf_0.
 CONFIDENCES = ("confidence", "conf", "likelihood", "score", "visibility", "c")

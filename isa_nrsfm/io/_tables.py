@@ -12,7 +12,6 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
 from isa_nrsfm.io._separated_values import (
@@ -21,6 +20,7 @@ from isa_nrsfm.io._separated_values import (
     first_lines,
     read_parquet,
 )
+from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
 
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = (

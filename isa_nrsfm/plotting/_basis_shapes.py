@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm.plotting._axes import (
     MEAN_COLOUR,
     MINUS_COLOUR,
@@ -33,6 +32,7 @@ from isa_nrsfm.plotting._page import (
     show_view,
 )
 from isa_nrsfm.plotting._views import depth_note, view_and_layout
+from isa_nrsfm.skeletons._column_names import checked_names
 
 # Arrows in the units of the points, with the same width in all axes.
 ARROW_STYLE = {

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.column_names import checked_names
-from isa_nrsfm._tables.frame_columns import checked_column
+from isa_nrsfm.analysis._frame_columns import checked_column
 from isa_nrsfm.analysis._labels import kind_of
 from isa_nrsfm.plotting._axes import MINUS_COLOUR, OBSERVED_COLOUR, check_axes
 from isa_nrsfm.plotting._page import PAGE_WIDTH, grid
+from isa_nrsfm.skeletons._column_names import checked_names
 
 Kind = Literal["classes", "number", "time"]
 THIN = {"linewidth": 0.7}

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm.plotting._axes import check_axes, percent
+from isa_nrsfm.skeletons._column_names import checked_names
 
 BLOCK = 3  # directions of space, rows and columns of one basis shape's block
 LINEAR_SHARE = 0.02  # of the largest absolute value, end of the linear colour scale

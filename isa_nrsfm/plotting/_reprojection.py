@@ -11,7 +11,6 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
-from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import FEWEST_POINTS, table_to_tracks, tracks_to_table
 from isa_nrsfm.metrics import inverse_snr
@@ -29,6 +28,7 @@ from isa_nrsfm.plotting._axes import (
 from isa_nrsfm.plotting._edges import Edges, Origin, choose_lines
 from isa_nrsfm.plotting._page import LEGEND_HEIGHT, add_legend, chosen_numbers, grid
 from isa_nrsfm.plotting._views import view_and_layout
+from isa_nrsfm.skeletons._column_names import checked_names
 
 
 def choose_frames(

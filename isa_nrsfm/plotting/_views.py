@@ -18,9 +18,9 @@ from isa_nrsfm._metric_upgrade.quadric import (
     symmetric_power,
     unit_cameras,
 )
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.plotting._edges import Origin, choose_lines
 from isa_nrsfm.skeletons import Skeleton
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 
 def viewing_rotation(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray:
