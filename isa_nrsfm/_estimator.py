@@ -796,7 +796,7 @@ class AffineNRSfM(
         """
         table, weights = self._weighted(X, point_weight)
         frames = self._jointly_fitted("rotation_covariance", calibrated=True)
-        space, certainty = frames.gauge.space, frames.certainty
+        space, certainty = frames.gauge.rotation, frames.certainty
         found = table.joined(self._model.posterior, *weights)
         covariance = space @ found.turn_covariance @ space.T
         if certainty.turns is not None:

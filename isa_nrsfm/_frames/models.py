@@ -74,6 +74,11 @@ class FrameMap(NamedTuple):
         """Return the identity map."""
         return cls(np.eye(n_components + 1), np.eye(3))
 
+    @property
+    def rotation(self) -> NDArray:
+        """The map (3, 3) of rotation vectors: `space` of Euclidean shapes, size one."""
+        return np.asarray(self.space / np.cbrt(abs(np.linalg.det(self.space))))
+
     def apply(
         self, motion: NDArray, alpha: NDArray, covariance: NDArray | None
     ) -> tuple[NDArray, NDArray, NDArray]:
