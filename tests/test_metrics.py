@@ -17,7 +17,7 @@ from isa_nrsfm.metrics import (
     inverse_snr,
     subspace_distance,
 )
-from isa_nrsfm.metrics._alignment import best_affinity, unit_shapes
+from isa_nrsfm.metrics._affine_shapes import best_affinity, unit_shapes
 
 AFFINITIES = [
     np.diag([1.0, -1.0, 1.0]),

@@ -19,18 +19,19 @@ from isa_nrsfm.plotting import (
     ModeCovarianceDisplay,
     ReprojectionDisplay,
 )
-from isa_nrsfm.plotting._axes import percent, row_width
-from isa_nrsfm.plotting._edges import (
-    choose_layout,
-    choose_lines,
-    choose_origin,
-    upright_turn,
-)
-from isa_nrsfm.plotting._page import (
+from isa_nrsfm.plotting._axes import (
     PAGE_WIDTH,
     block_limits,
     choose_n_columns,
     new_page,
+    percent,
+    row_width,
+)
+from isa_nrsfm.plotting._views import (
+    choose_layout,
+    choose_lines,
+    choose_origin,
+    upright_turn,
 )
 from isa_nrsfm.skeletons import get_skeleton
 
