@@ -166,8 +166,8 @@ def test_refuses(face, arguments, message):
 
 
 def test_refuses_shapes(face):
-    with pytest.raises(ValueError, match="'ibug-68' has 68 points, the shape 60"):
-        canonical_pose(face[:60], scheme="ibug-68")
+    message = "'ibug-68' has 68 points, the shape 60"
+    refused(message, canonical_pose, face[:60], scheme="ibug-68")
     refused(r"\(n_points, 3\).*got the shape \(68, 2\)", canonical_pose, face[:, :2])
     holes = face.copy()
     holes[3] = np.nan
