@@ -28,6 +28,7 @@ from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
 from benchmarks._isolated import run_isolated
 from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._tables.tracks import (
@@ -36,7 +37,6 @@ from isa_nrsfm._tables.tracks import (
     table_to_tracks,
     weighting_sizes,
 )
-from isa_nrsfm._estimator import frames_of
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.export import pose_function

@@ -27,8 +27,14 @@ from isa_nrsfm.plotting import (
     ModeCovarianceDisplay,
     ReprojectionDisplay,
 )
-from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
-from isa_nrsfm.plotting._page import VIEWS, add_legend, block_limits, new_page
+from isa_nrsfm.plotting._axes import (
+    MEAN_COLOUR,
+    VIEWS,
+    add_legend,
+    block_limits,
+    new_page,
+    wrap_title,
+)
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
 # `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.

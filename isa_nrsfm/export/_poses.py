@@ -19,7 +19,7 @@ from isa_nrsfm.export._upright import (
     upright_frames,
     upright_space,
 )
-from isa_nrsfm.plotting._edges import Origin
+from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 

@@ -24,15 +24,13 @@ from isa_nrsfm._metric_upgrade.deforming import (
 )
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
-from isa_nrsfm.plotting._edges import (
+from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,
     choose_layout,
     choose_origin,
-    upright_turn,
-)
-from isa_nrsfm.plotting._views import (
     euclidean_axes,
+    upright_turn,
     viewing_rotation,
     viewing_transform,
 )
@@ -80,12 +78,11 @@ def upright_space(
     certainty = frames_of(model).certainty
     if camera is not None and not certainty.determined:
         warn_caller(certainty.advice)
+    to_metric = np.eye(3)
     if fitted != "affine":
         transform = euclidean_axes(model)
-        shape = model.mean_shape_ @ transform.T
     elif camera is None:
         transform = viewing_transform(model.motion_, model.reference_motion_)
-        shape = model.mean_shape_ @ transform.T
     else:
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
@@ -95,8 +92,7 @@ def upright_space(
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )
-        shape = model.mean_shape_ @ (transform @ to_metric).T
-
+    shape = model.mean_shape_ @ (transform @ to_metric).T
     image_axes = np.eye(3)
     layout = choose_layout(edges, shape, names_of_points(model))
     if choose_origin(origin, shape, layout) == "lower":
@@ -140,8 +136,7 @@ def upright_basis(
         return model.mean_shape_ @ space.transform.T, model.basis_ @ space.transform.T
     n_frames, n_components = model.alpha_.shape
     size = model.mean_shape_.size
-    gram = np.zeros((1 + n_components, 1 + n_components))
-    product = np.zeros((1 + n_components, size))
+    gram, product = (np.zeros((1 + n_components, n)) for n in (1 + n_components, size))
     for block in gen_batches(n_frames, max(1, block_numbers // size)):
         motion, alpha = model.motion_[block], model.alpha_[block]
         shapes = upright_frames(space, model, motion, alpha).shapes

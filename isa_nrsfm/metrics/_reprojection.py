@@ -1,5 +1,7 @@
 """Measures of the reprojection of a table."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
@@ -90,13 +92,9 @@ def frame_energies(
     X: ArrayLike, X_hat: ArrayLike, layout: Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
+    checks: dict[str, Any] = {"dtype": np.float64, "ensure_all_finite": "allow-nan"}
     tables = [
-        check_array(
-            unmasked(table),
-            dtype=np.float64,
-            ensure_all_finite="allow-nan",
-            input_name=name,
-        )
+        check_array(unmasked(table), input_name=name, **checks)
         for table, name in ((X, "X"), (X_hat, "X_hat"))
     ]
     check_same_shape("X", tables[0], "X_hat", tables[1])
