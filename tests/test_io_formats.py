@@ -230,7 +230,7 @@ def test_openpose_parts_are_chosen(tmp_path):
         ({"people": {}}, "b_keypoints.json: expected an object with a list of obj"),
         ({"people": [3]}, "b_keypoints.json: expected an object with a list of obj"),
         ([], "b_keypoints.json: expected an object with a list of objects called"),
-        (points_of_openpose(4), "a_keypoints.json has 5 points of pose, b_.* has 4"),
+        (points_of_openpose(4), "a_keypoints.json has 5 points, b_.* has 4"),
         ([[1, 2]], "b_keypoints.json: pose_keypoints_2d .* each point; got 2 numbers"),
         ([["1", 2, 3]], r"b_.*: pose_keypoints_2d should be .* got \['1', 2, 3\]"),
         ([[1, 2, np.inf]], "b_.*: pose_keypoints_2d should be a list of finite"),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._compat.texts import as_utf8, by_number
-from isa_nrsfm.io._landmarks import Landmarks, assemble
+from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
 from isa_nrsfm.io._separated_values import first_lines
 
 _PTS = re.compile(
@@ -44,17 +44,13 @@ def read_pts(path: Path) -> Landmarks:
         files = sorted(filter(_is_pts_name, path.iterdir()), key=by_number)
         if not files:
             raise ValueError("there are no .pts files in the folder")
-    tracks = []
+    points = []
     for file in files:
         with errors_of(file.name):
-            tracks.append(_points_of(file.read_bytes().decode("utf-8-sig")))
-        if len(tracks[-1]) != len(tracks[0]):
-            raise ValueError(
-                f"{files[0].name} has {len(tracks[0])} points, {file.name} has "
-                f"{len(tracks[-1])}: all files must have the same number"
-            )
+            points.append({0: _points_of(file.read_bytes().decode("utf-8-sig"))})
+    *_, tracks = stacked(points, [file.name for file in files])
     names = {"file": [as_utf8(file.name) for file in files]}
-    return assemble(np.stack(tracks), None, names, format="pts")
+    return assemble(tracks, None, names, format="pts")
 
 
 def is_wflw(path: Path) -> bool:

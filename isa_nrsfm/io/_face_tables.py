@@ -14,7 +14,7 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
-from isa_nrsfm.io._landmarks import Landmarks, assemble
+from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
 from isa_nrsfm.io._separated_values import header_names, read_columns
 
 # OpenFace names points in space, in millimetres, by capital letters.
@@ -102,8 +102,6 @@ def read_mediapipe(
     Coordinates divided by the width and height of the image are multiplied by
     ``image_size``, or the columns ``image_width`` and ``image_height``.
     """
-    if image_size is not None:
-        image_size = _checked_size(image_size)
     names = header_names(path)
     found = find_landmark_columns(names)
     sizes = [name for name in ("image_width", "image_height") if name in names]
@@ -121,9 +119,10 @@ def read_mediapipe(
                 "1920x1080), or columns image_width and image_height"
             )
         _check_inside(tracks)
-        scale = (
-            table[sizes].to_numpy(float) if image_size is None else np.array(image_size)
-        )
+        if image_size is None:
+            scale = table[sizes].to_numpy(float)
+        else:
+            scale = checked_sizes("image_size", image_size, 1)
         with np.errstate(over="ignore"):  # `assemble` refuses infinite numbers
             tracks = tracks * scale.reshape(-1, 1, 2)
     elif image_size is not None:
@@ -184,20 +183,6 @@ def _assembled(
         columns=found.interleaved,
         confidence=confidence,
     )
-
-
-def _checked_size(image_size: tuple[float, float]) -> tuple[float, float]:
-    """Return the width and the height of an image, or raise."""
-    try:
-        width, height = (float(length) for length in image_size)
-    except (TypeError, ValueError):
-        width = height = np.nan
-    if not (0 < width < np.inf and 0 < height < np.inf):
-        raise ValueError(
-            "image_size must be a width and a height in pixels, such as (1920, 1080); "
-            f"got {image_size!r}"
-        )
-    return width, height
 
 
 def _need(names: list[str], needed: Iterable[str]) -> None:

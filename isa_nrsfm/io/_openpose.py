@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm._parameters.choices import OPENPOSE_PARTS
 from isa_nrsfm.io._coco import begins_as_openpose, read_json
-from isa_nrsfm.io._landmarks import Landmarks, assemble
+from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
 
 _NAME = re.compile(r"(?!\.).*?(\d*)_keypoints\.json", re.IGNORECASE)
 
@@ -60,25 +59,12 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     part = part or found
     if part not in known:
         raise ValueError(f"it has no points of {part}, but of {found}")
-    rows: list[tuple[int, int | None, NDArray[np.float64]]] = [
-        (i, k, person[part])
-        for i, persons in enumerate(people)
-        for k, person in enumerate(persons)
-        if part in person
+    chosen = [
+        {k: person[part] for k, person in enumerate(persons) if part in person}
+        for persons in people
     ]
-    first, _, points = rows[0]
-    for i, _, others in rows:
-        if len(others) != len(points):
-            raise ValueError(
-                f"{files[first].name} has {len(points)} points of {part}, "
-                f"{files[i].name} has {len(others)}: all must have the same number"
-            )
-    shown = {i for i, _, _ in rows}
-    gap = np.full(points.shape, np.nan)
-    rows += [(i, None, gap) for i in range(len(files)) if i not in shown]
-    rows.sort(key=lambda row: row[0])
-    of_file, persons, values = zip(*rows, strict=True)
-    tracks, confidence = np.split(np.stack(values), [2], axis=2)
+    image, numbers, values = stacked(chosen, [file.name for file in files])
+    tracks, confidence = np.split(values, [2], axis=2)
     tracks = np.where(confidence == 0, np.nan, tracks)
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(tracks)) <= 1:
@@ -86,11 +72,11 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             "the coordinates are shares of the image's size, which stretch the shapes. "
             "Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    numbers = _numbers(files)
+    of_files = _numbers(files)
     frames = {
-        "file": [as_utf8(files[i].name) for i in of_file],
-        "frame": [numbers[i] for i in of_file],
-        "person": pd.array(persons, dtype="Int64"),
+        "file": [as_utf8(files[i].name) for i in image],
+        "frame": [of_files[i] for i in image],
+        "person": numbers,
     }
     return assemble(
         tracks, None, frames, format="openpose", confidence=confidence[..., 0]

@@ -242,15 +242,13 @@ def read_named_columns(
     """Read a table whose landmark columns are recognised by their names."""
     points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
     confidence = confidences_in(other, points.columns[::2], points.columns[1::2])
-    if confidence is not None:
-        other = other.drop(columns=confidence.columns)
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
         point_names(points.columns[::2]),
-        other,
+        other if confidence is None else other.drop(columns=confidence.columns),
         format="table",
         columns=list(points.columns),
-        confidence=None if confidence is None else confidence.to_numpy(),
+        confidence=confidence,
     )
 
 
