@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
-from isa_nrsfm.io._separated_values import first_lines
+from isa_nrsfm.io._tables import first_lines
 
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"

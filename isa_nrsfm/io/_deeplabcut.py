@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.io._hdf5 import Columns, is_hdf5, read_stored_frame, root_groups
 from isa_nrsfm.io._landmarks import Landmarks, assemble_individuals
-from isa_nrsfm.io._separated_values import SEPARATORS, header_rows, read_columns
+from isa_nrsfm.io._tables import SEPARATORS, header_rows, read_columns
 
 _LEVELS = ["scorer", "bodyparts", "coords"]
 _LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]

@@ -15,7 +15,7 @@ from isa_nrsfm.io._landmark_columns import (
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
-from isa_nrsfm.io._separated_values import header_names, read_columns
+from isa_nrsfm.io._tables import header_names, read_columns
 
 # OpenFace names points in space, in millimetres, by capital letters.
 _OPENFACE_NOT_READ = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")

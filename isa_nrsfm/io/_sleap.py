@@ -13,7 +13,7 @@ from isa_nrsfm.io._face_tables import points_of
 from isa_nrsfm.io._hdf5 import content_of, is_hdf5, numbers_of, root_groups
 from isa_nrsfm.io._landmark_columns import find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
-from isa_nrsfm.io._separated_values import header_names, read_columns
+from isa_nrsfm.io._tables import header_names, read_columns
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
 _DIMS = ("frame", "track", "node", "xy")
