@@ -50,6 +50,11 @@ from isa_nrsfm.io._tables import TABLE_SUFFIXES
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
+# Options that are parameters of the same name; none stands for None.
+_PARAMETERS = (
+    *("block_recovery", "refinement", "camera", "independence", "loss"),
+    *("random_state", "n_jobs"),
+)
 
 
 def run(args: Namespace, warned: list[str]) -> str:
@@ -181,17 +186,12 @@ def _fitted(
     if args.isa == "fast" or args.n_init is not None:
         strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
         isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
+    given = {name: getattr(args, name) for name in _PARAMETERS}
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=isa,
-        block_recovery=args.block_recovery,
-        refinement=None if args.refinement == NONE else args.refinement,
-        camera=args.camera,
-        independence=None if args.independence == NONE else args.independence,
-        loss=args.loss,
         scale_frames=not args.no_scale_frames,
-        random_state=args.random_state,
-        n_jobs=args.n_jobs,
+        **{name: None if given[name] == NONE else given[name] for name in given},
     )
     search, X = None, frames.X
     if len(args.n_components) > 1:

@@ -515,6 +515,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command, (line, description, examples, groups) in _COMMANDS.items():
         own = commands.add_parser(command, help=line, **_manners(description, examples))
+        own.set_defaults(weights=None, points=None)  # for commands without these
         for title, entries in groups.items():
             group = own.add_argument_group(title)
             for entry in entries:

@@ -39,9 +39,9 @@ class LandmarkFormat:
     suffixes : tuple of str
         Suffixes of its files in lower case; "/" for a folder of files.
     reader : str
-        Module and name of its two functions, such as ``_coco.coco``. ``is_coco`` takes
-        the path and returns whether the file begins like this format. ``read_coco``
-        returns its `Landmarks`, or raises a ValueError without the path.
+        Module and name of its two functions, such as ``_keypoints.coco``. ``is_coco``
+        takes the path and returns whether the file begins like this format.
+        ``read_coco`` returns its `Landmarks`, or raises a ValueError without the path.
     options : tuple of str
         Names of the options that `read` takes.
     """
@@ -341,7 +341,7 @@ _ALL = (
         "images, annotations and categories with keypoints, or a list of results; "
         "write json of other programs as a table",
         (".json",),
-        "_coco.coco",
+        "_keypoints.coco",
         ("category",),
     ),
     LandmarkFormat(
@@ -350,7 +350,7 @@ _ALL = (
         "people with pose_keypoints_2d, face_keypoints_2d, ...; a folder has a file "
         "..._keypoints.json for each frame",
         (".json", _FOLDER),
-        "_openpose.openpose",
+        "_keypoints.openpose",
         ("part",),
     ),
     LandmarkFormat(
