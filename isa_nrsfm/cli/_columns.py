@@ -143,14 +143,10 @@ def column_results(
 
 def class_means(label: Label, alpha: NDArray) -> dict[str, NDArray]:
     """Return the mean of the standardised coefficients in each class."""
-    deviation = alpha.std(axis=0)
-    standard = np.zeros_like(alpha)
-    np.divide(alpha - alpha.mean(axis=0), deviation, where=deviation > 0, out=standard)
+    deviation, y = alpha.std(axis=0), label.values
+    standard = (alpha - alpha.mean(axis=0)) / np.where(deviation > 0, deviation, np.inf)
     known = standard[label.known]
-    return {
-        str(name): known[label.values == name].mean(axis=0)
-        for name in np.unique(label.values)
-    }
+    return {str(name): known[y == name].mean(axis=0) for name in np.unique(y)}
 
 
 def _numbered(

@@ -80,9 +80,7 @@ def fit_table(
     frames = read_frames(args, table=table)
     X = frames.X
     if X.empty:
-        out = ", ".join(
-            f"{len(rows)} left out ({reason})" for reason, rows, _ in frames.left_out
-        )
+        out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
     asked = asked_columns(args, frames)
     figures = {} if args.no_figures else figures_of(args, asked)

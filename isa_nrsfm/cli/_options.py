@@ -508,11 +508,9 @@ The folder has the files of 'isa-nrsfm fit', and the table as tracks.csv.""",
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
-    parser.add_argument(
-        "--version", action="version", version=f"{PROGRAM} {__version__}"
-    )
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    top = argparse.ArgumentParser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
+    top.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command, (line, description, examples, groups) in _COMMANDS.items():
         own = commands.add_parser(command, help=line, **_manners(description, examples))
         own.set_defaults(weights=None, points=None)  # for commands without these
@@ -525,7 +523,7 @@ def build_parser() -> argparse.ArgumentParser:
                 either = group.add_mutually_exclusive_group()
                 for name in entry:
                     _add(either, command, name)
-    return parser
+    return top
 
 
 def flag_of(name: str) -> str:

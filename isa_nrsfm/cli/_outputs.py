@@ -162,11 +162,9 @@ def write_results(
     save_model(estimator, folder / "model.npz")
 
 
-def fitted_table(estimator: AffineNRSfM) -> NDArray:
+def fitted_table(model: AffineNRSfM) -> NDArray:
     """Return the table of the model, in the frames that it was fitted to."""
-    return estimator.inverse_transform(
-        estimator.alpha_, estimator.motion_, estimator.translation_
-    )
+    return model.inverse_transform(model.alpha_, model.motion_, model.translation_)
 
 
 def read_model(path: str) -> AffineNRSfM:

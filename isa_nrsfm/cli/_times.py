@@ -158,11 +158,9 @@ def _read(cells: "pd.Series", format: str) -> "pd.Series":
 
 def _shown(time: object) -> str:
     """Return a date, or seconds, as they are read by people."""
-    return (
-        f"{time:g} s"
-        if isinstance(time, float)
-        else str(time).removesuffix(" 00:00:00")
-    )
+    if isinstance(time, float):
+        return f"{time:g} s"
+    return str(time).removesuffix(" 00:00:00")
 
 
 def _cell(cells: "pd.Series", which: "pd.Series") -> str:

@@ -17,10 +17,7 @@ _PTS = re.compile(
 )
 _N_WFLW = 98
 _WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
-_WFLW_ATTRIBUTES = (
-    *("pose", "expression", "illumination"),
-    *("make_up", "occlusion", "blur"),
-)
+_WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
 # Fields of a line: points and image, without and with the box and the attributes.
 _WFLW_LENGTHS = (197, 207)
 

@@ -18,9 +18,9 @@ from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
 from isa_nrsfm.io._tables import header_names, read_columns
 
 # OpenFace names points in space, in millimetres, by capital letters.
-_OPENFACE_NOT_READ = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
+_NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
 # The vector that identifies faces, and the mesh beside the 68 points.
-_PYFEAT_NOT_READ = re.compile(r"Identity_\d+|mesh_[xyz]_\d+|z_\d+")
+_NOT_PYFEAT = re.compile(r"Identity_\d+|mesh_[xyz]_\d+|z_\d+")
 _PYFEAT_BOX = ("FaceRectX", "FaceRectY", "FaceRectWidth", "FaceRectHeight")
 
 
@@ -28,10 +28,8 @@ def is_openface(path: Path) -> bool:
     """Return whether the header is one of OpenFace."""
     names = header_names(path)
     of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
-    groups = {"x_0", "pose_Rx", "gaze_0_x", "AU01_r"}
-    return (of_video or names[:2] == ["face", "confidence"]) and not (
-        groups.isdisjoint(names)
-    )
+    groups = {"x_0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
+    return (of_video or names[:2] == ["face", "confidence"]) and bool(groups)
 
 
 def read_openface(path: Path) -> Landmarks:
@@ -52,9 +50,8 @@ def read_openface(path: Path) -> Landmarks:
     scores = ["confidence", "success"] if of_video else ["confidence"]
     _need(names, scores)
     found = find_landmark_columns(names, "x_#,y_#")
-    table = read_columns(
-        path, leave_out=_OPENFACE_NOT_READ, numbers=[*found.interleaved, *scores]
-    )
+    numbers = [*found.interleaved, *scores]
+    table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
     if of_video:
         if not table["success"].isin((0, 1)).all():
             raise ValueError("the column success must hold 0 and 1 only")
@@ -81,9 +78,7 @@ def read_pyfeat(path: Path) -> Landmarks:
     found = find_landmark_columns(names, "x_#,y_#")
     scores = [name for name in names if name == "FaceScore"]
     numbers = [*found.interleaved, *scores]
-    table = read_columns(
-        path, leave_out=_PYFEAT_NOT_READ, numbers=numbers, text=("input",)
-    )
+    table = read_columns(path, leave_out=_NOT_PYFEAT, numbers=numbers, text=["input"])
     return _assembled(table, found, "pyfeat", score=scores[0] if scores else None)
 
 

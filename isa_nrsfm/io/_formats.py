@@ -233,9 +233,8 @@ def find_format(path: str | os.PathLike[str]) -> str:
     path = Path(path)
     _check_exists(path)
     possible = [found for found in FORMATS.values() if _suffix(path) in found.suffixes]
-    matching = [
-        found.name for found in possible if found.name != TABLE and found.matches(path)
-    ]
+    others = [each for each in possible if each.name != TABLE]
+    matching = [each.name for each in others if each.matches(path)]
     if len(matching) > 1:
         raise ValueError(
             f"{path} matches more than one format: {', '.join(matching)}. Choose with "
@@ -243,7 +242,7 @@ def find_format(path: str | os.PathLike[str]) -> str:
         )
     if matching:
         return matching[0]
-    if any(found.name == TABLE for found in possible):
+    if len(others) < len(possible):
         return TABLE
     if _suffix(path) in (".xlsx", ".xls", ".ods"):
         raise ValueError(f"{path} is a file of a spreadsheet: save it as .csv there")
@@ -364,5 +363,5 @@ _ALL = (
 )
 
 FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
-    {found.name: found for found in _ALL}
+    {each.name: each for each in _ALL}
 )

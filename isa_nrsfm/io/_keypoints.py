@@ -255,8 +255,8 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         for persons in people
     ]
     image, numbers, values = stacked(chosen, [file.name for file in files])
-    tracks, confidence = np.split(values, [2], axis=2)
-    tracks = np.where(confidence == 0, np.nan, tracks)
+    tracks, scores = np.split(values, [2], axis=2)
+    tracks = np.where(scores == 0, np.nan, tracks)
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(tracks)) <= 1:
         raise ValueError(
@@ -269,9 +269,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         "frame": [of_files[i] for i in image],
         "person": numbers,
     }
-    return assemble(
-        tracks, None, frames, format="openpose", confidence=confidence[..., 0]
-    )
+    return assemble(tracks, None, frames, format="openpose", confidence=scores[..., 0])
 
 
 def _people_in(content: Any) -> list[dict[str, NDArray[np.float64]]]:

@@ -197,9 +197,8 @@ def _digest(header: dict[str, Any], arrays: Arrays) -> str:
 def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     """Return the fitted estimator of a model file."""
     estimator = with_parts(AffineNRSfM, header, arrays)
-    entries = {
-        name: unpacked(value, arrays) for name, value in header["frames"].items()
-    }
+    stored = header["frames"].items()
+    entries = {name: unpacked(value, arrays) for name, value in stored}
     for name, choices in (("camera", CAMERAS), ("layout", LAYOUTS), ("loss", LOSSES)):
         if name in entries and entries[name] not in choices:
             raise ValueError(f"its {name} is not known: {entries[name]}")

@@ -113,9 +113,8 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
 
 def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     """Return an object with the parameters and attributes of `packed_parts`."""
-    parameters = {
-        name: unpacked(value, arrays) for name, value in parts["parameters"].items()
-    }
+    stored = parts["parameters"].items()
+    parameters = {name: unpacked(value, arrays) for name, value in stored}
     # Parameters that are newer than the file have their defaults.
     defaults = kind().get_params(deep=False)
     check_names({**defaults, **parameters}, defaults, "parameters")

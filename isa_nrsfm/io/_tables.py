@@ -384,7 +384,7 @@ def read_columns(
         separator = SEPARATORS[path.suffix.lower()]
         if sum(1 for _ in checked_rows(path, separator)) <= n_header:
             raise ValueError("it has a header but no rows")
-        options: dict[str, Any] = {
+        given: dict[str, Any] = {
             "sep": separator,
             "header": None,
             "names": names,
@@ -397,13 +397,9 @@ def read_columns(
             "low_memory": False,
         }
         used = [name for name in names if name not in leave_out]
-        frame = pd.read_csv(
-            path, dtype=dict.fromkeys(text, str), usecols=used, **options
-        )
+        frame = pd.read_csv(path, dtype=dict.fromkeys(text, str), usecols=used, **given)
         whole = frame.select_dtypes("integer").columns.difference(numbers)
-        for name, cells in pd.read_csv(
-            path, dtype=str, usecols=whole, **options
-        ).items():
+        for name, cells in pd.read_csv(path, dtype=str, usecols=whole, **given).items():
             if _of_codes(cells):
                 frame[name] = cells
     kinds = dict(frame.dtypes)
@@ -430,11 +426,9 @@ def _of_codes(cells: "pd.Series") -> bool:
 
 def _without_nulls(lines: Iterator[str]) -> Iterator[str]:
     """Yield lines, and raise at a null character."""
-    for number, line in enumerate(lines, start=1):
+    for i, line in enumerate(lines, start=1):
         if "\0" in line:
-            raise ValueError(
-                f"its text is not in UTF-8: line {number} has a null character"
-            )
+            raise ValueError(f"its text is not in UTF-8: line {i} has a null character")
         yield line
 
 
