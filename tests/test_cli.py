@@ -101,12 +101,8 @@ def test_fit_writes_all_that_its_report_lists(fits, table, tmp_path):
 
 
 def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
-    model, alpha, cameras, X = (
-        fitted.model,
-        fitted.alpha,
-        fitted.cameras,
-        faces[LANDMARKS],
-    )
+    model, alpha, cameras = fitted.model, fitted.alpha, fitted.cameras
+    X = faces[LANDMARKS]
     # The model is that of Python: neither terminal nor figures are in it.
     assert model.verbose == 0
     again = AffineNRSfM(**model.get_params(deep=False)).fit(X)
@@ -326,10 +322,8 @@ def test_points_at_zero_cause_a_warning(fits, changed):
         faces.loc[[3, 9], ["x_5", "y_5"]] = 0.0
 
     found = fits(changed(change), *NO_FIGURES, "-k", 1)
-    zeros, few = found.report["warnings"]
-    assert found.err == "".join(
-        f"isa-nrsfm: warning: {text}\n" for text in (zeros, few)
-    )
+    zeros, few = texts = found.report["warnings"]
+    assert found.err == "".join(f"isa-nrsfm: warning: {text}\n" for text in texts)
     assert zeros.startswith("in 2 of 60 rows points are at exactly (0, 0) (2 in all).")
     assert "--zeros-missing" in zeros
     assert re.search(r"alpha_1 \(.* row [39]\)", few)

@@ -207,9 +207,8 @@ def test_inner_points_are_fitted_and_drawn(fits, transforms, faces, tmp_path, op
     [("without:0-16", range(17, 68)), ("36-47, 30,48-67,30", [30, *range(36, 68)])],
 )
 def test_points_are_named(fits, faces, tmp_path, points, kept):
-    names = fits(
-        faces, "--no-figures", "--points", points, *QUICK
-    ).model.feature_names_in_
+    found = fits(faces, "--no-figures", "--points", points, *QUICK)
+    names = found.model.feature_names_in_
     assert names[::2].tolist() == [f"x_{j}" for j in kept]
     expected = get_skeleton("ibug-68").subset(kept).edges.tolist()
     assert edges_of(tmp_path / "viewer.html")[0] == {*map(tuple, expected)}

@@ -362,6 +362,4 @@ _ALL = (
     ),
 )
 
-FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
-    {each.name: each for each in _ALL}
-)
+FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType({f.name: f for f in _ALL})

@@ -123,7 +123,7 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
     """
     axes = ("time", "individual", "keypoint", "space")
     position = _by_axes(dataset, "position", axes)
-    space = _names(position, "space")
+    space = _names(position, 3)
     if sorted(space) != ["x", "y"]:
         raise ValueError(
             "the positions must be in an image, with space x and y; got "
@@ -135,7 +135,7 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
         confidence = np.asarray(found.values, dtype=np.float64)
     tracks = np.asarray(position.values, dtype=np.float64)
     tracks = tracks[..., [space.index("x"), space.index("y")]]
-    names = _names(position, "individual")
+    names = _names(position, 1)
     if individual is not None:
         if individual not in names:
             raise ValueError(
@@ -147,7 +147,7 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
     return assemble_individuals(
         tracks,
         names,
-        _names(position, "keypoint"),
+        _names(position, 2),
         {"frame": range(len(tracks)), "time": position.coords["time"].values},
         format="movement",
         confidence=confidence,
@@ -194,10 +194,9 @@ def _by_axes(dataset: Any, name: str, wanted: tuple[str, ...]) -> Any:
     return variable.transpose(*(dims[singular.index(dim)] for dim in wanted))
 
 
-def _names(variable: Any, axis: str) -> list[str]:
+def _names(variable: Any, axis: int) -> list[str]:
     """Return the names along an axis."""
-    plural = {new: old for old, new in _MOVEMENT_DIMS.items()}
-    dim = axis if axis in variable.dims else plural.get(axis, axis)
+    dim = variable.dims[axis]
     if dim not in variable.coords:
         raise ValueError(f"the axis {dim} of the dataset has no names")
     return [str(name) for name in variable.coords[dim].values]
