@@ -18,7 +18,7 @@ from isa_nrsfm.analysis import WithinGroups, association, between_share
 from isa_nrsfm.cli import main
 from isa_nrsfm.cli._fit import extrapolated
 from isa_nrsfm.cli._sections import fit_sections, text_of
-from isa_nrsfm.cli._times import read_times, time_unit
+from isa_nrsfm.cli._times import read_times
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses
 from isa_nrsfm.plotting import ComponentChoiceDisplay
@@ -262,7 +262,7 @@ def test_times_of_change(answers, scales, expected):
 )
 def test_the_unit_of_times_is_that_of_the_column(name, cells, unit):
     column = pd.Series(cells, name=name)
-    assert time_unit(column, read_times(column, None)) == unit
+    assert read_times(column, None)[1] == unit
 
 
 @pytest.mark.parametrize(
