@@ -49,6 +49,11 @@ from isa_nrsfm.io._tables import TABLE_SUFFIXES
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
+# Options that are parameters of the same name; none stands for None.
+_PARAMETERS = (
+    *("block_recovery", "refinement", "camera", "independence", "loss"),
+    *("random_state", "n_jobs"),
+)
 
 
 def run(args: Namespace, warned: list[str]) -> str:
@@ -74,9 +79,7 @@ def fit_table(
     frames = read_frames(args, table=table)
     X = frames.X
     if X.empty:
-        out = ", ".join(
-            f"{len(rows)} left out ({reason})" for reason, rows, _ in frames.left_out
-        )
+        out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
     asked = asked_columns(args, frames)
     figures = {} if args.no_figures else figures_of(args, asked)
@@ -180,17 +183,12 @@ def _fitted(
     if args.isa == "fast" or args.n_init is not None:
         strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
         isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
+    given: dict[str, Any] = {name: getattr(args, name) for name in _PARAMETERS}
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=isa,
-        block_recovery=args.block_recovery,
-        refinement=None if args.refinement == NONE else args.refinement,
-        camera=args.camera,
-        independence=None if args.independence == NONE else args.independence,
-        loss=args.loss,
         scale_frames=not args.no_scale_frames,
-        random_state=args.random_state,
-        n_jobs=args.n_jobs,
+        **{name: None if value == NONE else value for name, value in given.items()},
     )
     search, X = None, frames.X
     if len(args.n_components) > 1:

@@ -85,9 +85,8 @@ def model_report(
     certainty = frames_of(estimator).certainty
     advice = certainty.advice.replace('camera="affine"', "--camera affine")
     _, layout, lines, _ = view_and_layout(estimator, edges)
-    found = (
-        estimator.diagnostics(X) if estimator.refinement in JOINT_REFINEMENTS else None
-    )
+    is_joint = estimator.refinement in JOINT_REFINEMENTS
+    found = estimator.diagnostics(X) if is_joint else None
     for message in () if found is None else found.messages:
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)

@@ -203,9 +203,8 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
         raise ValueError(f"the patterns {joined} match {twice!r} twice")
     if not {"#", "*"}.isdisjoint(joined):
         _warn_of_left_out(names, chosen, joined)
-    return LandmarkColumns(
-        joined, point_names(x), tuple(x), tuple(y), _z_of(names, x), tuple(gaps)
-    )
+    points, z = point_names(x), _z_of(names, x)
+    return LandmarkColumns(joined, points, tuple(x), tuple(y), z, tuple(gaps))
 
 
 def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:
