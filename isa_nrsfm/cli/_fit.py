@@ -183,12 +183,15 @@ def _fitted(
     if args.isa == "fast" or args.n_init is not None:
         strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
         isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
-    given: dict[str, Any] = {name: getattr(args, name) for name in _PARAMETERS}
+    given: dict[str, Any] = {
+        name: None if getattr(args, name) == NONE else getattr(args, name)
+        for name in _PARAMETERS
+    }
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=isa,
         scale_frames=not args.no_scale_frames,
-        **{name: None if value == NONE else value for name, value in given.items()},
+        **given,
     )
     search, X = None, frames.X
     if len(args.n_components) > 1:
