@@ -21,7 +21,7 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS, JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import check_table, validated_table
-from isa_nrsfm._prepare.point_weights import weighted_table
+from isa_nrsfm._prepare.point_weights import weighted_rows
 from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
@@ -32,12 +32,7 @@ from isa_nrsfm._tables.sources import (
     open_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import (
-    Layout,
-    clean_tracks,
-    table_to_tracks,
-    tracks_to_table,
-)
+from isa_nrsfm._tables.tracks import Layout, tracks_to_table
 
 _NEEDS_CALIBRATED = (
     "needs a model with calibrated cameras; got camera='affine'. Fit with "
@@ -623,7 +618,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
     def _weighted(
         self, X: Any, point_weight: Any, reset: bool = False
     ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
-        """Return a table, as `_opened`, and the weights (n, J) of its points.
+        """Return the rows of a table, as `_opened`, and the weights (n, J) of points.
 
         There are none if all visible points have weight one. Points of weight zero are
         missing.
@@ -654,12 +649,11 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
                 "dataframe, or no point_weight"
             )
         table = self._opened(X, reset)
-        layout = self.layout if reset else self._model.layout
-        visible, weights = weighted_table(table, point_weight, layout)
+        visible, weights = weighted_rows(table, point_weight)
         return visible, () if weights is None else (weights,)
 
     def _opened(self, X: Any, reset: bool = False) -> FrameBlocks:
-        """Return a table in checked blocks; unless `reset`, it must match the fit."""
+        """Return checked rows of a table; unless `reset`, it must match the fit."""
         if not reset:
             check_is_fitted(self)
         layout = self.layout if reset else self._model.layout
@@ -670,11 +664,14 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
             least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
             X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
             checked_range(X)
-            if not reset:  # a fit warns of half points itself
-                names = getattr(self, "feature_names_in_", None)
-                tracks = clean_tracks(table_to_tracks(X, layout), layout, names)
-                X = tracks_to_table(tracks, layout)
-        return open_table(X, self.n_jobs, self.working_memory)
+        return open_table(
+            X,
+            layout,
+            getattr(self, "feature_names_in_", None),
+            counted=reset,
+            n_jobs=self.n_jobs,
+            working_memory=self.working_memory,
+        )
 
 
 def frames_of(estimator: TableTransformer) -> Any:

@@ -336,7 +336,7 @@ def test_more_basis_shapes_come_from_residuals_of_some_frames(n_frames):
     start = extended(frames, table, 3)
     assert start.noise_variance == 1e-3
     few = np.linspace(0, n_frames - 1, min(n_frames, 200)).round().astype(int)
-    fit = frames.posterior(rows[few].transpose(0, 2, 1))
+    fit = frames.posterior(rows[few])
     centred = rows[few] - fit.translation[:, :, None]
     expected = extended_shapes(centred, shapes[:2], fit.motion, fit.alpha, 2)
     assert start.shapes.shape == (4, 3, 30)

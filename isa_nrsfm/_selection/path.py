@@ -133,7 +133,7 @@ def extended(frames: PosteriorFrames, table: ScaledTable, n_components: int) -> 
     n_frames = table.rows.n_frames
     few = spread(np.arange(n_frames), min(n_frames, 200))
     rows = table.rows.take(few)
-    fit = frames.posterior(rows.transpose(0, 2, 1))
+    fit = frames.posterior(rows)
     n_more = n_components + 1 - len(frames.shapes)
     rows = rows - fit.translation[:, :, None]
     shapes = extended_shapes(rows, frames.shapes, fit.motion, fit.alpha, n_more)
@@ -145,7 +145,7 @@ def _check_part(
 ) -> None:
     """Refuse a part of a table that is not enough for so many basis shapes."""
     n_frames, names = len(part.sizes), getattr(estimator, "feature_names_in_", None)
-    visible = part.rows.joined(lambda rows: visible_points(rows.transpose(0, 2, 1)))
+    visible = part.rows.joined(visible_points)
 
     def refused(k: int) -> ValueError | None:
         try:
