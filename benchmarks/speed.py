@@ -331,13 +331,15 @@ def found_by_search(model, tracks, seed):
     Both are in units of the noise variance: minus twice the log posterior.
     """
     frames = frames_of(model)
-    fit = frames.posterior(tracks).objective
+    fit = frames.posterior(tracks.transpose(0, 2, 1)).objective
     found = np.full(len(tracks), np.inf)
     rng = np.random.default_rng(seed)
     for _ in range(N_STARTS):
         alpha = SPREAD * rng.normal(size=(len(tracks), model.n_components))
         search = frame_search("affine", frames.shapes)
-        other = search.fit_tracks(tracks, frames.noise_variance, initial=alpha)
+        other = search.fit_rows(
+            tracks.transpose(0, 2, 1), frames.noise_variance, initial=alpha
+        )
         found = np.minimum(found, other.objective)
     return fit / frames.noise_variance, found / frames.noise_variance
 

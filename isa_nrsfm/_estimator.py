@@ -53,7 +53,7 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
 )
 from isa_nrsfm._prepare.checks import check_table, validated_table
-from isa_nrsfm._prepare.point_weights import weighted_table
+from isa_nrsfm._prepare.point_weights import weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
 from isa_nrsfm._tables.sources import (
@@ -66,13 +66,7 @@ from isa_nrsfm._tables.sources import (
     open_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import (
-    LAYOUTS,
-    Layout,
-    clean_tracks,
-    table_to_tracks,
-    tracks_to_table,
-)
+from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.analysis._summary import summary_html
@@ -1090,7 +1084,7 @@ class AffineNRSfM(
     def _weighted(
         self, X: Any, point_weight: Any, reset: bool = False
     ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
-        """Return a table, as `_opened`, and the weights (n, J) of its points.
+        """Return the rows of a table, as `_opened`, and the weights (n, J) of points.
 
         There are none if all visible points have weight one. Points of weight zero are
         missing.
@@ -1125,12 +1119,11 @@ class AffineNRSfM(
                 "dataframe, or no point_weight"
             )
         table = self._opened(X, reset)
-        layout = self.layout if reset else self._model.layout
-        visible, weights = weighted_table(table, point_weight, layout)
+        visible, weights = weighted_rows(table, point_weight)
         return visible, () if weights is None else (weights,)
 
     def _opened(self, X: Any, reset: bool = False) -> FrameBlocks:
-        """Return a table in checked blocks; unless `reset`, it must match the fit."""
+        """Return checked rows of a table; unless `reset`, it must match the fit."""
         if not reset:
             check_is_fitted(self)
         layout = self.layout if reset else self._model.layout
@@ -1141,11 +1134,14 @@ class AffineNRSfM(
             least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
             X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
             checked_range(X)
-            if not reset:  # a fit warns of half points itself
-                names = getattr(self, "feature_names_in_", None)
-                tracks = clean_tracks(table_to_tracks(X, layout), layout, names)
-                X = tracks_to_table(tracks, layout)
-        return open_table(X, self.n_jobs, self.working_memory)
+        return open_table(
+            X,
+            layout,
+            getattr(self, "feature_names_in_", None),
+            counted=reset,
+            n_jobs=self.n_jobs,
+            working_memory=self.working_memory,
+        )
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:

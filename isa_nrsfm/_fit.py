@@ -327,7 +327,7 @@ def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointS
     if n_more:
         rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
         frames = replace(frames, shapes=shapes, noise_variance=noise)
-        fit = frames.posterior(rows.transpose(0, 2, 1))
+        fit = frames.posterior(rows)
         rows = rows - fit.translation[:, :, None]
         shapes = extended_shapes(rows, shapes, fit.motion, fit.alpha, n_more)
     return JointState(shapes, np.empty((0, 2, 3)), noise)

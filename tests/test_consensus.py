@@ -359,7 +359,7 @@ class TestConsensus:
         model, rows, (scene, distances, n_components, *_), result = self.found(
             monkeypatch
         )
-        fit = model.posterior(rows.transpose(0, 2, 1))
+        fit = model.posterior(rows)
         shapes = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
         assert_array_equal(scene.rows, rows)
         assert_allclose(scene.motion, fit.motion)

@@ -89,7 +89,7 @@ def prepared(name):
 def scaled(X, K):
     """Return a table as the stages after the first one take it."""
     return scaled_table(
-        open_table(X),
+        open_table(X, "interleaved"),
         K,
         layout="interleaved",
         names=None,

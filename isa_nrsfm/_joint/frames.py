@@ -26,8 +26,7 @@ class WeightedRows(NamedTuple):
     @classmethod
     def without(cls, rows: NDArray, left_out: NDArray) -> Self:
         """Return frames with weight zero for some points (n_frames, n_points)."""
-        seen = seen_points(rows.transpose(0, 2, 1))
-        return cls(rows, (seen & ~left_out) * 1.0)
+        return cls(rows, (seen_points(rows) & ~left_out) * 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +71,7 @@ class JointFrames:
     @classmethod
     def from_weighted(cls, weighted: FrameBlocks) -> Self:
         """Return frames by points, from blocks of `WeightedRows`."""
-        return cls(
-            weighted.derive(
-                lambda b: frame_tracks(b.rows.transpose(0, 2, 1), b.weights)
-            )
-        )
+        return cls(weighted.derive(lambda block: frame_tracks(*block)))
 
     @classmethod
     def from_repeated(cls, rows: FrameBlocks, weights: NDArray) -> Self:
@@ -120,8 +115,7 @@ def _totals(block: FrameTracks, repeated: bool) -> tuple[float, float]:
 
 def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:
     """Return frames of rows (n_frames, 2, n_points), missing points of weight zero."""
-    tracks = rows.transpose(0, 2, 1)
-    return frame_tracks(tracks, None if complete else seen_points(tracks) * 1.0)
+    return frame_tracks(rows, None if complete else seen_points(rows) * 1.0)
 
 
 def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:

@@ -25,10 +25,9 @@ def inlying_rows(
     model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
 ) -> tuple[NDArray, FramePosterior]:
     """Return frames (n, 2, J) of size one with outliers as NaN, and their fit."""
-    tracks = rows.transpose(0, 2, 1)
-    found = model.posterior(tracks, covariances=False, weights=weights)
+    found = model.posterior(rows, covariances=False, weights=weights)
     if model.loss != "linear":
-        off = distances(tracks, model.shapes, *found[:3])
+        off = distances(rows, model.shapes, *found[:3])
         outlying = off > OUTLYING * np.sqrt(model.noise_variance)
         rows = np.where(outlying[:, None], np.nan, rows)
     return rows, found
@@ -39,7 +38,7 @@ def posterior_blocks(
 ) -> FrameBlocks:
     """Return the fits of all frames in blocks of FramePosterior, before the gauge."""
     if model.loss != "linear":
-        return rows.derive(lambda block: model.posterior(block.transpose(0, 2, 1)))
+        return rows.derive(model.posterior)
     shapes = frames.coordinates(model.shapes)
     return frames.blocks.derive(replace(model, shapes=shapes).prepared_posterior)
 

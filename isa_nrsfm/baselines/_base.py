@@ -32,11 +32,10 @@ from isa_nrsfm._tables.sources import CHECKS, checked_range, open_table
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
-    centred_tracks,
-    measurement_matrix,
-    table_to_tracks,
+    centred_frames,
+    refuse_one_place,
+    table_to_rows,
     tracks_to_table,
-    weighting_sizes,
 )
 
 
@@ -119,7 +118,7 @@ class ShapeSequenceNRSfM(
         """
         X = self._checked(X, reset=True)
         table = scaled_table(
-            open_table(X),
+            open_table(X, self.layout),
             self.n_components,
             layout=self.layout,
             names=getattr(self, "feature_names_in_", None),
@@ -137,7 +136,7 @@ class ShapeSequenceNRSfM(
         mean_shape, basis, coefficients = principal_shapes(shapes, self.n_components)
         model = compose(mean_shape, basis, coefficients)
         noise, error = (
-            np.mean((W - measurement_matrix(each @ cameras.transpose(0, 2, 1))) ** 2)
+            np.mean((W - (cameras @ each.transpose(0, 2, 1)).reshape(W.shape)) ** 2)
             for each in (model, shapes)
         )
         self.inverse_snr_ = float(error / np.mean(W**2))
@@ -285,14 +284,16 @@ class ShapeSequenceNRSfM(
 
     def _decompose(self, X: NDArray) -> Decomposition:
         """Return camera and coefficients of each frame of a valid table."""
-        tracks = table_to_tracks(X, self.layout).astype(np.float64)
-        sizes = np.full(len(tracks), self._unit)
+        rows = table_to_rows(X, self.layout).astype(np.float64)
+        sizes = np.full(len(rows), self._unit)
         if self.scale_frames:
-            sizes = weighting_sizes(centred_tracks(tracks)[0], True)
+            _, report = centred_frames(rows)
+            refuse_one_place(report, rows.shape[2])
+            sizes = report.size
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
         search = frame_search("orthographic", shapes.transpose(0, 2, 1).astype(float))
-        fits = search.fit_tracks(
-            tracks / sizes[:, None, None],
+        fits = search.fit_rows(
+            rows / sizes[:, None, None],
             self.noise_variance_ / self._unit**2,
             covariances=False,
         )

@@ -251,7 +251,7 @@ def _frames(
     if confidence is not None:
         confidence = confidence[list(columns.x)].iloc[rows]
         tracks[confidence.to_numpy() == 0] = np.nan
-    _, report = centred_frames(tracks)
+    _, report = centred_frames(tracks.transpose(0, 2, 1))
     reasons = _reasons(report, None if failed is None else failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     _warn_of_code(tracks[report.usable])
@@ -467,10 +467,11 @@ def _layout(
     if stored is not None:
         return stored
     tracks = _tracks(args, table, columns, _rows_to_keep(args, table)[0])
-    centred, report = centred_frames(tracks[np.isfinite(tracks).all(axis=(1, 2))])
+    complete = tracks[np.isfinite(tracks).all(axis=(1, 2))]
+    centred, report = centred_frames(complete.transpose(0, 2, 1))
     extended = report.size > 0
     images = centred[extended] / report.size[extended, None, None]
-    shape = images.mean(axis=0) if extended.any() else None
+    shape = images.mean(axis=0).T if extended.any() else None
     return find_skeleton(len(names), names, shape=shape)
 
 
