@@ -28,6 +28,7 @@ from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
 from benchmarks._isolated import run_isolated
 from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._tables.tracks import (
@@ -36,7 +37,6 @@ from isa_nrsfm._tables.tracks import (
     table_to_tracks,
     weighting_sizes,
 )
-from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.export import pose_function
@@ -331,13 +331,15 @@ def found_by_search(model, tracks, seed):
     Both are in units of the noise variance: minus twice the log posterior.
     """
     frames = frames_of(model)
-    fit = frames.posterior(tracks).objective
+    fit = frames.posterior(tracks.transpose(0, 2, 1)).objective
     found = np.full(len(tracks), np.inf)
     rng = np.random.default_rng(seed)
     for _ in range(N_STARTS):
         alpha = SPREAD * rng.normal(size=(len(tracks), model.n_components))
         search = frame_search("affine", frames.shapes)
-        other = search.fit_tracks(tracks, frames.noise_variance, initial=alpha)
+        other = search.fit_rows(
+            tracks.transpose(0, 2, 1), frames.noise_variance, initial=alpha
+        )
         found = np.minimum(found, other.objective)
     return fit / frames.noise_variance, found / frames.noise_variance
 

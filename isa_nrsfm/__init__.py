@@ -22,11 +22,13 @@ if TYPE_CHECKING:
     )
     from isa_nrsfm._estimator import AffineNRSfM as AffineNRSfM
     from isa_nrsfm._frames.models import Decomposition as Decomposition
-    from isa_nrsfm._selection.estimator import AffineNRSfMCV as AffineNRSfMCV
-    from isa_nrsfm._transformer import SmoothedCoefficients as SmoothedCoefficients
+    from isa_nrsfm._selection import AffineNRSfMCV as AffineNRSfMCV
     from isa_nrsfm.analysis import (
         WithinGroups as WithinGroups,
         association as association,
+    )
+    from isa_nrsfm.analysis._smoothing import (
+        SmoothedCoefficients as SmoothedCoefficients,
     )
     from isa_nrsfm.isa import FastISA as FastISA, PooledFastICA as PooledFastICA
 else:

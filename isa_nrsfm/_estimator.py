@@ -2,35 +2,85 @@
 
 import copy
 import os
+import warnings
+from functools import partial
 from numbers import Integral, Real
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import clone
-from sklearn.utils import check_random_state
+from sklearn.base import TransformerMixin, clone
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import (
+    check_array,
+    check_random_state,
+    check_scalar,
+    estimator_html_repr,
+)
+from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
+from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
-from isa_nrsfm._fit import STEPWISE, Limits, fit_table, stages_of
-from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._compat.scikit_learn import (
+    CoefficientNamesMixin,
+    HasMethods,
+    Interval,
+    ShownEstimator,
+    StrOptions,
+    fit_context,
+)
+from isa_nrsfm._fit import (
+    STEPWISE,
+    FitSettings,
+    Limits,
+    fit_table,
+    ready_table,
+    stages_of,
+    supported_components,
+)
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
+from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
+from isa_nrsfm._frames.projection import compose, project
+from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
+    CALIBRATED_CAMERAS,
     CAMERA_NAMES,
     INDEPENDENCE,
+    JOINT_REFINEMENTS,
     LOSSES,
     REFINEMENTS,
 )
+from isa_nrsfm._prepare.checks import check_table, validated_table
+from isa_nrsfm._prepare.point_weights import weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.kept_arrays import kept_arrays
-from isa_nrsfm._tables.sources import StoredTable, is_on_dask
-from isa_nrsfm._tables.tracks import LAYOUTS, Layout
-from isa_nrsfm._transformer import TableTransformer
+from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
+from isa_nrsfm._tables.sources import (
+    CHECKS,
+    StoredTable,
+    checked_range,
+    column_sample,
+    is_on_dask,
+    is_read_later,
+    open_table,
+    unmasked,
+)
+from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
+from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose
+from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
+from isa_nrsfm.analysis._summary import summary_html
 from isa_nrsfm.isa import PooledFastICA
 
+_NEEDS_CALIBRATED = (
+    "needs a model with calibrated cameras; got camera='affine'. Fit with "
+    "camera='weak_perspective' or camera='orthographic'"
+)
 
-class AffineNRSfM(CallbackSupportMixin, TableTransformer):
+
+class AffineNRSfM(
+    CallbackSupportMixin, CoefficientNamesMixin, TransformerMixin, ShownEstimator
+):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
 
@@ -261,6 +311,36 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     (5, 4)
     """
 
+    mean_shape_: NDArray
+    basis_: NDArray
+    alpha_: NDArray
+    alpha_std_: NDArray
+    motion_: NDArray
+    translation_: NDArray
+    rotations_: NDArray
+    scales_: NDArray
+    inverse_snr_: float
+    rank_floor_: float
+    noise_variance_: float
+    camera_noise_ratio_: float
+    depth_uncertainty_: float
+    reliability_: NDArray
+    objective_history_: NDArray
+    gradient_norm_: float
+    energy_share_: NDArray
+    mode_covariance_: NDArray
+    singular_values_: NDArray
+    reference_motion_: NDArray
+    reference_translation_: NDArray
+    isa_: Any
+    n_iter_: int
+    camera_: str
+    frames_scaled_: bool
+    n_features_in_: int
+    feature_names_in_: NDArray
+
+    _model: TableModel
+    _frame_sizes: NDArray
     _limits: ClassVar[Limits] = Limits()  # others: `limited`
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
@@ -369,19 +449,11 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             table much better, or if a refinement has not converged.
         """
         self._forget()
-        stages = stages_of(self.refinement)
         with kept_arrays(self.frames_folder) as keep:
+            self._forget()
+            stages = stages_of(self.refinement)
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
-            fitted = copy.copy(self)
-            source, weights = fitted._checked(X, point_weight)
-            frames = fit_table(fitted, source, progress, *weights)
-            if self.keep_frames:
-                kept = keep(frames._asdict())
-                fitted._set_frames(*map(source.as_collected, kept.values()))
-            certainty = fitted._model.frames.certainty
-            if not certainty.determined:
-                warn_caller(certainty.advice)
-        self.__dict__.update(vars(fitted))  # all at once
+            self._fit(X, point_weight, progress, keep=keep, errors=True)
         progress.end()
         return self
 
@@ -410,19 +482,81 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             return self.alpha_.copy()
         return self.transform(X, point_weight=point_weight)
 
-    def _checked(
-        self, X: Any, point_weight: Any = None
-    ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
-        """Check parameters and a table, and set the attributes that a fit needs.
+    def _fit(
+        self,
+        X: Any,
+        point_weight: Any,
+        progress: FitProgress | NoProgress,
+        *,
+        start: TableModel | None = None,
+        keep: Keep = dict,
+        errors: bool = False,
+    ) -> None:
+        """Fit a table, and set all attributes at once.
 
-        Returns the table in blocks, and the weights of its points, if any.
+        The joint fit starts from the model of a similar table, if given.
+        `errors`: estimate those of the depths, and warn of those not determined.
         """
+        opened = copy.copy(self)  # a fit that fails sets no attribute
+        source, weights, settings = opened._ready(X, point_weight)
+        isa, n_components = self._strategy(settings.joint), self.n_components
+        auto = n_components == "auto"
+        if auto:
+            with warnings.catch_warnings(action="ignore"):  # the fit warns again
+                table = ready_table(source, weights, 1, settings)
+            n_components, all_relevant = supported_components(table, isa, settings)
+            # A consensus has more components.
+            if all_relevant and self.refinement != "consensus":
+                warn_caller(
+                    f"all {n_components} basis shapes that were tried are relevant: "
+                    f"more than n_components={n_components} may be needed for this "
+                    "table"
+                )
+        table = ready_table(source, weights, n_components, settings)
+        fit = fit_table(
+            table, n_components, isa, settings, progress, start, auto, errors
+        )
+        if not fit.converged:
+            warn_caller(
+                f"the refinement did not converge in max_iter={self.max_iter} steps; "
+                "increase max_iter or tol",
+                ConvergenceWarning,
+            )
+        attributes = {**vars(opened), **fit.attributes}
+        if self.keep_frames:
+            kept = keep(fit.frames._asdict())
+            frames = Decomposition(*map(source.as_collected, kept.values()))
+            attributes |= {
+                f"{name}_": value for name, value in frames._asdict().items()
+            }
+            attributes["_frame_sizes"] = fit.sizes
+            if not settings.joint:
+                del attributes["alpha_std_"]
+            if self.camera != "affine":
+                R, scales = full_rotations(frames.motion)
+                attributes |= {"rotations_": R, "scales_": scales}
+        certainty = fit.model.frames.certainty
+        if errors and not certainty.determined:
+            warn_caller(certainty.advice)
+        self.__dict__.update(attributes)
+        self._model, self._n_features_out = fit.model, len(fit.model.basis)
+        self.isa_, self.camera_ = fit.isa, self.camera
+        self.frames_scaled_ = settings.scale_frames
+
+    def _ready(
+        self, X: Any, point_weight: Any = None
+    ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
+        """Check parameters and a table of a fit; return it, its weights and settings.
+
+        Sets the attributes of the columns.
+        """
+        joint = self.refinement in JOINT_REFINEMENTS
         only_joint = {
             "n_components": self.n_components == "auto",
             "loss": self.loss != "linear",
             "independence": self.independence == "coefficients",
         }
-        if not self._is_joint:
+        if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
             for name, asked_for in only_joint.items():
                 if asked_for:
@@ -444,16 +578,29 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
                 "refinement='joint', or give no point_weight"
             )
         source, weights = self._weighted(X, point_weight, reset=True)
-        self.isa_ = self._strategy()
-        self.frames_scaled_ = self.scale_frames and self.camera != "orthographic"
-        return source, weights
+        settings = FitSettings(
+            self.refinement,
+            self.camera,
+            self.loss,
+            self.independence,
+            self.block_recovery,
+            self.layout,
+            self.scale_frames and self.camera != "orthographic",
+            self.max_iter,
+            self.tol,
+            self.n_jobs,
+            names=getattr(self, "feature_names_in_", None),
+            silent_isa=joint and self.isa is None,
+            limits=self._limits,
+        )
+        return source, weights[0] if weights else None, settings
 
-    def _strategy(self) -> Any:
+    def _strategy(self, joint: bool) -> Any:
         """Return the unfitted strategy, with parameters inherited where not set."""
         if self.isa is not None:
             isa = clone(self.isa)
         else:
-            isa = PooledFastICA(n_init=2 if self._is_joint else 16)
+            isa = PooledFastICA(n_init=2 if joint else 16)
         params = isa.get_params(deep=False)
         if params.get("subspace_size", 3) != 3:
             raise ValueError(
@@ -475,13 +622,526 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         left = [name for name in vars(self) if not name.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in left if name not in found}
 
-    def _set_frames(self, *frames: NDArray) -> None:
-        """Set the attributes of the frames, in the order of `Decomposition`."""
-        self.motion_, self.translation_, self.alpha_, alpha_std = frames
-        if self._is_joint:
-            self.alpha_std_ = alpha_std
-        if self.camera != "affine":
-            self.rotations_, self.scales_ = full_rotations(self.motion_)
+    def __sklearn_tags__(self) -> Any:
+        """Return the estimator's tags."""
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = ["float64", "float32"]
+        tags.input_tags.allow_nan = True
+        return tags
+
+    def __sklearn_is_fitted__(self) -> bool:
+        """Return whether a fit has ended."""
+        return hasattr(self, "_model")
+
+    if not TYPE_CHECKING:  # mypy would accept any name
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise an error; it states why affine fits lack an attribute."""
+            affine = vars(self).get("camera_") == "affine"
+            if affine and name in ("rotations_", "scales_", "depth_uncertainty_"):
+                raise AttributeError(f"{name} {_NEEDS_CALIBRATED}", name=name, obj=self)
+            return super().__getattribute__(name)
+
+    def _html_repr(self) -> str:
+        """Return scikit-learn's diagram for notebooks, and a summary."""
+        picture = estimator_html_repr(self)
+        return picture + summary_html(self) if hasattr(self, "basis_") else picture
+
+    def transform(self, X: Any, *, point_weight: Any = None) -> NDArray:
+        """
+        Return the coefficients of the frames of a table.
+
+        Each frame is fitted by itself: its result does not depend on the others.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_components)
+            Coefficients; `alpha_` for the fitted table. NaN for rows with too few
+            visible points.
+        """
+        table, weights = self._weighted(X, point_weight)
+        coefficients = partial(self._model.decompose, deviations=False)
+        return table.collect(coefficients, *weights).alpha
+
+    def decompose(self, X: Any, *, point_weight: Any = None) -> Decomposition:
+        """
+        Return camera and coefficients of each frame of a table.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
+
+        Returns
+        -------
+        Decomposition
+            Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
+            alpha_std (n_frames, n_components).
+        """
+        table, weights = self._weighted(X, point_weight)
+        return table.collect(self._model.decompose, *weights)
+
+    def smooth(
+        self,
+        X: Any,
+        *,
+        point_weight: Any = None,
+        time: Any = None,
+        groups: Any = None,
+        max_gap: int = 30,
+        max_iter: int = 100,
+        tol: float = 1.0,
+    ) -> SmoothedCoefficients:
+        """
+        Return coefficients and cameras of the frames of a video, smoothed in time.
+
+        Coefficients are Gaussian processes in time, cameras are integrated random
+        walks, both estimated from the table. Each frame has the weight of its
+        likelihood: frames with few visible points have little weight, with less than
+        six none. The fit of the shapes does not depend on the order of the frames:
+        smoothing is a step after it.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one. The rows of each group are in
+            temporal order.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
+        time : array-like of shape (n_frames,), default=None
+            Times of the frames, numbers or dates (in seconds from the first). Their
+            median difference is one step. Other differences are rounded to whole steps.
+            If None, consecutive frames are one step apart.
+        groups : array-like of shape (n_frames,), default=None
+            Person, video or scene of each frame. Smoothing does not cross groups.
+            Each sequence has its own intercept, so that differences between people are
+            not taken for dynamics. None for one group.
+        max_gap : int, default=30
+            Largest gap, in steps, across which coefficients are smoothed.
+        max_iter : int, default=100
+            Largest number of iterations of the search for time scales.
+        tol : float, default=1.0
+            The search ends when no derivative of the log-likelihood, by the logarithm
+            of a time scale or variance, is larger.
+
+        Returns
+        -------
+        SmoothedCoefficients
+            Named tuple of alpha, alpha_std (n_frames, n_components), time_scales and
+            decomposition.
+
+        Raises
+        ------
+        ValueError
+            If times are missing or do not rise within a group, if no group has two
+            rows, or if the model was not refined jointly.
+
+        Notes
+        -----
+        The processes have the Matern covariance of order 3/2 (Hartikainen, Sarkka,
+        2010). Coefficients and camera of a frame are observed through its likelihood,
+        linearised at the fit of `transform` (Rauch, Tung, Striebel, 1965). Time scales
+        and variances maximise the likelihood. If the evidence for dynamics of the
+        coefficients is weak, as for photos in any order, the result is that of
+        `decompose`: the likelihood is compared with that of intercepts alone.
+        """
+        check_scalar(max_gap, "max_gap", Integral, min_val=1)
+        check_scalar(max_iter, "max_iter", Integral, min_val=1)
+        check_scalar(tol, "tol", Real, min_val=0.0)
+        table, weights = self._weighted(X, point_weight)
+        frames = self._jointly_fitted("smooth")
+        alone = table.joined(self._model.linearised, *weights)
+        camera, limits = CAMERAS[self.camera_], (max_gap, max_iter, tol)
+        dtype = table.empty.dtype
+        return smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
+
+    def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
+        """
+        Return the posterior covariances of the rotations of calibrated cameras.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 3, 3)
+            Posterior covariances, in radians squared, of the errors w of the rotations,
+            as rotation vectors: ``R exp(hat(w))``, with w in the axes of the shapes.
+            Each is the covariance of the frame plus that of the shapes, from a
+            jackknife over groups of points. NaN for rows with too few visible points.
+
+        Raises
+        ------
+        ValueError
+            If the model has affine cameras, or was not refined jointly.
+        """
+        table, weights = self._weighted(X, point_weight)
+        frames = self._jointly_fitted("rotation_covariance", calibrated=True)
+        space, certainty = frames.gauge.rotation, frames.certainty
+        found = table.joined(self._model.posterior, *weights)
+        covariance = space @ found.turn_covariance @ space.T
+        if certainty.turns is not None:
+            R, _ = full_rotations(found.motion @ space.T)
+            covariance = covariance + R.transpose(0, 2, 1) @ certainty.turns @ R
+        return np.asarray(covariance).astype(table.empty.dtype, copy=False)
+
+    def reconstruct(
+        self,
+        X: Any,
+        camera: str | None = None,
+        *,
+        return_std: bool = False,
+        point_weight: Any = None,
+    ) -> Any:
+        """
+        Return the 3D shape of each frame of a table.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points), or Decomposition
+            A table with the points of the fitted one, or the result of `decompose`,
+            whose frames are not fitted again.
+        camera : {"orthographic", "weak_perspective"} or None, default=None
+            Calibrated camera model of the images, for a model that was fitted with
+            affine cameras. None returns affine shapes, in the space of `mean_shape_`:
+            their angles and proportions in depth are not those of the object. Otherwise
+            shapes are Euclidean, up to one rotation and one mirror image for all
+            frames. With "weak_perspective" each camera has its own scale, and the sizes
+            of the shapes have no meaning. With "orthographic" all cameras have one
+            scale, and shapes are in the units of the table.
+
+        return_std : bool, default=False
+            Whether to return the standard deviations of the depths, for a model with
+            calibrated cameras.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points of a table, as in `fit`.
+
+        Returns
+        -------
+        shapes : ndarray of shape (n_frames, n_points, 3)
+            Shapes in their own axes, not in the axes of the camera. NaN for rows with
+            too few visible points. If `camera` is given for an affine model, each shape
+            is rotated as near as possible to the mean shape.
+        depth_std : ndarray of shape (n_frames, n_points)
+            Only with `return_std`. Standard deviations of the coordinates of the points
+            along the viewing direction of their frame, in the units of the shapes. They
+            contain the uncertainty of camera, coefficients and shapes.
+
+        Raises
+        ------
+        ValueError
+            If `camera` is none of these, if the cameras of the fitted table see fewer
+            than three directions of space, or if the model was fitted with calibrated
+            cameras other than `camera`. If `return_std` is given with a decomposition,
+            or the decomposition has another number of coefficients.
+
+        Warns
+        -----
+        UserWarning
+            If the cameras of the fitted table rotate too little to determine the metric
+            of space.
+
+        See Also
+        --------
+        isa_nrsfm.calibration.euclidean_frames : Shapes, rotations and scales.
+
+        Notes
+        -----
+        The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
+        `motion_` and `alpha_`, the cameras and coefficients of the fitted table, for
+        any X. If the model was fitted with calibrated cameras, its shapes are Euclidean
+        already. They are not rotated, so that `scales_` and `rotations_` are those of
+        their cameras.
+        """
+        if camera is not None and camera not in CALIBRATED_CAMERAS:
+            raise ValueError(
+                f"camera must be None or one of {CALIBRATED_CAMERAS}; got {camera!r}"
+            )
+        check_is_fitted(self)
+        decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
+        if decomposed and point_weight is not None:
+            raise ValueError(
+                "point_weight needs the table; give it to decompose, not its result"
+            )
+        if decomposed and X.alpha.shape[1:] != (n_components,):
+            raise ValueError(
+                f"the decomposition must be that of a model with {n_components} basis "
+                f"shapes; got alpha of shape {X.alpha.shape}"
+            )
+        if return_std:
+            self._jointly_fitted("return_std", calibrated=True)
+            if decomposed:
+                raise ValueError(
+                    "return_std needs the table, not the result of decompose, which "
+                    "has no covariances"
+                )
+        fitted, metric = self.camera_, None
+        if fitted != "affine" and camera not in (None, fitted):
+            raise ValueError(
+                f"the model was fitted with camera={fitted!r}, whose shapes are "
+                f"Euclidean as they are; got camera={camera!r}"
+            )
+        if camera is not None and fitted == "affine":
+            check_frames_kept(self, "reconstruct with a camera")
+            metric = deformation_metric(self.motion_, self.alpha_)
+        scaled = metric is not None and camera == "orthographic"
+        if decomposed:
+            return self._model.shapes(X, metric, scaled)
+        table, weights = self._weighted(X, point_weight)
+        if return_std:
+            return tuple(table.collect(self._model.uncertain_shapes, *weights))
+        shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
+        return table.collect(shapes, *weights)
+
+    def mirrored(self) -> Self:
+        """
+        Return the mirror image of the model in depth, which fits equally well.
+
+        Neither affine nor calibrated cameras distinguish an object from its mirror
+        image. The fit chooses the one whose mean shape has depths of positive skewness.
+        Use this method if that is the wrong one, for example a face whose nose points
+        away. Coefficients, reprojection and score stay the same.
+
+        Returns
+        -------
+        AffineNRSfM
+            A copy with changed signs of z of the shapes and of the third column of the
+            cameras. Its rotations are ``D R D`` with ``D = diag(1, 1, -1)``.
+
+        Examples
+        --------
+        >>> from isa_nrsfm import AffineNRSfM
+        >>> from isa_nrsfm.datasets import make_face_tracks
+        >>> faces = make_face_tracks(n_frames=100, random_state=0)
+        >>> model = AffineNRSfM(2, camera="weak_perspective").fit(faces.data)
+        >>> bool((model.mirrored().mean_shape_[:, 2] == -model.mean_shape_[:, 2]).all())
+        True
+        """
+        check_is_fitted(self)
+        found, dtype = copy.copy(self), self.mean_shape_.dtype
+        for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
+            if hasattr(self, name):
+                setattr(found, name, getattr(self, name) * MIRROR.astype(dtype))
+        if hasattr(self, "rotations_"):
+            turned = MIRROR[:, None] * self.rotations_ * MIRROR
+            found.rotations_ = turned.astype(dtype, copy=False)
+        signs = np.tile(MIRROR, len(self.basis_))
+        found.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
+        found._model = self._model._replace(
+            frames=self._model.frames.mirrored(),
+            mean_shape=found.mean_shape_,
+            basis=found.basis_,
+        )
+        return found
+
+    def reproject(self, X: Any) -> NDArray:
+        """
+        Return the images of the fitted shapes, including missing points.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 2 * n_points)
+            Points of the fitted shapes in the fitted cameras. NaN for rows with too
+            few visible points.
+        """
+        return self._opened(X).collect(self._model.reproject)
+
+    def inverse_transform(
+        self, alpha: Any, motion: Any = None, translation: Any = None
+    ) -> NDArray:
+        """
+        Return the table of shapes with given coefficients.
+
+        Parameters
+        ----------
+        alpha : array-like of shape (n_frames, n_components)
+            Coefficients.
+        motion : array-like of shape (n_frames, 2, 3) or (2, 3), default=None
+            Cameras; None is `reference_motion_`, the mean view of the fitted table.
+        translation : array-like of shape (n_frames, 2) or (2,), default=None
+            Positions; None is `reference_translation_`, the mean centroid of the
+            fitted table.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 2 * n_points)
+            The table, in the order of `layout`.
+
+        Raises
+        ------
+        ValueError
+            If the shapes do not fit the model or each other.
+        """
+        check_is_fitted(self)
+        alpha = unmasked(alpha)
+        alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
+        if motion is None:
+            motion = self.reference_motion_
+        if translation is None:
+            translation = self.reference_translation_
+        n_frames, n_components = len(alpha), len(self.basis_)
+        alpha = checked("alpha", alpha, (n_frames, n_components))
+        motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
+        translation = checked("translation", translation, (n_frames, 2), (2,))
+        shapes = compose(self.mean_shape_, self.basis_, alpha)
+        return tracks_to_table(project(shapes, motion, translation), self._model.layout)
+
+    def score(self, X: Any, y: Any = None, *, point_weight: Any = None) -> float:
+        """
+        Return minus the inverse SNR of points held out of the fit of their frame.
+
+        The points are divided into five parts, always the same. Each part is predicted
+        from the others, frame by frame. Unlike the reprojection error of fitted points,
+        this error rises with too many basis shapes. So the score can choose
+        `n_components`.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+        y : None
+            Ignored.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`. They also multiply the terms of the
+            sums.
+
+        Returns
+        -------
+        float
+            ``-sum ||m - m_hat||^2 / sum ||m - centroid_i||^2`` over all points, with
+            frames scaled as in the fit. Larger is better. A point is left out if the
+            other points of its frame do not determine the fit. In frames with missing
+            points it is also left out if the camera of the others adds more than
+            twice the noise variance to its prediction.
+        """
+        table, weights = self._weighted(X, point_weight)
+        noise, signal = table.joined(self._model.held_out, *weights).sum(axis=0)
+        return -float(noise / signal) if signal > 0 else float("nan")
+
+    def diagnostics(self, X: Any = None) -> Diagnostics:
+        """
+        Return diagnostics of how well the fitted table determines its fit.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points), default=None
+            The fitted table. If given, it is searched for outliers.
+
+        Returns
+        -------
+        Diagnostics
+            Named tuple of camera_singular_values, deformation_amplitude, reliability,
+            effective_frames, weak_deviations, depth_uncertainty, camera_noise_ratio,
+            camera_meaning, pose_share, outlier_share, outliers and messages. The
+            messages are sentences, for example if the table supports fewer basis
+            shapes, or if it has outliers.
+
+        Raises
+        ------
+        ValueError
+            If the model was not refined jointly: the paper's pipeline has no noise
+            variance.
+        """
+        check_is_fitted(self)
+        self._jointly_fitted("diagnostics")
+        check_frames_kept(self, "diagnostics")
+        distance = None
+        if X is not None:
+            distance = self._opened(X).joined(self._model.distances)
+        rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
+        return diagnose(self, distance, rows)
+
+    def _jointly_fitted(self, name: str, calibrated: bool = False) -> PosteriorFrames:
+        """Return the model of a frame with noise, and calibrated cameras, or raise."""
+        frames = self._model.frames
+        if not isinstance(frames, PosteriorFrames):
+            raise ValueError(
+                f"{name} needs a model with refinement='joint', which has a noise "
+                f"variance; got refinement={self.refinement!r}"
+            )
+        if calibrated and self.camera_ == "affine":
+            raise ValueError(f"{name} {_NEEDS_CALIBRATED}")
+        return frames
+
+    def _weighted(
+        self, X: Any, point_weight: Any, reset: bool = False
+    ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
+        """Return the rows of a table, as `_opened`, and the weights (n, J) of points.
+
+        There are none if all visible points have weight one. Points of weight zero are
+        missing.
+        """
+        if point_weight is None:
+            return self._opened(X, reset), ()
+        if not reset:
+            check_is_fitted(self)
+        # Parameters that are set after a fit have no effect on its model.
+        frames = None if reset else self._model.frames
+        if not (
+            self.refinement in JOINT_REFINEMENTS
+            if reset
+            else isinstance(frames, PosteriorFrames)
+        ):
+            raise ValueError(
+                "point_weight needs a fit with refinement='joint', because the "
+                "refinement of the paper has no weights. Set refinement='joint', or "
+                "set points of low weight to NaN"
+            )
+        loss = self.loss if reset else getattr(frames, "loss", "linear")
+        if loss != "linear":
+            raise ValueError(
+                "point_weight needs loss='linear', because robust losses find weights "
+                f"of their own; got loss={loss!r}. Set loss='linear', or set points of "
+                "low weight to NaN"
+            )
+        if is_read_later(X):
+            raise ValueError(
+                "point_weight needs a table in memory, because weights are not read "
+                f"block by block; got a {type(X).__name__}. Give a NumPy array or a "
+                "dataframe, or no point_weight"
+            )
+        table = self._opened(X, reset)
+        visible, weights = weighted_rows(table, point_weight)
+        return visible, () if weights is None else (weights,)
+
+    def _opened(self, X: Any, reset: bool = False) -> FrameBlocks:
+        """Return checked rows of a table; unless `reset`, it must match the fit."""
+        if not reset:
+            check_is_fitted(self)
+        layout = self.layout if reset else self._model.layout
+        if is_read_later(X):
+            check_table(X, layout)
+            validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
+        else:
+            least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
+            X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
+            checked_range(X)
+        return open_table(
+            X,
+            layout,
+            getattr(self, "feature_names_in_", None),
+            counted=reset,
+            n_jobs=self.n_jobs,
+            working_memory=self.working_memory,
+        )
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:
@@ -494,4 +1154,33 @@ def check_class(estimator: object, where: str) -> None:
     if not isinstance(estimator, AffineNRSfM):
         raise ValueError(
             f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
+        )
+
+
+def frames_of(estimator: AffineNRSfM) -> Any:
+    """Return the fitted model of single frames."""
+    return estimator._model.frames
+
+
+def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
+    """Return values as a finite array of one of the allowed shapes, or raise."""
+    array = check_array(
+        unmasked(values),
+        dtype=[np.float64, np.float32],
+        input_name=name,
+        ensure_2d=False,
+        allow_nd=True,
+    )
+    if array.shape not in allowed:
+        expected = " or ".join(map(str, allowed))
+        raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
+    return array
+
+
+def check_frames_kept(estimator: Any, what: str) -> None:
+    """Raise an error if the frames of the fit are needed and were not kept."""
+    if not hasattr(estimator, "motion_"):
+        raise ValueError(
+            f"{what} needs the cameras and coefficients of the fitted table, which "
+            "were not kept: got keep_frames=False. Fit again with keep_frames=True"
         )

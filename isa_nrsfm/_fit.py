@@ -1,4 +1,8 @@
-"""The stages of a fit, in order: from a table to the attributes of an estimator.
+"""The stages of a fit, in order: from a table to all that an estimator shows.
+
+    FrameBlocks -> ScaledTable -> FactorisedTable -> PaperResult -> JointFit
+    checks, size   outliers,       SVD, ISA,          maximum      gauge, measures
+                   completion      blocks             likelihood   -> TableFit
 
 1. The table is checked, scaled and, where points are missing, completed.
 2. Factorisation of the measurement matrix, of the frames of a sample if there are many.
@@ -8,15 +12,15 @@
    `refinement="consensus"`; or the frames of the paper.
 6. Measures of the fit.
 
-Stages 1, 5 and 6 use all frames, the other stages those of the sample.
+Stages 1, 5 and 6 use all frames, the other stages those of the sample. No function here
+has an estimator: `fit_table` returns a `TableFit`, and `AffineNRSfM.fit` shows it.
 """
 
-import copy
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +29,6 @@ from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
-from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import nearest_calibrated, reference_camera
 from isa_nrsfm._frames.depth import leverages
@@ -46,17 +48,20 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
+from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.jackknife import depth_certainty
 from isa_nrsfm._joint.problem import FactorisedTable, JointOptions, JointSettings
+from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.sample_posterior import (
+    LEAST_RELIABILITY,
     posterior_blocks,
     posterior_moments,
+    reliabilities,
     shape_uncertainty,
     shown_frames,
 )
-from isa_nrsfm._joint.starts import rigid_start
+from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._paper.factors import (
     DENSE,
     Factorisation,
@@ -71,8 +76,8 @@ from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import of_all_rows
-from isa_nrsfm._transformer import TableTransformer
+from isa_nrsfm._tables.ordering import spread
+from isa_nrsfm._tables.tracks import Layout, of_all_rows
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
@@ -99,6 +104,62 @@ class Limits(NamedTuple):
     joint: JointOptions = JointOptions()
 
 
+class FitSettings(NamedTuple):
+    """The parameters of `AffineNRSfM` of the same names, and limits.
+
+    scale_frames: False with orthographic cameras. names: those of the columns, if any.
+    silent_isa: whether a strategy that only starts the joint fit may end early.
+    """
+
+    refinement: str | None
+    camera: str
+    loss: str
+    independence: str | None
+    block_recovery: str
+    layout: Layout
+    scale_frames: bool
+    max_iter: int
+    tol: float | None
+    n_jobs: int | None
+    names: NDArray | None
+    silent_isa: bool
+    limits: Limits
+
+    @property
+    def joint(self) -> bool:
+        """Whether the refinement is the joint fit, or begins with it."""
+        return self.refinement in JOINT_REFINEMENTS
+
+    @property
+    def joint_camera(self) -> str | None:
+        """The camera model of the joint refinement, None without it."""
+        return self.camera if self.joint else None
+
+    def of_joint_fit(self, on_step: Callable[[], None] | None = None) -> JointSettings:
+        """Return the settings of the joint refinement."""
+        tol = JOINT_TOL if self.tol is None else self.tol
+        return JointSettings(
+            self.camera, self.loss, self.max_iter, tol, on_step, self.limits.joint
+        )
+
+
+class TableFit(NamedTuple):
+    """The fit of a table.
+
+    model: the model of new tables. frames: cameras and coefficients of all rows, NaN
+    for rows without visible points. sizes (n_rows,): those of the frames. isa: the
+    fitted strategy, None if the fit started from another one. attributes: the other
+    public attributes of `AffineNRSfM`, by name.
+    """
+
+    model: TableModel
+    frames: Decomposition
+    sizes: NDArray
+    isa: Any
+    converged: bool
+    attributes: dict[str, Any]
+
+
 def stages_of(refinement: str | None) -> list[str]:
     """Return the names of the stages of a fit, in order."""
     stages = ["table", "factorisation"]
@@ -110,201 +171,133 @@ def stages_of(refinement: str | None) -> list[str]:
     return [*stages, "gauge and coefficients"]
 
 
-def fit_table(
-    estimator: TableTransformer,
-    source: FrameBlocks,
-    progress: FitProgress,
-    weights: NDArray | None = None,
-) -> Decomposition:
-    """Fit a table, and set the attributes of an estimator.
-
-    Its parameters are checked, and its `isa_` is the unfitted strategy. Weights are
-    (n_rows, J). Returns the fit of all rows, NaN for rows without visible points.
-    """
-    n_components = estimator.n_components
-    if n_components == "auto":
-        n_components = _count_components(estimator, source, weights)
-    table = ready_table(estimator, source, n_components, weights)
-    return fit_ready_table(estimator, table, n_components, progress, errors=True)
-
-
-@one_blas_thread
-def fit_ready_table(
-    estimator: TableTransformer,
-    table: ScaledTable,
-    n_components: int,
-    progress: FitProgress | NoProgress,
-    starts: Sequence[Start] = (),
-    errors: bool = False,
-) -> Decomposition:
-    """Fit a checked and scaled table, as `fit_table`; estimate errors on demand."""
-    # 1. and 2. The rest of the table, and its factorisation
-    wanted = n_components
-    if estimator.refinement == "consensus":
-        n_components = min(n_components, MOST_FIRST)
-    factorised = _factorised(estimator, table, n_components, progress)
-    factors = factorised.factors
-    # 3. and 4. The paper's pipeline
-    if starts:
-        estimator.isa_, paper = None, None
-    else:
-        paper = _paper_result(estimator, factors, n_components, progress)
-    # 5. Refinement, gauge and frames
-    if estimator._is_joint:
-        shapes = starts[0].shapes if paper is None else paper.shapes
-        settings = _joint_settings(estimator, progress.step)
-        fitted, tracks, alpha = fit_jointly(factorised, shapes, settings, starts)
-        model = _frame_model(estimator, fitted.state.shapes, fitted.state.noise, alpha)
-        progress(JOINT_STAGE)
-        if errors and estimator.camera != "affine":
-            certainty = depth_certainty(model, table.rows, table.weights)
-            model = replace(model, certainty=certainty)
-            estimator.depth_uncertainty_ = model.certainty.total
-        if estimator.refinement == "consensus":
-            # A residual below the noise of the spectrum leaves nothing for groups.
-            n_numbers, square = tracks.totals
-            share = factorised.noise_level(n_components)
-            if wanted > n_components or fitted.left > share * square / n_numbers:
-                model = _consensus_model(estimator, table, model, settings, wanted)
-                tracks = JointFrames.from_points(table.rows, table.complete)
-            progress(CONSENSUS_STAGE)
-        frames = _joint_frames(estimator, table, model, tracks)
-        estimator.camera_noise_ratio_ = fitted.camera_noise_ratio
-        estimator.objective_history_ = fitted.history
-        estimator.gradient_norm_ = fitted.gradient_norm
-        estimator.n_iter_ = len(fitted.history) - 1
-        converged = fitted.converged
-    else:
-        assert paper is not None
-        frames = _paper_frames(estimator, table, factors, paper)
-        converged = paper.converged
-    if not converged:
-        warn_caller(
-            f"the refinement did not converge in max_iter={estimator.max_iter} steps; "
-            "increase max_iter or tol",
-            ConvergenceWarning,
-        )
-    # 6. Measures of the fit
-    unit, fit = table.unit or 1.0, estimator._model
-    estimator.mean_shape_, estimator.basis_ = fit.mean_shape, fit.basis
-    estimator.camera_, estimator._n_features_out = estimator.camera, len(fit.basis)
-    estimator.rank_floor_ = factorised.rest_share
-    estimator.singular_values_ = unit * factorised.singular_values
-    estimator.mode_covariance_ *= unit**2
-    cameras = frames.motion / table.sizes[:, None, None]
-    energy = image_energies(cameras, fit.basis, frames.alpha)
-    estimator.energy_share_ = energy / (energy.sum() or 1.0)
-    estimator.inverse_snr_ = reprojection_error(
-        table.rows,
-        np.concatenate([fit.mean_shape[None], fit.basis]).transpose(0, 2, 1),
-        cameras,
-        (frames.translation - table.translation) / table.sizes[:, None],
-        frames.alpha,
-    )
-    reference = reference_camera(cameras, table.sizes)
-    if estimator.camera != "affine":
-        (row,), (scale,) = nearest_calibrated(reference[None])
-        reference = scale * row
-    estimator.reference_motion_ = reference.astype(table.dtype)
-    centre = frames.translation.mean(axis=0)
-    estimator.reference_translation_ = centre.astype(table.dtype)
-    if estimator.keep_frames:
-        estimator._frame_sizes = of_all_rows(table.sizes, table.shown)
-    progress("gauge and coefficients")
-    return Decomposition(
-        *(of_all_rows(each.astype(table.dtype), table.shown) for each in frames)
-    )
-
-
-@one_blas_thread
-def _count_components(
-    estimator: TableTransformer, source: FrameBlocks, weights: NDArray | None
-) -> int:
-    """Return the number of basis shapes that a table supports, of at most twelve."""
-    with warnings.catch_warnings(action="ignore"):  # the fit itself warns again
-        table = ready_table(estimator, source, 1, weights)
-    possible = most_components(len(table.sizes), table.n_points, estimator.camera)
-    most = min(12, possible)
-    trial = copy.copy(estimator)
-    trial.refinement = "joint"
-    factorised = _factorised(trial, table, most, NoProgress())
-    paper = _paper_result(trial, factorised.factors, most, NoProgress())
-    found = count_components(factorised, paper.shapes, _joint_settings(estimator))
-    # Down-weighted outliers look like basis shapes: fit again with the final weights.
-    while found > 1 and estimator.loss != "linear":
-        trial = copy.copy(trial)
-        with warnings.catch_warnings(action="ignore"):
-            fit_ready_table(trial, table, found, NoProgress())
-        n_supported = int(np.sum(trial.reliability_ >= LEAST_RELIABILITY))
-        if n_supported == found:
-            break
-        found = max(n_supported, 1)
-    # A consensus has more components.
-    if found == most and estimator.refinement != "consensus":
-        warn_caller(
-            f"all {most} basis shapes that were tried are relevant: more than "
-            f"n_components={most} may be needed for this table"
-        )
-    return found
-
-
 @one_blas_thread
 def ready_table(
-    estimator: TableTransformer,
-    source: FrameBlocks,
-    n_components: int,
-    weights: NDArray | None = None,
+    source: FrameBlocks, weights: NDArray | None, n_components: int, s: FitSettings
 ) -> ScaledTable:
     """Return a table centred, scaled and checked for fits of at most K basis shapes."""
     return scaled_table(
         source,
         n_components,
-        layout=estimator.layout,
-        names=getattr(estimator, "feature_names_in_", None),
-        scale_frames=estimator.frames_scaled_,
-        robust=estimator.loss != "linear",
-        camera=joint_camera(estimator),
+        layout=s.layout,
+        names=s.names,
+        scale_frames=s.scale_frames,
+        robust=s.loss != "linear",
+        camera=s.joint_camera,
         weights=weights,
     )
 
 
-def joint_camera(estimator: TableTransformer) -> str | None:
-    """Return the camera model of the joint refinement, None without it."""
-    return estimator.camera if estimator._is_joint else None
+@one_blas_thread
+def fit_table(
+    table: ScaledTable,
+    n_components: int,
+    isa: Any,
+    settings: FitSettings,
+    progress: FitProgress | NoProgress,
+    start: TableModel | None = None,
+    free: bool = False,
+    errors: bool = False,
+) -> TableFit:
+    """Fit a table with K basis shapes and a clone of the strategy `isa`.
+
+    The joint fit starts from the model of a similar table, if `start` is given, instead
+    of the paper's result. `free`: a consensus has all components that exceed the noise
+    instead of K. `errors`: estimate those of the depths.
+    """
+    camera, wanted = settings.camera, n_components
+    if settings.refinement == "consensus":
+        n_components = min(wanted, MOST_FIRST)
+    # 1. and 2. The rest of the table, and its factorisation
+    factorised = _factorised(table, n_components, settings, progress)
+    # 3. and 4. The paper's pipeline
+    paper = given = None
+    if start is None:
+        isa = clone(isa)
+        paper = _paper_result(factorised.factors, n_components, isa, settings, progress)
+        shapes = paper.shapes
+    else:
+        isa, given = None, _started(table, start, n_components)
+        shapes = given.shapes
+    # 5. Refinement, gauge and frames
+    if settings.joint:
+        joint = settings.of_joint_fit(progress.step)
+        fit, tracks, alpha = fit_jointly(factorised, shapes, joint, given)
+        model = _frame_model(fit.state.shapes, fit.state.noise, alpha, settings)
+        progress(JOINT_STAGE)
+        attributes = {
+            "camera_noise_ratio_": fit.camera_noise_ratio,
+            "objective_history_": fit.history,
+            "gradient_norm_": fit.gradient_norm,
+            "n_iter_": len(fit.history) - 1,
+        }
+        if errors and camera != "affine":
+            certainty = depth_certainty(model, table.rows, table.weights)
+            model = replace(model, certainty=certainty)
+            attributes["depth_uncertainty_"] = certainty.total
+        if settings.refinement == "consensus":
+            # A residual below the noise of the spectrum leaves nothing for groups.
+            n_numbers, square = tracks.totals
+            noise = factorised.noise_level(n_components) * square / n_numbers
+            if wanted > n_components or fit.left > noise:
+                wanted_or_free = None if free else wanted
+                model = _consensus_model(table, model, joint, wanted_or_free, settings)
+                tracks = JointFrames.from_points(table.rows, table.complete)
+            progress(CONSENSUS_STAGE)
+        fitted, frames, measures = _joint_frames(table, model, tracks, settings)
+        converged = fit.converged
+    else:
+        assert paper is not None
+        fitted, frames, measures = _paper_frames(
+            table, factorised.factors, paper, settings
+        )
+        attributes, converged = {"n_iter_": paper.n_iter}, paper.converged
+    # 6. Measures of the fit
+    attributes |= measures | _measures(table, factorised, fitted, frames, settings)
+    progress("gauge and coefficients")
+    rows = (of_all_rows(part.astype(table.dtype), table.shown) for part in frames)
+    sizes = of_all_rows(table.sizes, table.shown)
+    return TableFit(fitted, Decomposition(*rows), sizes, isa, converged, attributes)
 
 
-def joint_tol(estimator: TableTransformer) -> float:
-    """Return the tolerance of the joint refinement."""
-    return JOINT_TOL if estimator.tol is None else estimator.tol
+@one_blas_thread
+def supported_components(
+    table: ScaledTable, isa: Any, settings: FitSettings
+) -> tuple[int, bool]:
+    """Return the number of basis shapes that a table supports, of at most twelve.
 
-
-def _joint_settings(
-    estimator: TableTransformer, on_step: Callable[[], None] | None = None
-) -> JointSettings:
-    """Return the settings of the joint refinement."""
-    return JointSettings(
-        estimator.camera,
-        estimator.loss,
-        estimator.max_iter,
-        joint_tol(estimator),
-        on_step,
-        estimator._limits.joint,
-    )
+    Also returns whether all that were tried are relevant.
+    """
+    settings = settings._replace(refinement="joint")
+    possible = most_components(len(table.sizes), table.n_points, settings.camera)
+    most = min(MOST_FIRST, possible)
+    factorised = _factorised(table, most, settings, NoProgress())
+    paper = _paper_result(factorised.factors, most, clone(isa), settings, NoProgress())
+    supported = count_components(factorised, paper.shapes, settings.of_joint_fit())
+    # Down-weighted outliers look like basis shapes: fit again with the final weights.
+    while supported > 1 and settings.loss != "linear":
+        with warnings.catch_warnings(action="ignore"):
+            fit = fit_table(table, supported, isa, settings, NoProgress())
+        reliable = fit.attributes["reliability_"] >= LEAST_RELIABILITY
+        before, supported = supported, max(int(reliable.sum()), 1)
+        if supported == before:
+            break
+    return supported, supported == most
 
 
 def _factorised(
-    estimator: TableTransformer,
     table: ScaledTable,
     n_components: int,
+    settings: FitSettings,
     report: Callable[[str], None],
 ) -> FactorisedTable:
     """Return a table with outliers (robust loss), completed frames and factors."""
-    limits, n_points = estimator._limits, table.n_points
+    limits, n_points = settings.limits, table.n_points
     # Calibrated cameras can have more basis shapes than the factorisation.
     n_triplets = min(3 * n_components + 3, n_points - 1)
     n_components = min(n_components, largest_n_components(n_points))
     outliers, completed, complete = None, table.rows, table.complete
-    if estimator.loss != "linear":
+    if settings.loss != "linear":
         outliers = gross_outliers(table.rows, limits.model_frames)
         completed = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
@@ -314,49 +307,56 @@ def _factorised(
     report("table")
     shape = 2 * len(table.sizes), n_points
     triplets = block_triplets(completed, shape, n_triplets, limits.dense)
-    singular_values, vectors, rest = triplets
-    if estimator._is_joint:
+    values, vectors, rest = triplets
+    if settings.joint:
         rigid, first = vectors[:3], limits.sample
         W, parts = sample_frames(completed, n_points, rigid, first, limits.small_table)
     else:
         W, parts = completed.whole().reshape(shape), []
     factors = factorise(W, n_components, table.precision, triplets)
     report("factorisation")
-    return FactorisedTable(
-        table.rows,
-        completed,
-        table.n_seen,
-        outliers,
-        singular_values,
-        rest,
-        W,
-        parts,
-        factors,
-        table.weights,
-    )
+    return FactorisedTable(table, completed, outliers, values, rest, W, parts, factors)
+
+
+def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointState:
+    """Return shapes and noise of a model, in units of a table, without cameras.
+
+    Missing basis shapes are directions of the residuals of at most 200 frames.
+    """
+    frames, unit = model.frames, (model.unit or 1.0) / (table.unit or 1.0)
+    assert isinstance(frames, PosteriorFrames)
+    n_frames, n_more = table.rows.n_frames, n_components + 1 - len(frames.shapes)
+    shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance
+    if n_more:
+        rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
+        frames = replace(frames, shapes=shapes, noise_variance=noise)
+        fit = frames.posterior(rows)
+        rows = rows - fit.translation[:, :, None]
+        shapes = extended_shapes(rows, shapes, fit.motion, fit.alpha, n_more)
+    return JointState(shapes, np.empty((0, 2, 3)), noise)
 
 
 def _paper_result(
-    estimator: TableTransformer,
     factors: Factorisation,
     n_components: int,
+    isa: Any,
+    settings: FitSettings,
     report: Callable[[str], None],
 ) -> PaperResult:
-    """Return the result of the paper's pipeline, and set the fitted strategy."""
-    estimator.isa_ = clone(estimator.isa_)
-    max_iter = estimator.max_iter if estimator.refinement else 0
-    tol = PAPER_TOL if estimator.tol is None else estimator.tol
+    """Return the result of the paper's pipeline, and fit its strategy."""
+    max_iter = settings.max_iter if settings.refinement else 0
+    tol = PAPER_TOL if settings.tol is None else settings.tol
     with warnings.catch_warnings():
-        if estimator._is_joint:  # it only starts from this result
+        if settings.joint:  # it only starts from this result
             max_iter, tol = 200, 1e-5
-            if estimator.isa is None:
+            if settings.silent_isa:
                 message = "PooledFastICA did not"
                 warnings.filterwarnings("ignore", message, ConvergenceWarning)
         return run_paper_pipeline(
             factors,
             n_components,
-            estimator.isa_,
-            block_recovery=estimator.block_recovery,
+            isa,
+            block_recovery=settings.block_recovery,
             max_iter=max_iter,
             tol=tol,
             report=report,
@@ -364,20 +364,17 @@ def _paper_result(
 
 
 def _paper_frames(
-    estimator: TableTransformer,
-    table: ScaledTable,
-    factors: Factorisation,
-    paper: PaperResult,
-) -> Decomposition:
-    """Return the frames of the paper's pipeline in its gauge, and set the model."""
+    table: ScaledTable, factors: Factorisation, paper: PaperResult, s: FitSettings
+) -> tuple[TableModel, Decomposition, dict[str, Any]]:
+    """Return model, frames and attributes of the paper's pipeline in its gauge."""
     shapes = paper.shapes
-    if estimator.camera != "affine":
-        scaled = estimator.camera == "weak_perspective"
+    if s.camera != "affine":
+        scaled = s.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
 
     def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
-        frames = RigidFrames(mean_shape, basis, estimator.camera)
-        return TableModel(frames, mean_shape, basis, estimator.layout, table.unit)
+        frames = RigidFrames(mean_shape, basis, s.camera)
+        return TableModel(frames, mean_shape, basis, s.layout, table.unit)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
     gauge, frames = rigid_gauge(
@@ -387,60 +384,48 @@ def _paper_frames(
         lambda mean_shape, basis: table.source.joined(
             partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
         ),
-        camera=estimator.camera,
+        camera=s.camera,
         dtype=table.dtype,
     )
-    estimator._model = fitted(gauge.mean_shape, gauge.basis)
-    estimator.mode_covariance_ = reorder_blocks(paper.mode_covariance, gauge.order)
-    estimator.n_iter_ = paper.n_iter
-    return frames
+    covariance = reorder_blocks(paper.mode_covariance, gauge.order)
+    attributes = {"mode_covariance_": (table.unit or 1.0) ** 2 * covariance}
+    return fitted(gauge.mean_shape, gauge.basis), frames, attributes
 
 
 def _frame_model(
-    estimator: TableTransformer, shapes: NDArray, noise: float, alpha: NDArray
+    shapes: NDArray, noise: float, alpha: NDArray, settings: FitSettings
 ) -> PosteriorFrames:
     """Return the model of a frame for shapes (K + 1, 3, J), before the gauge."""
-    return PosteriorFrames(
-        shapes,
-        noise,
-        spread_starts(alpha, 8),
-        estimator.loss,
-        FrameMap.identity(len(shapes) - 1),
-        estimator.camera,
-    )
+    starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
+    return PosteriorFrames(shapes, noise, starts, settings.loss, gauge, settings.camera)
 
 
 def _consensus_model(
-    estimator: TableTransformer,
     table: ScaledTable,
     model: PosteriorFrames,
-    settings: JointSettings,
-    n_components: int,
+    joint: JointSettings,
+    wanted: int | None,
+    settings: FitSettings,
 ) -> PosteriorFrames:
     """Return the consensus of groups of points, with the errors of the depths."""
-    wanted = None if estimator.n_components == "auto" else n_components
-    most = most_components(len(table.sizes), table.n_points, estimator.camera)
+    most = most_components(len(table.sizes), table.n_points, settings.camera)
     most = min(most, MOST_COMPONENTS)
     shapes, noise, alpha, variances = consensus(
-        model, table.rows, settings, wanted, most, estimator.n_jobs
+        model, table.rows, joint, wanted, most, settings.n_jobs
     )
     # If the object hardly turns, groups share the errors of the depths.
     certainty = model.certainty
     if variances is not None and certainty.determined:
         certainty = certainty._replace(points=variances, leverage=1.0)
-    model = _frame_model(estimator, shapes, noise, alpha)
+    model = _frame_model(shapes, noise, alpha, settings)
     return replace(model, certainty=certainty)
 
 
 def _joint_frames(
-    estimator: TableTransformer,
-    table: ScaledTable,
-    frames: PosteriorFrames,
-    tracks: JointFrames,
-) -> Decomposition:
-    """Return the frames of a joint fit in the independent gauge, and set the model."""
-    shapes = frames.shapes
-    posteriors = posterior_blocks(frames, tracks, table.rows)
+    table: ScaledTable, model: PosteriorFrames, tracks: JointFrames, s: FitSettings
+) -> tuple[TableModel, Decomposition, dict[str, Any]]:
+    """Return model, frames and attributes of a joint fit in the independent gauge."""
+    posteriors = posterior_blocks(model, tracks, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
     unknown = np.isnan(motion).any(axis=(1, 2))
     if unknown.any():
@@ -451,34 +436,66 @@ def _joint_frames(
             "these rows"
         )
     # Gauge of shapes, cameras and coefficients
+    unit = table.unit if s.camera == "orthographic" else None
     gauge, frame_map = independent_gauge(
-        shapes,
-        motion,
-        alpha,
-        estimator.independence,
-        estimator.camera,
-        table.unit if estimator.camera == "orthographic" else None,
+        model.shapes, motion, alpha, s.independence, s.camera, unit
     )
-    certainty = frames.certainty
+    certainty = model.certainty
     if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
-    frames = replace(frames, gauge=frame_map, certainty=certainty)
+    model = replace(model, gauge=frame_map, certainty=certainty)
     weight = table.weight
     share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
-    last_pass = partial(shown_frames, frames=frames, uncertainty=uncertainty)
+    last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
     parts, *chance = zip(
         *posteriors.map(last_pass, table.sizes, table.n_seen, weight), strict=True
     )
-    shown = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
-    mean_shape, basis = (each.astype(table.dtype) for each in gauge[:2])
-    estimator._model = TableModel(
-        frames, mean_shape, basis, estimator.layout, table.unit
-    )
-    cameras = shown.motion / table.sizes[:, None, None]
-    estimator.mode_covariance_ = mode_covariance(cameras, shown.alpha)
-    estimator.noise_variance_ = (table.unit or 1.0) ** 2 * frames.noise_variance
-    estimator.reliability_ = reliabilities(
-        alpha, covariance, *(sum(part) for part in chance)
-    )
-    return shown._replace(translation=shown.translation + table.translation)
+    frames = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
+    mean_shape, basis = (part.astype(table.dtype) for part in gauge[:2])
+    cameras = frames.motion / table.sizes[:, None, None]
+    square = (table.unit or 1.0) ** 2
+    attributes = {
+        "mode_covariance_": square * mode_covariance(cameras, frames.alpha),
+        "noise_variance_": square * model.noise_variance,
+        "reliability_": reliabilities(
+            alpha, covariance, *(sum(part) for part in chance)
+        ),
+    }
+    frames = frames._replace(translation=frames.translation + table.translation)
+    fitted = TableModel(model, mean_shape, basis, s.layout, table.unit)
+    return fitted, frames, attributes
+
+
+def _measures(
+    table: ScaledTable,
+    factorised: FactorisedTable,
+    model: TableModel,
+    frames: Decomposition,
+    settings: FitSettings,
+) -> dict[str, Any]:
+    """Return the attributes that describe any fit, by name."""
+    mean_shape, basis = model.mean_shape, model.basis
+    cameras = frames.motion / table.sizes[:, None, None]
+    energy = image_energies(cameras, basis, frames.alpha)
+    reference = reference_camera(cameras, table.sizes)
+    if settings.camera != "affine":
+        (row,), (scale,) = nearest_calibrated(reference[None])
+        reference = scale * row
+    centre = frames.translation.mean(axis=0)
+    return {
+        "mean_shape_": mean_shape,
+        "basis_": basis,
+        "rank_floor_": factorised.rest_share,
+        "singular_values_": (table.unit or 1.0) * factorised.singular_values,
+        "energy_share_": energy / (energy.sum() or 1.0),
+        "inverse_snr_": reprojection_error(
+            table.rows,
+            np.concatenate([mean_shape[None], basis]).transpose(0, 2, 1),
+            cameras,
+            (frames.translation - table.translation) / table.sizes[:, None],
+            frames.alpha,
+        ),
+        "reference_motion_": reference.astype(table.dtype),
+        "reference_translation_": centre.astype(table.dtype),
+    }

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import (
     Decomposition,
@@ -22,10 +21,8 @@ from isa_nrsfm._tables.tracks import (
     centred_frames,
     of_all_rows,
     seen_points,
-    table_to_tracks,
     tracks_to_table,
     weighted_sizes,
-    without_half_points,
 )
 
 
@@ -42,7 +39,7 @@ class UncertainShapes(NamedTuple):
 class TableModel(NamedTuple):
     """Model of a frame, shapes and layout: all that is needed to fit a new table.
 
-    Methods take rows (n, 2 * n_points) of a table and return NaN for rows with too few
+    Methods take rows (n, 2, n_points) of a table and return NaN for frames with too few
     visible points. The mean shape (J, 3) and the basis (K, J, 3) are in the gauge.
     `unit` is the common size of all frames, or None if each frame has its own.
     """
@@ -64,9 +61,7 @@ class TableModel(NamedTuple):
 
         Weights (n, n_points) are zero where points are missing, by default one.
         """
-        usable, centred, translation, sizes, weights = self._ready(
-            self._tracks(rows), weights
-        )
+        usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
         dtype = rows.dtype if dtype is None else dtype
@@ -77,7 +72,7 @@ class TableModel(NamedTuple):
     ) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
         assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, _, sizes, weights = self._ready(self._tracks(rows), weights)
+        usable, centred, _, sizes, weights = self._ready(rows, weights)
         whole = FramePosterior.unknown(len(rows), len(self.basis))
         unit = centred / sizes[:, None, None]
         whole.put(usable, self.frames.posterior(unit, weights=weights))
@@ -88,9 +83,7 @@ class TableModel(NamedTuple):
     ) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
         assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, translation, sizes, weights = self._ready(
-            self._tracks(rows), weights
-        )
+        usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.linearised(centred, sizes, weights)
         fit = fit._replace(translation=fit.translation + translation)
         return LinearisedFrames(*(of_all_rows(each, usable) for each in fit))
@@ -129,7 +122,7 @@ class TableModel(NamedTuple):
         """Return the shapes of frames and standard deviations of their depths."""
         assert isinstance(self.frames, PosteriorFrames)
         fit = self.decompose(rows, weights, deviations=False)
-        usable, centred, _, sizes, weights = self._ready(self._tracks(rows), weights)
+        usable, centred, _, sizes, weights = self._ready(rows, weights)
         found = self.frames.depth_deviations(centred, sizes, weights)
         deviations = of_all_rows(found, usable).astype(rows.dtype, copy=False)
         _, scales = full_rotations(fit.motion)
@@ -145,20 +138,20 @@ class TableModel(NamedTuple):
 
     def distances(self, rows: NDArray) -> NDArray:
         """Return lengths of residuals (n, n_points) of frames of size one."""
-        usable, centred, _, sizes, _ = self._ready(self._tracks(rows))
+        usable, centred, _, sizes, _ = self._ready(rows)
         fit = self.frames.fit(centred, sizes, False)
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
-        off = centred - project(shapes, fit.motion, fit.translation)
-        return of_all_rows(np.linalg.norm(off, axis=2) / sizes[:, None], usable)
+        images = project(shapes, fit.motion, fit.translation).transpose(0, 2, 1)
+        distance = np.linalg.norm(centred - images, axis=1)
+        return of_all_rows(distance / sizes[:, None], usable)
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of `held_out_energies`."""
-        tracks = self._tracks(rows)
-        usable, _, _, sizes, weights = self._ready(tracks, weights)
-        return np.array([self.held_out_energies(tracks[usable], sizes, weights)])
+        usable, _, _, sizes, weights = self._ready(rows, weights)
+        return np.array([self.held_out_energies(rows[usable], sizes, weights)])
 
     def held_out_energies(
-        self, tracks: NDArray, sizes: NDArray, weights: NDArray | None = None
+        self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
     ) -> tuple[float, float]:
         """Return the energies of the error and of the signal of held-out points.
 
@@ -174,8 +167,8 @@ class TableModel(NamedTuple):
         frames would dominate the score. This does not depend on the basis, so scores of
         different K use the same points.
         """
-        folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
-        seen = seen_points(tracks)
+        folds = np.random.RandomState(0).permutation(rows.shape[2]) % 5
+        seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
         counts = counts * sizes[:, None] ** -2.0
         # Complete frames are fitted without these points, others with NaN instead.
@@ -186,7 +179,7 @@ class TableModel(NamedTuple):
         for fold in range(5):
             held = folds == fold
             # Fit without the held-out points
-            visible = np.where(held[:, None], np.nan, tracks)
+            visible = np.where(held, np.nan, rows)
             enough = centred_frames(visible)[1].usable
             usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
             if not len(usable):
@@ -195,7 +188,8 @@ class TableModel(NamedTuple):
             if complete:
                 assert isinstance(frames, PosteriorFrames)
                 kept = frames.of_points(~held)  # their centroid is the origin
-                fit = kept.fit(tracks[usable][:, ~held], sizes[usable], False)
+                visible = np.ascontiguousarray(rows[usable][..., ~held])
+                fit = kept.fit(visible, sizes[usable], False)
                 mean = mean - self.mean_shape[~held].mean(axis=0)
                 others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
             else:
@@ -205,7 +199,7 @@ class TableModel(NamedTuple):
             predicted = project(
                 compose(mean, others, fit.alpha), fit.motion, fit.translation
             )
-            part = tracks[usable]
+            part = np.ascontiguousarray(rows[usable].transpose(0, 2, 1))
             centre = np.nanmean(part, axis=1, keepdims=True)
             weight = counts[np.ix_(usable, held)][..., None]
             counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
@@ -220,21 +214,11 @@ class TableModel(NamedTuple):
             signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
         return float(noise), float(signal)
 
-    def _tracks(self, rows: NDArray) -> NDArray:
-        """Return the tracks (n, n_points, 2) of some rows."""
-        tracks, n_half, _ = without_half_points(table_to_tracks(rows, self.layout))
-        if n_half.any():  # of a table read later: row numbers would be of the block
-            warn_caller(
-                "some points have only one of their two coordinates. They count as "
-                "missing"
-            )
-        return tracks
-
     def _ready(
-        self, tracks: NDArray, weights: NDArray | None = None
+        self, rows: NDArray, weights: NDArray | None = None
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None]:
-        """Return a mask of usable tracks; these centred, centres, sizes and weights."""
-        centred, report = centred_frames(tracks)
+        """Return a mask of usable rows; these centred, centres, sizes and weights."""
+        centred, report = centred_frames(rows)
         usable = report.usable
         if not usable.all():
             centred, report = centred[usable], report.of_frames(usable)
@@ -242,11 +226,11 @@ class TableModel(NamedTuple):
         frames = self.frames
         robust = isinstance(frames, PosteriorFrames) and frames.loss != "linear"
         if robust and len(centred):
-            centred, translation = robustly_centred(tracks[usable])
+            centred, translation = robustly_centred(rows[usable])
             sizes = robust_sizes(centred)
         if weights is not None:
             weights = weights[usable]
-            sizes = weighted_sizes(centred, weights)
+            sizes = weighted_sizes(centred, weights, sizes)
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes, weights

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+import pandas as pd
 import pytest
 from estimator_contract import widen
 from hypothesis import settings
@@ -120,6 +121,30 @@ def succeeds(run):
         return out, err
 
     return outputs
+
+
+@pytest.fixture
+def fits(succeeds, tmp_path):
+    """Return a function that fits a table into a folder: its `Results`."""
+
+    def results(table, *options, folder=tmp_path):
+        from fit_runs import Results
+
+        return Results(folder, *succeeds("fit", table, "-o", folder, *options))
+
+    return results
+
+
+@pytest.fixture
+def transforms(succeeds, tmp_path):
+    """Return a function that transforms a table: its coefficients, output, errors."""
+
+    def results(model, table, *options):
+        path = tmp_path / "transformed.csv"
+        out, err = succeeds("transform", model, table, "-o", path, *options)
+        return pd.read_csv(path), out, err
+
+    return results
 
 
 @pytest.fixture

@@ -130,9 +130,9 @@ def disk_faults(folder, strike, at):
         if "b" in mode and buffering == 0:
             return raw
         buffered = (io.BufferedRandom if "+" in mode else io.BufferedWriter)(raw)
-        return (
-            buffered if "b" in mode else io.TextIOWrapper(buffered, *args, **keywords)
-        )
+        if "b" in mode:
+            return buffered
+        return io.TextIOWrapper(buffered, *args, **keywords)
 
     def counting(name):
         """Return an operation of the system that counts."""

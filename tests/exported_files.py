@@ -1,5 +1,6 @@
 """Readers of exported files: what is in them, by their specifications."""
 
+import base64
 import json
 import re
 import struct
@@ -52,3 +53,8 @@ def content_of(path):
     text = path.read_text(encoding="utf-8")
     pattern = r'<script type="application/json" id="model">(.*?)</script>'
     return json.loads(re.search(pattern, text, re.DOTALL)[1])
+
+
+def numbers(text, dtype="<f4"):
+    """Return the numbers of a text on a page."""
+    return np.frombuffer(base64.b64decode(text), dtype)

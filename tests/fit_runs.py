@@ -7,6 +7,7 @@ import pandas as pd
 
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.io import load_model
 
 MODEL = "model.npz"
 FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
@@ -20,6 +21,34 @@ FILES = {
     "shapes.npz",
     "viewer.html",
 }
+
+
+# Options of fits that take no time.
+QUICK = "--isa fast --n-init 2 --refinement none --no-figures -k".split()
+
+
+class Results:
+    """What a fit has written to its folder and to the terminal."""
+
+    def __init__(self, folder, out="", err=""):
+        self.folder, self.out, self.err = folder, out, err
+        self.path = folder / MODEL
+
+    @property
+    def report(self):
+        return json.loads((self.folder / "report.json").read_text(encoding="utf-8"))
+
+    @property
+    def alpha(self):
+        return pd.read_csv(self.folder / "alpha.csv", dtype={"code": str})
+
+    @property
+    def cameras(self):
+        return pd.read_csv(self.folder / "cameras.csv")
+
+    @property
+    def model(self):
+        return load_model(self.path)
 
 
 def write_landmarks(path):

@@ -25,7 +25,9 @@ def numbers_of(fits):
 
 def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     """Return the fit of frames by a new search."""
-    return frame_search(camera, shapes).fit_tracks(tracks, noise, **given)
+    return frame_search(camera, shapes).fit_rows(
+        tracks.transpose(0, 2, 1), noise, **given
+    )
 
 
 def assert_same_fits(got, expected, atol):

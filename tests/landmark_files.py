@@ -243,9 +243,7 @@ def coco_annotations(tracks, *, names=BODYPARTS, image=None):
             }
             for i, (of, row) in enumerate(zip(image, values, strict=True))
         ],
-        "categories": [
-            {"id": 1, "name": "person", "keypoints": list(names), "skeleton": []}
-        ],
+        "categories": [{"id": 1, "name": "person", "keypoints": list(names)}],
     }
 
 
@@ -277,13 +275,12 @@ def write_openpose(folder, people, first=0):
 
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
 FRAME = deeplabcut_frame(TRACKS)
+SCORED = np.dstack([TRACKS, np.full((12, 8), 0.7)])
 RESULTS = [
     {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
-    for i, row in enumerate(np.dstack([TRACKS, np.full((12, 8), 0.7)]))
+    for i, row in enumerate(SCORED)
 ]
-POSES = [
-    [openpose_person(pose=row)] for row in np.dstack([TRACKS, np.full((12, 8), 0.7)])
-]
+POSES = [[openpose_person(pose=row)] for row in SCORED]
 # Of each format, files of one individual: what writes them into a folder and returns
 # their path. A further word tells variants of a format apart.
 WRITERS = {

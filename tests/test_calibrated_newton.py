@@ -100,7 +100,9 @@ def problem_of(scene, camera, noise):
     search = CalibratedSearch(scene.shapes, CAMERAS[camera].scaled)
     seen = np.isfinite(scene.tracks[..., 0])
     weights = None if seen.all() else 1.0 * seen
-    products = frame_sums(frame_tracks(scene.tracks, weights), search.shared)
+    products = frame_sums(
+        frame_tracks(scene.tracks.transpose(0, 2, 1), weights), search.shared
+    )
     problem = search.problem(products, np.full(len(scene.tracks), noise))
     return search, problem, frames_last(scene.motion @ search.space.T)
 
@@ -293,7 +295,9 @@ class TestReversal:
 
     def search(self, scene, camera, noise, motion):
         search = CalibratedSearch(scene.shapes, CAMERAS[camera].scaled)
-        products = frame_sums(frame_tracks(scene.tracks), search.shared)
+        products = frame_sums(
+            frame_tracks(scene.tracks.transpose(0, 2, 1)), search.shared
+        )
         return search.reversed_cameras(products, noise, motion)
 
     @BOTH

@@ -1,4 +1,4 @@
-"""Shapes turned upright and frontal, by their axes or by points of the object."""
+"""Shapes turned upright and frontal, and the angles of rotations."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm.calibration import canonical_pose
+from isa_nrsfm.calibration import angle_deviations, canonical_pose, view_angles
 from isa_nrsfm.datasets import make_face_tracks
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -166,9 +166,68 @@ def test_refuses(face, arguments, message):
 
 
 def test_refuses_shapes(face):
-    with pytest.raises(ValueError, match="'ibug-68' has 68 points, the shape 60"):
-        canonical_pose(face[:60], scheme="ibug-68")
+    message = "'ibug-68' has 68 points, the shape 60"
+    refused(message, canonical_pose, face[:60], scheme="ibug-68")
     refused(r"\(n_points, 3\).*got the shape \(68, 2\)", canonical_pose, face[:, :2])
     holes = face.copy()
     holes[3] = np.nan
     refused("with 3 entries that are not", canonical_pose, holes)
+
+
+NOSE, CROWN = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
+
+
+def rotation(yaw, pitch, roll):
+    """Return a rotation from its definition, right-handed turns about three axes."""
+    turns = [("z", roll), ("x", -pitch), ("y", -yaw)]
+    R = np.eye(3)
+    for axis, angle in turns:
+        R = R @ Rotation.from_euler(axis, angle, degrees=True).as_matrix()
+    return R
+
+
+def test_angles_of_their_definition(rng):
+    wanted = rng.uniform([-180, -90, -180], [180, 90, 180], (50, 3))
+    found = view_angles([rotation(*each) for each in wanted])
+    assert_allclose(np.transpose(found), wanted, atol=1e-9)
+
+
+def test_signs_are_what_a_viewer_sees():
+    # The image of a point is the first two coordinates: x to the right, y down.
+    assert (rotation(30, 0, 0) @ NOSE)[0] > 0.4  # to the right
+    assert (rotation(0, 30, 0) @ NOSE)[1] < -0.4  # up
+    assert (rotation(0, 0, 30) @ CROWN)[0] > 0.4  # clockwise
+    assert_allclose(np.ravel(view_angles([np.eye(3)])), 0)
+
+
+def test_frames_without_a_rotation_have_no_angles():
+    R = np.stack([rotation(1, 2, 3), np.full((3, 3), np.nan)])
+    found = np.transpose(view_angles(R))
+    assert_allclose(found[0], [1, 2, 3])
+    assert np.isnan(found[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("rotations", "message"),
+    [
+        (np.eye(3), r"\(n_frames, 3, 3\); got \(3, 3\)"),
+        (2 * np.eye(3)[None], "off by 3"),
+        (-np.eye(3)[None], "1 are mirror images"),
+    ],
+)
+def test_refused_rotations(rotations, message):
+    refused(message, view_angles, rotations)
+
+
+class TestAngleDeviations:
+    def test_of_random_small_turns(self, rng):
+        R = Rotation.from_euler("ZXY", [20, -35, 50], degrees=True)
+        root = 0.003 * rng.normal(size=(3, 3))
+        turns = Rotation.from_rotvec(rng.normal(size=(20000, 3)) @ root.T)
+        expected = np.std(np.array(view_angles((R * turns).as_matrix())), axis=1)
+        found = angle_deviations(view_angles([R.as_matrix()]), [root @ root.T])
+        assert_allclose(np.ravel(found), expected, rtol=0.03)
+
+    def test_refuses_another_number_of_frames(self):
+        message, angles = r"\(1, 3, 3\); got \(2, 3, 3\)", view_angles([np.eye(3)])
+        refused(message, angle_deviations, angles, np.zeros((2, 3, 3)))

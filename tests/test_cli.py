@@ -1,6 +1,5 @@
 """The command line, run in this process and as an installed program."""
 
-import json
 import os
 import pty
 import re
@@ -9,21 +8,19 @@ import subprocess
 import sys
 import time
 import warnings
-from argparse import Namespace
 
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import FIGURES, FILES as FIT_FILES, MODEL
+from fit_runs import FIGURES, FILES as FIT_FILES, MODEL, Results
 from layers import slow_after
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
 from isa_nrsfm import AffineNRSfM, __version__
-from isa_nrsfm._compat.whole_files import files_together
-from isa_nrsfm.cli import _demo, _fit, main
-from isa_nrsfm.cli._options import build_parser
+from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import load_model, save_model
+from isa_nrsfm.io import save_model
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import ModeCovarianceDisplay
 
@@ -34,6 +31,7 @@ UNREFINED = [*NO_FIGURES, "--refinement", "none"]
 MODULE = [sys.executable, "-m", "isa_nrsfm"]
 LANDMARKS = [f"{axis}_{j}" for j in range(68) for axis in "xy"]
 PNG = b"\x89PNG\r\n\x1a\n"
+ALPHA = ["alpha_1", "alpha_2"]
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +55,10 @@ def table(faces, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(table, tmp_path_factory):
-    """Return the folder of a fit without figures."""
+    """Return the results of a fit without figures."""
     folder = tmp_path_factory.mktemp("fit") / "results"
     assert main(["fit", str(table), "--output", str(folder), *NO_FIGURES]) == 0
-    return folder
+    return Results(folder)
 
 
 @pytest.fixture
@@ -76,15 +74,12 @@ def changed(faces, tmp_path):
     return write
 
 
-def report_of(folder):
-    return json.loads((folder / "report.json").read_text())
-
-
-def test_fit_writes_all_that_its_report_lists(run, table, tmp_path):
+def test_fit_writes_all_that_its_report_lists(fits, table, tmp_path):
     folder, since = tmp_path / "new" / "results", time.perf_counter()
-    code, out, err = run("fit", table, "--output", folder, *QUICK)
-    assert (code, err) == (0, "")
-    assert {path.name for path in folder.iterdir()} == FIT_FILES | FIGURES
+    found = fits(table, *QUICK, folder=folder)
+    out, report, listed = found.out, found.report, FIT_FILES | FIGURES
+    assert found.err == ""
+    assert {path.name for path in folder.iterdir()} == listed
     for name in FIGURES:
         assert (folder / name).read_bytes().startswith(PNG)
         assert name in out
@@ -92,14 +87,12 @@ def test_fit_writes_all_that_its_report_lists(run, table, tmp_path):
     assert str(table) in out
     assert all(len(line) <= 120 for line in out.splitlines())
 
-    report = report_of(folder)
     assert report["table"]["n_rows"] == report["table"]["n_frames"] == N_FRAMES
     assert report["table"]["rows_left_out"] == report["warnings"] == []
     assert report["table"]["columns"] == "x_#,y_#"
     assert report["table"]["n_missing_points"] == 0
-    assert report["model"]["parameters"]["isa__n_init"] == 2
     assert report["versions"]["isa_nrsfm"] == __version__
-    assert set(report["files"]) == (FIT_FILES | FIGURES) - {"report.json"}
+    assert set(report["files"]) == listed - {"report.json"}
     assert set(report["seconds"]) == {"read", "fit", "write", "figures"}
     seconds = sum(report["seconds"].values())
     assert seconds == pytest.approx(time.perf_counter() - since, abs=0.5)
@@ -108,39 +101,36 @@ def test_fit_writes_all_that_its_report_lists(run, table, tmp_path):
 
 
 def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
-    model = load_model(fitted / MODEL)
+    model, alpha, cameras = fitted.model, fitted.alpha, fitted.cameras
     X = faces[LANDMARKS]
     # The model is that of Python: neither terminal nor figures are in it.
     assert model.verbose == 0
     again = AffineNRSfM(**model.get_params(deep=False)).fit(X)
-    np.testing.assert_array_equal(again.alpha_, model.alpha_)
-    alpha = pd.read_csv(fitted / "alpha.csv", dtype={"code": str})
-    assert list(alpha) == ["row", "name", "code", "alpha_1", "alpha_2"]
+    assert_array_equal(again.alpha_, model.alpha_)
+    assert list(alpha) == ["row", "name", "code", *ALPHA]
     assert list(alpha["row"]) == list(range(N_FRAMES))
     pd.testing.assert_frame_equal(alpha[["name", "code"]], faces[["name", "code"]])
-    np.testing.assert_allclose(alpha[["alpha_1", "alpha_2"]], model.alpha_, rtol=1e-12)
+    assert_allclose(alpha[ALPHA], model.alpha_, rtol=1e-12)
 
-    cameras = pd.read_csv(fitted / "cameras.csv")
     numbers = "row m00 m01 m02 m10 m11 m12 tx ty inverse_snr yaw pitch roll scale"
     assert " ".join(cameras) == numbers
-    arrays = np.load(fitted / "shapes.npz", allow_pickle=False)
-    assert list(arrays["component_names"]) == ["alpha_1", "alpha_2"]
+    arrays = np.load(fitted.folder / "shapes.npz", allow_pickle=False)
+    assert list(arrays["component_names"]) == ALPHA
     assert list(arrays["point_names"]) == [str(j) for j in range(68)]
-    weights = alpha[["alpha_1", "alpha_2"]].to_numpy()
-    shapes = arrays["mean_shape"] + np.tensordot(weights, arrays["basis"], 1)
-    points = pd.read_csv(fitted / "shapes.csv", dtype={"point": str})
+    points = pd.read_csv(fitted.folder / "shapes.csv", dtype={"point": str})
     assert list(points["point"]) == list(arrays["point_names"])
     assert " ".join(points)[:46] == "point mean_X mean_Y mean_Z basis_1_X basis_1_Y"
-    for k, name in enumerate(["mean", "basis_1", "basis_2"]):
-        written = points.filter(regex=f"^{name}_[XYZ]$")
-        expected = [arrays["mean_shape"], *arrays["basis"]][k]
-        np.testing.assert_allclose(written, expected, rtol=1e-12)
+    assert_allclose(
+        points.iloc[:, 1:],
+        np.hstack([arrays["mean_shape"], *arrays["basis"]]),
+        rtol=1e-12,
+    )
+    shapes = arrays["mean_shape"] + np.tensordot(alpha[ALPHA], arrays["basis"], 1)
     motion = cameras.iloc[:, 1:7].to_numpy().reshape(-1, 2, 3)
     images = shapes @ motion.swapaxes(1, 2) + cameras[["tx", "ty"]].to_numpy()[:, None]
-    images_of_table = images.reshape(len(X), -1)
-    np.testing.assert_allclose(images_of_table, model.reproject(X), rtol=1e-9)
+    assert_allclose(images.reshape(len(X), -1), model.reproject(X), rtol=1e-9)
 
-    report = report_of(fitted)["model"]
+    report = fitted.report["model"]
     assert report["inverse_snr"] == pytest.approx(model.inverse_snr_)
     assert report["held_out_error"] == pytest.approx(-model.score(X))
     assert report["noise_variance"] == pytest.approx(model.noise_variance_)
@@ -154,10 +144,11 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
     row = X.index[of_rows.argmax()]
     expected = {"row": row, "rms": pytest.approx(of_rows.max())}
     assert report["largest_error"] == expected
-    assert f", of row {row}<" in (fitted / "report.html").read_text(encoding="utf-8")
-    for k, row in enumerate(rows):
+    page = (fitted.folder / "report.html").read_text(encoding="utf-8")
+    assert f", of row {row}<" in page
+    for name, row in zip(ALPHA, rows, strict=True):
         for kind in ("min", "max"):
-            at = alpha.set_index("row")[f"alpha_{k + 1}"][row[f"row_of_{kind}"]]
+            at = alpha.set_index("row")[name][row[f"row_of_{kind}"]]
             assert at == pytest.approx(row[kind])
 
 
@@ -167,53 +158,43 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
         (
             "--isa fast --n-init 3 --block-recovery eigen --refinement none -k 1 "
             "--independence none --no-scale-frames --random-state 7 --n-jobs 1",
-            {
-                "isa__n_init": 3,
-                "block_recovery": "eigen",
-                "refinement": None,
-                "n_components": 1,
-                "independence": None,
-                "scale_frames": False,
-                "random_state": 7,
-                "n_jobs": 1,
-            },
+            {"isa__n_init": 3, "block_recovery": "eigen", "refinement": None}
+            | {"n_components": 1, "independence": None, "scale_frames": False}
+            | {"random_state": 7, "n_jobs": 1},
         ),
         (
             "--independence coefficients --loss huber -k 1 --isa fast --n-init 1",
-            {
-                "independence": "coefficients",
-                "loss": "huber",
-                "n_components": 1,
-                "isa__n_init": 1,
-            },
+            {"independence": "coefficients", "loss": "huber", "n_components": 1}
+            | {"isa__n_init": 1},
         ),
     ],
 )
-def test_options_reach_the_estimator(succeeds, table, tmp_path, options, expected):
-    out, _ = succeeds("fit", table, "-o", tmp_path, "--no-figures", *options.split())
-    found = load_model(tmp_path / MODEL).get_params()
+def test_options_reach_the_estimator(fits, table, options, expected):
+    fit = fits(table, "--no-figures", *options.split())
+    found = fit.model.get_params()
     default = AffineNRSfM(random_state=0).get_params()
     assert type(found["isa"]).__name__ == "FastISA"
     isa = {name: found[name] for name in found if name.startswith("isa")}
     assert found == default | isa | expected
-    assert (" % (outliers count fully): energy " in out) == ("huber" in options)
+    assert (" % (outliers count fully): energy " in fit.out) == ("huber" in options)
 
 
 @pytest.mark.parametrize("camera", slow_after(1, ["orthographic", "weak_perspective"]))
-def test_calibrated_cameras(run, tmp_path, camera):
+def test_calibrated_cameras(fits, tmp_path, camera):
     options = {"camera": camera, "noise": 0.01, "random_state": 0}
     faces = make_face_tracks(40, n_components=1, **options)
     X = pd.DataFrame(faces.data, columns=faces.feature_names)
-    path, folder = tmp_path / "faces.csv", tmp_path / "results"
-    X.to_csv(path, index=False)
-    code, out, err = run("fit", path, "-o", folder, "--camera", camera, "-k", "auto")
-    assert (code, err) == (0, "")
+    X.to_csv(tmp_path / "faces.csv", index=False)
+    options = ["--camera", camera, "-k", "auto", "--fps", 25, "--no-figures"]
+    found = fits(tmp_path / "faces.csv", *options)
+    out, model, report = found.out, found.model, found.report["model"]
+    assert found.err == ""
     assert all(len(line) <= 120 for line in out.splitlines())
     assert "Choice     K = 1: found by auto\n" in out
     assert f"Cameras    {camera.replace('_', '-')}: shapes are known up to " in out
     assert "true proportions" not in out
+    assert "Time       seconds: " in out
 
-    model, report = load_model(folder / MODEL), report_of(folder)["model"]
     assert (model.n_components, model.camera, len(model.basis_)) == ("auto", camera, 1)
     assert (report["n_components"], report["camera"]) == (1, camera)
     assert report["camera_noise_ratio"] == pytest.approx(model.camera_noise_ratio_)
@@ -228,69 +209,63 @@ def test_calibrated_cameras(run, tmp_path, camera):
     assert report["inverse_snr"] == pytest.approx(expected, rel=1e-6)
 
     # The images of cameras.csv and shapes.npz are scaled rotations of true shapes.
-    cameras = pd.read_csv(folder / "cameras.csv")
-    M = cameras.filter(regex="^m[01][012]$").to_numpy().reshape(-1, 2, 3)
+    M = found.cameras.filter(regex="^m[01][012]$").to_numpy().reshape(-1, 2, 3)
     scales = model.scales_[:, None, None] ** 2
     gram, atol = M @ M.transpose(0, 2, 1), 1e-6 * scales.max()
-    np.testing.assert_allclose(gram, scales * np.eye(2), atol=atol)
-    page = (folder / "viewer.html").read_text(encoding="utf-8")
+    assert_allclose(gram, scales * np.eye(2), atol=atol)
+    page = (tmp_path / "viewer.html").read_text(encoding="utf-8")
     assert f"{camera.replace('_', '-')} cameras" in page
 
 
-def test_outliers_are_reported(succeeds, tmp_path):
+def test_outliers_are_reported(fits, tmp_path):
     scene = make_nonrigid_tracks(60, 20, 1, noise=0.01, random_state=0)
     table = pd.DataFrame(scene.data, columns=scene.feature_names)
     for row in range(8, 16):
         table.loc[row, f"x_{row}"] += 3.0
     table["name"] = np.where(np.arange(60) < 5, "skip", "keep")
     table.to_csv(tmp_path / "faces.csv", index=False)
-    fit = ["fit", tmp_path / "faces.csv", "-o", tmp_path, "--no-figures", "-k", 1]
-    out, err = succeeds(*fit, "--skip-rows", "name=skip")
-    assert "warning: the table has outliers: " in err
-    assert "Use --loss cauchy, or correct them" in err
-    model = report_of(tmp_path)["model"]
-    assert model["outliers"]["message"][1:] in " ".join(out.split())
+    options = [tmp_path / "faces.csv", "--no-figures", "-k", 1]
+    found = fits(*options, "--skip-rows", "name=skip")
+    assert "warning: the table has outliers: " in found.err
+    assert "Use --loss cauchy, or correct them" in found.err
+    outliers = found.report["model"]["outliers"]
+    assert outliers["message"][1:] in " ".join(found.out.split())
     # The basis shape bends to some of the eight. Rows are those of the table.
-    largest = model["outliers"]["largest"]
-    largest = [(each["row"], int(each["point"])) for each in largest]
-    assert 4 <= len(largest) == model["outliers"]["n_points"]
+    largest = [(each["row"], int(each["point"])) for each in outliers["largest"]]
+    assert 4 <= len(largest) == outliers["n_points"]
     assert {row for row, _ in largest} < {*range(8, 16)}
     assert all(point == row for row, point in largest[:4])
-    _, err = succeeds(*fit, "--loss", "cauchy")
-    assert "outliers" not in err
+    assert "outliers" not in fits(*options, "--loss", "cauchy").err
 
 
-def test_rows_with_missing_points_are_fitted(succeeds, changed, faces, tmp_path):
+def test_rows_with_missing_points_are_fitted(fits, changed, faces):
     def change(faces):
         faces.loc[[3, 9], ["x_5", "y_5"]] = 0.0  # 9 is an ir row
         faces.loc[[4, 11], ["x_7", "y_7"]] = np.nan
         faces.loc[12, "y_8"] = np.nan
 
     options = ["--skip-rows", "name=^ir", "--zeros-missing", *UNREFINED]
-    out, err = succeeds("fit", changed(change), "-o", tmp_path, *options)
+    found = fits(changed(change), *options)
     # The row is that of the table, however many are skipped before.
-    assert len(err.splitlines()) == 1
-    assert "point 8 (x_8, y_8) in row 12" in err
-    assert re.search(r" 6  left out: name matches '\^ir'\n +54  used\n", out)
-    assert " 4 points (0.109 %) are missing in 4 of these rows\n" in out
-    report = report_of(tmp_path)
+    assert len(found.err.splitlines()) == 1
+    assert "point 8 (x_8, y_8) in row 12" in found.err
+    assert re.search(r" 6  left out: name matches '\^ir'\n +54  used\n", found.out)
+    assert " 4 points (0.109 %) are missing in 4 of these rows\n" in found.out
+    report, alpha = found.report, found.alpha
     assert report["table"]["n_missing_points"] == 4
     assert report["table"]["n_frames_with_missing_points"] == 4
     assert report["model"]["rank_floor"] is None
     X = faces.loc[~faces["name"].str.startswith("ir"), LANDMARKS].copy()
     X.loc[3, ["x_5", "y_5"]] = X.loc[[4, 11], ["x_7", "y_7"]] = np.nan
     X.loc[12, ["x_8", "y_8"]] = np.nan
-    model = load_model(tmp_path / MODEL)
-    again = AffineNRSfM(**model.get_params(deep=False)).fit(X)
-    alpha = pd.read_csv(tmp_path / "alpha.csv")
+    again = AffineNRSfM(**found.model.get_params(deep=False)).fit(X)
     assert list(alpha["row"]) == list(X.index)
-    np.testing.assert_allclose(alpha[["alpha_1", "alpha_2"]], again.alpha_, atol=1e-9)
-    off = (again.reproject(X) - X).to_numpy()
-    error = np.sqrt(2 * np.nanmean(off**2))
+    assert_allclose(alpha[ALPHA], again.alpha_, atol=1e-9)
+    error = np.sqrt(2 * np.nanmean((again.reproject(X) - X).to_numpy() ** 2))
     assert report["model"]["rms_point_error"] == pytest.approx(error)
 
 
-def test_rows_that_cannot_be_fitted_are_empty(succeeds, changed, faces, tmp_path):
+def test_rows_that_cannot_be_fitted_are_empty(fits, transforms, changed, faces):
     def change(faces):
         faces.loc[[4, 9], LANDMARKS] = np.nan  # 9 is an ir row
         faces.loc[5, LANDMARKS[6:]] = np.nan
@@ -300,9 +275,9 @@ def test_rows_that_cannot_be_fitted_are_empty(succeeds, changed, faces, tmp_path
 
     path, skipped = changed(change), ["--skip-rows", "name=^ir"]
     options = [*skipped, "--skip-rows", "code = 1$|^nothing", "--std", *NO_FIGURES]
-    out, err = succeeds("fit", path, "-o", tmp_path, *options)
-    assert err == ""
-    left_out = report_of(tmp_path)["table"]["rows_left_out"]
+    found = fits(path, *options)
+    assert found.err == ""
+    left_out = found.report["table"]["rows_left_out"]
     assert {each["reason"]: each["first_rows"] for each in left_out} == {
         "name matches '^ir'": [9, 19, 29, 39, 49, 59],
         "all points missing": [4],
@@ -311,172 +286,147 @@ def test_rows_that_cannot_be_fitted_are_empty(succeeds, changed, faces, tmp_path
         "points on one line, others missing": [21],
     }
     for each in left_out:
-        assert f" {each['n_rows']}  left out: {each['reason']}\n" in out
+        assert f" {each['n_rows']}  left out: {each['reason']}\n" in found.out
     kept = [i for i in range(N_FRAMES) if i % 10 != 9]
-    for name in ("alpha.csv", "cameras.csv"):
-        written = pd.read_csv(tmp_path / name)
+    for written in (found.alpha, found.cameras):
         assert list(written["row"]) == kept
-        results = written.iloc[:, -4:]
         empty = written["row"].isin([4, 5, 20, 21])
-        assert results[empty].isna().all(axis=None)
-        assert results[~empty].notna().all(axis=None)
-    alpha = pd.read_csv(tmp_path / "alpha.csv")
-    assert list(alpha["name"]) == list(faces["name"][kept])
+        assert written.iloc[:, -4:][empty].isna().all(axis=None)
+        assert written.iloc[:, -4:][~empty].notna().all(axis=None)
+    assert list(found.alpha["name"]) == list(faces["name"][kept])
     # transform leaves out the same rows, and gives the same numbers.
-    again = tmp_path / "again.csv"
-    out, _ = succeeds("transform", tmp_path / MODEL, path, "-o", again, "--std",
-                       *skipped)  # fmt: skip
+    again, out, _ = transforms(found.path, path, "--std", *skipped)
     assert " 1  without coefficients: points on one line, others missing\n" in out
-    again = pd.read_csv(again)
-    assert list(again) == list(alpha)
-    found, expected = again.filter(like="alpha"), alpha.filter(like="alpha")
-    np.testing.assert_allclose(found, expected, atol=1e-7)
+    assert list(again) == list(found.alpha)
+    numbers = (each.filter(like="alpha") for each in (again, found.alpha))
+    assert_allclose(*numbers, atol=1e-7)
 
 
-def test_standard_deviations_are_written(run, fails, table, fitted, tmp_path):
-    output = tmp_path / "alpha.csv"
-    assert run("transform", fitted / MODEL, table, "-o", output, "--std")[0] == 0
-    written = pd.read_csv(output)
+def test_standard_deviations_are_written(
+    transforms, fits, fails, table, fitted, tmp_path
+):
+    written, *_ = transforms(fitted.path, table, "--std")
     assert list(written)[-2:] == ["alpha_1_std", "alpha_2_std"]
-    expected = load_model(fitted / MODEL).alpha_std_
-    np.testing.assert_allclose(written.iloc[:, -2:], expected, rtol=1e-6)
-
-    folder = tmp_path / "results"
-    options = ["--refinement", "none", *NO_FIGURES]
+    assert_allclose(written.iloc[:, -2:], fitted.model.alpha_std_, rtol=1e-6)
     for wrong in ("--std", "--n-components=auto"):
-        message = fails("fit", table, "-o", folder, *options, wrong)
+        message = fails("fit", table, "-o", tmp_path / "no", *UNREFINED, wrong)
         assert "needs --refinement joint or consensus; got --refinement none" in message
-    assert not folder.exists()
-    assert run("fit", table, "-o", folder, *options)[0] == 0
-    message = fails("transform", folder / MODEL, table, "-o", output, "--std")
+    assert not (tmp_path / "no").exists()
+    path = fits(table, *UNREFINED).path
+    message = fails("transform", path, table, "-o", tmp_path / "a.csv", "--std")
     assert "was fitted with refinement=None" in message
 
 
-def test_points_at_zero_cause_a_warning(succeeds, changed, tmp_path):
+def test_points_at_zero_cause_a_warning(fits, changed):
     def change(faces):
         faces.loc[[3, 9], ["x_5", "y_5"]] = 0.0
 
-    _, err = succeeds("fit", changed(change), "-o", tmp_path, *NO_FIGURES, "-k", 1)
-    zeros, few = report_of(tmp_path)["warnings"]
-    assert "".join(f"isa-nrsfm: warning: {text}\n" for text in (zeros, few)) == err
+    found = fits(changed(change), *NO_FIGURES, "-k", 1)
+    zeros, few = texts = found.report["warnings"]
+    assert found.err == "".join(f"isa-nrsfm: warning: {text}\n" for text in texts)
     assert zeros.startswith("in 2 of 60 rows points are at exactly (0, 0) (2 in all).")
     assert "--zeros-missing" in zeros
     assert re.search(r"alpha_1 \(.* row [39]\)", few)
 
 
-def test_origin_is_not_a_missing_point(succeeds, fails, changed, tmp_path):
-    def change(faces):
+def test_origin_is_not_a_missing_point(fits, fails, changed, tmp_path):
+    def centre(faces):
         nose = faces[["x_30", "y_30"]].to_numpy()
         faces[LANDMARKS] -= np.tile(nose, 68)
         faces.loc[1, LANDMARKS] *= -1  # the origin is (-0, -0)
 
-    path, folder = changed(change), tmp_path / "results"
-    _, err = succeeds("fit", path, "-o", folder, *UNREFINED)
+    def away(faces):
+        faces[LANDMARKS] += 1000.0
+        faces[["x_30", "y_30"]] = 0.0
+
+    err = fits(changed(away), *UNREFINED).err
+    assert "in 60 of 60 rows points are at exactly (0, 0) (60 in all)" in err
+    path = changed(centre)
+    err = fits(path, *UNREFINED).err
     assert "(0, 0)" not in err
     assert "(-0" not in err
-    message = fails("fit", path, "-o", folder, *UNREFINED, "--zeros-missing")
+    message = fails("fit", path, "-o", tmp_path, *UNREFINED, "--zeros-missing")
     expected = "--zeros-missing: 1 of 68 points are missing in all rows (first: 30)"
     assert expected in message
     assert "leave out --zeros-missing" in message
     left = message.partition("--points ")[2]
-    options = ["--zeros-missing", "--points", left]
-    succeeds("fit", path, "-o", folder, *UNREFINED, *options)
+    fits(path, *UNREFINED, "--zeros-missing", "--points", left)
 
 
-def test_zeros_of_a_point_that_no_row_shows_cause_a_warning(run, changed, tmp_path):
-    def change(faces):
-        faces[LANDMARKS] += 1000.0
-        faces[["x_30", "y_30"]] = 0.0
-
-    _, _, err = run("fit", changed(change), "-o", tmp_path, *UNREFINED)
-    assert "in 60 of 60 rows points are at exactly (0, 0) (60 in all)" in err
-
-
-def test_transform_gives_each_row_its_coefficients(succeeds, fitted, faces, tmp_path):
-    model = load_model(fitted / MODEL)
-    new = faces.iloc[::-1].reset_index(drop=True)
+def test_transform_gives_each_row_its_coefficients(transforms, fitted, faces, tmp_path):
+    model, new = fitted.model, faces.iloc[::-1].reset_index(drop=True)
     new.loc[2, ["x_3", "y_3"]] = np.nan
     new["alpha_1"] = "mine"
-    shuffled = new[[*LANDMARKS[1::2], "alpha_1", "name", *LANDMARKS[0::2]]]
-    path, output = tmp_path / "new.parquet", tmp_path / "new-alpha.csv"
-    shuffled.to_parquet(path)
-    transform = ["transform", fitted / MODEL, path, "-o", output]
-    out, err = succeeds(*transform, "--skip-rows", "name=^ir")
+    path = tmp_path / "new.parquet"
+    new[[*LANDMARKS[1::2], "alpha_1", "name", *LANDMARKS[0::2]]].to_parquet(path)
+    alpha, out, err = transforms(fitted.path, path, "--skip-rows", "name=^ir")
     assert "renamed to alpha_1_ (not alpha_1)\n" in err
     assert out.startswith("2 coefficients of 54 frames\n")
     assert " 1 points (0.0272 %) are missing in 1 of these rows\n" in out
     assert out.endswith("54 rows\n")
-    alpha = pd.read_csv(output)
     assert list(alpha) == ["row", "alpha_1", "name", "alpha_1_", "alpha_2"]
     assert list(alpha["name"]) == [n for n in new["name"] if not n.startswith("ir")]
     assert list(new["name"][alpha["row"]]) == list(alpha["name"])
-    X = new[LANDMARKS].iloc[alpha["row"]]
-    found = alpha[["alpha_1_", "alpha_2"]]
-    np.testing.assert_allclose(found, model.transform(X), atol=1e-9)
+    X, found = new[LANDMARKS].iloc[alpha["row"]], alpha[["alpha_1_", "alpha_2"]]
+    assert_allclose(found, model.transform(X), atol=1e-9)
     snr = inverse_snr(X, model.reproject(X), scale_frames=True)
     for name, expected in (("held-out error", -model.score(X)), ("inverse SNR", snr)):
         shown = float(re.search(rf"{name} ([\d.e-]+) %", out)[1])
         assert shown == pytest.approx(100 * expected, rel=5e-3)
     complete = alpha["row"] != 2
     rows = N_FRAMES - 1 - alpha["row"][complete]
-    np.testing.assert_allclose(found[complete], model.alpha_[rows], atol=1e-9)
+    assert_allclose(found[complete], model.alpha_[rows], atol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("number", "option"), [(0, ["--zeros-missing"]), (-1, ["--missing-value", "-1"])]
 )
-def test_transform_knows_missing_points(run, changed, tmp_path, number, option):
+def test_transform_knows_missing_points(fits, transforms, changed, number, option):
     def change(faces):
         faces.loc[[3, 9], ["x_5", "y_5"]] = float(number)
 
-    path, folder, output = changed(change), tmp_path / "fit", tmp_path / "alpha.csv"
-    assert run("fit", path, "-o", folder, *UNREFINED, *option)[0] == 0
-    assert report_of(folder)["table"]["missing_values"] == [number]
-    code, out, err = run("transform", folder / MODEL, path, "-o", output)
-    assert (code, err) == (0, "")
+    path = changed(change)
+    fit = fits(path, *UNREFINED, *option)
+    assert fit.report["table"]["missing_values"] == [number]
+    alpha, out, err = transforms(fit.path, path)
+    assert err == ""
     assert f"points at ({number}, {number}) count as missing" in out
-    alpha = pd.read_csv(output)[["alpha_1", "alpha_2"]]
-    (folder / "report.json").unlink()
-    code, out, err = run("transform", folder / MODEL, path, "-o", output)
-    assert (code, "count as missing" in out) == (0, False)
-    if number == 0:  # without the report nothing but a warning is left
-        assert "use --zeros-missing" in err
-    assert not np.allclose(pd.read_csv(output)["alpha_1"], alpha["alpha_1"])
-    assert run("transform", folder / MODEL, path, "-o", output, *option)[0] == 0
-    expected = pd.read_csv(output)[["alpha_1", "alpha_2"]]
-    pd.testing.assert_frame_equal(alpha, expected)
+    (fit.folder / "report.json").unlink()
+    other, out, err = transforms(fit.path, path)
+    assert "count as missing" not in out
+    # Without the report nothing but a warning is left.
+    assert ("use --zeros-missing" in err) == (number == 0)
+    assert not np.allclose(other["alpha_1"], alpha["alpha_1"])
+    pd.testing.assert_frame_equal(alpha, transforms(fit.path, path, *option)[0])
 
 
 def test_transform_of_no_usable_row_is_empty(succeeds, fitted, faces, tmp_path):
     path, output = tmp_path / "new.csv", tmp_path / "alpha.tsv"
     faces.assign(**dict.fromkeys(LANDMARKS, "")).to_csv(path, index=False)
-    transform = ["transform", fitted / MODEL, path, "-o", output]
+    transform = ["transform", fitted.path, path, "-o", output]
     out, _ = succeeds(*transform)
     assert "60  without coefficients: all points missing" in out
     assert "no frame was fitted" in out
     assert pd.read_csv(output, sep="\t")["alpha_2"].isna().all()
-    out, _ = succeeds(*transform, "--skip-rows", "name=i")
-    assert out.endswith(" 0 rows\n")
+    assert succeeds(*transform, "--skip-rows", "name=i")[0].endswith(" 0 rows\n")
 
 
 @pytest.mark.parametrize(
     ("layout", "named"), [("interleaved", True), ("planar", True), ("planar", False)]
 )
 def test_transform_has_the_layout_of_the_model(
-    run, faces, table, tmp_path, layout, named
+    transforms, faces, table, tmp_path, layout, named
 ):
     planar = layout == "planar"
     names = LANDMARKS[0::2] + LANDMARKS[1::2] if planar else LANDMARKS
     X = faces[names].rename(columns=lambda name: f" {name}")
     model = AffineNRSfM(2, layout=layout, refinement=None, random_state=0)
     save_model(model.fit(X if named else X.to_numpy()), tmp_path / MODEL)
-    code, _, err = run("transform", tmp_path / MODEL, table, "-o", tmp_path / "a.csv")
-    assert (code, err) == (0, "")
-    alpha = pd.read_csv(tmp_path / "a.csv")[["alpha_1", "alpha_2"]]
-    np.testing.assert_allclose(alpha, model.alpha_, atol=1e-9)
+    alpha, _, err = transforms(tmp_path / MODEL, table)
+    assert err == ""
+    assert_allclose(alpha[ALPHA], model.alpha_, atol=1e-9)
 
 
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_transform_names_the_difference_between_points(fails, fitted, faces, tmp_path):
     path, output = tmp_path / "new.csv", ["-o", tmp_path / "alpha.csv"]
     renamed = faces.rename(columns=lambda name: name.replace("_", ""))
@@ -488,46 +438,36 @@ def test_transform_names_the_difference_between_points(fails, fitted, faces, tmp
     ):
         table.to_csv(path, index=False)
         columns = [f"--columns={each}" for each in columns]
-        message = fails("transform", fitted / MODEL, path, *output, *columns)
+        message = fails("transform", fitted.path, path, *output, *columns)
         assert "{} columns are only in the {}".format(*differences) in message
 
     X = faces[LANDMARKS].to_numpy()[:, :40]
-    save_model(AffineNRSfM(1, random_state=0).fit(X), tmp_path / MODEL)
+    model = AffineNRSfM(1, refinement=None, random_state=0).fit(X)
+    save_model(model, tmp_path / MODEL)
     faces.to_csv(path, index=False)
     message = fails("transform", tmp_path / MODEL, path, *output)
     assert "the model has 20 points, the table has 68 (x_#,y_#)" in message
 
 
-def test_columns_choose_among_several_sets(succeeds, fails, faces, tmp_path):
-    path = tmp_path / "faces.csv"
-    eyes = faces[LANDMARKS].add_prefix("eye_")
+def test_columns_choose_among_several_sets(fits, fails, faces, tmp_path):
+    path, eyes = tmp_path / "faces.csv", faces[LANDMARKS].add_prefix("eye_")
     pd.concat([faces, eyes], axis=1).to_csv(path, index=False)
     message = fails("fit", path, "-o", tmp_path / "results")
     assert "more than one set of landmark columns: 'x_#,y_#' (68 points: " in message
     assert not (tmp_path / "results").exists()
-    fit = [
-        "fit",
-        path,
-        "-o",
-        tmp_path,
-        "--columns",
-        "eye_x_#,eye_y_#",
-        *UNREFINED,
-        "--no-figures",
-    ]
-    out, _ = succeeds(*fit)
+    out = fits(path, "--columns", "eye_x_#,eye_y_#", *UNREFINED).out
     assert "eye_x_0, eye_y_0, eye_x_1, eye_y_1, ..., eye_x_67, eye_y_67" in out
     assert "coordinates not used: x_#,y_# (68)" in out
 
 
-def test_named_index_of_a_parquet_file_is_a_column(run, faces, tmp_path):
-    path, options = (tmp_path / "faces.parquet", ["-o", tmp_path, *UNREFINED])
+def test_named_index_of_a_parquet_file_is_a_column(fits, faces, tmp_path):
+    path = tmp_path / "faces.parquet"
     # An index without a name, such as the numbers of chosen rows, is none.
     for table in (faces.set_index("name"), faces[5:]):
         table.to_parquet(path)
-        assert run("fit", path, *options, "--skip-rows", "name=^ir")[::2] == (0, "")
-        alpha = pd.read_csv(tmp_path / "alpha.csv")
-        assert list(alpha)[:3] == ["row", "name", "code"]
+        found = fits(path, *UNREFINED, "--skip-rows", "name=^ir")
+        assert found.err == ""
+        assert list(found.alpha)[:3] == ["row", "name", "code"]
 
 
 def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_path):
@@ -548,7 +488,6 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
         (["--columns", "u#,v#"], "no column matches 'u#'"),
         (["--skip-rows", "nam=i"], "no column 'nam'; its columns are name, x_0, y_0"),
         (["--skip-rows", "name=^i"], "fitted: 60 left out (name matches '^i')"),
-        (["-k", "30"], "at least 94 points"),
         (
             ["-k", "40"],
             "--n-components 40 needs at least 124 points, the table has 68; with 68 "
@@ -559,11 +498,10 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
         (["--skip-rows", "code=[1-9].$", "-k", "1-3"], "of cv fits 6 frames, enough"),
     ):
         assert expected in fails("fit", table, *folder, *options)
-    output = ["-o", tmp_path / "alpha.csv"]
-    absent, model = tmp_path / "absent.npz", fitted / MODEL
+    absent, output = tmp_path / "absent.npz", ["-o", tmp_path / "alpha.csv"]
     assert f"{absent}: No such file" in fails("transform", absent, table, *output)
     assert "cannot be read as a model" in fails("transform", table, table, *output)
-    message = fails("transform", model, table, "-o", tmp_path / "a.txt")
+    message = fails("transform", fitted.path, table, "-o", tmp_path / "a.txt")
     assert "a.txt: a table is a .csv, .tsv or .parquet file" in message
 
 
@@ -575,7 +513,7 @@ def test_bad_outputs_are_refused(fails, table, fitted, faces, tmp_path):
     assert not any(tmp_path.iterdir())
     message = fails("fit", table, "-o", table / "results", *QUICK)
     assert "Not a directory" in message
-    transform = ["transform", fitted / MODEL]
+    transform = ["transform", fitted.path]
     assert "no" in fails(*transform, table, "-o", tmp_path / "no/a.csv")
     copy = tmp_path / "alpha.csv"
     faces.to_csv(copy, index=False)
@@ -584,52 +522,54 @@ def test_bad_outputs_are_refused(fails, table, fitted, faces, tmp_path):
     pd.testing.assert_frame_equal(pd.read_csv(copy, dtype={"code": str}), faces)
 
 
-def test_a_figure_that_fails_costs_no_results(run, fitted, table, tmp_path):
-    folder = tmp_path / "results"
-    shutil.copytree(fitted, folder)
+def test_a_figure_that_fails_costs_no_results(
+    fits, fitted, table, tmp_path, monkeypatch
+):
+    folder, seen = tmp_path / "results", []
+    shutil.copytree(fitted.folder, folder)
     (folder / "mode_covariance.png").write_bytes(PNG)
-    seen = []
 
     def fail(*_args, **_keywords):
-        seen.extend(sorted(path.name for path in folder.iterdir() if path.is_file()))
+        seen.extend(path.name for path in folder.iterdir() if path.is_file())
         raise np.linalg.LinAlgError("no axes")
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ModeCovarianceDisplay, "from_estimator", fail)
-        quick = ["--force", *QUICK, "--refinement", "none"]
-        code, out, err = run("fit", table, "-o", folder, *quick)
-    warning = "mode_covariance.png was not drawn: no axes"
-    assert (code, err) == (0, f"isa-nrsfm: warning: {warning}\n")
+    monkeypatch.setattr(ModeCovarianceDisplay, "from_estimator", fail)
+    options = ["--force", *QUICK, "--refinement", "none"]
+    found = fits(table, *options, folder=folder)
+    warning, report = "mode_covariance.png was not drawn: no axes", found.report
+    assert found.err == f"isa-nrsfm: warning: {warning}\n"
     # All results were there, and only they, when figures began.
     assert set(seen) == FIT_FILES
     left = FIT_FILES | FIGURES - {"mode_covariance.png"}
     assert {path.name for path in folder.iterdir()} == left
-    assert "mode_covariance" not in out
-    report = report_of(folder)
+    assert "mode_covariance" not in found.out
     assert set(report["files"]) == set(report["sha256"]) == left - {"report.json"}
     assert report["warnings"] == [warning]
     assert warning in (folder / "report.html").read_text()
 
 
-def test_old_figures_cause_a_warning(run, table, tmp_path):
+def test_old_figures_cause_a_warning(fits, table, tmp_path):
     (tmp_path / "basis_shapes.png").write_bytes(PNG)
-    _, _, err = run("fit", table, "-o", tmp_path, *UNREFINED)
+    err = fits(table, *UNREFINED).err
     assert "figures of an earlier run: basis_shapes.png" in err
     assert (tmp_path / "basis_shapes.png").read_bytes() == PNG
 
 
-def test_figures_are_not_written_to_another_run(fails, fitted, table, tmp_path):
-    def write_another_run(*_args, **_keywords):
-        shutil.copytree(fitted, tmp_path, dirs_exist_ok=True)
-        return files_together(*_args, **_keywords)
+def test_figures_are_not_written_to_another_run(
+    fails, fitted, table, tmp_path, monkeypatch
+):
+    remove = shutil.rmtree
 
-    steps = iter([files_together, write_another_run])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_fit, "files_together", lambda *a, **kw: next(steps)(*a, **kw))
-        message = fails("fit", table, "-o", tmp_path, *QUICK, "--refinement", "none")
+    def and_write_another_run(*args, **keywords):
+        remove(*args, **keywords)
+        shutil.copytree(fitted.folder, tmp_path, dirs_exist_ok=True)
+
+    # Folders beside the results are removed when these are in place.
+    monkeypatch.setattr(shutil, "rmtree", and_write_another_run)
+    message = fails("fit", table, "-o", tmp_path, *QUICK, "--refinement", "none")
     assert "another run has written to" in message
     for name in FIT_FILES:
-        assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
+        assert (tmp_path / name).read_bytes() == (fitted.folder / name).read_bytes()
 
 
 def test_missing_libraries_are_named_at_once(fails, table, tmp_path, monkeypatch):
@@ -647,7 +587,6 @@ FIT = "fit t.csv -o d"
     [
         ("", "required: COMMAND"),
         ("fit", "required: TABLE, -o/--output"),
-        ("fit t.csv", "required: -o/--output"),
         (f"transform {MODEL} t.csv", "required: -o/--output"),
         *(
             (f"{FIT} -k {numbers}", f"got {numbers.split(',')[-1]!r}\n")
@@ -694,7 +633,7 @@ def test_interruption_ends_with_code_130(run, table, tmp_path, monkeypatch):
     assert (code, out, err) == (130, "", "isa-nrsfm: interrupted\n")
 
 
-def test_warnings_are_shown_once_with_options(run, table, tmp_path, monkeypatch):
+def test_warnings_are_shown_once_with_options(fits, table, monkeypatch):
     fit = AffineNRSfM.fit
 
     def warn_and_fit(self, X, y=None):
@@ -705,54 +644,32 @@ def test_warnings_are_shown_once_with_options(run, table, tmp_path, monkeypatch)
         return fit(self, X, y)
 
     monkeypatch.setattr(AffineNRSfM, "fit", warn_and_fit)
-    code, _, err = run("fit", table, "-o", tmp_path, *UNREFINED)
+    found = fits(table, *UNREFINED)
     text = "got --camera affine; --n-components 2 of a/camera=1.csv, layout='x'"
-    assert (code, err) == (0, f"isa-nrsfm: warning: {text}\n")
-    assert report_of(tmp_path)["warnings"] == [text]
+    assert found.err == f"isa-nrsfm: warning: {text}\n"
+    assert found.report["warnings"] == [text]
 
 
 @pytest.mark.slow
-def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
+def test_demo_writes_a_table_and_finds_its_faces(succeeds, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    # All numbers that the demo tries would take long.
-    started = Namespace(since=time.perf_counter())
-    args, warned = build_parser().parse_args(["demo", "--no-figures"], started), []
-    out = _demo.run(args, warned, tried="3-4")
-    assert warned == []
-    folder = tmp_path / "isa-nrsfm-demo"
-    assert {path.name for path in folder.iterdir()} == FIT_FILES | {"tracks.csv"}
-    report = report_of(folder)
+    out, err = succeeds("demo", "--no-figures")
+    assert "warning" not in err
+    demo = Results(tmp_path / "isa-nrsfm-demo")
+    assert {path.name for path in demo.folder.iterdir()} == FIT_FILES | {"tracks.csv"}
+    report, before = demo.report, (demo.folder / "alpha.csv").read_bytes()
     truth = report["truth"]
     assert [row["name"] for row in truth["basis"]][:2] == ["jaw open", "smile"]
     assert truth["shape_error"] < 0.3 * truth["mean_shape_error"]
     assert all(row["similarity"] > 0.9 for row in truth["basis"])
     assert all(row["correlation"] > 0.9 for row in truth["basis"])
+    assert report["choice"]["n_components"] == [1, 2, 3, 4, 5]
     assert report["choice"]["chosen"] == len(truth["basis"]) == 3
-    assert list(pd.read_csv(folder / "tracks.csv"))[:3] == ["frame", "x_0", "y_0"]
+    assert list(pd.read_csv(demo.folder / "tracks.csv"))[:3] == ["frame", "x_0", "y_0"]
     command = out[out.index("isa-nrsfm fit") :].split()[1:]
-    before = (folder / "alpha.csv").read_bytes()
-    assert build_parser().parse_args(command).n_components == (3, 4)
-    command[command.index("3-4")] = "3"
-    assert run(*command)[0] == 0
-    assert (folder / "alpha.csv").read_bytes() == before
-
-
-@pytest.mark.slow
-def test_table_as_it_is_distributed(succeeds, data_path, tmp_path):
-    table = data_path("raw/muct76-opencv.csv")
-    out, err = succeeds(
-        "fit", table, "--skip-rows", "name=^ir", "--zeros-missing", "-k", "2",
-        "--n-init", "1", "--no-figures", "-o", tmp_path,
-    )  # fmt: skip
-    # Faces of this table are turned, and their jaw is the visible outline.
-    (warned,) = err.splitlines()
-    assert "15 points of xm2vts-68 follow the visible outline" in warned
-    assert "3755  left out: name matches '^ir'" in out
-    assert "2544 points (0.996 %) are missing in 840 of these rows" in out
-    alpha, source = pd.read_csv(tmp_path / "alpha.csv"), pd.read_csv(table)
-    assert len(alpha) == 3755
-    assert alpha["alpha_2"].notna().all()
-    assert list(alpha["name"]) == list(source["name"][alpha["row"]])
+    command[command.index("1-5")] = "3"
+    succeeds(*command)
+    assert (demo.folder / "alpha.csv").read_bytes() == before
 
 
 @pytest.mark.subprocess
@@ -778,6 +695,6 @@ def test_reader_that_goes_away_is_no_error(fitted, table, tmp_path, monkeypatch,
     os.close(reading)
     with os.fdopen(writing, "w") as stdout:
         monkeypatch.setattr(sys, "stdout", stdout)
-        argv = ["transform", fitted / MODEL, table, "-o", tmp_path / "a.csv"]
+        argv = ["transform", fitted.path, table, "-o", tmp_path / "a.csv"]
         assert main([str(word) for word in argv]) == 141
     assert capfd.readouterr() == ("", "")

@@ -1,7 +1,6 @@
 """The command line: names that are not UTF-8, encodings of output, interruptions."""
 
 import io
-import json
 import os
 import re
 import subprocess
@@ -10,6 +9,7 @@ import sys
 import pandas as pd
 import pytest
 from fit_runs import MODEL
+from landmark_files import write_pts
 from layers import slow_after
 
 from isa_nrsfm.cli import main
@@ -32,37 +32,30 @@ def faces():
     return pd.concat([pd.Series(CELLS, name="ομάδα"), frame], axis=1)
 
 
-def test_paths_that_are_not_utf8(run, faces, tmp_path):
+def test_paths_that_are_not_utf8(fits, succeeds, faces, tmp_path):
     folder = tmp_path / NOT_UTF8
     folder.mkdir()
-    table, results = folder / f"{NOT_UTF8}.csv", folder / "results"
+    table = folder / f"{NOT_UTF8}.csv"
     faces.to_csv(table, index=False)
-    code, out, err = run("fit", table, "-o", results, *QUICK)
-    assert (code, err) == (0, "")
-    assert "caf\\udce9 \\udcff" in out
-    report = json.loads((results / "report.json").read_text(encoding="utf-8"))
-    assert report["table"]["path"].endswith("caf\\udce9 \\udcff.csv")
-    model, alpha = results / MODEL, folder / f"alpha {NOT_UTF8}.csv"
-    assert run("transform", model, table, "-o", alpha)[0] == 0
-    assert list(pd.read_csv(alpha)["ομάδα"]) == CELLS
-    page = folder / f"{NOT_UTF8}.html"
-    assert run("export", model, table, "-o", page)[0] == 0
+    found = fits(table, *QUICK, folder=folder / "results")
+    assert found.err == ""
+    assert "caf\\udce9 \\udcff" in found.out
+    assert found.report["table"]["path"].endswith("caf\\udce9 \\udcff.csv")
+    alpha, page = (folder / f"{NOT_UTF8}.{suffix}" for suffix in ("tsv", "html"))
+    succeeds("transform", found.path, table, "-o", alpha)
+    assert list(pd.read_csv(alpha, sep="\t")["ομάδα"]) == CELLS
+    succeeds("export", found.path, table, "-o", page)
     assert page.stat().st_size > 0
 
 
-def test_files_of_points_whose_names_are_not_utf8(succeeds, faces, tmp_path):
+def test_files_of_points_whose_names_are_not_utf8(fits, faces, tmp_path):
     folder = tmp_path / os.fsdecode(b"pts \xfe")
-    folder.mkdir()
     points = faces.iloc[:, 1:].to_numpy().reshape(40, -1, 2)
-    for i, frame in enumerate(points):
-        lines = "\n".join(f"{x} {y}" for x, y in frame)
-        text = f"version: 1\nn_points: {len(frame)}\n{{\n{lines}\n}}\n"
-        (folder / f"{i:02d} {NOT_UTF8}.pts").write_text(text)
-    found = read_landmarks(folder)
-    assert found.frames["file"][3] == "03 caf\\udce9 \\udcff.pts"
-    succeeds("fit", folder, "-o", tmp_path / "results", *QUICK)
-    alpha = pd.read_csv(tmp_path / "results" / "alpha.csv")
-    assert list(alpha["file"]) == list(found.frames["file"])
+    for file in write_pts(folder, points).glob("*.pts"):
+        file.rename(folder / f"{file.stem} {NOT_UTF8}.pts")
+    files = list(read_landmarks(folder).frames["file"])
+    assert files[3] == "image_003 caf\\udce9 \\udcff.pts"
+    assert list(fits(folder, *QUICK).alpha["file"]) == files
 
 
 @pytest.mark.parametrize("encoding", slow_after(1, ["cp1252", "ascii", "utf-16"]))

@@ -1,13 +1,11 @@
 """The command line on files of other programs."""
 
-import json
 from functools import cache
 
 import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import MODEL
 from layers import slow_after
 
 from isa_nrsfm import AffineNRSfM
@@ -74,28 +72,23 @@ def write_sleap(folder):
         3, [write_openface, write_sleap, write_openpose, write_pts, write_mediapipe]
     ),
 )
-def test_files_are_fitted_and_transformed(write, run, tmp_path):
+def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
     path, options, kept, empty = write(tmp_path)
-    folder = tmp_path / "results"
-    code, out, err = run("fit", path, "-o", folder, *options, *QUICK)
-    assert (code, err) == (0, "")
-    assert f"{path} (" in out
-    table = json.loads((folder / "report.json").read_text())["table"]
+    found = fits(path, *options, *QUICK, folder=tmp_path / "results")
+    assert found.err == ""
+    assert f"{path} (" in found.out
+    table, alpha = found.report["table"], found.alpha
     assert table["format"] == write.__name__.removeprefix("write_")
-    assert table["n_points"] == len(np.load(folder / "shapes.npz")["mean_shape"])
-    alpha = pd.read_csv(folder / "alpha.csv")
+    assert table["n_points"] == len(found.model.mean_shape_)
     assert kept <= set(alpha)
     assert "x_0" not in alpha
     missing = alpha["alpha_1"].isna()
     assert list(alpha["frame" if "frame" in alpha else "row"][missing]) == empty
-    assert (" 1  left out: tracking failed" in out) == (len(empty) > 0)
-    uncertain = " 1  left out: all points missing or uncertain" in out
+    assert (" 1  left out: tracking failed" in found.out) == (len(empty) > 0)
+    uncertain = " 1  left out: all points missing or uncertain" in found.out
     assert uncertain == (write is write_openface)
-
-    output = tmp_path / "again.csv"
-    code, _, err = run("transform", folder / MODEL, path, "-o", output, *options)
-    assert (code, err) == (0, "")
-    again = pd.read_csv(output)
+    again, _, err = transforms(found.path, path, *options)
+    assert err == ""
     assert list(again) == list(alpha)
     np.testing.assert_allclose(again["alpha_1"], alpha["alpha_1"], atol=1e-3)
 
@@ -125,22 +118,18 @@ def test_options_without_effect_are_refused(fails, tmp_path, write, options, mes
     assert message in fails("fit", path, *options.split(), *folder)
 
 
-def test_columns_make_any_file_a_table(succeeds, tmp_path):
+def test_columns_make_any_file_a_table(fits, tmp_path):
     path, *_ = write_openface(tmp_path)
-    out, _ = succeeds("fit", path, "--columns", "x_#,y_#", "-o", tmp_path, *QUICK)
-    assert "fitted to 40 frames" in out
+    assert "fitted to 40 frames" in fits(path, "--columns", "x_#,y_#", *QUICK).out
 
 
-def test_a_model_of_other_points_is_refused(fails, succeeds, tmp_path):
+def test_a_model_of_other_points_is_refused(fails, fits, transforms, tmp_path):
     # All name their points x_0, y_0, ..., and are not the same points.
-    path, *_ = write_pts(tmp_path)
-    folder, output = tmp_path / "results", ["-o", tmp_path / "a.csv"]
-    succeeds("fit", path, "-o", folder, *QUICK)
+    model = fits(write_pts(tmp_path)[0], *QUICK).path
     mesh, options, *_ = write_mediapipe(tmp_path)
-    message = fails("transform", folder / MODEL, mesh, *output, *options)
+    message = fails("transform", model, mesh, "-o", tmp_path / "a.csv", *options)
     assert "820 columns are only in the table (x_68, y_68," in message
-    openface, *_ = write_openface(tmp_path)
-    out, _ = succeeds("transform", folder / MODEL, openface, *output)
+    _, out, _ = transforms(model, write_openface(tmp_path)[0])
     assert "1  without coefficients: tracking failed" in out
 
 
@@ -156,45 +145,46 @@ def with_confidences(folder, axes):
 
 @pytest.mark.parametrize(
     ("axes", "word"),
-    [
-        ("p{1}_{0}", "conf"),
-        ("joint {1}.{0}", "likelihood"),
-        ("{0}{1}", "c"),
-        ("{0}_{1}", "score"),
-    ],
+    slow_after(
+        1,
+        [
+            ("p{1}_{0}", "conf"),
+            ("joint {1}.{0}", "likelihood"),
+            ("{0}{1}", "c"),
+            ("{0}_{1}", "score"),
+        ],
+        together=True,
+    ),
 )
-def test_confidences_of_a_plain_table(succeeds, tmp_path, axes, word):
+def test_confidences_of_a_plain_table(fits, transforms, tmp_path, axes, word):
     table, confidence, path = with_confidences(tmp_path, axes)
     points = table.columns[1:]
+    without = table.copy()
+    without[points] = without[points].mask(np.repeat(confidence < 0.4, 2, axis=1))
+    without.to_csv(tmp_path / "without.csv", index=False)
+    blanked = fits(tmp_path / "without.csv", *QUICK).alpha
     for j in range(20):
         table[axes.format(word, j)] = confidence[:, j]
     table.to_csv(path, index=False)
-    folder, blanked = tmp_path / "results", tmp_path / "blanked"
     unsure = ["--min-confidence", "0.4"]
-    succeeds("fit", path, "-o", folder, *QUICK, *unsure)
-    alpha = pd.read_csv(folder / "alpha.csv")
+    found = fits(path, *QUICK, *unsure)
+    alpha = found.alpha
     assert list(alpha) == ["row", "id", "alpha_1"]
-    without = table[["id", *points]].copy()
-    without[points] = without[points].mask(np.repeat(confidence < 0.4, 2, axis=1))
-    without.to_csv(tmp_path / "without.csv", index=False)
-    succeeds("fit", tmp_path / "without.csv", "-o", blanked, *QUICK)
-    pd.testing.assert_frame_equal(alpha, pd.read_csv(blanked / "alpha.csv"))
-    output = tmp_path / "again.csv"
-    succeeds("transform", folder / MODEL, path, "-o", output, *unsure)
-    found = pd.read_csv(output)["alpha_1"]
-    np.testing.assert_allclose(found, alpha["alpha_1"], atol=1e-3)
+    pd.testing.assert_frame_equal(alpha, blanked)
+    again, *_ = transforms(found.path, path, *unsure)
+    np.testing.assert_allclose(again["alpha_1"], alpha["alpha_1"], atol=1e-3)
 
     found = read_landmarks(path, "table", min_confidence=0.4)
     np.testing.assert_array_equal(found.confidence, confidence)
     np.testing.assert_array_equal(found.points, without[points])
     assert list(found.frames) == ["id"]
     # Unused, they are counted, and not copied.
-    out, _ = succeeds("fit", path, "-o", folder, *QUICK)
-    assert f"not used: {axes.format(word, 0)}, ... (confidences) (20)" in out
-    assert list(pd.read_csv(folder / "alpha.csv")) == ["row", "id", "alpha_1"]
+    found = fits(path, *QUICK)
+    assert f"not used: {axes.format(word, 0)}, ... (confidences) (20)" in found.out
+    assert list(found.alpha) == ["row", "id", "alpha_1"]
 
 
-def test_confidences_of_a_plain_table_are_weights(run, tmp_path):
+def test_confidences_of_a_plain_table_are_weights(fits, fails, tmp_path):
     table, confidence, path = with_confidences(tmp_path, "p{1}_{0}")
     confidence[3, 5] = 0.0
     points = table.columns[1:]
@@ -204,23 +194,21 @@ def test_confidences_of_a_plain_table_are_weights(run, tmp_path):
         table[f"p{j}_conf"] = confidence[:, j]
     table.to_csv(path, index=False)
     options = ["--weights", "confidence", "-k", "1", "--no-figures"]
-    some = ["--points", "without:2,7"]
-    code, out, _ = run("fit", path, "-o", tmp_path / "fit", *options, *some)
-    assert code == 0
+    found = fits(path, *options, "--points", "without:2,7")
     left = np.delete(np.arange(20), [2, 7])
     X = table[points].to_numpy().reshape(N_FRAMES, 20, 2)[:, left]
     model, X = AffineNRSfM(1, random_state=0), X.reshape(N_FRAMES, -1)
     model.fit(X, point_weight=confidence[:, left])
-    alpha = pd.read_csv(tmp_path / "fit/alpha.csv")["alpha_1"]
+    alpha = found.alpha["alpha_1"]
     np.testing.assert_allclose(alpha, model.alpha_[:, 0], atol=1e-6)
-    report = json.loads((tmp_path / "fit/report.json").read_text())["model"]
     error = -model.score(X, point_weight=confidence[:, left])
-    assert report["held_out_error"] == pytest.approx(error, rel=1e-4)
+    shown = found.report["model"]["held_out_error"]
+    assert shown == pytest.approx(error, rel=1e-4)
     assert error != pytest.approx(-model.score(X), rel=0.01)
-    assert "Points count by their weights here" in " ".join(out.split())
+    assert "Points count by their weights here" in " ".join(found.out.split())
     table["p3_conf"] = "good"
     table.to_csv(path, index=False)
-    _, _, err = run("fit", path, "-o", tmp_path / "fit", *options)
+    err = fails("fit", path, "-o", tmp_path / "fit", *options)
     assert "column 'p3_conf' should hold numbers, but in row 0" in err
 
 
@@ -248,32 +236,24 @@ def write_shares(folder, change=lambda shares: shares):
     ],
     ids=["shares", "4 % outside", "6 % outside", "centred", "scaled", "pixels"],
 )
-def test_shares_of_an_image_are_named(succeeds, tmp_path, change, is_named):
-    path = write_shares(tmp_path, change)
-    _, err = succeeds("fit", path, "-o", tmp_path / "results", *QUICK)
+def test_shares_of_an_image_are_named(fits, tmp_path, change, is_named):
+    err = fits(write_shares(tmp_path, change), *QUICK).err
     assert (SHARES in err) == is_named
     assert ("--format mediapipe --image-size" in err) == is_named
 
 
-MEDIAPIPE = ["--format", "mediapipe", "--image-size", "1920x1080"]
-
-
-def test_points_outside_of_the_image_are_counted(succeeds, tmp_path):
+def test_points_outside_of_the_image_are_counted(fits, fails, tmp_path):
     def change(shares):
         shares[3, 5] = [0.5, 1.25]
         shares[4, 6] = [-0.125, 0.5]
         return shares
 
-    path = write_shares(tmp_path, change)
-    _, err = succeeds("fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK)
+    options = ["--format", "mediapipe", "--image-size", "1920x1080", *QUICK]
+    err = fits(write_shares(tmp_path, change), *options).err
     expected = "warning: 2 of 840 points are outside the image, by at most 0.25 of its "
     expected += "width or height (point 5 in row 3)\n"
     assert expected in err
     assert SHARES not in err
-
-
-def test_coordinates_that_are_no_shares_are_refused(fails, tmp_path):
     path = write_shares(tmp_path, lambda shares: shares - shares[:, :1])
-    assert "the coordinates are no shares of the width and height of an image" in fails(
-        "fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK
-    )
+    message = "the coordinates are no shares of the width and height of an image"
+    assert message in fails("fit", path, "-o", tmp_path / "results", *options)

@@ -1,13 +1,12 @@
 """What joins the points in the results of commands: --edges and --skeleton."""
 
 import base64
-import json
 
 import numpy as np
 import pandas as pd
 import pytest
 from exported_files import Read, content_of
-from fit_runs import MODEL
+from fit_runs import Results
 
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import (
@@ -17,7 +16,6 @@ from isa_nrsfm.datasets import (
     make_nonrigid_tracks,
 )
 from isa_nrsfm.export import frame_poses
-from isa_nrsfm.io import load_model
 from isa_nrsfm.skeletons import get_skeleton
 
 QUICK = [*"--n-components 1 --refinement none --isa fast --n-init 2".split()]
@@ -43,7 +41,7 @@ def pairs_of(name):
 
 @pytest.fixture(scope="module")
 def bodies():
-    return make_body_tracks(120, noise=0.002, random_state=0)
+    return make_body_tracks(60, noise=0.002, random_state=0)
 
 
 @pytest.fixture(scope="module")
@@ -52,26 +50,24 @@ def table(bodies, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def folder(table, tmp_path_factory):
-    """Return the folder of a fit of bodies without names."""
+def bodies_fit(table, tmp_path_factory):
+    """Return the results of a fit of bodies without names."""
     folder = tmp_path_factory.mktemp("fit")
     assert main(["fit", str(table), "-o", str(folder), "--no-figures", *QUICK]) == 0
-    return folder
+    return Results(folder)
 
 
-def test_layouts_are_recognised_by_order_or_names(succeeds, bodies, folder, tmp_path):
+def test_layouts_are_recognised_by_order_or_names(fits, bodies, bodies_fit, tmp_path):
     path = write(make_hand_tracks(120, random_state=0), tmp_path / "hands.csv")
-    report, _ = succeeds("fit", path, "-o", tmp_path, *QUICK)
-    assert "points recognised as hand-21" in report
-    stored = json.loads((tmp_path / "report.json").read_text())["model"]["skeleton"]
-    assert stored == "hand-21"
+    found = fits(path, "--no-figures", *QUICK)
+    assert "points recognised as hand-21" in found.out
+    assert found.report["model"]["skeleton"] == "hand-21"
     assert edges_of(tmp_path / "viewer.html") == (pairs_of("hand-21"), [])
     # Bodies of 17 points are not guessed.
-    assert edges_of(folder / "viewer.html") == (set(), [])
-    assert json.loads((folder / "report.json").read_text())["model"]["skeleton"] is None
+    assert edges_of(bodies_fit.folder / "viewer.html") == (set(), [])
+    assert bodies_fit.report["model"]["skeleton"] is None
     names = [f"{name}_{axis}" for name in bodies.point_names for axis in "xy"]
-    path = write(bodies, tmp_path / "bodies.csv", names)
-    succeeds("fit", path, "-o", tmp_path, "--no-figures", *QUICK)
+    fits(write(bodies, tmp_path / "bodies.csv", names), "--no-figures", *QUICK)
     sides = get_skeleton("coco-17").sides.tolist()
     assert edges_of(tmp_path / "viewer.html") == (pairs_of("coco-17"), sides)
 
@@ -94,74 +90,64 @@ def test_fit_takes_a_skeleton_for_all_that_it_draws(run, table, tmp_path, monkey
     assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("coco-17")
 
 
-def test_edges_of_a_file(succeeds, table, folder, tmp_path):
-    own = tmp_path / "edges.csv"
+def test_edges_of_a_file(fits, succeeds, table, bodies_fit, tmp_path):
+    own, config = tmp_path / "edges.csv", tmp_path / "config.yaml"
+
+    def drawn(*options):
+        found = fits(table, "--no-figures", *QUICK, *options)
+        # Without any, the report names the options.
+        advice = "--edges FILE or --skeleton LAYOUT (of 17 points: coco-17, h36m-17)"
+        is_noted = advice in " ".join(found.out.split())
+        assert is_noted == (options == ())
+        return edges_of(tmp_path / "viewer.html")[0]
+
+    assert drawn() == drawn("--edges", "none") == set()
     own.write_text("5,7\n7,9\n")
-    fit = ["fit", table, "-o", tmp_path / "out", "--no-figures", *QUICK]
-    # Without any, the report names the options.
-    for options, is_noted in (
-        ([], True),
-        (["--edges", "none"], False),
-        (["--edges", own], False),
-    ):
-        report, _ = succeeds(*fit, *options)
-        assert ("--edges FILE or --skeleton LAYOUT" in report) == is_noted
-    assert edges_of(tmp_path / "out/viewer.html")[0] == {(5, 7), (7, 9)}
+    assert drawn("--edges", own) == {(5, 7), (7, 9)}
     # Of triangles the sides are drawn, each once.
     own.write_text("0,1,2\n2,1,3\n")
-    succeeds(*fit, "--edges", own)
-    sides = {(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)}
-    assert edges_of(tmp_path / "out/viewer.html")[0] == sides
-    config = tmp_path / "config.yaml"
+    assert drawn("--edges", own) == {(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)}
     config.write_text("skeleton:\n- ['5', '7']\n- ['6', '8']\n")
-    succeeds(*fit, "--skeleton", config)
-    assert edges_of(tmp_path / "out/viewer.html")[0] == {(5, 7), (6, 8)}
-    skeleton = ["--skeleton", "coco-17"]
-    export = ["export", folder / MODEL, "-o", tmp_path / "a.glb"]
-    succeeds(*export, *skeleton)
+    assert drawn("--skeleton", config) == {(5, 7), (6, 8)}
+    export = ["export", bodies_fit.path, "-o", tmp_path / "a.glb"]
+    succeeds(*export, "--skeleton", "coco-17")
     materials = Read(tmp_path / "a.glb").document["materials"]
     assert [m["name"] for m in materials] == ["points and edges", "left", "right"]
 
 
-def test_transform_writes_a_page(fails, succeeds, table, folder, tmp_path):
-    page = tmp_path / "new.html"
-    transform = ["transform", folder / MODEL, table]
-    transform += ["-o", tmp_path / "alpha.csv", "--skeleton", "coco-17"]
-    report, _ = succeeds(*transform, "--viewer", page)
-    assert str(page) in report
+def test_transform_writes_a_page(fails, transforms, table, bodies_fit, tmp_path):
+    page, skeleton = tmp_path / "new.html", ["--skeleton", "coco-17"]
+    _, out, _ = transforms(bodies_fit.path, table, *skeleton, "--viewer", page)
+    assert str(page) in out
     assert edges_of(page)[0] == pairs_of("coco-17")
-    assert len(content_of(page)["rows"]) == 120
-    assert "--edges, --skeleton and --origin need --viewer" in fails(*transform)
+    assert len(content_of(page)["rows"]) == 60
+    output = ["-o", tmp_path / "a.csv"]
+    message = fails("transform", bodies_fit.path, table, *output, *skeleton)
+    assert "--edges, --skeleton and --origin need --viewer" in message
 
 
-def test_where_y_is_zero_is_said(run, tmp_path):
+def test_where_y_is_zero_is_said(fits, transforms, succeeds, tmp_path):
     # Points without a known layout, which nothing else says to be upside down.
     scene = make_nonrigid_tracks(40, 12, 1, camera="weak_perspective", random_state=0)
     path = write(scene, tmp_path / "points.csv")
-    fitted, new = tmp_path / "fit", tmp_path / "new.html"
-    lower = ["--origin", "lower"]
     options = ["--camera", "weak_perspective", "-k", "1", "--no-figures", "--std"]
-    assert run("fit", path, "-o", fitted, *options, *lower)[0] == 0
-    model = fitted / MODEL
+    lower = ["--origin", "lower", "--viewer", tmp_path / "new.html"]
+    fit = fits(path, *options, *lower[:2])
     exported = {name: tmp_path / f"{name}.html" for name in ("upper", "lower")}
     for name, page in exported.items():
-        run("export", model, path, "-o", page, "--origin", name)
-    transform = ["transform", model, path, "-o", tmp_path / "a.csv", "--viewer", new]
-    run(*transform, *lower, "--std")
-    shapes = content_of(fitted / "viewer.html")["shapes"]
-    assert shapes == content_of(exported["lower"])["shapes"]
-    assert shapes == content_of(new)["shapes"]
-    assert shapes != content_of(exported["upper"])["shapes"]
+        succeeds("export", fit.path, path, "-o", page, "--origin", name)
+    transforms(fit.path, path, *lower, "--std")
+    pages = [tmp_path / "viewer.html", exported["lower"], lower[-1]]
+    fitted, shapes, new = map(content_of, pages)
+    assert fitted["shapes"] == shapes["shapes"] == new["shapes"]
+    assert fitted["shapes"] != content_of(exported["upper"])["shapes"]
     # Error bars are those that are asked for.
-    bars = content_of(fitted / "viewer.html")["deviations"]
-    assert bars
-    assert bars == content_of(new)["deviations"]
-    run(*transform, *lower)
-    assert content_of(new)["deviations"] == ""
-    cameras, estimator = pd.read_csv(fitted / "cameras.csv"), load_model(model)
-    poses = {name: frame_poses(estimator, origin=name) for name in exported}
-    np.testing.assert_allclose(cameras["yaw"], poses["lower"].yaw, atol=1e-6)
-    assert not np.allclose(cameras["yaw"], poses["upper"].yaw, atol=1)
+    assert fitted["deviations"] == new["deviations"] != ""
+    transforms(fit.path, path, *lower)
+    assert content_of(lower[-1])["deviations"] == ""
+    yaw = {name: frame_poses(fit.model, origin=name).yaw for name in exported}
+    np.testing.assert_allclose(fit.cameras["yaw"], yaw["lower"], atol=1e-6)
+    assert not np.allclose(fit.cameras["yaw"], yaw["upper"], atol=1)
 
 
 @pytest.mark.parametrize(
@@ -200,41 +186,32 @@ def faces(tmp_path_factory):
 
 
 @pytest.mark.parametrize("options", [[], ["--skeleton", "ibug-68"]])
-def test_inner_points_are_fitted_and_drawn(succeeds, faces, tmp_path, options):
-    inner = ["--points", "inner", *options, "--no-figures"]
-    report, _ = succeeds("fit", faces, "-o", tmp_path, *inner, *QUICK)
-    assert "60 frames of 51 points" in report
-    assert "coordinates not used: --points inner (17)" in report
-    assert "points recognised as ibug-51" in report
+def test_inner_points_are_fitted_and_drawn(fits, transforms, faces, tmp_path, options):
+    found = fits(faces, "--points", "inner", *options, "--no-figures", *QUICK)
+    assert "60 frames of 51 points" in found.out
+    assert "coordinates not used: --points inner (17)" in found.out
+    assert "points recognised as ibug-51" in found.out
     assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("ibug-51")
-    names = load_model(tmp_path / MODEL).feature_names_in_
-    assert names.tolist()[:2] == ["x_17", "y_17"]
-    alpha = pd.read_csv(tmp_path / "alpha.csv")
+    assert found.model.feature_names_in_.tolist()[:2] == ["x_17", "y_17"]
+    alpha, page = found.alpha, tmp_path / "v.html"
     assert alpha.columns.tolist() == ["row", "alpha_1"]
     # The table with all points has these points.
     for columns in ([], ["--columns", "x_#,y_#"]):
-        page = ["--viewer", tmp_path / "v.html"]
-        report, _ = succeeds(
-            "transform", tmp_path / MODEL, faces, "-o", tmp_path / "a.csv",
-            *columns, *page,
-        )  # fmt: skip
-        found = pd.read_csv(tmp_path / "a.csv")["alpha_1"]
-        np.testing.assert_allclose(found, alpha["alpha_1"], atol=1e-9)
-        assert edges_of(tmp_path / "v.html")[0] == pairs_of("ibug-51")
+        again, *_ = transforms(found.path, faces, *columns, "--viewer", page)
+        np.testing.assert_allclose(again["alpha_1"], alpha["alpha_1"], atol=1e-9)
+        assert edges_of(page)[0] == pairs_of("ibug-51")
 
 
 @pytest.mark.parametrize(
     ("points", "kept"),
     [("without:0-16", range(17, 68)), ("36-47, 30,48-67,30", [30, *range(36, 68)])],
 )
-def test_points_are_named(run, faces, tmp_path, points, kept):
-    fit = ["fit", faces, "-o", tmp_path, "--no-figures", "--points", points, *QUICK]
-    assert run(*fit)[0] == 0
-    names = load_model(tmp_path / MODEL).feature_names_in_
+def test_points_are_named(fits, faces, tmp_path, points, kept):
+    found = fits(faces, "--no-figures", "--points", points, *QUICK)
+    names = found.model.feature_names_in_
     assert names[::2].tolist() == [f"x_{j}" for j in kept]
     expected = get_skeleton("ibug-68").subset(kept).edges.tolist()
-    found, _ = edges_of(tmp_path / "viewer.html")
-    assert found == {tuple(edge) for edge in expected}
+    assert edges_of(tmp_path / "viewer.html")[0] == {*map(tuple, expected)}
 
 
 @pytest.mark.parametrize(

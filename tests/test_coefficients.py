@@ -34,7 +34,8 @@ class Scene(scenes.Scene):
 
     def posterior(self, noise=NOISE, **options):
         products = frame_sums(
-            frame_tracks(self.tracks, self.weights), ShapeProducts(self.shapes)
+            frame_tracks(self.tracks.transpose(0, 2, 1), self.weights),
+            ShapeProducts(self.shapes),
         )
         return coefficient_posterior(products, self.M, noise, **options)
 

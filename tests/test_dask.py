@@ -1,4 +1,4 @@
-"""Tables on dask: threads, a cluster, workers that are lost, joblib's backend."""
+"""Tables on a cluster of dask: workers that are lost, what comes back, joblib."""
 
 import os
 import signal
@@ -6,12 +6,10 @@ import signal
 import joblib
 import numpy as np
 import pytest
-from layers import slow_after
 from numpy.testing import assert_allclose
-from refusals import refused
 from sklearn.model_selection import GridSearchCV
 
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import FastISA
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
 from isa_nrsfm._tables.blocks import DaskBlocks
@@ -51,69 +49,6 @@ def cluster():
     with distributed.LocalCluster(**options) as cluster:
         with distributed.Client(cluster):
             yield cluster
-
-
-class TestThreads:
-    @pytest.mark.parametrize("missing", slow_after(1, [0.1, 0.0]))
-    def test_fit_is_that_in_memory(self, missing):
-        X = table(missing)
-        model = AffineNRSfM(K, random_state=0).fit(chunked(X, columns=16))
-        assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
-
-    @pytest.mark.slow
-    def test_robust_fit_is_that_in_memory(self):
-        X = table(0.1)
-        wrong = np.random.default_rng(1).random(X.shape) < 0.03
-        X = np.where(wrong, 3 * X, X)
-        model = AffineNRSfM(K, loss="huber", random_state=0)
-        found = model.fit(chunked(X, columns=16))
-        expected = AffineNRSfM(K, loss="huber", random_state=0).fit(X)
-        assert_same_model(found, expected)
-
-    def test_rows_that_show_nothing_are_left_out(self):
-        X = table()
-        empty = np.arange(300) % 5 == 2
-        empty[70:220] = True  # a whole chunk
-        expected = AffineNRSfM(K, random_state=0).fit(X[~empty])
-        X[empty] = np.nan
-        with pytest.warns(UserWarning, match=f"{empty.sum()} of 300 rows"):
-            model = AffineNRSfM(K, random_state=0).fit(chunked(X))
-        assert model.alpha_.chunks[0] == (70, 150, 80)
-        found = np.asarray(model.alpha_)
-        assert np.isnan(found[empty]).all()
-        assert_allclose(found[~empty], expected.alpha_, rtol=0, atol=1e-8)
-        assert_allclose(model.basis_, expected.basis_, rtol=0, atol=1e-8)
-
-    def test_results_are_dask_arrays(self):
-        X = table()
-        model = AffineNRSfM(K, random_state=0).fit(chunked(X))
-        plain = AffineNRSfM(K, random_state=0).fit(X)
-        for name in ("alpha_", "motion_", "translation_", "alpha_std_"):
-            assert isinstance(getattr(model, name), array.Array)
-            assert getattr(model, name).chunks[0] == (70, 150, 80)
-        for name in ("transform", "reconstruct", "reproject"):
-            got = getattr(model, name)(chunked(X))
-            assert isinstance(got, array.Array)
-            assert_allclose(got.compute(), getattr(plain, name)(X), atol=1e-8)
-        assert model.score(chunked(X)) == pytest.approx(plain.score(X), rel=1e-8)
-        found, expected = (each.diagnostics() for each in (model, plain))
-        assert_allclose(found.weak_deviations, expected.weak_deviations, rtol=1e-6)
-
-    def test_chunks_of_unknown_length(self):
-        X = table()
-        unknown = chunked(np.column_stack([X, np.arange(300)]), columns=41)
-        unknown = unknown[unknown[:, 40] % 7 != 0][:, :40]
-        model = AffineNRSfM(K, random_state=0).fit(unknown)
-        expected = AffineNRSfM(K, random_state=0).fit(X[np.arange(300) % 7 != 0])
-        assert_same_model(model, expected)
-
-    def test_errors(self):
-        refused("got n_features=39", AffineNRSfM(K).fit, chunked(table())[:, :39])
-        with pytest.raises(ValueError, match=r"not in memory needs refinement='joint'"):
-            AffineNRSfM(K, refinement="alternating").fit(chunked(table()))
-        X = table()
-        X[200, 3] = np.inf
-        refused("infinity", AffineNRSfM(K).fit, chunked(X))
 
 
 # The first steps are taken on few frames, as of large tables.

@@ -16,10 +16,10 @@ from numpy.testing import assert_array_equal
 from refusals import refused
 from scipy.io import savemat
 
-from isa_nrsfm._tables.column_names import names_layout
 from isa_nrsfm.datasets import _muct, _shark, fetch_muct, fetch_shark
 from isa_nrsfm.datasets._remote import RemoteFile, fetch_file
 from isa_nrsfm.io import landmark_table
+from isa_nrsfm.skeletons._column_names import names_layout
 
 CONTENT = bytes(range(256)) * 100
 BY_HAND = "To put it there by hand, take it from {url}; its sha256 is {sha256}"

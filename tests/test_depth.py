@@ -195,15 +195,6 @@ class TestTurnedFaces:
         _, deviation = model.reconstruct(X, return_std=True)
         assert np.isnan(deviation).all(axis=1).tolist() == [False, True, False]
 
-    def test_units_make_no_difference(self, turned):
-        X, _, _, model = turned
-        other = fitted(100 * X)
-        assert_allclose(other.depth_uncertainty_, model.depth_uncertainty_, rtol=0.02)
-        _, deviation = model.reconstruct(X, return_std=True)
-        _, larger = other.reconstruct(100 * X, return_std=True)
-        expected = 100 * model.scales_[:, None] * deviation
-        assert_allclose(other.scales_[:, None] * larger, expected, rtol=0.02)
-
     @pytest.mark.parametrize("error", [0.88, 0.5])
     def test_large_errors_of_depths_are_named(self, turned, error):
         model = copy.copy(turned[3])

@@ -12,12 +12,12 @@ from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._diagnostics import (
+from isa_nrsfm._joint.sample_posterior import reliabilities
+from isa_nrsfm.analysis._diagnostics import (
     camera_advice,
     gross_residuals,
     outlier_advice,
     pose_share,
-    reliabilities,
     weak_information,
 )
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks

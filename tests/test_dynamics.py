@@ -9,7 +9,10 @@ from scipy.special import logit
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
-from isa_nrsfm._frames.dynamics import (
+from isa_nrsfm._frames.models import LinearisedFrames
+from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
+from isa_nrsfm.analysis._frame_columns import sequences_of
+from isa_nrsfm.analysis._smoothing import (
     Dynamics,
     Observations,
     estimated_dynamics,
@@ -17,9 +20,6 @@ from isa_nrsfm._frames.dynamics import (
     smoothed,
     smoothed_frames,
 )
-from isa_nrsfm._frames.models import LinearisedFrames
-from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
-from isa_nrsfm._tables.frame_columns import sequences_of
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 

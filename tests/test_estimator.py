@@ -92,7 +92,11 @@ def size_weights(model, table):
     """Return one over the square of the sizes of frames, those of the loss."""
     tracks = tracks_of(table, model.layout)
     linear = model.loss == "linear"
-    weights = frame_weights(tracks, True) if linear else robust_sizes(tracks) ** -2
+    weights = (
+        frame_weights(tracks, True)
+        if linear
+        else robust_sizes(tracks.transpose(0, 2, 1)) ** -2
+    )
     if scales_frames(model):
         return weights
     return np.full_like(weights, 1 / np.mean(1 / weights))

@@ -253,22 +253,6 @@ def test_robust_fits_are_invariant(loss):
         assert_allclose(first.transform(changed), first.alpha_, atol=1e-4, rtol=0)
 
 
-def test_moved_and_turned_images_move_and_turn_the_cameras(tracks, model, variant):
-    R, t = rotations(0.3), np.array([20.0, -30.0])
-    moved = estimator(variant).fit(table_of(2.0 * tracks @ R.T + t))
-    expected = 2 * model.translation_ @ R.T + t
-    assert_allclose(moved.translation_, expected, rtol=1e-7)
-    # x and y of the shapes turn with the mean camera, and so their product does.
-    cameras = moved.motion_ @ np.swapaxes(all_shapes(moved)[:, None], -1, -2)
-    expected = 2 * R @ (model.motion_ @ np.swapaxes(all_shapes(model)[:, None], -1, -2))
-    tolerance = 1e-5 * np.abs(expected).max()
-    assert_allclose(cameras, expected, atol=tolerance, rtol=0)
-    # The mean view is upright in both: it has no part that turns.
-    for fitted in (model, moved):
-        view = fitted.reference_motion_
-        assert_allclose(view[0, 1], view[1, 0], atol=1e-9 * np.abs(view).max())
-
-
 # --- gauge --------------------------------------------------------------------------
 
 

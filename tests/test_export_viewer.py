@@ -13,15 +13,16 @@ from export_models import (
     face_model,
     faces,
 )
-from exported_files import content_of
+from exported_files import content_of, numbers
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm.export import write_viewer
 from isa_nrsfm.skeletons import get_skeleton
 
 
-def numbers(text, dtype="<f4"):
-    return np.frombuffer(base64.b64decode(text), dtype)
+def shapes_of(data):
+    """Return the mean shape and the basis shapes of a page."""
+    return numbers(data["shapes"]).reshape(1 + len(data["components"]), -1, 3)
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def test_a_page_is_one_file_that_asks_for_nothing(tmp_path):
 
 def test_shapes_have_y_up_and_size_one(written):
     data = written(face_model())
-    shapes = numbers(data["shapes"]).reshape(1 + N_COMPONENTS, 68, 3)
+    shapes = shapes_of(data)
     assert np.linalg.norm(shapes[0], axis=1).max() == pytest.approx(1)
     assert_allclose(shapes[0].mean(axis=0), 0, atol=1e-6)
     assert shapes[0, 8, 1] < shapes[0, 27, 1]
@@ -70,25 +71,62 @@ def test_frames_are_those_of_the_fit(written):
     assert data["labels"] == data["categories"] == []
 
 
-@pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
-def test_rotations_show_the_shapes_as_the_images_do(written, camera):
+@pytest.mark.parametrize(
+    ("camera", "options"),
+    [
+        *((camera, {}) for camera in ("weak_perspective", "orthographic")),
+        ("affine", {}),
+        ("affine", {"mirrored": True}),
+        ("affine", {"origin": "lower"}),
+        ("orthographic", {"origin": "lower", "mirrored": True}),
+    ],
+)
+def test_rotations_show_the_shapes_as_the_images_do(written, camera, options):
     truth, model = faces(noise=0.0), face_model(noise=0.0)
     if camera != "affine":
         truth, model = faces(camera=camera), calibrated_model(camera)
-    data = written(model)
+    data = written(model, **options)
     told = "weak_perspective" if camera == "affine" else camera
     assert f"{told.replace('_', '-')} cameras" in data["about"]
-    shapes = numbers(data["shapes"]).reshape(1 + N_COMPONENTS, -1).astype(float)
+    shapes = shapes_of(data).astype(float)
     alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
     rotations = numbers(data["rotations"]).reshape(-1, 3, 3)
-    frames = (shapes[0] + alpha @ shapes[1:]).reshape(-1, 68, 3)
+    assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-5)
+    frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
     seen = (frames @ rotations.transpose(0, 2, 1))[:, :, :2] * [1, -1]
-    images = truth.clean
+    # The page turns the images of y that points up.
+    images = truth.clean * [1, -1 if "origin" in options else 1]
     images = images - images.mean(axis=1, keepdims=True)
     seen = seen - seen.mean(axis=1, keepdims=True)
     scale = np.sum(seen * images, axis=(1, 2)) / np.sum(seen**2, axis=(1, 2))
     error = images - scale[:, None, None] * seen
     assert np.sum(error**2) < 1e-3 * np.sum(images**2)
+
+
+@pytest.mark.parametrize(
+    ("options", "signs"),
+    [({"mirrored": True}, [1, 1, -1]), ({"origin": "lower"}, [1, -1, -1])],
+)
+def test_mirror_images_and_origins_change_signs(written, options, signs):
+    shapes, other = shapes_of(written(blob_model())), written(blob_model(), **options)
+    assert_allclose(shapes_of(other), shapes * signs, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
+def test_basis_shapes_are_those_of_the_frames(written, camera):
+    # The model's, or the least squares fit to Euclidean shapes of affine cameras.
+    model = face_model() if camera == "affine" else calibrated_model(camera)
+    shapes = model.mean_shape_[None], model.basis_
+    if camera == "affine":
+        frames = model.reconstruct(faces().data, camera="weak_perspective")
+        weights = np.insert(model.alpha_, 0, 1.0, axis=1)
+        best = np.linalg.lstsq(weights, frames.reshape(len(frames), -1))[0]
+        shapes = np.split(best.reshape(-1, 68, 3), [1])
+    rows = np.concatenate([shapes[0] - shapes[0].mean(axis=1), shapes[1]])
+    drawn = shapes_of(written(model))
+    inner, expected = (np.tensordot(each, each, [2, 2]) for each in (drawn, rows))
+    unit = np.linalg.norm(expected) / np.linalg.norm(inner)
+    assert_allclose(unit * inner, expected, atol=1e-4 * expected.max())
 
 
 def test_deviations_have_the_size_of_the_shapes(written):
@@ -98,8 +136,8 @@ def test_deviations_have_the_size_of_the_shapes(written):
     found = numbers(data["deviations"]).reshape(4, 68)
     size = np.linalg.norm(shapes[0, 0] - shapes[0, 16])
     alpha = numbers(data["alpha"]).reshape(4, -1)[0]
-    drawn = numbers(data["shapes"]).reshape(1 + N_COMPONENTS, 68, 3)
-    drawn = drawn[0] + np.tensordot(alpha, drawn[1:], 1)
+    mean, *basis = shapes_of(data)
+    drawn = mean + np.tensordot(alpha, basis, 1)
     unit = np.linalg.norm(drawn[0] - drawn[16]) / size
     assert_allclose(found, unit * std[[0, 49, 99, 149]], rtol=1e-4)
     assert written(model)["deviations"] == ""
@@ -143,7 +181,6 @@ def test_labels_are_sorted_numbers_first_and_none_last(written):
     data = written(model, labels=labels)
     assert data["categories"] == ["9.5", "10", "a", "b", "(no label)"]
     assert data["labels"][:8] == [1, 0, 3, 4, 2, 4, 0, 1]
-    pd = pytest.importorskip("pandas", reason="needs the extra io")
     labels = pd.array(["b", None, "a", "b"] * 10, dtype="string")
     data = written(model, labels=labels)
     assert data["categories"] == ["a", "b", "(no label)"]
@@ -160,7 +197,11 @@ def test_the_sides_of_a_known_layout_are_told(written):
     data = written(face_model())
     assert data["sides"] == get_skeleton("ibug-68").sides.tolist()
     assert written(face_model(), edges=None)["sides"] == []
-    assert written(blob_model())["sides"] == []
+    data = written(blob_model(), edges=[[0, 1, 2], [2, 1, 3]])
+    assert data["sides"] == []
+    # The sides of triangles, once
+    edges = numbers(data["edges"], "<u4").reshape(-1, 2).tolist()
+    assert edges == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
 
 
 def test_times_are_seconds_that_rise(written):

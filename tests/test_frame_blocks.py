@@ -152,7 +152,7 @@ def test_threads_have_few_results_ahead(array):
 
 
 def test_no_frames():
-    blocks = open_table(np.empty((0, 4), np.float32))
+    blocks = open_table(np.empty((0, 4), np.float32), "interleaved")
     got = blocks.collect(lambda block: 2 * block)
-    assert got.shape == (0, 4)
+    assert got.shape == (0, 2, 2)
     assert got.dtype == np.float32

@@ -50,7 +50,8 @@ def random_fit(seed, noise=0.0, n_frames=12, n_components=2):
 
 def rigid(tracks, mean_shape, basis, camera="affine"):
     """Return the fit of the paper's model of a frame."""
-    return RigidFrames(mean_shape, basis, camera).fit(tracks, np.ones(len(tracks)))
+    rows = tracks.transpose(0, 2, 1)
+    return RigidFrames(mean_shape, basis, camera).fit(rows, np.ones(len(rows)))
 
 
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
@@ -145,7 +146,7 @@ class TestPosteriorFrames:
         frames, tracks = posterior_frames(0)
         frames, tracks = replace(frames, camera=camera), with_gaps(tracks, missing)
         sizes = np.linspace(0.5, 200.0, len(tracks))
-        fitted = frames.fit(tracks * sizes[:, None, None], sizes)
+        fitted = frames.fit((tracks * sizes[:, None, None]).transpose(0, 2, 1), sizes)
         expected = fit_posterior(
             tracks, frames.shapes, NOISE**2, camera=camera, starts=frames.starts
         )
@@ -163,15 +164,15 @@ class TestPosteriorFrames:
         frames, tracks = posterior_frames(0, loss)
         tracks = with_gaps(tracks, missing)
         tracks[:, 7] += 2.0
-        fitted = frames.posterior(tracks)
-        apart = distances(tracks, frames.shapes, *fitted[:3])
+        fitted = frames.posterior(tracks.transpose(0, 2, 1))
+        apart = distances(tracks.transpose(0, 2, 1), frames.shapes, *fitted[:3])
         weights = np.nan_to_num(WEIGHTS[loss](apart / NOISE))
         again = fit_posterior(
             tracks, frames.shapes, NOISE**2, weights=weights, initial=fitted.alpha
         )
         # The fit ends when its weights change by less than 1e-4. Entries of cameras can
         # change by more where points are missing.
-        apart = distances(tracks, frames.shapes, *again[:3])
+        apart = distances(tracks.transpose(0, 2, 1), frames.shapes, *again[:3])
         new = np.nan_to_num(WEIGHTS[loss](apart / NOISE))
         assert_allclose(new, weights, rtol=0, atol=1e-4)
         assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
@@ -180,11 +181,14 @@ class TestPosteriorFrames:
     @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_robust_loss_is_not_drawn_to_an_outlier(self, loss, size, point):
         frames, tracks = posterior_frames(0)
-        expected = frames.posterior(tracks)
+        expected = frames.posterior(tracks.transpose(0, 2, 1))
         deviation = np.sqrt(np.einsum("ikk->ik", expected.covariance))
         tracks[:, point] += size
-        drawn = frames.posterior(tracks).alpha - expected.alpha
-        robust = replace(frames, loss=loss).posterior(tracks).alpha - expected.alpha
+        drawn = frames.posterior(tracks.transpose(0, 2, 1)).alpha - expected.alpha
+        robust = (
+            replace(frames, loss=loss).posterior(tracks.transpose(0, 2, 1)).alpha
+            - expected.alpha
+        )
         assert np.median(np.abs(drawn / deviation)) > 3
         assert np.abs(robust / deviation).max() < 2
 
@@ -192,10 +196,10 @@ class TestPosteriorFrames:
     def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
         frames, tracks = posterior_frames(0, loss)
         tracks[:, 7] = np.nan
-        expected = frames.posterior(tracks)
+        expected = frames.posterior(tracks.transpose(0, 2, 1))
         for far in [1e3, 1e8, 1e16, 1e140]:
             tracks[:, 7] = far
-            fitted = frames.posterior(tracks)
+            fitted = frames.posterior(tracks.transpose(0, 2, 1))
             assert_allclose(fitted.alpha, expected.alpha, atol=1e-6)
             assert_allclose(fitted.covariance, expected.covariance, atol=1e-6)
 
@@ -209,8 +213,8 @@ class TestPosteriorFrames:
         shapes = np.concatenate([mean_shape.T[None], 1e-3 * frames.shapes[1:]])
         seen = np.arange(len(mean_shape)) < 9
         tracks = np.where(seen[:, None], mean_shape[:, :2], np.nan)[None]
-        assert distant_points(tracks)[0, 6:9].all()
-        fitted = replace(frames, shapes=shapes).posterior(tracks)
+        assert distant_points(tracks.transpose(0, 2, 1))[0, 6:9].all()
+        fitted = replace(frames, shapes=shapes).posterior(tracks.transpose(0, 2, 1))
         images = project(mean_shape[None], fitted.motion, fitted.translation)
         assert_allclose(images[0, seen], tracks[0, seen], atol=1e-2)
 
@@ -221,8 +225,8 @@ class TestDepthDeviations:
     def test_without_certainty_are_those_of_the_frame(self, camera, missing):
         frames, tracks = posterior_frames(0)
         frames, tracks = replace(frames, camera=camera), with_gaps(tracks, missing)
-        found = frames.depth_deviations(tracks, np.ones(len(tracks)))
-        fit = frames.posterior(tracks)
+        found = frames.depth_deviations(tracks.transpose(0, 2, 1), np.ones(len(tracks)))
+        fit = frames.posterior(tracks.transpose(0, 2, 1))
         n_pose = CAMERAS[camera].n_parameters
         prior = np.diag([0.0] * n_pose + [1.0] * 2)
         for i, M in enumerate(fit.motion):
@@ -249,23 +253,23 @@ class TestDepthDeviations:
         frames = replace(frames, camera="weak_perspective")
         sizes = np.linspace(1.0, 2.0, len(tracks))
         tracks = sizes[:, None, None] * tracks
-        alone = frames.depth_deviations(tracks, sizes)
+        alone = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
         points = np.linspace(0.0, 1e-2, tracks.shape[1])
         frames = replace(frames, certainty=DepthCertainty(points=points))
         expected = alone**2 + sizes[:, None] ** 2 * points
-        found = frames.depth_deviations(tracks, sizes)
+        found = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
         assert_allclose(found**2, expected, rtol=1e-9)
 
     def test_variances_of_points_grow_with_the_leverage_of_the_frame(self):
         frames, tracks = posterior_frames(0)
         frames, sizes = replace(frames, camera="weak_perspective"), np.ones(len(tracks))
-        alone = frames.depth_deviations(tracks, sizes)
+        alone = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
         certainty = DepthCertainty(points=np.linspace(0.0, 1e-2, 20), leverage=3.0)
         frames = replace(frames, certainty=certainty)
-        alpha = frames.posterior(tracks).alpha
+        alpha = frames.posterior(tracks.transpose(0, 2, 1)).alpha
         leverage = 1.0 + np.sum(alpha**2, axis=1)
         expected = alone**2 + np.outer(leverage / 3.0, certainty.points)
-        found = frames.depth_deviations(tracks, sizes)
+        found = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
         assert_allclose(found**2, expected, rtol=1e-9)
         assert np.ptp(leverage) > 1.0
 
@@ -277,7 +281,7 @@ def posteriors(camera):
     frames = replace(frames, camera=camera)
     root = rng.normal(size=(9, 12))
     # Leverages differ between frames and are far from zero.
-    return frames.posterior(tracks), frames, 5e-3 * root @ root.T
+    return frames.posterior(tracks.transpose(0, 2, 1)), frames, 5e-3 * root @ root.T
 
 
 def rows_of(tracks):
@@ -298,7 +302,7 @@ class TestSamplePosterior:
             directions = np.linalg.svd(model.shapes.reshape(9, -1))[2][:9]
             frames = JointFrames.from_directions(blocks, directions)
         found = posterior_blocks(model, frames, blocks)
-        expected = model.posterior(rows.transpose(0, 2, 1))
+        expected = model.posterior(rows)
         motion, alpha, covariance = posterior_moments(found)
         assert_allclose(motion, expected.motion, atol=1e-7)
         assert_allclose(alpha, expected.alpha, atol=1e-7)
@@ -309,9 +313,9 @@ class TestSamplePosterior:
         tracks[np.arange(12), np.arange(12), 0] += NOISE * np.linspace(1.0, 8.0, 12)
         rows, _ = rows_of(tracks)
         cleaned, found = inlying_rows(model, rows)
-        expected = model.posterior(rows.transpose(0, 2, 1))
+        expected = model.posterior(rows)
         assert_array_equal(found.alpha, expected.alpha)
-        far = distances(rows.transpose(0, 2, 1), model.shapes, *expected[:3])
+        far = distances(rows, model.shapes, *expected[:3])
         outlying = far > 4 * NOISE
         assert 2 < outlying.sum() < 12
         for row in range(2):

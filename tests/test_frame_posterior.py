@@ -39,7 +39,9 @@ def energy_of(tracks):
 def problem_of(tracks, shapes, variance, weights=None):
     """Return the search for shapes, and the frames as it takes them."""
     search = AffineSearch(shapes)
-    products = frame_sums(frame_tracks(tracks, weights), search.shared)
+    products = frame_sums(
+        frame_tracks(tracks.transpose(0, 2, 1), weights), search.shared
+    )
     return search, search.problem(products, np.full(len(tracks), variance))
 
 

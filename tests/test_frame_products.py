@@ -41,7 +41,9 @@ def plain_gram(shapes, weights):
 class TestProducts:
     def test_by_definition(self):
         tracks, shapes, weights = random_problem(0)
-        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
+        products = frame_sums(
+            frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(shapes)
+        )
         first, second = pair_indices(3)
         for i, w in enumerate(weights):
             mean = w @ tracks[i] / w.sum()
@@ -60,7 +62,9 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         rng = np.random.default_rng(1)
         motion, alpha = rng.normal(size=(6, 2, 3)), rng.normal(size=(6, 2))
-        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
+        products = frame_sums(
+            frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(shapes)
+        )
         positions = products.positions(motion, alpha)
         for i, w in enumerate(weights):
             shape = shapes[0] + alpha[i, 0] * shapes[1] + alpha[i, 1] * shapes[2]
@@ -69,9 +73,12 @@ class TestProducts:
 
     def test_complete_frames_share_a_gram_matrix(self):
         tracks, shapes, weights = random_problem(0)
-        shared = frame_sums(frame_tracks(tracks), ShapeProducts(shapes))
+        shared = frame_sums(
+            frame_tracks(tracks.transpose(0, 2, 1)), ShapeProducts(shapes)
+        )
         own = frame_sums(
-            frame_tracks(tracks, np.ones_like(weights)), ShapeProducts(shapes)
+            frame_tracks(tracks.transpose(0, 2, 1), np.ones_like(weights)),
+            ShapeProducts(shapes),
         )
         pairs = np.broadcast_to(shared.gram.pairs[..., None], own.gram.pairs.shape)
         assert_allclose(own.gram.pairs, pairs, atol=1e-13)
@@ -82,16 +89,22 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         hidden = np.where(weights[..., None] == 0, np.nan, tracks)
         hidden[0, 0, 0], weights[0, 0] = np.inf, 0.0
-        got = frame_sums(frame_tracks(hidden, weights), ShapeProducts(shapes))
+        got = frame_sums(
+            frame_tracks(hidden.transpose(0, 2, 1), weights), ShapeProducts(shapes)
+        )
         tracks[0, 0] = 5.0
-        expected = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
+        expected = frame_sums(
+            frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(shapes)
+        )
         assert_array_equal(got.cross, expected.cross)
         assert_array_equal(got.energy, expected.energy)
 
     def test_frame_without_points(self):
         tracks, shapes, weights = random_problem(0)
         tracks[1], weights[1] = np.nan, 0.0
-        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
+        products = frame_sums(
+            frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(shapes)
+        )
         for each in (products.cross, products.centroid, products.gram.pairs):
             assert_array_equal(each[..., 1], 0)
             assert np.isfinite(each).all()
@@ -101,9 +114,13 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         some = np.array([4, 1, 1])
         w = weights if weighted else None
-        taken = frame_sums(frame_tracks(tracks, w), ShapeProducts(shapes)).take(some)
+        taken = frame_sums(
+            frame_tracks(tracks.transpose(0, 2, 1), w), ShapeProducts(shapes)
+        ).take(some)
         w = weights[some] if weighted else None
-        expected = frame_sums(frame_tracks(tracks[some], w), ShapeProducts(shapes))
+        expected = frame_sums(
+            frame_tracks(tracks[some].transpose(0, 2, 1), w), ShapeProducts(shapes)
+        )
         for got, want in zip(taken, expected, strict=True):
             if isinstance(got, np.ndarray):
                 assert_allclose(got, want, rtol=1e-13, atol=1e-14)
@@ -116,7 +133,7 @@ class TestGram:
         tracks, shapes, weights = random_problem(3)
         if not weighted:
             weights = np.ones_like(weights)
-        given = frame_tracks(tracks, weights if weighted else None)
+        given = frame_tracks(tracks.transpose(0, 2, 1), weights if weighted else None)
         plain = np.stack([plain_gram(shapes, w) for w in weights], axis=-1)
         return frame_sums(given, ShapeProducts(shapes)).gram, plain
 
@@ -177,7 +194,9 @@ class TestDeterminesCamera:
     def answer(self, shapes, weights):
         white, _ = whitened(shapes)
         tracks = np.zeros((*weights.shape, 2))
-        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(white))
+        products = frame_sums(
+            frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(white)
+        )
         return determines_camera(products, white[0])
 
     def test_number_of_points(self):

@@ -58,7 +58,9 @@ class TestExact:
     @GAPS
     def test_prepared_and_rough_frames(self, camera, gaps):
         scene = scene_of(camera, gaps)
-        frames = frame_tracks(scene.tracks, np.isfinite(scene.tracks[..., 0]) * 1.0)
+        frames = frame_tracks(
+            scene.tracks.transpose(0, 2, 1), np.isfinite(scene.tracks[..., 0]) * 1.0
+        )
         search = frame_search(camera, scene.shapes)
         expected = fitted(scene, camera)
         assert_same_fits(search.fit(frames, NOISE**2), expected, 1e-8)

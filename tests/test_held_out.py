@@ -34,7 +34,7 @@ def scene(seed=0, n_frames=12, n_points=23):
 
 def energies_of(frames, mean_shape, basis, tracks, sizes):
     model = TableModel(frames, mean_shape, basis, "interleaved", None)
-    return model.held_out_energies(tracks, sizes)
+    return model.held_out_energies(tracks.transpose(0, 2, 1), sizes)
 
 
 def error_of(*scene):
@@ -54,7 +54,7 @@ def by_plain_loops(frames, shapes, tracks, sizes):
             visible = np.where((folds == fold)[:, None], np.nan, points)
             if np.sum(~np.isnan(visible[:, 0])) < 4:
                 continue
-            fit = frames.fit(visible[None], np.array([size]))
+            fit = frames.fit(visible.T[None], np.array([size]))
             known = ~np.isnan(visible[:, 0])
             affine = np.column_stack([shapes[0], np.ones(n_points)])
             S = shapes[0] + np.tensordot(fit.alpha[0], shapes[1:], 1)

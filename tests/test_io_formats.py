@@ -51,9 +51,9 @@ def individuals_of(landmarks):
 
 
 @pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.filterwarnings("default")  # tables of HDF5 files stay open
 def test_files_read_back_as_they_were_written(name, tmp_path):
-    path = WRITERS[name](tmp_path)
-    format = name.partition("-")[0]
+    path, format = WRITERS[name](tmp_path), name.partition("-")[0]
     assert find_format(path) == format
     landmarks = read_landmarks(path)
     assert landmarks.format == format
@@ -61,12 +61,6 @@ def test_files_read_back_as_they_were_written(name, tmp_path):
     assert not landmarks.failed.any()
     again = FORMATS[format].read(path)
     pd.testing.assert_frame_equal(again.points, landmarks.points)
-
-
-@pytest.mark.parametrize("name", WRITERS)
-@pytest.mark.filterwarnings("default")  # tables of HDF5 files stay open
-def test_files_of_other_formats_are_refused(name, tmp_path):
-    path, format = WRITERS[name](tmp_path), name.partition("-")[0]
     if path.is_dir():
         path = min(file for file in path.iterdir() if file.suffix != ".png")
     for wrong in {*FORMATS} - {format}:
@@ -146,8 +140,8 @@ def test_shares_of_the_image_become_pixels(tmp_path):
     assert_allclose(tracks_of(landmarks), MESH)
     assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
     for size in (640, (640, 0), (640, 480, 3), ("a", "b"), (np.nan, 480)):
-        with pytest.raises(ValueError, match="image_size must be a width and a height"):
-            read_landmarks(path, image_size=size)
+        message = "image_size must be a width and a height"
+        refused(message, read_landmarks, path, image_size=size)
     pixels = files.write_mesh(tmp_path / "b.csv", MESH, shares=False)
     refused("these are in pixels", read_landmarks, pixels, image_size=files.IMAGE_SIZE)
 
@@ -215,13 +209,11 @@ def test_openpose_parts_are_chosen(tmp_path):
         found = read_landmarks(folder, part=part)
         assert_array_equal(tracks_of(found)[0], values[:, :2])
     assert found.skeleton is get_skeleton("hand-21")
-    refused(
-        "no points of hand_right, but of pose, face",
-        read_landmarks,
-        folder,
-        part="hand_right",
-    )
-    refused("part must be one of pose, face", read_landmarks, folder, part="feet")
+    for part, message in (
+        ("hand_right", "no points of hand_right, but of pose, face"),
+        ("feet", "part must be one of pose, face"),
+    ):
+        refused(message, read_landmarks, folder, part=part)
 
 
 @pytest.mark.parametrize(
@@ -230,7 +222,7 @@ def test_openpose_parts_are_chosen(tmp_path):
         ({"people": {}}, "b_keypoints.json: expected an object with a list of obj"),
         ({"people": [3]}, "b_keypoints.json: expected an object with a list of obj"),
         ([], "b_keypoints.json: expected an object with a list of objects called"),
-        (points_of_openpose(4), "a_keypoints.json has 5 points of pose, b_.* has 4"),
+        (points_of_openpose(4), "a_keypoints.json has 5 points, b_.* has 4"),
         ([[1, 2]], "b_keypoints.json: pose_keypoints_2d .* each point; got 2 numbers"),
         ([["1", 2, 3]], r"b_.*: pose_keypoints_2d should be .* got \['1', 2, 3\]"),
         ([[1, 2, np.inf]], "b_.*: pose_keypoints_2d should be a list of finite"),
@@ -249,16 +241,7 @@ def test_damaged_files_of_openpose_are_refused(tmp_path, content, message):
     refused(f"json cannot .* openpose .*{message}", read_landmarks, folder)
 
 
-def test_file_of_a_folder_in_another_encoding_is_named_with_the_way(tmp_path):
-    person = files.openpose_person(pose=points_of_openpose(5))
-    folder = files.write_openpose(tmp_path / "json", [[person]])
-    other = folder / "b_keypoints.json"
-    other.write_text('{"people": [], "author": "Jos\xe9"}', encoding="latin-1")
-    message = "b_keypoints.json: its text is not in UTF-8 .* Save it as UTF-8"
-    refused(message, read_landmarks, folder)
-
-
-def test_openpose_in_shares_or_without_people_is_refused(tmp_path):
+def test_openpose_that_cannot_be_read_is_refused_with_the_way(tmp_path):
     shares = points_of_openpose(25) / [640, 480, 1]
     shares[3, 0] = 1.02  # a foot that the image cuts off
     people = [[files.openpose_person(pose=shares)]]
@@ -267,6 +250,10 @@ def test_openpose_in_shares_or_without_people_is_refused(tmp_path):
     empty = files.write_openpose(tmp_path / "empty", [[], [files.openpose_person()]])
     refused("no visible points in the lists pose_keypoints_2d", read_landmarks, empty)
     refused("no files with names", read_landmarks, tmp_path, "openpose")
+    other = folder / "b_keypoints.json"
+    other.write_text('{"people": [], "author": "Jos\xe9"}', encoding="latin-1")
+    message = "b_keypoints.json: its text is not in UTF-8 .* Save it as UTF-8"
+    refused(message, read_landmarks, folder)
 
 
 @pytest.mark.parametrize(
@@ -374,15 +361,10 @@ def test_h5_files_run_no_code(tmp_path):
 
 
 def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
-    both = pd.concat(
-        [
-            files.deeplabcut_frame(TRACKS, individuals=["mouse"]),
-            files.deeplabcut_frame(
-                TRACKS[:, :1], bodyparts=["corner"], individuals=["single"]
-            ),
-        ],
-        axis=1,
-    )
+    mouse = files.deeplabcut_frame(TRACKS, individuals=["mouse"])
+    corner = {"bodyparts": ["corner"], "individuals": ["single"]}
+    both = [mouse, files.deeplabcut_frame(TRACKS[:, :1], **corner)]
+    both = pd.concat(both, axis=1)
     path = files.write_deeplabcut(tmp_path / "a.csv", both)
     landmarks = warned("points corner belong to no animal", read_landmarks, path)
     assert_allclose(tracks_of(landmarks), TRACKS)
@@ -453,15 +435,11 @@ def test_points_without_a_confidence_are_kept(tmp_path):
     assert not landmarks.failed.any()
 
 
-def test_sleap_files_without_tracks_are_refused(tmp_path):
-    pytest.importorskip("h5py", reason="needs the extra h5")
-    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None][:, :0], names=[])
-    refused(r"a\.h5 .*one individual or more", read_landmarks, path)
-
-
 def test_sleap_files_that_contradict_themselves_are_refused(tmp_path):
     h5py = pytest.importorskip("h5py", reason="needs the extra h5")
-    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], names=["a", "b"])
+    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None][:, :0], names=[])
+    refused(r"a\.h5 .*one individual or more", read_landmarks, path)
+    files.write_sleap(path, TRACKS[:, None], names=["a", "b"])
     refused("holds 1 tracks, track_names 2", read_landmarks, path)
     with h5py.File(path, "a") as file:
         del file["node_names"]
@@ -502,8 +480,8 @@ def test_coco_categories_are_not_mixed(tmp_path):
     hands = read_landmarks(path, category="hand")
     assert hands.failed.sum() == 11
     assert_array_equal(tracks_of(hands)[0], [[1, 2], [3, 4]])
-    with pytest.raises(ValueError, match=r"no category 'cat'.* there are person, hand"):
-        read_landmarks(path, category="cat")
+    message = "no category 'cat'.* there are person, hand"
+    refused(message, read_landmarks, path, category="cat")
 
 
 def test_coco_results_have_confidences(tmp_path):
@@ -522,8 +500,8 @@ def test_coco_results_have_confidences(tmp_path):
     assert list(landmarks.frames["image_id"])[:2] == ["0.jpg", "1.jpg"]
     assert list(landmarks.points)[:2] == ["x_0", "y_0"]
     content[3]["category_id"] = 2
-    with pytest.raises(ValueError, match="more than one category_id: 1, 2"):
-        read_landmarks(files.write_json(path, content))
+    files.write_json(path, content)
+    refused("more than one category_id: 1, 2", read_landmarks, path)
 
 
 @pytest.mark.parametrize(
@@ -534,11 +512,11 @@ def test_coco_results_have_confidences(tmp_path):
         ([3], "all results must be objects"),
         ([], "no frames"),
         ([{"keypoints": [1] * 3, "image_id": [1]}], "a number or a text"),
-        ([{"keypoints": [1, 2]}], "for each keypoint, 3 in all; got 2"),
-        ([{"keypoints": [1, 2, True]}], "a list of numbers; got"),
-        ([{"keypoints": [1, 2, "3"]}], "a list of numbers; got"),
-        ([{"keypoints": [1, 2, 10**400]}], "too large"),
-        ([{"keypoints": [1] * 6}, {"keypoints": [1] * 9}], "6 in all; got 9"),
+        ([{"keypoints": [1, 2]}], "for each point; got 2 numbers"),
+        ([{"keypoints": [1, 2, True]}], "a list of finite numbers; got"),
+        ([{"keypoints": [1, 2, "3"]}], "a list of finite numbers; got"),
+        ([{"keypoints": [1, 2, 10**400]}], "a list of finite numbers; got"),
+        ([{"keypoints": [1] * 6}, {"keypoints": [1] * 9}], "have 2 keypoints; got 3"),
         (
             {"images": [], "annotations": [{"image_id": 1}], "categories": [{}]},
             "no category has keypoints",
@@ -598,24 +576,22 @@ def test_options_of_other_formats_are_refused(tmp_path):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
     refused("openface has no option columns", read_landmarks, path, columns="x_#,y_#")
     for threshold in (np.nan, "0.5", True, np.inf):
-        with pytest.raises(ValueError, match="min_confidence must be a finite number"):
-            read_landmarks(path, min_confidence=threshold)
+        message = "min_confidence must be a finite number"
+        refused(message, read_landmarks, path, min_confidence=threshold)
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (lambda text: text[:-40], "line 13 has .* values, but .* truncated"),
-        (lambda text: text.replace("\n2,0,", "\n2,0,,"), "line 3 has 415 values"),
         (lambda text: text.replace("face_id", "frame"), "one column .* 'frame'"),
         (lambda text: text.replace(",y_3,", ",why,"), "'x_3' has no partner"),
         (lambda text: text.partition("\n")[0], "a header but no rows"),
         (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",?,", 1), "'x_2'.*'\\?'"),
         (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",inf,", 1), "infinite"),
         (lambda text: text.replace("0.98", "0.9\xe9"), "'confidence'.*in row 0"),
-        (lambda text: text.replace("0.98", "0\x00.98", 1), "line 2 has a null"),
     ],
-    ids="truncated long twice unpaired empty text inf letter null".split(),
+    ids="truncated twice unpaired empty text inf letter".split(),
 )
 def test_damaged_tables_are_refused(damage, message, tmp_path):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
@@ -625,10 +601,9 @@ def test_damaged_tables_are_refused(damage, message, tmp_path):
 
 def landmarker_result(part, faces, **extra):
     """Return what MediaPipe's landmarkers return."""
-    points = [
-        [SimpleNamespace(x=x, y=y, z=0.0, **extra) for x, y in face] for face in faces
-    ]
-    return SimpleNamespace(**{part: points})
+    return SimpleNamespace(
+        **{part: [[SimpleNamespace(x=x, y=y, **extra) for x, y in f] for f in faces]}
+    )
 
 
 @pytest.mark.parametrize("part", ["face_landmarks", "hand_landmarks", "pose_landmarks"])
@@ -659,8 +634,8 @@ def test_bad_mediapipe_results_are_refused():
     for sizes in (640, [(640, 480)] * 2, (640, -1), (np.nan, 480)):
         refused("image_sizes must be", from_mediapipe, [face], sizes)
     refused("none of the 0 results", from_mediapipe, [], (640, 480))
-    with pytest.raises(ValueError, match="numbers x and y"):
-        from_mediapipe([SimpleNamespace(face_landmarks=[[1, 2]])], (640, 480))
+    strange = SimpleNamespace(face_landmarks=[[1, 2]])
+    refused("numbers x and y", from_mediapipe, [strange], (640, 480))
 
 
 class Variable:
@@ -713,12 +688,11 @@ def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
 
 def test_other_datasets_are_refused():
     dataset = movement_dataset(plural=False)
-    with pytest.raises(ValueError, match="no individual 'x'; there are id_0, id_1"):
-        from_movement(dataset, individual="x")
+    message = "no individual 'x'; there are id_0, id_1"
+    refused(message, from_movement, dataset, individual="x")
     refused("should have position; got dict", from_movement, {})
     flat = Variable(np.zeros((2, 3)), ["time", "space"], {})
-    with pytest.raises(ValueError, match=r"should have the axes .* got time, space"):
-        from_movement({"position": flat})
+    refused("have the axes .* got time, space", from_movement, {"position": flat})
     dataset["position"].coords["space"].values = np.array(["x", "z"])
     refused("with space x and y; got x, z", from_movement, dataset)
 

@@ -1,7 +1,5 @@
 """Tables of landmarks read from files and taken out of data frames."""
 
-import os
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -62,12 +60,6 @@ def test_byte_order_mark_blank_lines_and_quotes_are_understood(write):
     assert table["x0"][0] == 1
 
 
-def test_unnamed_index_column_is_kept(write):
-    table = read_table(write(",x0,y0\n0,1,2\n1,3,4\n"))
-    assert list(table) == ["", "x0", "y0"]
-    assert list(table[""]) == ["0", "1"]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -76,10 +68,7 @@ def test_unnamed_index_column_is_kept(write):
         ("x0,y0\n", "a header but no rows"),
         ("x0,y0\n1,2\n3\n", "line 3 has 1 values, but the header has 2 names"),
         ("x0,y0\n\n1,2,3\n", "line 3 has 3 values, but the header has 2 names"),
-        ("x0,x0\n1,2\n", "more than one column is called 'x0'"),
         ("x0, x0\n1,2\n", "more than one column is called 'x0'"),
-        ("x0;y0\n1;2\n", "separated by ';'; ',' is needed"),
-        ("x0\ty0\n1\t2\n", r"end with '.t': rename it to \*\.tsv"),
         ("x0,y0\n1\x002,3\n", "line 2 has a null character"),
     ],
 )
@@ -90,10 +79,10 @@ def test_files_that_are_no_tables_are_refused(write, text, message):
 
 def test_wrong_encodings_and_formats_are_refused(write, tmp_path):
     for encoding in ("latin-1", "utf-16"):
-        with pytest.raises(ValueError, match="as a table: its text is not in UTF-8"):
-            read_table(write("näme,x0\n1,2\n", encoding=encoding))
-    with pytest.raises(ValueError, match=r"as a table: .*magic bytes"):
-        read_table(write("x0,y0\n1,2\n", name="table.parquet"))
+        path = write("näme,x0\n1,2\n", encoding=encoding)
+        refused("as a table: its text is not in UTF-8", read_table, path)
+    path = write("x0,y0\n1,2\n", name="table.parquet")
+    refused("as a table: .*magic bytes", read_table, path)
     message = r"is a \.csv, \.tsv or \.parquet.*got '.xlsx'"
     refused(message, read_table, tmp_path / "table.xlsx")
     refused("got ''", write_table, pd.DataFrame({"a": [1]}), tmp_path / "table")
@@ -120,18 +109,9 @@ def test_landmarks_and_other_columns_are_separated(frame):
     pd.testing.assert_frame_equal(table.other, frame[["id"]])
     assert (table.points.dtypes == np.float64).all()
 
-
-def test_result_does_not_depend_on_the_order_of_columns(frame):
-    planar = NAMES[0::2] + NAMES[1::2]
-    expected = landmark_table(frame).points
-    pd.testing.assert_frame_equal(landmark_table(frame[planar]).points, expected)
-
-
-def test_rows_keep_their_labels_and_names_lose_their_blanks(frame):
     part = frame.iloc[[4, 1]].rename(columns={"x0": " x0 "})
     points, other = landmark_table(part)
-    assert list(points.index) == [4, 1]
-    assert list(other.index) == [4, 1]
+    assert list(points.index) == list(other.index) == [4, 1]
     assert points.columns[0] == "x0"
 
 
@@ -146,8 +126,8 @@ def test_zeros_are_missing_only_on_request_and_only_in_pairs(frame):
     assert_array_equal(points.isna(), missing)
     pd.testing.assert_frame_equal(landmark_table(frame, missing=0).points, points)
     for wrong in (True, np.inf, "nan"):
-        with pytest.raises(ValueError, match=r'"zeros" or a finite number; got'):
-            landmark_table(frame, missing=wrong)
+        message = '"zeros" or a finite number; got'
+        refused(message, landmark_table, frame, missing=wrong)
 
 
 def test_numbers_of_all_kinds_become_floats(frame):
@@ -189,12 +169,3 @@ def test_other_input_is_refused(frame):
     refused("no landmark columns", landmark_table, frame[["id"]])
     doubled = pd.concat([frame, frame[["id"]]], axis=1)
     refused("more than one column is called 'id'", landmark_table, doubled)
-
-
-@pytest.mark.skipif(
-    not hasattr(os, "getuid") or os.getuid() == 0, reason="needs a user"
-)
-def test_permissions_raise_os_errors(write):
-    path = write("x0,y0\n1,2\n")
-    path.chmod(0)
-    refused(None, read_table, path, error=PermissionError)

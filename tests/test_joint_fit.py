@@ -1,6 +1,7 @@
 """The joint fit of a table: cameras, samples, robust losses, noise."""
 
 from functools import cache
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -111,8 +112,8 @@ def test_noise_level_and_missing_share_of_the_spectrum(n_components, n_points):
     squares = np.random.default_rng(0).exponential(size=n_points - 1)
     squares, rank = np.sort(squares)[::-1], 3 * n_components + 3
     kept, rest = np.sqrt(squares[:rank]), squares[rank:].sum()
-    seen, W = np.full(30, n_points), np.empty((60, n_points))
-    table = FactorisedTable(None, None, seen, None, kept, rest, W, [], None)
+    scaled, W = SimpleNamespace(n_seen=np.full(30, n_points)), np.empty((60, n_points))
+    table = FactorisedTable(scaled, None, None, kept, rest, W, [], None)
     others = squares[rank:].mean() / squares.mean() if n_points > 7 else 0.0
     assert table.noise_level(n_components) == pytest.approx(others)
     missing = squares[n_components + 3 :].sum() / squares.sum()

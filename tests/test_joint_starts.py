@@ -12,11 +12,8 @@ from numpy.typing import NDArray
 from scenes import random_scene as random_model, with_gaps
 
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
 from isa_nrsfm._joint.fit import (
-    Start,
     _calibrated_fit,
-    _continued_fit,
     _first_fit,
     relevant_components,
 )
@@ -27,14 +24,12 @@ from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
-    extended_shapes,
     lifted_shapes,
     likely_basis,
     mixed_cameras,
     rigid_start,
 )
 from isa_nrsfm._paper.factors import Factorisation, factorise
-from isa_nrsfm._selection.path import extended
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -165,7 +160,7 @@ def started(scene, camera, problem=None):
     factors = scene.factors
     problem = problem or problem_of(scene)
     paper = paper_shapes(factors)
-    table = FactorisedTable(*[None] * 6, scene.W, [], factors)
+    table = FactorisedTable(*[None] * 5, scene.W, [], factors)
     return best_starts(problem, table, paper, CAMERAS[camera])
 
 
@@ -255,44 +250,12 @@ class TestLikelyBasis:
             assert objective(*step) > least
 
 
-@pytest.mark.parametrize("n_frames", [150, 300])
-def test_more_basis_shapes_come_from_residuals_of_some_frames(n_frames):
-    shapes, motion, alpha = random_frames(n_frames=n_frames, n_components=3)
-    shapes -= shapes.mean(axis=2, keepdims=True)
-    rows = motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
-    moved = rows + np.random.default_rng(1).normal(size=(n_frames, 2, 1))
-    still = np.zeros((0, 1)), "linear", FrameMap.identity(1)
-    frames = PosteriorFrames(shapes[:2], 1e-3, *still)
-    table = SimpleNamespace(rows=FrameBlocks.of_array(moved, 64))
-    start = extended(frames, table, 3)
-    assert start.noise_variance == 1e-3
-    few = np.linspace(0, n_frames - 1, min(n_frames, 200)).round().astype(int)
-    fit = frames.posterior(rows[few].transpose(0, 2, 1))
-    centred = rows[few] - fit.translation[:, :, None]
-    expected = extended_shapes(centred, shapes[:2], fit.motion, fit.alpha, 2)
-    assert start.shapes.shape == (4, 3, 30)
-    # The signs of principal components are free.
-    sign = np.sign(np.einsum("kaj,kaj->k", start.shapes, expected))[:, None, None]
-    assert_array_equal(start.shapes[:2], shapes[:2])
-    assert_allclose(sign * start.shapes, expected, atol=1e-6)
-
-
-def test_the_better_given_start_is_taken_whatever_the_order():
-    # A basis shape of zero stays zero: from there the fit cannot catch up.
-    scene = random_scene(noise=0.02)
-    good = Start(scene.shapes, 1e-3)
-    poor = Start(scene.shapes * np.array([1, 1, 0])[:, None, None], 1e-3)
-    several = [good], [good, poor], [poor, good]
-    ends = [_continued_fit(problem_of(scene), each)[0].value for each in several]
-    assert_allclose(ends[1:], ends[0], rtol=1e-4)
-
-
 def test_the_likeliest_fit_of_the_starts_counts():
     scene = random_scene(amplitude=0.6, noise=0.02)
     problem, factors = problem_of(scene), scene.factors
     camera, states = CAMERAS["orthographic"], started(scene, "orthographic", problem)
     ends = [_calibrated_fit(problem, state, camera).value for state in states]
-    table = FactorisedTable(*[None] * 6, scene.W, [], factors)
+    table = FactorisedTable(*[None] * 5, scene.W, [], factors)
     fit, _ = _first_fit(problem, table, paper_shapes(factors))
     assert max(ends) > min(ends)
     assert fit.value == min(ends)

@@ -3,13 +3,17 @@
 import numpy as np
 import pytest
 from landmark_files import openface_names
-from refusals import refused
+from refusals import refused, warned
 
-from isa_nrsfm._tables.column_names import names_layout, parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import (
     MIN_POINTS,
     find_landmark_columns,
     landmark_sets,
+)
+from isa_nrsfm.skeletons._column_names import (
+    names_layout,
+    parse_coordinate,
+    point_names,
 )
 
 N_POINTS = 9
@@ -104,12 +108,10 @@ def test_a_numbered_set_with_another_point_of_that_form_is_ambiguous():
 
 def test_several_pairs_of_patterns_follow_one_another():
     names = named("right_{p}_{a}") + named("left_{p}_{a}")
-    found = find_landmark_columns(
-        names, columns="left_#_x, left_#_y, right_#_x, right_#_y"
-    )
+    patterns = ["left_#_x", "left_#_y", "right_#_x", "right_#_y"]
+    found = find_landmark_columns(names, columns=patterns)
     assert found.points[N_POINTS - 1 : N_POINTS + 1] == ("left_8", "right_0")
-    as_list = ["left_#_x", "left_#_y", "right_#_x", "right_#_y"]
-    assert find_landmark_columns(names, columns=as_list) == found
+    assert find_landmark_columns(names, columns=", ".join(patterns)) == found
 
 
 def test_patterns_reach_names_of_any_form():
@@ -205,8 +207,8 @@ def test_names_layout(names, layout):
 
 def test_patterns_that_match_a_part_of_a_set_say_so():
     names = named("{a}_{p}", points=range(20))
-    with pytest.warns(UserWarning, match="leave out 20 .* first is 'x_0'"):
-        found = find_landmark_columns(names, columns="x_1#,y_1#")
+    message = "leave out 20 .* first is 'x_0'"
+    found = warned(message, find_landmark_columns, names, "x_1#,y_1#")
     assert found.points == tuple(map(str, range(10, 20)))
 
 

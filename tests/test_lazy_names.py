@@ -18,7 +18,7 @@ from refusals import refused
 import isa_nrsfm
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.lazy import lazy_names
-from isa_nrsfm.cli._options import build_parser
+from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import FORMATS, save_model, write_table
 from isa_nrsfm.isa import FastISA, PooledFastICA
@@ -175,7 +175,7 @@ def test_transform_loads_no_more_than_it_uses(tmp_path):
 
 
 def test_the_help_has_the_formats_and_defaults_that_there_are(capsys):
-    refused(None, build_parser().parse_args, ["fit", "--help"], error=SystemExit)
+    refused(None, main, ["fit", "--help"], error=SystemExit)
     text = " ".join(capsys.readouterr().out.split())
     assert f"{', '.join(FORMATS).removesuffix(', table')}, or table" in text
     pooled, fast = PooledFastICA().n_init, FastISA().n_init

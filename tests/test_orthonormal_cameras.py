@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
+from scenes import measurements
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._tables.tracks import centred_tracks, measurement_matrix
 from isa_nrsfm.calibration import orthonormal_cameras
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -18,7 +18,7 @@ def scene(seed, noise=0.0, n_frames=60):
     """Return the left singular vectors times singular values, and true cameras."""
     options = {"camera": "orthographic", "noise": noise, "random_state": seed}
     truth = make_nonrigid_tracks(n_frames, 40, N_COMPONENTS, **options)
-    W = measurement_matrix(centred_tracks(truth.tracks)[0])
+    W = measurements(truth.tracks, scale_frames=False)
     U, S, _ = np.linalg.svd(W, full_matrices=False)
     n = 3 * N_COMPONENTS + 3
     return U[:, :n] * S[:n], truth.motion
@@ -91,8 +91,7 @@ class TestResult:
 
     def test_local_minimum_is_left(self, load_data):
         # From the first three columns alone the cost ends at 2e-4 and above.
-        tracks = load_data("akhter_yoga")["W2d"]
-        W = measurement_matrix(centred_tracks(tracks)[0])
+        W = measurements(load_data("akhter_yoga")["W2d"], scale_frames=False)
         U = np.linalg.svd(W, full_matrices=False)[0]
         assert orthonormal_cameras(U[:, :6]).cost < 0.005
         assert orthonormal_cameras(U[:, :30]).cost < 3e-6
@@ -100,6 +99,7 @@ class TestResult:
 
 class TestNoise:
     def test_price_is_what_noise_costs(self, rng):
+        # As the minimum above has it.
         cameras = Rotation.random(3000, np.random.default_rng(0)).as_matrix()[:, :2]
         Q = rng.normal(size=(5, 3))
         P = cameras.reshape(-1, 3) @ np.linalg.pinv(Q)

@@ -1,4 +1,4 @@
-"""The contract of all displays: axes, refusals, styles; and their common helpers."""
+"""The contract of all displays: axes, refusals, styles, and what all have in common."""
 
 import subprocess
 import sys
@@ -18,19 +18,6 @@ from isa_nrsfm.plotting import (
     ComponentChoiceDisplay,
     ModeCovarianceDisplay,
     ReprojectionDisplay,
-)
-from isa_nrsfm.plotting._axes import percent, row_width
-from isa_nrsfm.plotting._edges import (
-    choose_layout,
-    choose_lines,
-    choose_origin,
-    upright_turn,
-)
-from isa_nrsfm.plotting._page import (
-    PAGE_WIDTH,
-    block_limits,
-    choose_n_columns,
-    new_page,
 )
 from isa_nrsfm.skeletons import get_skeleton
 
@@ -75,7 +62,7 @@ DISPLAYS = {
         },
     ),
 }
-EACH = pytest.mark.parametrize("kind", DISPLAYS, ids=lambda kind: kind.__name__)
+EACH = pytest.mark.parametrize("kind", DISPLAYS)
 
 
 @pytest.fixture(autouse=True)
@@ -84,12 +71,9 @@ def close_figures():
     plt.close("all")
 
 
-def test_the_list_of_displays_is_complete():
-    assert [kind.__name__ for kind in DISPLAYS] == plotting.__all__
-
-
 @pytest.mark.subprocess
 def test_matplotlib_is_imported_only_to_draw():
+    assert [kind.__name__ for kind in DISPLAYS] == plotting.__all__
     code = "import sys, isa_nrsfm.plotting; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -201,83 +185,66 @@ def test_bad_arguments_of_plot_are_refused(kind, arguments, message):
     refused(message, kind(**DISPLAYS[kind][0]).plot, **arguments)
 
 
-@pytest.mark.parametrize(
-    ("fraction", "text"),
-    [
-        (0.0, "0 %"),
-        (1.0, "100 %"),
-        (0.434, "43 %"),
-        (0.0996, "10 %"),
-        (0.996, "100 %"),
-        (1.234, "123 %"),
-        (0.000996, "0.10 %"),
-        (3.2e-5, "0.0032 %"),
-        (4.1e-32, "4.1e-30 %"),
-    ],
-)
-def test_percent(fraction, text):
-    assert percent(fraction) == text
+def drawn_shapes(mean_shape, basis=None, **options):
+    """Return a display of shapes, by default of one that does not move."""
+    basis = np.zeros((1, *np.shape(mean_shape))) if basis is None else basis
+    return BasisShapeDisplay(mean_shape=mean_shape, basis=basis, **options)
 
 
-@pytest.mark.parametrize("layout", [None, "constrained"])
-def test_the_width_of_a_row(layout):
-    figure, axes = plt.subplots(2, 4, width_ratios=[1, 3, 1, 3], layout=layout)
-    figure.set_size_inches(8, 3)
-    for ax in figure.axes:
-        ax.set(xticks=[], yticks=[])
-    pair, alone = row_width(axes[0, :2]), row_width(axes[0, 1:2])
-    assert alone < pair <= 4.0
-    figure.canvas.draw()
-    boxes = [ax.get_position() for ax in axes[0, :2]]
-    assert pair == pytest.approx(8 * (boxes[1].x1 - boxes[0].x0), rel=0.1)
-    # One above the other: the width of the first.
-    assert row_width(axes[::-1, 0]) == pytest.approx(row_width(axes[:1, 0]), rel=0.2)
+def test_shares_are_percent_of_two_digits():
+    shown = {
+        **{0.0: "0", 1.0: "100", 0.434: "43", 0.0996: "10", 0.996: "100"},
+        **{1.234: "123", 0.000996: "0.10", 3.2e-5: "0.0032", 4.1e-32: "4.1e-30"},
+    }
+    basis, share = np.zeros((9, 4, 3)), [*shown]
+    axes = drawn_shapes(np.eye(4, 3), basis, energy_share=share).plot().axes_
+    titles = [ax.get_title(loc="left").replace("\n", " ") for ax in axes[1:, 0]]
+    numbers = enumerate(shown.values(), 1)
+    assert titles == [f"Basis shape {k} ({text} % of energy)" for k, text in numbers]
 
 
 def test_shapes_are_inside_limits_of_one_scale(rng):
     mean = rng.standard_normal((20, 3)) * [2, 1, 0.5]
-    blocks = [mean[None]]
-    for size in (0.1, 0.2, 0.1, 30.0):
-        drift = size * rng.standard_normal((20, 3))
-        blocks.append(np.stack([mean, mean + drift, mean - drift]))
-    limits, reduction = block_limits(blocks)
-    for block, (low, high) in zip(blocks, np.moveaxis(limits, 2, 1), strict=True):
-        assert (block > low).all()
-        assert (block < high).all()
+    sizes = np.array([0.1, 0.2, 0.1, 30.0])
+    basis = sizes[:, None, None] * rng.standard_normal((4, 20, 3))
+    display = drawn_shapes(mean, basis).plot(n_std=1)
+    limits = np.array([[ax.get_xlim(), ax.get_ylim()] for ax in display.axes_.ravel()])
+    limits = np.sort(limits.reshape(5, 2, 2, 2))
+    for drift, (front, side) in zip([0 * mean, *basis], limits, strict=True):
+        points = np.concatenate([mean - drift, mean + drift])
+        for (low, high), xy in ((front.T, points[:, :2]), (side.T, points[:, [2, 1]])):
+            assert (low < xy).all()
+            assert (xy < high).all()
     # One scale and one window, but for the basis shape out of all proportion.
-    assert_array_equal(reduction[:4], 1)
     assert_array_equal(limits[1:4], limits[[0, 0, 0]])
-    assert reduction[4] > 10
-    extent = np.ptp(limits, axis=2)
-    assert_allclose(extent[4], reduction[4] * extent[0])
-    # One of two is reduced. Large drifts alone are no reason for another scale.
-    line = np.array([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
-    _, reduction = block_limits([line, 1.1 * line, 30 * line])
-    assert_array_equal(reduction[:2], 1)
-    assert reduction[2] == pytest.approx(30 / 1.1, rel=0.05)
-    drifts = [5 * rng.standard_normal((20, 3)) for _ in range(3)]
-    blocks = [mean[None], *(np.stack([mean + d, mean - d]) for d in drifts)]
-    assert_array_equal(block_limits(blocks)[1], 1)
-    limits, reduction = block_limits([np.ones((1, 5, 3)), np.ones((3, 5, 3))])
-    assert (np.ptp(limits, axis=2) > 0).all()
-    assert_array_equal(reduction, 1)
+    ratio = np.ptp(limits[4], axis=-1) / np.ptp(limits[0], axis=-1)
+    assert_allclose(ratio, ratio[0, 0])
+    assert ratio[0, 0] > 10
+    title = display.axes_[4, 0].get_title(loc="left")
+    assert title == f"Basis shape 4 (drawn 1:{ratio[0, 0]:.2g})"
+    # Large drifts alone are no reason for another scale.
+    display.plot(n_std=50 / sizes)
+    assert len({ax.get_xlim() for ax in display.axes_[1:, 0]}) == 1
+    display = drawn_shapes(np.ones((5, 3))).plot()
+    assert all(np.ptp(ax.get_xlim()) > 0 for ax in display.axes_.ravel())
 
 
-@pytest.mark.parametrize("aspect", [0.5, 1.6, 6.0])
 @pytest.mark.parametrize("n_shapes", [2, 3, 10])
-def test_shapes_fit_on_a_page(n_shapes, aspect):
-    n_columns = choose_n_columns(n_shapes, aspect)
-    assert 1 <= n_columns <= n_shapes
-    axes = new_page(n_shapes, np.array([aspect / 2, 1, aspect / 2]), None)
-    figure = axes[0].figure
-    assert figure.axes == list(axes)
-    assert len(axes) == 2 * n_shapes
-    assert figure.get_figwidth() == PAGE_WIDTH
-    assert figure.get_figheight() <= 7.6
-    assert axes[0].get_subplotspec().get_gridspec().ncols == 2 * n_columns
-    grid = new_page(5, np.array([1.0, 2.0, 3.0]), 2)[0].get_subplotspec().get_gridspec()
+def test_shapes_fit_on_a_page(n_shapes, rng):
+    for aspect in (0.25, 0.8, 3.0):
+        mean = rng.uniform(size=(20, 3)) * [aspect, 1, aspect]
+        display = drawn_shapes(mean, np.zeros((n_shapes - 1, 20, 3))).plot()
+        figure = display.figure_
+        assert figure.axes == list(display.axes_.ravel())
+        assert display.axes_.shape == (n_shapes, 2)
+        assert figure.get_figwidth() == 7.2
+        assert figure.get_figheight() <= 7.6
+    mean = np.array([[0, 0, 0], [1.0, 2.0, 3.0]])
+    display = drawn_shapes(mean, np.zeros((4, 2, 3))).plot(n_columns=2)
+    grid = display.axes_[0, 0].get_subplotspec().get_gridspec()
     assert (grid.nrows, grid.ncols) == (3, 4)
-    assert grid.get_width_ratios() == [1.0, 3.0, 1.0, 3.0]
+    ratios = np.array(grid.get_width_ratios())
+    assert_allclose(ratios / ratios[0], [1, 3, 1, 3], rtol=0.1)
 
 
 FACE = make_face_tracks(n_frames=2, random_state=0).mean_shape
@@ -286,26 +253,19 @@ BODY = make_body_tracks(n_frames=60, random_state=0).mean_shape
 IBUG, COCO, HAND_21 = map(get_skeleton, ("ibug-68", "coco-17", "hand-21"))
 
 
-def lines_of(edges, shape, names=None):
-    """Return what is drawn of a shape."""
-    return choose_lines(edges, "auto", shape, names)[1]
-
-
 def test_layouts_are_recognised_named_or_given():
+    def lines_of(edges, shape):
+        return drawn_shapes(shape, edges=edges).skeleton
+
     assert lines_of("auto", FACE) is IBUG
     assert lines_of("auto", HAND) is HAND_21
     assert lines_of("auto", BODY) is None
-    assert lines_of("auto", BODY, COCO.point_names) == COCO
     assert lines_of("coco-17", BODY) is COCO
     assert lines_of(COCO, BODY) is COCO
-    assert lines_of(None, BODY) is None
+    assert lines_of(None, FACE) is None
     found = lines_of([(0, 1), (4, 2)], BODY)
     assert_array_equal(found.edges, [[0, 1], [4, 2]])
     assert not found.sides.any()
-    # The layout is known whatever is drawn.
-    for edges in (None, [[0, 1]]):
-        assert choose_layout(edges, FACE) is IBUG
-        assert choose_layout(edges, BODY) is None
 
 
 @pytest.mark.parametrize(
@@ -321,28 +281,24 @@ def test_layouts_are_recognised_named_or_given():
     ],
 )
 def test_bad_edges(edges, message):
-    refused(message, lines_of, edges, np.zeros((5, 3)))
+    refused(message, drawn_shapes, np.zeros((5, 3)), edges=edges)
 
 
+# The layout is known whatever is drawn. Hands are in any direction.
 @pytest.mark.parametrize(
-    ("shape", "layout"), [(FACE, IBUG), (BODY, COCO), (HAND, HAND_21)]
+    ("shape", "edges", "flipped"),
+    [
+        (FACE, "auto", "lower"),
+        (FACE, None, "lower"),
+        (FACE, [[0, 1]], "lower"),
+        (BODY, "coco-17", "lower"),
+        (BODY, "auto", "upper"),
+        (HAND, "auto", "upper"),
+    ],
 )
-def test_layouts_determine_which_way_is_up(shape, layout):
-    flipped = shape * [1, -1, 1]
-    assert choose_origin("auto", shape, layout) == "upper"
-    # Hands are in any direction.
-    auto = "upper" if layout is HAND_21 else "lower"
-    assert choose_origin("auto", flipped, layout) == auto
-    assert choose_origin("auto", flipped, None) == "upper"
-    assert choose_origin("lower", shape, layout) == "lower"
-    refused("got 'top'", choose_origin, "top", shape, layout)
-    for origin in ("upper", "lower"):
-        seen = shape if origin == "upper" else shape * [1, -1, -1]
-        tilt = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
-        turned = seen @ tilt.T @ upright_turn(seen @ tilt.T, layout, origin).T
-        expected = seen @ upright_turn(seen, layout, origin).T
-        assert_allclose(turned, expected, atol=1e-9 * np.abs(shape).max())
-        below, above = turned[np.array(layout.up), 1].mean(axis=0)
-        assert (above < below) == (origin == "upper")
-    for unknown in (None, lines_of([[0, 1]], shape)):
-        assert_array_equal(upright_turn(shape, unknown, "upper"), np.eye(3))
+def test_layouts_determine_which_way_is_up(shape, edges, flipped):
+    for given, origin in ((shape, "upper"), (shape * [1, -1, 1], flipped)):
+        display = drawn_shapes(given, edges=edges).plot()
+        assert display.origin == origin
+        assert display.axes_[0, 0].yaxis_inverted() == (origin == "upper")
+        assert drawn_shapes(given, edges=edges, origin="lower").origin == "lower"

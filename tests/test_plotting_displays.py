@@ -6,9 +6,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from cameras import lorentz_cameras
 from layers import slow_after
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
+from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM
@@ -22,14 +25,11 @@ from isa_nrsfm.plotting import (
     ModeCovarianceDisplay,
     ReprojectionDisplay,
 )
-from isa_nrsfm.plotting._axes import MINUS_COLOUR, PLUS_COLOUR, percent
-from isa_nrsfm.plotting._mode_covariance import asinh_ticks, correlations
-from isa_nrsfm.plotting._reprojection import choose_frames
-from isa_nrsfm.plotting._views import viewing_transform
 from isa_nrsfm.skeletons import get_skeleton
 
 # The figures do not depend on how far the iterations of the fit got.
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+PLUS_COLOUR, MINUS_COLOUR = "#D55E00", "#0072B2"
 ALPHA = np.random.default_rng(0).normal(size=(30, 2))
 FLIPPED = np.tile([1.0, -1.0], 68)
 
@@ -69,6 +69,16 @@ def random_frames(n_points=10, **kw):
     return ReprojectionDisplay(observed=observed, reprojected=observed + noise, **kw)
 
 
+def view_of(estimator, display):
+    """Return the transform from the space of a model to that of a display."""
+    return np.linalg.lstsq(estimator.mean_shape_, display.mean_shape)[0].T
+
+
+def percent(fraction):
+    """Return a share between 0.1 and 100 % with two digits."""
+    return f"{100 * fraction:#.2g}".rstrip(".") + " %"
+
+
 def texts(display):
     return [ax.get_title(loc="left") for ax in display.axes_[:, 0]]
 
@@ -80,14 +90,17 @@ def legend_of(display):
 
 def test_shapes_are_those_of_the_estimator_in_natural_proportions(faces, estimator):
     display = BasisShapeDisplay.from_estimator(estimator)
-    T = viewing_transform(estimator.motion_, estimator.reference_motion_)
-    # Faces of known layouts are turned upright there.
-    seen = estimator.mean_shape_ @ T.T
-    T = canonical_pose(seen, scheme="ibug-68").rotation @ T
+    T = view_of(estimator, display)
     assert_allclose(display.mean_shape, estimator.mean_shape_ @ T.T)
     # alpha has unit variance: a basis shape is the drift by a standard deviation.
     scale = np.abs(display.basis).max()
     assert_allclose(display.basis, estimator.basis_ @ T.T, atol=1e-6 * scale)
+    # Faces of known layouts are turned upright.
+    pose = canonical_pose(display.mean_shape, scheme="ibug-68")
+    assert_allclose(pose.rotation, np.eye(3), atol=1e-9)
+    # The median of the cameras has rows of length one.
+    sizes = np.linalg.norm(estimator.motion_ @ np.linalg.inv(T), axis=(1, 2))
+    assert np.median(sizes) == pytest.approx(np.sqrt(2))
     # Up to a rotation and its mirror image the mean shape is the true face. Rigid
     # cameras of a deforming face are only nearly right.
     seen, truth = display.mean_shape, faces.mean_shape
@@ -120,6 +133,35 @@ def test_shapes_of_calibrated_cameras_are_only_turned(camera):
     front = BasisShapeDisplay.from_estimator(model).mean_shape[:, :2].T
     unit = np.linalg.norm(model.reference_motion_[0]) / np.median(model.scales_)
     assert_allclose(unit * front, seen, atol=1e-6 * np.abs(seen).max())
+
+
+def rigid_view(motion, shape):
+    """Return a model of a rigid table, and its display."""
+    tracks = shape @ motion.swapaxes(1, 2)
+    model = AffineNRSfM(1, refinement=None, scale_frames=False, random_state=0)
+    model.fit(tracks.reshape(len(tracks), -1))
+    return model, BasisShapeDisplay.from_estimator(model)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_turntable_is_seen_upright_from_its_broad_side(seed):
+    rng = np.random.default_rng(seed)
+    turns = Rotation.from_euler("y", 2 * np.pi * np.arange(40)[:, None] / 40)
+    # Points with y down, broad along a direction between x and z.
+    points = rng.standard_normal((50, 3)) * [3, 5, 1]
+    points = (points - points.mean(axis=0)) @ Rotation.from_euler("y", 1).as_matrix()
+    seen = rigid_view(turns.as_matrix()[:, :2], points)[1].mean_shape
+    assert_allclose(seen[:, 1], points[:, 1], atol=1e-6)
+    assert seen[:, 0].std() > 2 * seen[:, 2].std()
+    assert_allclose(seen @ seen.T, points @ points.T, atol=1e-5)
+
+
+def test_without_a_metric_the_mean_camera_is_made_isotropic(rng):
+    model, display = rigid_view(lorentz_cameras(rng), rng.standard_normal((30, 3)))
+    unit = model.motion_ / np.linalg.norm(model.motion_, axis=(1, 2), keepdims=True)
+    rows = (unit @ np.linalg.inv(view_of(model, display))).reshape(-1, 3)
+    second = rows.T @ rows
+    assert_allclose(second / second[0, 0], np.eye(3), atol=1e-6)
 
 
 def test_points_and_arrows_are_the_shapes(estimator):
@@ -395,28 +437,26 @@ def test_labels_of_the_matrix_do_not_touch(n_components):
 
 @pytest.mark.parametrize("largest", [3e-7, 0.017, 1.0, 99.0])
 def test_ticks_of_the_asinh_scale(largest):
-    ticks = asinh_ticks(largest, signed=True)
+    display = ModeCovarianceDisplay(mode_covariance=largest * np.eye(6)).plot()
+    display.figure_.canvas.draw()
+    axis = display.colorbar_.ax
+    ticks = axis.get_yticks()
     assert_array_equal(ticks, -ticks[::-1])
     assert 0 in ticks
     assert largest / 10 < ticks.max() <= largest
-    assert_array_equal(asinh_ticks(largest, signed=False), ticks[ticks >= 0])
-    display = ModeCovarianceDisplay(mode_covariance=largest * np.eye(6)).plot()
-    display.figure_.canvas.draw()
-    boxes = [t.get_window_extent() for t in display.colorbar_.ax.get_yticklabels()]
+    boxes = [tick.get_window_extent() for tick in axis.get_yticklabels()]
     assert len(boxes) == len(ticks)
     assert not any(a.overlaps(b) for a, b in pairwise(boxes))
+    display.plot(absolute=True)
+    assert_array_equal(display.colorbar_.ax.get_yticks(), ticks[ticks >= 0])
 
 
 def test_correlations():
     matrix = covariance()
-    result = correlations(matrix)
-    assert_allclose(np.diag(result), 1)
-    scale = np.sqrt(np.diag(matrix))
-    assert_allclose(result * np.outer(scale, scale), matrix)
-    matrix[2] = matrix[:, 2] = 0
-    assert_array_equal(correlations(matrix)[2], 0)
+    expected = matrix / np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+    expected[2] = expected[:, 2] = matrix[2] = matrix[:, 2] = 0
     display = ModeCovarianceDisplay(mode_covariance=matrix).plot(normalize=True)
-    assert_array_equal(display.im_.get_array(), correlations(matrix))
+    assert_allclose(display.im_.get_array(), expected)
     assert display.im_.get_clim() == pytest.approx((-1, 1))
 
 
@@ -468,19 +508,11 @@ def test_random_frames(faces, estimator):
     assert_array_equal(one.frames, np.unique(one.frames))
     assert_array_equal(one.frames, same.frames)
     assert set(one.frames) != set(other.frames)
-    # Each row is as likely as the others.
-    counts = np.zeros(5)
-    rng = np.random.RandomState(0)
-    for _ in range(300):
-        counts[choose_frames(np.zeros((5, 8)), 2, None, rng)] += 1
-    assert_allclose(counts, 120, atol=40)
-    assert_array_equal(choose_frames(np.zeros((4, 8)), None, None, rng), range(4))
+    assert_array_equal(show(estimator, faces.data[:4]).frames, range(4))
     message = "between 1 and the 4 rows of X with at least 4 points; got 6"
-    with pytest.raises(ValueError, match=message):
-        ReprojectionDisplay.from_estimator(estimator, faces.data[:4], n_frames=6)
+    refused(message, show, estimator, faces.data[:4], n_frames=6)
     for frames in ([80], [-1], 3, [], [0.5]):
-        with pytest.raises(ValueError, match="frames must be"):
-            ReprojectionDisplay.from_estimator(estimator, faces.data, frames=frames)
+        refused("frames must be", show, estimator, faces.data, frames=frames)
 
 
 def test_random_rows_can_be_fitted(estimator, faces):
@@ -489,8 +521,8 @@ def test_random_rows_can_be_fitted(estimator, faces):
     X[4, 2:] = np.nan
     display = ReprojectionDisplay.from_estimator(estimator, X)
     assert_array_equal(display.frames, [0, 2, 3, 5])
-    with pytest.raises(ValueError, match="the 4 rows of X with at least 4 points"):
-        ReprojectionDisplay.from_estimator(estimator, X, n_frames=5)
+    message, show = "the 4 rows of X with at least", ReprojectionDisplay.from_estimator
+    refused(message, show, estimator, X, n_frames=5)
 
 
 def test_rows_of_dataframes_may_have_names(faces):

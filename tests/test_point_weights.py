@@ -236,15 +236,16 @@ class TestMethods:
         weights = np.tile(counts.astype(float), (6, 1))
         holed = np.where(weights[..., None] > 0, tracks, np.nan)
         holed = holed - np.nanmean(holed, axis=1, keepdims=True)
-        sizes = weighted_sizes(holed, weights)
-        found = frames.linearised(holed, sizes, weights)
-        expected = repeated.linearised(holed[:, many], sizes)
+        rows = holed.transpose(0, 2, 1)
+        sizes = weighted_sizes(rows, weights, np.ones(6))
+        found = frames.linearised(rows, sizes, weights)
+        expected = repeated.linearised(rows[:, :, many], sizes)
         for name in ("motion", "alpha", "covariance", "precision"):
             found_here, here = getattr(found, name), getattr(expected, name)
             assert_allclose(found_here, here, rtol=1e-5, atol=1e-7 * np.abs(here).max())
         if camera != "affine":
-            found = frames.depth_deviations(holed, sizes, weights)
-            expected = repeated.depth_deviations(holed[:, many], sizes)
+            found = frames.depth_deviations(rows, sizes, weights)
+            expected = repeated.depth_deviations(rows[:, :, many], sizes)
             assert_allclose(found[:, many], expected, rtol=1e-5)
 
     def test_all_methods_leave_out_points_of_weight_zero(self):
@@ -349,10 +350,14 @@ class TestFrames:
             many = np.repeat(points, w, axis=0)
             expected.append(np.sqrt(np.mean((many - many.mean(axis=0)) ** 2)))
         tracks[weights == 0] = np.nan
-        assert_allclose(weighted_sizes(tracks, weights * 1.0), expected)
+        assert_allclose(
+            weighted_sizes(tracks.transpose(0, 2, 1), weights, np.ones(3)), expected
+        )
         # All of the weight in one place
-        size = weighted_sizes(np.eye(2)[None], np.array([[1.0, 1e-40]]))
-        assert_allclose(size, 0.5 * np.sqrt(2.0))
+        size = weighted_sizes(
+            np.eye(2)[None], np.array([[1.0, 1e-40]]), np.array([0.7])
+        )
+        assert_allclose(size, 0.7)
 
 
 class TestRouting:

@@ -129,7 +129,9 @@ class TestSpatialMedian:
 
     def test_has_nearly_the_least_sum_of_distances(self):
         tracks = self.random_tracks()
-        for frame, middle in zip(tracks, spatial_median(tracks), strict=True):
+        for frame, middle in zip(
+            tracks, spatial_median(tracks.transpose(0, 2, 1)), strict=True
+        ):
 
             def cost(point, frame=frame):
                 return np.nansum(np.linalg.norm(frame - point, axis=1))
@@ -140,12 +142,15 @@ class TestSpatialMedian:
     def test_moves_and_turns_with_the_image(self):
         tracks = self.random_tracks()
         angle = np.linspace(0, np.pi, len(tracks))
-        expected = turned(10 * spatial_median(tracks)[:, None], angle)[:, 0] + 3.0
-        got = spatial_median(turned(10 * tracks, angle) + 3.0)
+        expected = (
+            turned(10 * spatial_median(tracks.transpose(0, 2, 1))[:, None], angle)[:, 0]
+            + 3.0
+        )
+        got = spatial_median((turned(10 * tracks, angle) + 3.0).transpose(0, 2, 1))
         assert_allclose(got, expected, atol=1e-9)
 
     def test_of_points_in_one_place_is_there(self):
-        assert_allclose(spatial_median(np.full((2, 5, 2), 3.0)), 3.0)
+        assert_allclose(spatial_median(np.full((2, 2, 5), 3.0)), 3.0)
 
     @pytest.mark.parametrize("n_points", [5, 7, 31])
     def test_a_point_at_any_distance_costs_no_digits_of_the_others(self, n_points):
@@ -156,7 +161,9 @@ class TestSpatialMedian:
         near = tracks[:, np.arange(n_points) != 2]
         expected = near - near.mean(axis=1, keepdims=True)
         for each in spoilt:
-            centred = robustly_centred(each)[0][:, np.arange(n_points) != 2]
+            centred = robustly_centred(each.transpose(0, 2, 1))[0].transpose(0, 2, 1)[
+                :, np.arange(n_points) != 2
+            ]
             middle = centred.mean(axis=1, keepdims=True)
             assert_allclose(centred - middle, expected, rtol=0, atol=1e-14)
             assert np.abs(middle).max() < 3
@@ -165,13 +172,15 @@ class TestSpatialMedian:
         tracks = np.random.default_rng(0).normal(size=(2, 9, 2))
         tracks[:, :5] = [3.0, -2.0]
         tracks[:, 8] = 1e30
-        assert_allclose(spatial_median(tracks), [[3.0, -2.0]] * 2, rtol=1e-12)
+        assert_allclose(
+            spatial_median(tracks.transpose(0, 2, 1)), [[3.0, -2.0]] * 2, rtol=1e-12
+        )
         # Exactly, whatever the place: their size is not that of rounding errors.
         places = np.random.default_rng(1).normal(scale=500, size=(50, 2))
         tracks = np.repeat(places[:, None], 68, axis=1)
         tracks[:, 0] += [1.0, 0.0]
-        assert_array_equal(spatial_median(tracks), places)
-        assert_allclose(robust_sizes(tracks), np.sqrt(1 / 68 / 2))
+        assert_array_equal(spatial_median(tracks.transpose(0, 2, 1)), places)
+        assert_allclose(robust_sizes(tracks.transpose(0, 2, 1)), np.sqrt(1 / 68 / 2))
 
 
 class TestSizes:
@@ -183,10 +192,10 @@ class TestSizes:
     def test_by_definition(self):
         tracks = self.random_tracks()
         tracks[3, :8] = np.nan
-        got = robust_sizes(tracks)
+        got = robust_sizes(tracks.transpose(0, 2, 1))
         for frame, size in zip(tracks, got, strict=True):
             points = frame[np.isfinite(frame).all(axis=1)]
-            middle = spatial_median(points[None])
+            middle = spatial_median(points.T[None])
             square = np.sum((points - middle) ** 2, axis=1)
             assert size == pytest.approx(np.sqrt(np.median(square) / 2))
 
@@ -194,7 +203,7 @@ class TestSizes:
         tracks = self.random_tracks()
         tracks[2, :20] = 1.0
         square = np.sum((tracks[2] - 1.0) ** 2, axis=1)
-        size = robust_sizes(tracks)[2]
+        size = robust_sizes(tracks.transpose(0, 2, 1))[2]
         assert size == pytest.approx(np.sqrt(np.mean(square) / 2))
 
 
@@ -206,8 +215,10 @@ class TestDistantPoints:
         tracks[6, 3, 1] -= 8 * DISTANT
         expected = np.zeros(tracks.shape[:2], dtype=bool)
         expected[5, 2] = expected[6, 3] = True
-        assert_array_equal(distant_points(tracks), expected)
-        assert_array_equal(distant_points(0.1 * tracks + 5.0), expected)
+        assert_array_equal(distant_points(tracks.transpose(0, 2, 1)), expected)
+        assert_array_equal(
+            distant_points((0.1 * tracks + 5.0).transpose(0, 2, 1)), expected
+        )
 
 
 LARGEST_SHARE = 0.4  # of the points of a frame that may be outliers

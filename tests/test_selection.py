@@ -21,8 +21,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._selection.choice import results_of, selected
-from isa_nrsfm._selection.path import Row
+from isa_nrsfm._selection import results_of, selected
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0).data
@@ -265,7 +264,7 @@ def test_what_cannot_be_tried_is_refused(parameters, message):
 
 
 def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
-    monkeypatch.delattr("isa_nrsfm._selection.estimator.walk")
+    monkeypatch.delattr("isa_nrsfm._selection.cross_validate")
     refused("n_components=500", AffineNRSfMCV((1, 500)).fit, X)
 
 
@@ -325,9 +324,11 @@ def test_held_out_rows_are_not_fitted_without_joint_refinement():
     assert_allclose(ours, cross_val_score(estimator, table, cv=2), rtol=1e-9)
 
 
+NAMES = "fit_time score_time test_score path_time".split()
+
+
 def test_the_best_mean_score_ranks_first_and_unknown_ones_last():
     means = [-0.5, np.nan, -0.2, -0.5, -0.9]
-    ones = np.ones(2)
-    scores = enumerate((mean * ones for mean in means), start=1)
-    rows = [Row(k, score, ones, ones, 0.0, 0) for k, score in scores]
-    assert_array_equal(results_of(rows)["rank_test_score"], [2, 5, 1, 2, 4])
+    parts = [dict.fromkeys(NAMES, np.full(2, mean)) for mean in means]
+    results = results_of(range(1, 6), parts)
+    assert_array_equal(results["rank_test_score"], [2, 5, 1, 2, 4])

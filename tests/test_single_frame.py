@@ -33,11 +33,12 @@ def assert_same(alone, together, atol=1e-9):
 @pytest.mark.parametrize("extent", [(1.0, 1.0, 0.5), (1.0, 1.0, 0.02), (3.0, 0.1, 1.0)])
 def test_is_the_fit_of_the_frame_among_others(camera, extent):
     model, tracks = model_and_tracks(camera, extent=extent)
-    together = model.posterior(tracks)
+    rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
+    together = model.posterior(rows)
     n_alone = 0
     for i in range(len(tracks)):
-        assert_same(model.posterior(tracks[[i]]), together.take([i]))
-        n_alone += model._alone(tracks[i]) is not None
+        assert_same(model.posterior(rows[[i]]), together.take([i]))
+        n_alone += model._alone(rows[i]) is not None
     # Frames whose reversed camera is the better one are left to the other search.
     assert n_alone >= (0.4 if extent[2] == 0.02 else 0.7) * len(tracks)
 
@@ -45,7 +46,7 @@ def test_is_the_fit_of_the_frame_among_others(camera, extent):
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_is_a_minimum_of_the_documented_objective(camera):
     model, tracks = model_and_tracks(camera, 1)
-    fit = model._alone(tracks[0])
+    fit = model._alone(tracks[0].T)
     image = scenes.images(model.shapes, fit.motion, fit.translation, fit.alpha)
     square = np.sum((tracks[:1] - image) ** 2) + NOISE**2 * np.sum(fit.alpha**2)
     assert_allclose(fit.objective, square, rtol=1e-9)
@@ -62,32 +63,37 @@ def test_unusual_frames_are_those_of_the_search_for_many(camera):
     tracks[2] = 1.0
     tracks[3] = np.nan
     tracks[4] *= 1e100
-    together = model.posterior(tracks)
+    rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
+    together = model.posterior(rows)
     for i in range(5):
-        assert_same(model.posterior(tracks[[i]]), together.take([i]))
-    assert [model._alone(frame) is None for frame in tracks[[0, 1, 3]]] == [True] * 3
+        assert_same(model.posterior(rows[[i]]), together.take([i]))
+    assert [model._alone(frame) is None for frame in rows[[0, 1, 3]]] == [True] * 3
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_flat_shapes(camera):
     model, tracks = model_and_tracks(camera, extent=(1.0, 1.0, 0.0))
-    together = model.posterior(tracks)
+    rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
+    together = model.posterior(rows)
     for i in range(5):
-        assert_same(model.posterior(tracks[[i]]), together.take([i]))
+        assert_same(model.posterior(rows[[i]]), together.take([i]))
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_single_precision(camera):
     model, tracks = model_and_tracks(camera)
     tracks = tracks.astype(np.float32)
-    together = model.posterior(tracks)
+    rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
+    together = model.posterior(rows)
     for i in range(3):
-        assert_same(model.posterior(tracks[[i]]), together.take([i]))
+        assert_same(model.posterior(rows[[i]]), together.take([i]))
 
 
 def test_covariances_can_be_left_out():
     model, tracks = model_and_tracks("weak_perspective")
-    with_them, without = (model.posterior(tracks[:1], which) for which in (True, False))
+    with_them, without = (
+        model.posterior(tracks[:1].transpose(0, 2, 1), which) for which in (True, False)
+    )
     assert_same(without._replace(covariance=with_them.covariance), with_them)
 
 

@@ -6,28 +6,21 @@ import re
 import warnings
 
 import numpy as np
+import pandas as pd
 import pytest
 from fit_runs import fit, write_landmarks
-from landmark_files import (
-    deeplabcut_frame,
-    scene,
-    write_deeplabcut,
-    write_openface,
-)
+from landmark_files import deeplabcut_frame, scene, write_deeplabcut, write_openface
 from refusals import refused
+from sklearn.base import clone
 
-pd = pytest.importorskip("pandas")
-
-from sklearn.base import clone  # noqa: E402
-
-from isa_nrsfm import AffineNRSfM, FastISA  # noqa: E402
-from isa_nrsfm.baselines import PseudoInverseNRSfM  # noqa: E402
-from isa_nrsfm.cli._columns import asked_columns  # noqa: E402
-from isa_nrsfm.cli._options import build_parser  # noqa: E402
-from isa_nrsfm.cli._reading import read_frames  # noqa: E402
-from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
-from isa_nrsfm.io import landmark_table, open_table, read_landmarks, read_table  # noqa: E402
-from isa_nrsfm.skeletons import read_skeleton  # noqa: E402
+from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm.baselines import PseudoInverseNRSfM
+from isa_nrsfm.cli._columns import asked_columns
+from isa_nrsfm.cli._options import build_parser
+from isa_nrsfm.cli._reading import read_frames
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.io import landmark_table, open_table, read_landmarks, read_table
+from isa_nrsfm.skeletons import read_skeleton
 
 N = 24
 POINTS = [f"{axis}{j}" for j in range(12) for axis in "xy"]
@@ -36,6 +29,13 @@ POINTS = [f"{axis}{j}" for j in range(12) for axis in "xy"]
 def landmarks(n_frames=N):
     scene = make_nonrigid_tracks(n_frames, 12, 1, noise=0.01, random_state=0)
     return pd.DataFrame(scene.data, columns=POINTS)
+
+
+def read_by_fit(path, *options):
+    """Read a table as the command fit does, without a fit: options and frames."""
+    argv = ["fit", path, "-o", "out", *options]
+    args = build_parser().parse_args([str(word) for word in argv])
+    return args, read_frames(args)
 
 
 @pytest.fixture
@@ -50,9 +50,7 @@ def asked(tmp_path):
             table.to_csv(path, index=False)
         else:
             table.to_parquet(path, index=False)
-        args = ["fit", path, "-o", tmp_path / "out", *options]
-        args = build_parser().parse_args([str(word) for word in args])
-        return asked_columns(args, read_frames(args))
+        return asked_columns(*read_by_fit(path, *options))
 
     return read
 
@@ -111,17 +109,17 @@ def test_times_are_read_in_the_one_way_that_reads_all(asked, cells, steps):
     ],
 )
 def test_times_of_several_readings_or_none_are_refused(asked, cell, message):
-    with pytest.raises(ValueError, match=f"--time t: .*{message}"):
-        asked({"t": [cell.format(i) for i in range(1, 13)]}, "--time", "t")
+    cells = {"t": [cell.format(i) for i in range(1, 13)]}
+    refused(f"--time t: .*{message}", asked, cells, "--time", "t")
 
 
 def test_times_of_several_ways_of_writing_are_refused(asked):
     cells = [f"{i}/03/2024" for i in range(8, N + 7)]
-    with pytest.raises(ValueError, match=r"1 of 24 are not .*row 23, 'tomorrow'"):
-        asked({"t": [*cells, "tomorrow"]}, "--time", "t")
+    columns, time = {"t": [*cells, "tomorrow"]}, ["--time", "t"]
+    refused("1 of 24 are not .*row 23, 'tomorrow'", asked, columns, *time)
     cells = [f"2024-02-01T12:00:{i}Z" for i in range(10, N + 9)]
-    with pytest.raises(ValueError, match=r"23 of 24 .* zone, .* none .*row 23, '2024"):
-        asked({"t": [*cells, "2024-02-01T13:00:00"]}, "--time", "t")
+    columns = {"t": [*cells, "2024-02-01T13:00:00"]}
+    refused("23 of 24 .* zone, .* none .*row 23, '2024", asked, columns, *time)
 
 
 @pytest.mark.parametrize(
@@ -140,8 +138,8 @@ def test_time_format_decides(asked, cell, format, step):
     cells = {"t": [cell.format(i) for i in range(1, 13)]}
     found = asked(cells, "--time", "t", "--time-format", format).times
     assert seconds(found)[1] == step
-    with pytest.raises(ValueError, match=f"written as {format}x.*12 of 12"):
-        asked(cells, "--time", "t", "--time-format", f"{format}x")
+    options = ["--time", "t", "--time-format", f"{format}x"]
+    refused(f"written as {format}x.*12 of 12", asked, cells, *options)
     refused("--time-format needs --time", asked, cells, "--time-format", format)
 
 
@@ -186,16 +184,8 @@ def test_fps_counts_images(asked, columns, options, numbers):
 @pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
-        (
-            FACES | {"frame": ROWS // 2},
-            [],
-            "12 of 24 .* same image .*frame, first: row 1",
-        ),
-        (
-            FACES | {"image": ROWS // 2},
-            [],
-            "12 of 24 .* same image .*image, first: row",
-        ),
+        (FACES | {"frame": ROWS // 2}, [], "12 of 24 .*same image .*frame, first: row"),
+        (FACES | {"image": ROWS // 2}, [], "12 of 24 .*same image .*image, first: row"),
         ({"frame": ROWS % 12}, [], "12 of 24 .*frame, first: row 12.*--group"),
         (FACES, ["--group", "face"], "rows .* are 2 rows apart: .* column frame"),
         (FACES, ["--skip-rows", "face=left"], "rows .* are 2 rows apart"),
@@ -235,8 +225,8 @@ def test_labels_of_parquet_files_keep_their_type(asked):
     assert [each.kind for each in found] == ["classes"] * 3
     assert set(found[0].values) == {"2024-02-01", "2024-02-02"}
     for name, got in (("day", "'2024-02-01' in row 0"), ("mood", "'b' in row 1")):
-        with pytest.raises(ValueError, match=f"{name}:number: .* numbers; got {got}"):
-            asked(columns, "--label", f"{name}:number", suffix=".parquet")
+        message, option = f"{name}:number: .* numbers; got {got}", f"{name}:number"
+        refused(message, asked, columns, "--label", option, suffix=".parquet")
 
 
 @pytest.mark.parametrize("word", ["NA", "nan", "NULL", "n/a", "", " ", "<NA>"])
@@ -316,10 +306,9 @@ def tracks_read(tmp_path):
         path = tmp_path / "table.csv"
         values = tracks.reshape(len(tracks), -1)
         pd.DataFrame(values, columns=POINTS).to_csv(path, index=False)
-        args = build_parser().parse_args(["fit", str(path), "-o", "out", *options])
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            frames = read_frames(args)
+            _, frames = read_by_fit(path, *options)
         return frames.points.to_numpy(), [str(each.message) for each in caught]
 
     return read
@@ -424,13 +413,13 @@ def test_whole_tables_are_no_tables_of_points(estimator, further, number, first)
     message += ".*landmark_table"
     refused(message, estimator.fit, table)
     columns = [tuple(f"DLC {name}".split()) for name in table]
-    with pytest.raises(ValueError, match=message.replace(first, f"DLC_{first}")):
-        estimator.fit(table.set_axis(pd.MultiIndex.from_tuples(columns), axis=1))
+    levels = table.set_axis(pd.MultiIndex.from_tuples(columns), axis=1)
+    refused(message.replace(first, f"DLC_{first}"), estimator.fit, levels)
     fitted = estimator.fit(landmarks().to_numpy())
     refused(message, fitted.transform, table)
     unnamed = landmarks().set_axis([f"c{j}" for j in range(24)], axis=1)
-    with pytest.raises(ValueError, match=r"X has texts: .*'Ann'.*landmark_table"):
-        estimator.fit(unnamed.assign(c24="Ann", c25="Bob"))
+    texts = unnamed.assign(c24="Ann", c25="Bob")
+    refused("X has texts: .*'Ann'.*landmark_table", estimator.fit, texts)
     message = r"the points of LandmarkTable: X\.points"
     refused(message, estimator.fit, landmark_table(landmarks()), error=TypeError)
 
@@ -471,8 +460,7 @@ def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
     np.testing.assert_array_equal(found.failed, np.arange(12) % 3 == 0)
     assert set(found.frames["subject"]) == {"007"}
     assert set(found.frames["age"]) == {30}
-    args = build_parser().parse_args(["fit", str(path), "-o", "out"])
-    frames = read_frames(args)
+    _, frames = read_by_fit(path)
     assert [reason for reason, *_ in frames.left_out] == ["tracking failed"]
     assert len(frames.X) == 8
 
@@ -526,28 +514,16 @@ LONG = "frame,point,x,y\n" + "".join(f"{i // 8},{i % 8},{i},{-i}\n" for i in ran
         ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
         ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
         ("a.csv", b"PK\3\4", r"a spreadsheet or .*: save it as \.csv"),
-        (
-            "a.csv",
-            gzip.compress(TEXT.encode()),
-            "a compressed file, in spite .* unpack",
-        ),
+        ("a.csv", gzip.compress(TEXT.encode()), "compressed file, in spite .* unpack"),
         ("a.csv.gz", gzip.compress(TEXT.encode()), "known .* Unpack compressed files"),
         ("a.npy", b"\x93NUMPY", r"Save tables and arrays as \.csv, in pandas: "),
         ("a.txt", TEXT, r"table: a line of names .* in \.csv or \.tsv"),
         ("a.csv", "my experiment of May\n" + TEXT, "line 2 .* delete titles"),
         ("a.csv", "# made by T, version 2\n" + TEXT, "line 2 .* delete .* comments"),
-        (
-            "a.csv",
-            re.sub("(?m)^([0-9])", r'"1",\1', TEXT),
-            "line 2 .* that of row names",
-        ),
+        ("a.csv", re.sub("(?m)^([0-9])", r'"1",\1', TEXT), "2 .* that of row names"),
         ("a.csv", re.sub("(?m)^(.*)$", r'"\1"', TEXT), "quotation marks: remove them"),
         ("a.csv", ",".join("xy" * 12) + TEXT[TEXT.index("\n") :], "called 'x': each"),
-        (
-            "a.csv",
-            TEXT.replace("\n", "\n" + ",".join(["px"] * 24) + "\n", 1),
-            "of units",
-        ),
+        ("a.csv", TEXT.replace("\n", "\n" + "px," * 23 + "px\n", 1), "of units"),
         ("a.csv", "p,,q,\nx,y,x,y\n1,2,3,4\n", "two lines; .* nose_y is needed$"),
         ("a.csv", TEXT + TEXT, r"row 2 .* 'x0'\. .* repeated names"),
         ("a.csv", WIDE.astype(str).add("%").to_csv(index=False), r"like 1234\.5"),
@@ -559,22 +535,24 @@ def test_tables_of_another_form_are_told_the_way(tmp_path, name, contents, messa
     if isinstance(contents, str):
         contents = contents.encode()
     path.write_bytes(contents)
-    with pytest.raises(ValueError, match=message):
-        read_frames(build_parser().parse_args(["fit", str(path), "-o", "out"]))
+    refused(message, read_by_fit, path)
+
+
+def followed(call, given, /, **scope):
+    """Do what an error advises in pandas; return the names that are set."""
+    told = str(refused("In pandas: ", call, given))
+    for line in told.partition("In pandas: ")[2].split(", and "):
+        exec(line, scope)
+    return scope
 
 
 @pytest.mark.parametrize("names", ["x,y", "X,Y"])
 def test_the_way_from_one_row_a_point_is_right(tmp_path, names):
     (tmp_path / "a.csv").write_text(LONG.replace("x,y", names))
     table = pd.read_csv(tmp_path / "a.csv")
-    told = str(refused("In pandas: ", landmark_table, table))
-    code = told.partition("In pandas: ")[2].split(", and ")
-    scope = {"table": table}
-    for line in code:
-        exec(line, scope)
-    points = landmark_table(scope["wide"]).points
-    np.testing.assert_array_equal(points.iloc[:, 6], [3, 11])
-    np.testing.assert_array_equal(points.iloc[:, 7], [-3, -11])
+    wide = followed(landmark_table, table, table=table)["wide"]
+    found = landmark_table(wide).points.iloc[:, 6:8]
+    np.testing.assert_array_equal(found, [[3, -3], [11, -11]])
 
 
 LEVELS = WIDE.set_axis(
@@ -597,10 +575,7 @@ LEVELS = WIDE.set_axis(
 def test_the_way_from_another_header_or_separator_is_right(tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.csv").write_text(text)
-    told = str(refused("In pandas: ", read_table, "a.csv"))
-    scope = {"pd": pd}
-    for line in told.partition("In pandas: ")[2].split(", and "):
-        exec(line, scope)
+    scope = followed(read_table, "a.csv", pd=pd)
     new = tmp_path / "new.csv"
     if not new.exists():
         scope["table"].to_csv(new, index=False)
@@ -613,15 +588,11 @@ def test_the_way_from_semicolons_keeps_texts_and_headers(tmp_path, monkeypatch):
     expected = read_landmarks(path).points
     text = path.read_text().replace(",", ";").replace(".", ",")
     (tmp_path / "b.csv").write_text(text)
+    followed(read_table, "b.csv", pd=pd)
+    np.testing.assert_array_equal(read_landmarks("new.csv").points, expected)
     table = WIDE.assign(who=["007", "1;2"], note="a, b")
     table.to_csv("c.csv", sep=";", decimal=",", index=False)
-    for name in ("b.csv", "c.csv"):
-        told = str(refused("In pandas: ", read_table, name))
-        scope = {"pd": pd}
-        for line in told.partition("In pandas: ")[2].split(", and "):
-            exec(line, scope)
-        if name == "b.csv":
-            np.testing.assert_array_equal(read_landmarks("new.csv").points, expected)
+    followed(read_table, "c.csv", pd=pd)
     found = read_table("new.csv")
     assert list(found["who"]) == ["007", "1;2"]
     assert list(found["note"]) == ["a, b"] * 2
@@ -629,10 +600,8 @@ def test_the_way_from_semicolons_keeps_texts_and_headers(tmp_path, monkeypatch):
 
 
 def test_the_way_from_several_levels_of_names_is_right():
-    told = str(refused("In pandas: ", landmark_table, LEVELS))
-    scope = {"table": LEVELS.copy()}
-    exec(told.partition("In pandas: ")[2], scope)
-    np.testing.assert_array_equal(landmark_table(scope["table"]).points, WIDE)
+    table = followed(landmark_table, LEVELS, table=LEVELS.copy())["table"]
+    np.testing.assert_array_equal(landmark_table(table).points, WIDE)
 
 
 @pytest.mark.parametrize(
@@ -647,14 +616,12 @@ def test_the_way_from_several_levels_of_names_is_right():
     ],
 )
 def test_names_of_another_form_are_told_their_pattern(name, pattern):
-    names = [
-        name.format(a=axis, j=j, letter="abcdefghijkl"[j])
-        for j in range(12)
-        for axis in "xy"
-    ]
-    told = str(refused("--columns", landmark_table, WIDE.set_axis(names, axis=1)))
+    points = enumerate("abcdefghijkl")
+    names = [name.format(a=a, j=j, letter=letter) for j, letter in points for a in "xy"]
+    table = WIDE.set_axis(names, axis=1)
+    told = str(refused("--columns", landmark_table, table))
     assert told.endswith(f"such as {pattern!r}")
-    found = landmark_table(WIDE.set_axis(names, axis=1), columns=pattern).points
+    found = landmark_table(table, columns=pattern).points
     np.testing.assert_array_equal(found, WIDE)
 
 
@@ -684,7 +651,6 @@ def test_tables_of_many_programs_are_read(tmp_path, text):
 def test_words_for_missing_points_are_missing(tmp_path, word):
     table = WIDE.copy()
     table.iloc[1, 4:6] = np.nan
-    (tmp_path / "a.csv").write_text(
-        table.to_csv(index=False, na_rep="@").replace("@", word)
-    )
+    text = table.to_csv(index=False, na_rep="@").replace("@", word)
+    (tmp_path / "a.csv").write_text(text)
     np.testing.assert_array_equal(read_landmarks(tmp_path / "a.csv").points, table)

@@ -38,7 +38,7 @@ class TestLayouts:
 
 
 def report_frames(tracks):
-    return centred_frames(tracks)[1]
+    return centred_frames(tracks.transpose(0, 2, 1))[1]
 
 
 class TestCentring:
@@ -75,7 +75,7 @@ class TestMissingPoints:
         tracks, seen = with_missing(points, 0.4)
         centred, translation = centred_tracks(tracks)
         sizes = weighting_sizes(centred, scale_frames=True)
-        assert_array_equal(seen_points(centred), seen)
+        assert_array_equal(seen_points(centred.transpose(0, 2, 1)), seen)
         assert centred.dtype == translation.dtype == np.float64
         for i, mask in enumerate(seen):
             part, place = centred_tracks(tracks[i : i + 1, mask])
@@ -90,15 +90,15 @@ class TestMissingPoints:
     def test_complete_tables_have_the_plain_values(self, rng, dtype, layout, order):
         X = np.asarray(7 + rng.normal(size=(50, 40)), dtype=dtype, order=order)
         tracks = table_to_tracks(X, layout)
-        assert clean_tracks(tracks) is tracks
+        assert_array_equal(clean_tracks(tracks), tracks)
         plain = np.ascontiguousarray(tracks, dtype=np.float64)
         centroid = plain.view(complex).sum(axis=1).view(float) / 20
         centred, translation = centred_tracks(tracks)
         assert_array_equal(translation, centroid)
         assert_array_equal(centred, plain - centroid[:, None])
         square = np.einsum("ijc,ijc->i", centred, centred) / 40
-        assert_array_equal(weighting_sizes(centred, True), np.sqrt(square))
-        assert_array_equal(weighting_sizes(centred, False)[0], np.sqrt(square.mean()))
+        assert_allclose(weighting_sizes(centred, True), np.sqrt(square))
+        assert_allclose(weighting_sizes(centred, False)[0], np.sqrt(square.mean()))
 
     def test_frames_without_any_point(self, rng):
         tracks = rng.normal(size=(4, 9, 2))

@@ -93,7 +93,7 @@ def prepared(name):
 def scaled(X, K):
     """Return a table as the stages after the first one take it."""
     return scaled_table(
-        open_table(X),
+        open_table(X, "interleaved"),
         K,
         layout="interleaved",
         names=None,
@@ -226,16 +226,15 @@ class Blocks(Stage):
 class JointRefinement(Stage):
     def prepare(self):
         scaled_rows = scaled(self.X, self.K)
-        self.rows, self.n_seen = scaled_rows.rows, scaled_rows.n_seen
+        self.scaled, self.rows = scaled_rows, scaled_rows.rows
         n_points = self.W.shape[1]
         self.sample = sample_frames(self.rows, n_points, self.factors.rigid_shape)
         self.of_sample = factorise(self.sample[0], self.K)
 
     def run(self):
         table = FactorisedTable(
+            self.scaled,
             self.rows,
-            self.rows,
-            self.n_seen,
             None,
             *leading_triplets(self.W, 3 * self.K + 3)[::2],
             *self.sample,

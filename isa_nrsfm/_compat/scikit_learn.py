@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from sklearn.base import BaseEstimator, _fit_context
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, _fit_context
 from sklearn.utils import _param_validation, _safe_indexing as taken_rows
 from sklearn.utils._param_validation import (
     HasMethods as HasMethods,
@@ -54,3 +56,25 @@ def checked_parameters(
         constraints, prefer_skip_nested_validation=True
     )
     return decorate
+
+
+class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
+    """Names of the columns of the results of `transform`."""
+
+    def get_feature_names_out(self, input_features: Any = None) -> NDArray:
+        """
+        Return the names of the coefficients.
+
+        Parameters
+        ----------
+        input_features : array-like of str, default=None
+            Checked against the names of the fitted columns; otherwise unused.
+
+        Returns
+        -------
+        ndarray of str, shape (n_components,)
+            ``alpha_1``, ``alpha_2`` and so on, as in the files of the command line.
+        """
+        n_components = len(super().get_feature_names_out(input_features))
+        names = [f"alpha_{k + 1}" for k in range(n_components)]
+        return np.array(names, dtype=object)

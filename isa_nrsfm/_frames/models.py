@@ -23,7 +23,7 @@ from isa_nrsfm._frames.search import FramePosterior, FrameSearch, largest_object
 from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import frames_last, in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
-from isa_nrsfm._tables.tracks import measurement_matrix, seen_points
+from isa_nrsfm._tables.tracks import seen_points
 
 # Factors of the coordinates of a mirror image in depth.
 MIRROR = np.array([1.0, 1.0, -1.0])
@@ -73,6 +73,11 @@ class FrameMap(NamedTuple):
     def identity(cls, n_components: int) -> "FrameMap":
         """Return the identity map."""
         return cls(np.eye(n_components + 1), np.eye(3))
+
+    @property
+    def rotation(self) -> NDArray:
+        """The map (3, 3) of rotation vectors: `space` of Euclidean shapes, size one."""
+        return np.asarray(self.space / np.cbrt(abs(np.linalg.det(self.space))))
 
     def apply(
         self, motion: NDArray, alpha: NDArray, covariance: NDArray | None
@@ -144,7 +149,7 @@ class RigidFrames(NamedTuple):
 
     def fit(
         self,
-        tracks: NDArray,
+        rows: NDArray,
         sizes: NDArray,
         deviations: bool = True,
         weights: NDArray | None = None,
@@ -155,25 +160,24 @@ class RigidFrames(NamedTuple):
         if the camera does not show B_k. Otherwise the solution of least norm. Ignores
         the other parameters.
         """
-        n_frames, n_components = len(tracks), len(self.basis)
+        n_frames, n_components = len(rows), len(self.basis)
         fit = Decomposition(
             np.empty((n_frames, 2, 3)),
             np.empty((n_frames, 2)),
             np.empty((n_frames, n_components)),
             np.full((n_frames, n_components), np.nan),
         )
-        seen = seen_points(tracks)
-        complete = np.asarray(seen.all(axis=1))
+        complete = np.asarray(seen_points(rows).all(axis=1))
         parts = [(np.array([i]), self._together) for i in np.flatnonzero(~complete)]
         for frames, fitted in [(complete, self._separately), *parts]:
-            part = fitted(tracks[frames])
+            part = fitted(rows[frames])
             fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
         return fit
 
-    def _separately(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return motion, translation and alpha of complete frames (n, n_points, 2)."""
-        translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
-        W = measurement_matrix(tracks - translation[:, None])
+    def _separately(self, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Return motion, translation and alpha of complete frames (n, 2, n_points)."""
+        translation = rows.mean(axis=2)
+        W = (rows - translation[..., None]).reshape(-1, rows.shape[2])
         motion = CAMERAS[self.camera].nearest(rigid_cameras(W, self.mean_shape))
         n_components, n_points, _ = self.basis.shape
         stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
@@ -189,10 +193,10 @@ class RigidFrames(NamedTuple):
         alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
         return motion, translation, alpha
 
-    def _together(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the fit of one frame (1, n_points, 2), all coefficients at once."""
-        seen = seen_points(tracks[0])
-        points, mean_shape = tracks[0, seen], self.mean_shape[seen]
+    def _together(self, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the fit of one frame (1, 2, n_points), all coefficients at once."""
+        (seen,) = seen_points(rows)
+        points, mean_shape = rows[0][:, seen].T, self.mean_shape[seen]
         centre, centroid = points.mean(axis=0), mean_shape.mean(axis=0)
         motion = rigid_cameras((points - centre).T, mean_shape - centroid)
         motion = CAMERAS[self.camera].nearest(motion)
@@ -258,16 +262,16 @@ class PosteriorFrames:
 
     def fit(
         self,
-        tracks: NDArray,
+        rows: NDArray,
         sizes: NDArray,
         deviations: bool = True,
         weights: NDArray | None = None,
     ) -> Decomposition:
-        """Return the fit of tracks (n, J, 2), NaN where missing, of sizes (n,).
+        """Return the fit of rows (n, 2, J), NaN where missing, of sizes (n,).
 
         With a robust loss the weights follow from the residuals of the fit.
         """
-        unit = tracks / sizes[:, None, None]
+        unit = rows / sizes[:, None, None]
         return self.shown(self.posterior(unit, deviations, weights), sizes)
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
@@ -288,13 +292,13 @@ class PosteriorFrames:
         return self._search.fit(block, self.noise_variance, starts=self.starts)
 
     def linearised(
-        self, tracks: NDArray, sizes: NDArray, weights: NDArray | None = None
+        self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
     ) -> LinearisedFrames:
-        """Return fits of tracks (n, J, 2), NaN where missing, of sizes (n,)."""
-        unit = tracks / sizes[:, None, None]
+        """Return fits of rows (n, 2, J), NaN where missing, of sizes (n,)."""
+        unit = rows / sizes[:, None, None]
         found = self.posterior(unit, weights=weights)
         if weights is None:
-            weights = seen_points(tracks).astype(float)
+            weights = seen_points(rows).astype(float)
         if self.loss != "linear":
             distance = distances(unit, self.shapes, *found[:3])
             deviation = np.sqrt(self.noise_variance)
@@ -309,7 +313,7 @@ class PosteriorFrames:
         slope = np.einsum("iprj,ij->ipr", T, share)
         T -= slope[..., None]
         T *= np.sqrt(weights / self.noise_variance)[:, None, None]
-        T = T.reshape(*T.shape[:2], 2 * tracks.shape[1]) / sizes[:, None, None]
+        T = T.reshape(*T.shape[:2], 2 * rows.shape[2]) / sizes[:, None, None]
         precision = T @ T.transpose(0, 2, 1)
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         return LinearisedFrames(
@@ -322,7 +326,7 @@ class PosteriorFrames:
         )
 
     def depth_deviations(
-        self, tracks: NDArray, sizes: NDArray, weights: NDArray | None = None
+        self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
     ) -> NDArray:
         """Compute the standard deviations (n, J) of depths with calibrated cameras.
 
@@ -331,9 +335,9 @@ class PosteriorFrames:
         depths by rotation vector, logarithm of the scale (if free) and coefficients.
         Weights (n, J) multiply the squares.
         """
-        unit = tracks / sizes[:, None, None]
+        unit = rows / sizes[:, None, None]
         found = self.posterior(unit, covariances=False, weights=weights)
-        seen, free = seen_points(tracks), CAMERAS[self.camera].scaled
+        seen, free = seen_points(rows), CAMERAS[self.camera].scaled
         weights = seen.astype(float) if weights is None else weights
         variances = np.full(seen.shape, np.nan)
         rotations, scales = full_rotations(found.motion)
@@ -355,39 +359,37 @@ class PosteriorFrames:
         return sizes[:, None] * np.sqrt(variances)
 
     def posterior(
-        self, tracks: NDArray, covariances: bool = True, weights: NDArray | None = None
+        self, rows: NDArray, covariances: bool = True, weights: NDArray | None = None
     ) -> FramePosterior:
-        """Return the fit of tracks of frames of size one, before the gauge.
+        """Return the fit of rows (n, 2, J) of size one, before the gauge.
 
         Weights (n, J) are by default 1. With a robust loss they follow from the
         residuals, as long as the points with positive weights determine a camera.
         """
-        # Rounding depends on the strides: use the same for all callers.
-        tracks = np.ascontiguousarray(tracks)
         fitted = partial(
-            self._search.fit_tracks, noise=self.noise_variance, covariances=covariances
+            self._search.fit_rows, noise=self.noise_variance, covariances=covariances
         )
         if self.loss == "linear":
             alone = None
-            if len(tracks) == 1 and weights is None:
-                alone = self._alone(tracks[0])
+            if len(rows) == 1 and weights is None:
+                alone = self._alone(rows[0])
             if alone is not None:
                 return alone
-            return fitted(tracks, weights=weights, starts=self.starts)
+            return fitted(rows, weights=weights, starts=self.starts)
         # Robust loss: first without gross outliers
-        weights = np.where(distant_points(tracks), 0.0, 1.0)
-        fit = fitted(tracks, weights=weights, starts=self.starts)
+        weights = np.where(distant_points(rows), 0.0, 1.0)
+        fit = fitted(rows, weights=weights, starts=self.starts)
         # If too few points remain, use the distant ones.
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
         if len(lost):
             weights[lost] = 1.0
-            fit.put(lost, fitted(tracks[lost], starts=self.starts))
-        sizes = robust_sizes(tracks)
+            fit.put(lost, fitted(rows[lost], starts=self.starts))
+        sizes = robust_sizes(rows)
         deviation = np.sqrt(self.noise_variance)
         changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
         # Then iteratively reweighted, for the frames whose weights still change
         for _ in range(50):
-            part = tracks[changing]
+            part = rows[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
             change = np.abs(new - weights[changing]).max(axis=1)
@@ -397,7 +399,7 @@ class PosteriorFrames:
             if not len(changing):
                 break
             refit = fitted(
-                tracks[changing], weights=weights[changing], initial=fit.alpha[changing]
+                rows[changing], weights=weights[changing], initial=fit.alpha[changing]
             )
             # If the model does not explain a frame, its weights can become so unequal
             # that they determine no camera. Such a frame keeps its fit.
@@ -407,13 +409,14 @@ class PosteriorFrames:
         return fit
 
     def _alone(self, points: NDArray) -> FramePosterior | None:
-        """Return the fit of a frame (J, 2), if it is complete and regular."""
+        """Return the fit of a frame (2, J), if it is complete and regular."""
         points = points.astype(np.float64, copy=False)
-        centre, space = points.mean(axis=0), self._search.space
+        centre, space = points.mean(axis=1), self._search.space
         if not np.isfinite(centre).all():
             return None
-        largest = largest_objective(len(points), self.noise_variance)
-        fit = self.single_search.fit((points - centre).T, self.noise_variance, largest)
+        largest = largest_objective(points.shape[1], self.noise_variance)
+        W = points - centre[:, None]
+        fit = self.single_search.fit(W, self.noise_variance, largest)
         if fit is None:
             return None
         motion, turns = fit.motion @ space, space.T @ fit.turns @ space

@@ -180,13 +180,13 @@ def seen_changes(cross: NDArray, T: NDArray, M: NDArray) -> NDArray:
     return F
 
 
-def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks:
-    """Return tracks (I, J, 2) with the frame index last, each frame centred.
+def frame_tracks(rows: NDArray, weights: NDArray | None = None) -> FrameTracks:
+    """Return rows (I, 2, J) with the frame index last, each frame centred.
 
     Weights (I, J) are non-negative, by default 1. Points of weight zero may be NaN.
     """
-    n_frames, n_points, _ = tracks.shape
-    centred = np.array(tracks.transpose(1, 2, 0), dtype=np.float64, order="C")
+    n_frames, _, n_points = rows.shape
+    centred = np.array(rows.T, dtype=np.float64, order="C")
     if weights is None:
         centroid = centred.mean(axis=0)
         centred -= centroid

@@ -43,12 +43,11 @@ def _sum_of_squares(values: NDArray) -> float:
 
 
 def distances(
-    tracks: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
+    rows: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> NDArray:
-    """Return distances (n, J) of points (n, J, 2) from a model, NaN if missing."""
-    stacked = shapes.transpose(0, 2, 1)
-    model = project(compose(stacked[0], stacked[1:], alpha), motion, position)
-    return np.linalg.norm(tracks - model, axis=2)
+    """Return distances (n, J) of points (n, 2, J) from a model, NaN if missing."""
+    images = motion @ compose(shapes[0], shapes[1:], alpha) + position[..., None]
+    return np.linalg.norm(rows - images, axis=1)
 
 
 def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
@@ -58,7 +57,7 @@ def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
 
 
 def compose(mean_shape: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
-    """Return the shapes of frames, ``B_0 + sum_k alpha_ik B_k`` (n, n_points, 3)."""
+    """Return the shapes of frames, ``B_0 + sum_k alpha_ik B_k`` (n, ...)."""
     return mean_shape + np.tensordot(alpha, basis, axes=1)
 
 

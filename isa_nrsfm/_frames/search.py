@@ -172,9 +172,9 @@ class FrameSearch:
     def __init__(self, shapes: NDArray, space: NDArray):
         self.shared, self.space = ShapeProducts(shapes), space
 
-    def fit_tracks(
+    def fit_rows(
         self,
-        tracks: NDArray,
+        rows: NDArray,
         noise: NDArray | float,
         *,
         weights: NDArray | None = None,
@@ -182,16 +182,15 @@ class FrameSearch:
         starts: NDArray | None = None,
         covariances: bool = True,
     ) -> FramePosterior:
-        """Fit tracks (I, J, 2), NaN where a point is missing, as `fit` does.
+        """Fit rows (I, 2, J), NaN where a point is missing, as `fit` does.
 
         The noise variance is at least 1e-13 of the energy. Weights (I, J) are 1 by
         default.
         """
-        tracks = np.asarray(tracks)
-        n_frames, n_components = len(tracks), len(self.shared.shapes) - 1
+        n_frames, n_components = len(rows), len(self.shared.shapes) - 1
         noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
         given = 1.0 if weights is None else weights
-        weights = np.where(seen_points(tracks), given, 0.0)
+        weights = np.where(seen_points(rows), given, 0.0)
         complete = (weights == 1.0).all(axis=1)
         fits = FramePosterior.unknown(n_frames, n_components, covariances)
         # Complete frames share one Gram matrix.
@@ -200,7 +199,7 @@ class FrameSearch:
                 frames = in_lanes(chosen)
                 own = None if complete[frames[0]] else weights[frames]
                 whole = len(chosen) == len(frames) == n_frames
-                part = tracks if whole else tracks[frames]
+                part = rows if whole else rows[frames]
                 fit = self.fit(
                     frame_tracks(part, own),
                     noise[frames],

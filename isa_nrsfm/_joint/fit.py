@@ -22,9 +22,8 @@ g_k is the share of the 3J numbers of B_k that the table determines rather than 
 prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,38 +43,29 @@ from isa_nrsfm._joint.starts import (
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 
 
-class Start(NamedTuple):
-    """Shapes and noise of a similar table from which a joint fit may start.
-
-    Basis shapes (K, 3, J) are as long as the standard deviation of their coefficients.
-    With `calibrated_first` a fit with calibrated cameras precedes that with affine
-    ones.
-    """
-
-    shapes: NDArray
-    noise_variance: float
-    calibrated_first: bool = False
-
-
 def fit_jointly(
     table: FactorisedTable,
     paper_shapes: NDArray,
     settings: JointSettings,
-    starts: Sequence[Start] = (),
+    start: JointState | None = None,
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
-    `paper_shapes` (K + 1, 3, J) are unused if `starts` are given. Returns the fit, the
-    fitted frames, and alpha (n_chosen, K) of the sample. Shapes are centred and mixed
-    such that alpha ~ N(0, I). The noise is corrected for degrees of freedom.
+    A fit from a given start uses only its shapes and noise, and of `paper_shapes` (K +
+    1, 3, J) only the shape. Returns the fit, the fitted frames, and alpha (n_chosen, K)
+    of the sample. Shapes are centred and mixed such that alpha ~ N(0, I). The noise is
+    corrected for degrees of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
     first, sampled, n_components = problems[0], len(problems) > 1, len(paper_shapes) - 1
     # Fit of the sample (of all frames if it is the table), and judgement of the model
-    if starts:
-        fit, start = _continued_fit(first, starts)
-    else:
+    if start is None:
         fit, start = _first_fit(first, table, paper_shapes)
+    else:
+        shapes = first.frames.coordinates(start.shapes)
+        start = first.aligned(start._replace(shapes=shapes))
+        fitted = _calibrated_fit if first.cameras.calibrated else JointProblem.refined
+        fit = fitted(first, start, first.cameras)
     ratio = fit.camera_noise_ratio
     levels = table.noise_level(n_components), table.missing_share(n_components)
     fit, least_noise, sufficient = judged(first, fit, start, *levels)
@@ -97,14 +87,16 @@ def fit_jointly(
     noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
     if table.outliers is not None:
         # This noise variance is corrected for the unknowns of the frames already.
-        fit, noise = reweighted(problem, table.rows, table.outliers, fit, least_noise)
+        fit, noise = reweighted(
+            problem, table.scaled.rows, table.outliers, fit, least_noise
+        )
         n_pose = 0
     shapes = problem.frames.points(fit.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
     if sampled:
         state = state._replace(motion=state.motion[table.parts[0]])
-    noise *= _freedom_correction(table.n_seen, shapes.shape, n_pose)
+    noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose)
     centred = shapes - shapes.mean(axis=2, keepdims=True)
     end = JointState(centred, fit.state.motion, max(noise, OF_DISTANCES**2))
     fit = fit._replace(state=end, camera_noise_ratio=ratio)
@@ -178,11 +170,11 @@ def _problems(
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         frames = JointFrames.from_directions(table.completed, directions)
-        complete = bool((table.n_seen == n_points).all())
-        if not complete or table.outliers is not None or table.weights is not None:
-            seen = _visible_frames(table, n_points)
+        every_point = table.scaled.complete and table.scaled.weights is None
+        if not every_point or table.outliers is not None:
+            seen = _visible_frames(table)
     else:
-        frames = _visible_frames(table, n_points)
+        frames = _visible_frames(table)
     thorough = frames.n_frames <= options.few_frames
     penalty = frames.basis_penalty(options.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
@@ -196,13 +188,14 @@ def _problems(
     return [*problems, problem], seen
 
 
-def _visible_frames(table: FactorisedTable, n_points: int) -> JointFrames:
+def _visible_frames(table: FactorisedTable) -> JointFrames:
     """Return the frames by their visible points, without outliers, weighted."""
-    if table.weights is not None:
-        return JointFrames.from_repeated(table.rows, table.weights)
+    rows, weights = table.scaled.rows, table.scaled.weights
+    if weights is not None:
+        return JointFrames.from_repeated(rows, weights)
     if table.outliers is not None and table.outliers.any():
-        return JointFrames.from_weighted(table.rows.derive(without, table.outliers))
-    return JointFrames.from_points(table.rows, bool((table.n_seen == n_points).all()))
+        return JointFrames.from_weighted(rows.derive(without, table.outliers))
+    return JointFrames.from_points(rows, table.scaled.complete)
 
 
 def _first_fit(
@@ -229,44 +222,6 @@ def _first_fit(
     if cameras.calibrated:
         return fit._replace(camera_noise_ratio=ratio), starts[0]
     return other._replace(camera_noise_ratio=ratio), rigid
-
-
-def _continued_fit(
-    problem: JointProblem, starts: Sequence[Start]
-) -> tuple[JointFit, JointState]:
-    """Return the fit from the best of given starts, and that start.
-
-    A later start is dropped if repeating the gain of its second half would not suffice
-    to catch up.
-    """
-    settings, cameras = problem.settings, problem.cameras
-    n_steps = min(settings.options.catching_up, settings.max_iter)
-    fitted = _calibrated_fit if cameras.calibrated else JointProblem.refined
-    fits: list[tuple[JointFit, JointState]] = []
-    for start in starts:
-        state = given = _aligned_start(problem, start)
-        if fits:
-            tried = problem.refined(state, max_iter=n_steps)
-            gained = tried.history[len(tried.history) // 2] - tried.value
-            if tried.value - min(fit.value for fit, _ in fits) > gained:
-                continue
-            state = tried.state
-        fits.append((fitted(problem, state, cameras), given))
-    return min(fits, key=lambda pair: pair[0].value)
-
-
-def _aligned_start(problem: JointProblem, start: Start) -> JointState:
-    """Return a given start with cameras, after calibrated ones if it asks for them."""
-    settings, calibrated = problem.settings, CAMERAS["weak_perspective"]
-    shapes = problem.frames.coordinates(start.shapes)
-    state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
-    if start.calibrated_first and not problem.cameras.calibrated:
-        # As many steps as starts of the search make
-        state = problem.aligned(state, calibrated)
-        steps = min(30, settings.max_iter)
-        fit = problem.refined(state, calibrated, max_iter=steps, tol=settings.tol)
-        state = fit.state
-    return problem.aligned(state)
 
 
 def _least(fits: Iterable[JointFit]) -> JointFit:

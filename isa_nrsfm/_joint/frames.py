@@ -22,7 +22,7 @@ WeightedRows = tuple[NDArray, NDArray]
 
 def without(rows: NDArray, left_out: NDArray) -> WeightedRows:
     """Return rows (n, 2, J), with weight zero for missing points and those left out."""
-    return rows, (seen_points(rows.transpose(0, 2, 1)) & ~left_out) * 1.0
+    return rows, (seen_points(rows) & ~left_out) * 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +67,12 @@ class JointFrames:
     @classmethod
     def from_weighted(cls, weighted: FrameBlocks) -> Self:
         """Return frames by points, from blocks of `WeightedRows`."""
-        return cls(weighted.derive(lambda block: _weighted_frames(*block)))
+        return cls(weighted.derive(lambda block: frame_tracks(*block)))
 
     @classmethod
     def from_repeated(cls, rows: FrameBlocks, weights: NDArray) -> Self:
         """Return frames by points, from rows (n, 2, J) and observations (I, J)."""
-        return cls(rows.derive(_weighted_frames, weights), repeated=True)
+        return cls(rows.derive(frame_tracks, weights), repeated=True)
 
     @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
@@ -108,15 +108,9 @@ def _totals(block: FrameTracks, repeated: bool) -> tuple[float, float]:
     return 2.0 * n_seen, block.energy.sum()
 
 
-def _weighted_frames(rows: NDArray, weights: NDArray) -> FrameTracks:
-    """Return frames of rows (n, 2, J) with weights (n, J)."""
-    return frame_tracks(rows.transpose(0, 2, 1), weights)
-
-
 def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:
     """Return frames of rows (n_frames, 2, n_points), missing points of weight zero."""
-    tracks = rows.transpose(0, 2, 1)
-    return frame_tracks(tracks, None if complete else seen_points(tracks) * 1.0)
+    return frame_tracks(rows, None if complete else seen_points(rows) * 1.0)
 
 
 def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:

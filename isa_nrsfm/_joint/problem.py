@@ -16,6 +16,7 @@ from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, MarginalLikelihood
 from isa_nrsfm._joint.quasi_newton import JointFit, JointState, refine_joint
 from isa_nrsfm._paper.factors import Factorisation
+from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 
 
@@ -46,9 +47,6 @@ class JointOptions(NamedTuple):
     # Convergence tolerance of compared starts, for each frame. The objectives of
     # different minima differ by tens per frame.
     compared_tol: float = 0.5
-    # Number of steps after which a further given start is dropped if it can no longer
-    # become the best
-    catching_up: int = 10
     # Frames with more points are represented by directions.
     many_points: int = 200
     # Threshold of a relevant basis shape, the share of its numbers that the table
@@ -63,28 +61,23 @@ JOINT_OPTIONS = JointOptions()
 class FactorisedTable(NamedTuple):
     """A table that is ready for a fit.
 
-    rows: centred frames (I, 2, J) of size one, NaN where a point is missing.
-    completed: the same with missing points and outliers filled in.
-    n_seen (I,): number of visible points.
+    completed: its frames (I, 2, J) with missing points and outliers filled in.
     outliers (I, J): points that a robust loss leaves out at first; None for other
     losses.
     singular_values (3 K + 3,): the largest ones of the completed table, decreasing.
     rest: sum of the squares of the other ones.
     W, parts, factors: matrix of a first sample, growing samples (`sample_frames`), and
     factors of the matrix.
-    weights (I, J): numbers of observations of the points; None where each has one.
     """
 
-    rows: FrameBlocks
+    scaled: ScaledTable
     completed: FrameBlocks
-    n_seen: NDArray
     outliers: NDArray | None
     singular_values: NDArray
     rest: float
     W: NDArray
     parts: list[NDArray]
     factors: Factorisation
-    weights: NDArray | None = None
 
     @property
     def rest_share(self) -> float:
@@ -98,7 +91,7 @@ class FactorisedTable(NamedTuple):
         "Probabilistic principal component analysis", 1999, eq. 8).
         """
         # Mean energy of the dimensions beyond, over that of all seen - 1 dimensions
-        seen = float(np.mean(self.n_seen))
+        seen = float(np.mean(self.scaled.n_seen))
         n_others = seen - 1 - (3 * n_components + 3)
         noise = self.rest_share * (seen - 1) / n_others if n_others > 0 else 0.0
         # Points that were filled in add to the energy of the table, but have no noise.

@@ -33,7 +33,7 @@ def reweighted(
     residuals, corrected for the degrees of freedom.
     """
     cameras, loss = problem.cameras, problem.settings.loss
-    sizes = rows.joined(lambda block: robust_sizes(block.transpose(0, 2, 1)))
+    sizes = rows.joined(robust_sizes)
     weighted = rows.derive(without, left_out)
     # Estimate the noise from the residuals of at most about 2,000 frames.
     few = representative_frames(rows, 2000)
@@ -45,7 +45,7 @@ def reweighted(
         position = weighted.joined(partial(_positions, shapes=shapes), motion, alpha)
         model = motion, position, alpha, sizes
         M, t, a, few_sizes = (part[few] for part in model)
-        distance = distances(few_rows.transpose(0, 2, 1), shapes, M, t, a)
+        distance = distances(few_rows, shapes, M, t, a)
         distance /= residual_deviations(M, a, shapes, weights, variance, cameras)
         deviation = max(median_noise(distance[np.isfinite(distance)]), OF_DISTANCES)
         # Weights from the residuals, and convergence test
@@ -119,7 +119,7 @@ def _weighted(
 ) -> WeightedRows:
     """Return frames (n, 2, J) with the weights of their residuals from a fit."""
     *model, sizes = fit
-    distance = distances(rows.transpose(0, 2, 1), shapes, *model)
+    distance = distances(rows, shapes, *model)
     return rows, frame_weights(loss, distance, deviation, sizes)
 
 

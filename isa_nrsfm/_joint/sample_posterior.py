@@ -16,16 +16,18 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 # With a robust loss, points with residuals above this threshold, in standard deviations
 # of a coordinate, are left out. Without outliers this is one point in 3,000.
 OUTLYING = 4.0
+# Directions of the coefficients with a lower reliability are not supported by the
+# table. Pure noise has reliability zero.
+LEAST_RELIABILITY = 0.1
 
 
 def inlying_rows(
     model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
 ) -> tuple[NDArray, FramePosterior]:
     """Return frames (n, 2, J) of size one with outliers as NaN, and their fit."""
-    tracks = rows.transpose(0, 2, 1)
-    found = model.posterior(tracks, covariances=False, weights=weights)
+    found = model.posterior(rows, covariances=False, weights=weights)
     if model.loss != "linear":
-        off = distances(tracks, model.shapes, *found[:3])
+        off = distances(rows, model.shapes, *found[:3])
         outlying = off > OUTLYING * np.sqrt(model.noise_variance)
         rows = np.where(outlying[:, None], np.nan, rows)
     return rows, found
@@ -36,7 +38,7 @@ def posterior_blocks(
 ) -> FrameBlocks:
     """Return the fits of all frames in blocks of FramePosterior, before the gauge."""
     if model.loss != "linear":
-        return rows.derive(lambda block: model.posterior(block.transpose(0, 2, 1)))
+        return rows.derive(model.posterior)
     shapes = frames.coordinates(model.shapes)
     return frames.blocks.derive(replace(model, shapes=shapes).prepared_posterior)
 
@@ -98,3 +100,47 @@ def shown_frames(
     own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
     shift = np.einsum("i,ikl,il->ik", weight * noise, posterior.covariance, own)
     return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
+
+
+def reliabilities(
+    alpha: NDArray, covariance: NDArray, moments: NDArray, noise: float
+) -> NDArray:
+    """
+    Return the shares of the variance of coefficients that are signal.
+
+    These are squared correlations (K,) of the coefficients alpha (I, K) with the true
+    ones, along uncorrelated directions, decreasing. The covariance is the mean
+    posterior one; moments and noise are sums over the blocks of `shown_frames`.
+
+    With known shapes they are the eigenvalues of ``(S + C)^-1 S``, with S the second
+    moment of the coefficients and C the mean covariance: ``S + C`` is the whole
+    variance. Estimated shapes follow the noise. A shape of ``gamma`` numbers a frame
+    raises the variance along it from ``1 + l`` to ``y = (1 + l) (1 + gamma / l)`` noise
+    variances, and noise alone to ``(1 + sqrt(gamma))^2``. The squared correlation is
+    ``(l^2 - gamma) / (l (l + 1))`` (Benaych-Georges, Nadakuditi, "The singular values
+    and vectors of low rank perturbations of large rectangular random matrices", 2012).
+    Here ``y = 1 / (1 - share)``; gamma is y times the share of S that is chance.
+    """
+    known = alpha / np.sqrt(len(alpha))  # known.T @ known is S
+    variance, axes = np.linalg.eigh(known.T @ known + covariance)
+    kept = variance > 1e-14 * variance[-1]  # others are rounding errors
+    white = axes[:, kept] / np.sqrt(variance[kept])
+    # Squared singular values are the eigenvalues, with less rounding error.
+    _, deviations, turn = np.linalg.svd(known @ white, full_matrices=False)
+    own = white @ turn.T
+    share = deviations**2
+    left = np.einsum("kd,kl,ld->d", own, covariance, own)  # 1 / y
+    caused = np.einsum("kd,kl,ld->d", own, moments, own) / (noise or 1.0)
+    # The factor is a margin for chance. With it all reliabilities are zero on tables of
+    # rigid objects (60 to 1,000 frames, 68 to 478 points, one to four basis shapes).
+    # Without it some are 0.9 (``python -m benchmarks.recovery rigid``).
+    gamma = 1.5 * np.maximum(caused, 0.0)  # gamma share / y
+    gamma = np.divide(gamma, share, where=share > 0, out=np.ones_like(share))
+    rest = share - gamma
+    found = (rest > 0) & (rest**2 > 4 * gamma * left)
+    rest, gamma, left = rest[found], gamma[found], left[found]
+    signal = (rest + np.sqrt(rest**2 - 4 * gamma * left)) / 2  # l / y
+    correlation = (signal**2 - gamma * left) / (signal * (signal + left))
+    shares = np.zeros(len(kept))
+    shares[: len(signal)] = np.sort(correlation)[::-1]
+    return shares

@@ -11,7 +11,6 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.column_names import names_layout, parse_coordinate
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
@@ -20,8 +19,11 @@ from isa_nrsfm._tables.tracks import (
     centred_frames,
     describe_point,
     seen_points,
-    table_to_tracks,
+    table_to_rows,
+    tracks_to_table,
+    without_half_points,
 )
+from isa_nrsfm.skeletons._column_names import names_layout, parse_coordinate
 
 # With fewer frames or points than this the layouts are not compared.
 FEWEST_COMPARED = 10
@@ -168,9 +170,9 @@ def check_size(
         )
 
 
-def visible_points(tracks: NDArray) -> NDArray:
-    """Return a mask of visible points of tracks (I, J, 2), eight points in a byte."""
-    return np.packbits(seen_points(tracks), axis=1)
+def visible_points(rows: NDArray) -> NDArray:
+    """Return a mask of visible points of rows (I, 2, J), eight points in a byte."""
+    return np.packbits(seen_points(rows), axis=1)
 
 
 def check_points(
@@ -237,26 +239,27 @@ def _groups(seen: NDArray) -> NDArray:
 
 
 def warn_if_other_layout(
-    rows: FrameBlocks, n_columns: int, layout: Layout, scale_frames: bool
+    rows: FrameBlocks, n_points: int, layout: Layout, scale_frames: bool
 ) -> None:
     """Warn if a rigid object fits the other column layout much better.
 
     Compares mean squares, not shares of the total energy. The wrong layout mixes x and
     y, and a rigid object explains the energy of their offset.
     """
-    if min(rows.n_frames, n_columns // 2) < FEWEST_COMPARED:
+    if min(rows.n_frames, n_points) < FEWEST_COMPARED:
         return
     # Some frames, evenly spread
-    enough = max(min(1000, 2_000_000 // n_columns), 100)
-    sample = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
+    enough = max(min(1000, 1_000_000 // n_points), 100)
+    given = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
     other = next(name for name in LAYOUTS if name != layout)
-    both = [table_to_tracks(sample, name) for name in (layout, other)]
+    X = tracks_to_table(given.transpose(0, 2, 1), layout)
+    both = [given, without_half_points(table_to_rows(X, other))[0]]
     # Points that few frames show are left out first, then frames that show few points
     # in one of the layouts.
-    both = [t[:, seen_points(t).sum(axis=0) >= FEWEST_POINTS] for t in both]
-    n_seen = np.min([seen_points(t).sum(axis=1) for t in both], axis=0)
-    both = [tracks[n_seen >= FEWEST_POINTS] for tracks in both]
-    if min(min(tracks.shape[:2]) for tracks in both) < FEWEST_COMPARED:
+    both = [r[:, :, seen_points(r).sum(axis=0) >= FEWEST_POINTS] for r in both]
+    n_seen = np.min([seen_points(r).sum(axis=1) for r in both], axis=0)
+    both = [r[n_seen >= FEWEST_POINTS] for r in both]
+    if min(min(len(r), r.shape[2]) for r in both) < FEWEST_COMPARED:
         return
     centred, reports = zip(*map(centred_frames, both), strict=True)
     # The size of a frame is the smaller of both layouts, that of the right one.
@@ -265,20 +268,19 @@ def warn_if_other_layout(
         squares = [np.mean(report.size**2) for report in reports]
         sizes = np.full_like(sizes, np.sqrt(min(squares)))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    given, swapped = (_rigid_noise(tracks, sizes) for tracks in centred)
+    noise, swapped = (_rigid_noise(each / sizes[:, None, None]) for each in centred)
     # On real tables the right layout leaves 0.04 to 0.5 of the energy of the other.
-    if given > OF_DIFFERENCES and swapped < 0.6 * given:
+    if noise > OF_DIFFERENCES and swapped < 0.6 * noise:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
-            f"its non-rigid part has {swapped / given:.2g} times the energy"
+            f"its non-rigid part has {swapped / noise:.2g} times the energy"
         )
 
 
-def _rigid_noise(centred: NDArray, sizes: NDArray) -> float:
-    """Return the noise variance of a rigid fit to tracks (I, J, 2) over sizes."""
-    rows = (centred / sizes[:, None, None]).transpose(0, 2, 1)
+def _rigid_noise(rows: NDArray) -> float:
+    """Return the noise variance of a rigid fit to centred rows (I, 2, J)."""
     if np.isfinite(rows).all():
         W = rows.reshape(-1, rows.shape[2])
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
         return max(float(energy[:-3].sum()), 0.0) / W.size
-    return completion_model(np.ascontiguousarray(rows), rank=3).noise
+    return completion_model(rows, rank=3).noise

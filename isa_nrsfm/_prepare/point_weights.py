@@ -1,6 +1,5 @@
 """Weights of points: numbers of observations, zero where points are missing."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,31 +8,23 @@ from sklearn.utils import check_array
 
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import unmasked
-from isa_nrsfm._tables.tracks import (
-    Layout,
-    refuse_odd,
-    seen_points,
-    table_to_tracks,
-    tracks_to_table,
-)
+from isa_nrsfm._tables.tracks import seen_points
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
 LARGEST_WEIGHT = 1e100
 
 
-def weighted_table(
-    table: FrameBlocks, point_weight: Any, layout: Layout
+def weighted_rows(
+    rows: FrameBlocks, point_weight: Any
 ) -> tuple[FrameBlocks, NDArray | None]:
-    """Return a table with NaN for points of weight zero, and the weights (n, J).
+    """Return rows (n, 2, J) with NaN for points of weight zero, and the weights (n, J).
 
     Weights of missing points are zero. None if all visible points have weight one.
     """
-    n_columns = table.empty.shape[1]
-    refuse_odd(n_columns)
-    weights = checked_weights(point_weight, (table.n_frames, n_columns // 2))
-    visible = table.derive(partial(_visible_rows, layout=layout), weights)
-    visible.empty = table.empty
-    seen = visible.joined(lambda rows: seen_points(table_to_tracks(rows, layout)))
+    weights = checked_weights(point_weight, (rows.n_frames, rows.empty.shape[2]))
+    visible = rows.derive(_visible_rows, weights)
+    visible.empty = rows.empty
+    seen = visible.joined(seen_points)
     weights = np.where(seen, weights, 0.0)
     return visible, None if (weights == seen).all() else weights
 
@@ -63,14 +54,9 @@ def checked_weights(point_weight: Any, shape: tuple[int, int]) -> NDArray:
     return weights
 
 
-def _visible_rows(rows: NDArray, weights: NDArray, layout: Layout) -> NDArray:
-    """Return rows of a table with NaN for points whose weight (n, J) is zero."""
-    hidden = weights == 0
-    if not hidden.any():
-        return rows
-    tracks = table_to_tracks(rows, layout)
-    nan = rows.dtype.type(np.nan)
-    return tracks_to_table(np.where(hidden[..., None], nan, tracks), layout)
+def _visible_rows(rows: NDArray, weights: NDArray) -> NDArray:
+    """Return rows (n, 2, J) with NaN for points whose weight (n, J) is zero."""
+    return np.where(weights[:, None] == 0, rows.dtype.type(np.nan), rows)
 
 
 def check_weights(weights: NDArray, n_components: int, camera: str | None) -> None:

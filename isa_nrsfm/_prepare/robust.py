@@ -50,14 +50,14 @@ def median_noise(distance: NDArray) -> float:
     return float(np.median(distance) / MEDIAN_DISTANCE)
 
 
-def distant_points(tracks: NDArray) -> NDArray:
-    """Return a mask (I, J) of points of tracks (I, J, 2) far from their frame."""
-    square = _squares(tracks)
+def distant_points(rows: NDArray) -> NDArray:
+    """Return a mask (I, J) of points of rows (I, 2, J) far from their frame."""
+    square = _squares(rows)
     return np.sqrt(square) > DISTANT * _sizes(square)[:, None]
 
 
 def robust_sizes(centred: NDArray) -> NDArray:
-    """Return sizes (I,) of frames (I, J, 2), robust against outliers.
+    """Return sizes (I,) of rows (I, 2, J), robust against outliers.
 
     The root of half the median squared distance of the visible points from their
     `spatial_median`. If half of them coincide, the RMS.
@@ -65,18 +65,16 @@ def robust_sizes(centred: NDArray) -> NDArray:
     return _sizes(_squares(centred))
 
 
-def robustly_centred(tracks: NDArray) -> tuple[NDArray, NDArray]:
-    """Return tracks (I, J, 2) as doubles minus their spatial medians, and these."""
-    # Keep the memory order, so that sums are the same to the last bit.
-    tracks = np.ascontiguousarray(tracks, dtype=np.float64)
-    middle = spatial_median(tracks)
-    return tracks - middle[:, None], middle
+def robustly_centred(rows: NDArray) -> tuple[NDArray, NDArray]:
+    """Return rows (I, 2, J) as doubles minus their spatial medians, and these."""
+    rows = rows.astype(np.float64, copy=False)
+    middle = spatial_median(rows)
+    return rows - middle[..., None], middle
 
 
-def _squares(tracks: NDArray) -> NDArray:
-    """Return squared distances (I, J) of points (I, J, 2) from their frame's median."""
-    tracks = np.ascontiguousarray(tracks)  # strides change the order of sums
-    return np.sum((tracks - spatial_median(tracks)[:, None]) ** 2, axis=2)
+def _squares(rows: NDArray) -> NDArray:
+    """Return squared distances (I, J) of points from the spatial median of rows."""
+    return np.sum((rows - spatial_median(rows)[..., None]) ** 2, axis=1)
 
 
 def _sizes(square: NDArray) -> NDArray:
@@ -87,14 +85,15 @@ def _sizes(square: NDArray) -> NDArray:
     return np.sqrt(np.where(median > OF_DISTANCES * upper, median, mean) / 2)
 
 
-def spatial_median(tracks: NDArray) -> NDArray:
-    """Return spatial medians (I, 2) of tracks (I, J, 2), of least sum of distances.
+def spatial_median(rows: NDArray) -> NDArray:
+    """Return spatial medians (I, 2) of rows (I, 2, J), of least sum of distances.
 
     A fixed number of steps of Weiszfeld (1937), from the mean of the `_nearest_half`.
     Unlike the medians of x and y it does not depend on the axes of the image.
     """
-    seen = seen_points(tracks)
-    points = np.where(seen[..., None], tracks, 0.0)
+    seen = seen_points(rows)
+    # Points (I, J, 2) in memory: x and y are summed in the order of the points.
+    points = np.nan_to_num(np.ascontiguousarray(rows.transpose(0, 2, 1)))
     half: NDArray = seen * 1.0
     for _ in range(5):
         half, distance, _ = _nearest_half(points, half, seen)
@@ -155,21 +154,21 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
     target, hidden = _start_of_hiding(rows)
     seen = seen_points(target)
-    filled = np.where(hidden[..., None], 0.0, target)
+    filled = np.where(hidden[:, None], 0.0, target)
     for _ in range(100):
-        # Rigid factorisation, rank 3, of the filled tracks
-        centred = filled - filled.mean(axis=1, keepdims=True)
-        W = centred.transpose(0, 2, 1).reshape(-1, rows.shape[2])
+        # Rigid factorisation, rank 3, of the filled rows
+        centred = filled - filled.mean(axis=2, keepdims=True)
+        W = centred.reshape(-1, rows.shape[2])
         axes = np.linalg.eigh(W.T @ W)[1][:, -3:]
         rigid = _rigid_part(target, ~hidden, axes)
         # Typical distances, of the table and of each point
-        distance = np.linalg.norm(target - rigid, axis=2)
+        distance = np.linalg.norm(target - rigid, axis=1)
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
         of_point = np.nanmedian(distance, axis=0) / MEDIAN_DISTANCE
         limit = 4.5 * np.maximum(typical, of_point)
         # Hide points that are too far, and fill them in
         previous, hidden = hidden, ~(distance <= limit)
-        before, filled = filled, np.where(hidden[..., None], rigid, target)
+        before, filled = filled, np.where(hidden[:, None], rigid, target)
         moved = np.abs(filled - before).max()
         if (hidden == previous).all() and moved <= 0.01 * typical:
             break
@@ -182,7 +181,7 @@ def _far_points(rows: NDArray, axes: NDArray, limit: NDArray) -> NDArray:
     for _ in range(100):  # a frame that is settled stays as it is
         rigid = _rigid_part(target, ~hidden, axes)
         previous = hidden
-        hidden = ~(np.linalg.norm(target - rigid, axis=2) <= limit)
+        hidden = ~(np.linalg.norm(target - rigid, axis=1) <= limit)
         if (hidden == previous).all():
             break
     return hidden
@@ -190,24 +189,22 @@ def _far_points(rows: NDArray, axes: NDArray, limit: NDArray) -> NDArray:
 
 def _unless_many(rows: NDArray, hidden: NDArray) -> NDArray:
     """Return the seen ones of hidden points (n, J); none if a frame has too many."""
-    seen = ~np.isnan(rows[:, 0])
+    seen = seen_points(rows)
     gross = hidden & seen
     few = gross.sum(axis=1) <= 0.4 * seen.sum(axis=1)
     return gross & few[:, None]
 
 
 def _start_of_hiding(rows: NDArray) -> tuple[NDArray, NDArray]:
-    """Return frames as tracks (I, J, 2) from their medians, and points hidden first."""
-    tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
-    hidden = ~seen_points(tracks) | distant_points(tracks)
-    return tracks - spatial_median(tracks)[:, None], hidden
+    """Return rows (I, 2, J) from their medians, and points (I, J) hidden first."""
+    hidden = ~seen_points(rows) | distant_points(rows)
+    return rows - spatial_median(rows)[..., None], hidden
 
 
 def _rigid_part(target: NDArray, kept: NDArray, axes: NDArray) -> NDArray:
-    """Return the rigid parts of tracks (n, J, 2): axes (J, 3) fitted to kept points."""
+    """Return the rigid parts of rows (n, 2, J): axes (J, 3) fitted to kept points."""
     design = np.column_stack([axes, np.full(len(axes), len(axes) ** -0.5)])
     pairs = (design[:, :, None] * design[:, None]).reshape(len(axes), -1)
     moments = (kept.astype(float) @ pairs).reshape(-1, 4, 4)
-    inner = design.T @ np.where(kept[..., None], target, 0.0)
-    found: NDArray = design @ (np.linalg.pinv(moments, OF_DISTANCES, True) @ inner)
-    return found
+    inner = np.where(kept[:, None], target, 0.0) @ design
+    return np.asarray(inner @ np.linalg.pinv(moments, OF_DISTANCES, True) @ design.T)

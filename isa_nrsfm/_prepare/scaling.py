@@ -21,11 +21,7 @@ from isa_nrsfm._tables.tracks import (
     Layout,
     centred_frames,
     check_frames,
-    refuse_odd,
-    table_to_tracks,
-    warn_of_half_points,
     weighted_sizes,
-    without_half_points,
 )
 
 
@@ -33,7 +29,7 @@ class ScaledTable(NamedTuple):
     """A table made ready for the fit.
 
     shown (n_rows,): mask of the rows that show any point, the frames.
-    source: these rows before centring and scaling.
+    source: their rows before centring and scaling.
     rows: blocks (I, 2, J) of centred frames of size one, NaN where not seen.
     sizes, n_seen (I,): divisors of the frames, and their numbers of visible points.
     translation (I, 2): centroids of visible points, or medians with a robust loss.
@@ -91,19 +87,15 @@ def scaled_table(
     camera: str | None = None,
     weights: NDArray | None = None,
 ) -> ScaledTable:
-    """Check a table, centre and scale its frames, robustly if `robust`.
+    """Check an opened table, centre and scale its frames, robustly if `robust`.
 
     Weights (n_rows, J) are zero where points are missing, None where all are one.
     """
-    n_columns, dtype = blocks.empty.shape[1], blocks.empty.dtype
-    n_points = n_columns // 2
-    refuse_odd(n_columns)
+    n_points, dtype = blocks.empty.shape[2], blocks.empty.dtype
     check_size(blocks.n_frames, n_points, n_components, camera)
-    examined = blocks.map(partial(_examine, layout=layout, robust=robust))
-    parts = map(np.concatenate, zip(*examined, strict=True))
-    n_half, first, visible, largest, *rest = parts
+    examined = blocks.map(partial(_examine, robust=robust))
+    visible, largest, *rest = map(np.concatenate, zip(*examined, strict=True))
     report = FrameReport(*rest)
-    warn_of_half_points(n_half, first, layout, names)
     check_frames(report, n_points)
     shown = report.n_seen > 0
     if not shown.all():
@@ -124,10 +116,10 @@ def scaled_table(
     check_points(visible, n_points, n_components, layout, names)
     if weights is not None:
         check_weights(weights, n_components, camera)
-    warn_if_other_layout(blocks, n_columns, layout, scale_frames)
+    warn_if_other_layout(blocks, n_points, layout, scale_frames)
     translation, size, n_seen = report[:3]
     if weights is not None:
-        size = blocks.joined(partial(_weighted_sizes, layout=layout), weights)
+        size = blocks.joined(_weighted_sizes, weights)
     if robust:
         # Outliers must not reduce the precision of other points.
         reach = np.abs(translation).max(axis=1) + DISTANT * size
@@ -138,9 +130,7 @@ def scaled_table(
     # the SVD. With fewer points matrix products are so small that it saves nothing.
     complete = bool((n_seen == n_points).all())
     single = dtype == np.float32 and n_points >= 200 and complete and not robust
-    unit_rows = partial(
-        _unit_rows, layout=layout, dtype=np.float32 if single else np.float64
-    )
+    unit_rows = partial(_unit_rows, dtype=np.float32 if single else np.float64)
     spacing = np.finfo(dtype).eps * largest.astype(np.float64)
     return ScaledTable(
         shown,
@@ -157,34 +147,30 @@ def scaled_table(
     )
 
 
-def _examine(rows: NDArray, layout: Layout, robust: bool) -> tuple[NDArray, ...]:
-    """Return half points, visible points, magnitudes and reports of some rows."""
-    tracks, n_half, first = without_half_points(table_to_tracks(rows, layout))
-    _, report = centred_frames(tracks)
+def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
+    """Return visible points, magnitudes and reports of rows (n, 2, J)."""
+    _, report = centred_frames(rows)
     shown = report.n_seen > 0
     if robust and shown.any():
         # Outliers must not shift the other points.
-        centred, report.translation[shown] = robustly_centred(tracks[shown])
+        centred, report.translation[shown] = robustly_centred(rows[shown])
         report.size[shown] = robust_sizes(centred)
-    largest = np.fmax.reduce(np.abs(tracks), axis=(1, 2), initial=0.0)
-    return n_half, first, visible_points(tracks), largest, *report
+    largest = np.fmax.reduce(np.abs(rows), axis=(1, 2), initial=0.0)
+    return visible_points(rows), largest, *report
 
 
-def _weighted_sizes(rows: NDArray, weights: NDArray, layout: Layout) -> NDArray:
-    """Return the sizes (n,) of rows of a table with weights (n, J)."""
-    tracks, *_ = without_half_points(table_to_tracks(rows, layout))
-    return weighted_sizes(centred_frames(tracks)[0], weights)
+def _weighted_sizes(rows: NDArray, weights: NDArray) -> NDArray:
+    """Return the sizes (n,) of rows (n, 2, J) with weights (n, J)."""
+    centred, report = centred_frames(rows)
+    return weighted_sizes(centred, weights, report.size)
 
 
 def _unit_rows(
-    rows: NDArray, translation: NDArray, sizes: NDArray, layout: Layout, dtype: Any
+    rows: NDArray, translation: NDArray, sizes: NDArray, dtype: Any
 ) -> NDArray:
-    """Return rows (n, 2 * n_points) of a table as centred frames of size one."""
-    tracks, *_ = without_half_points(table_to_tracks(rows, layout))
-    centred = np.array(tracks.transpose(0, 2, 1), dtype=np.float64, order="C")
-    centred -= translation[:, :, None]
-    centred /= sizes[:, None, None]
-    return centred.astype(dtype, copy=False)
+    """Return rows (n, 2, J) centred and of size one."""
+    unit = (rows - translation[:, :, None]) / sizes[:, None, None]
+    return unit.astype(dtype, copy=False)
 
 
 def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:

@@ -1,6 +1,7 @@
 """Sources of a table: an array, or an object that is read block by block."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,15 @@ from sklearn import get_config
 from sklearn.utils import check_array
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks
+from isa_nrsfm._tables.tracks import (
+    Layout,
+    refuse_odd,
+    table_to_rows,
+    warn_of_half_points,
+    without_half_points,
+)
 
 # Range of the coordinates of a frame: squares beyond it leave the range of double
 # precision. Fits at both ends agree with fits of sizes about one.
@@ -23,9 +32,18 @@ CHECKS: dict[str, Any] = {
 
 
 def open_table(
-    X: Any, n_jobs: int | None = 1, working_memory: float | None = None
+    X: Any,
+    layout: Layout,
+    names: NDArray | None = None,
+    *,
+    counted: bool = True,
+    n_jobs: int | None = 1,
+    working_memory: float | None = None,
 ) -> FrameBlocks:
-    """Return a table (n_frames, 2 * n_points) in blocks of float32 or float64 rows.
+    """Return a table in blocks of rows (n, 2, n_points), float32 or float64.
+
+    Points with one coordinate become missing, with a warning. Of tables that are read
+    later it counts them only if they are `counted`, which reads the table once.
 
     Arrays in memory must be checked already. `n_jobs` threads share their blocks and
     those of memory maps. Chunks of dask stay on its workers. Blocks of tables that are
@@ -36,12 +54,21 @@ def open_table(
             f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
             "per frame and two columns per point"
         )
+    refuse_odd(X.shape[1])
     n_columns = max(X.shape[1], 1)
     # Blocks large enough that products of matrices are fast
     length, n_threads = max(2**21 // n_columns, 1), effective_n_jobs(n_jobs)
+    dtype = np.float32 if X.dtype == np.float32 else np.float64
+    empty = np.empty((0, 2, X.shape[1] // 2), dtype)
+    if not is_read_later(X):
+        rows, n_half, first = without_half_points(table_to_rows(X, layout))
+        warn_of_half_points(n_half, first, layout, names)
+        blocks = FrameBlocks.of_array(rows, min(length, 2048), n_threads)
+        blocks.empty = empty
+        return blocks
     if is_on_dask(X):
-        blocks: FrameBlocks = DaskBlocks.of_chunks(X).derive(checked_rows)
-    elif is_read_later(X):
+        blocks = DaskBlocks.of_chunks(X)
+    else:
         if working_memory is None:
             working_memory = get_config()["working_memory"]
         # A block needs at most eight times its own memory, copies included.
@@ -51,12 +78,28 @@ def open_table(
             blocks = FrameBlocks.of_stored(X, min(most, length), n_threads)
         else:  # row groups of parquet files are read whole for each block
             blocks = FrameBlocks.of_stored(X, most)
-        blocks = blocks.derive(checked_rows)
-    else:
-        blocks = FrameBlocks.of_array(X, min(length, 2048), n_threads)
-    dtype = np.float32 if X.dtype == np.float32 else np.float64
-    blocks.empty = np.empty((0, X.shape[1]), dtype)
+    if counted and blocks.n_frames:
+        half = zip(*blocks.map(partial(_half_points, layout=layout)), strict=True)
+        n_half, first = map(np.concatenate, half)
+        warn_of_half_points(n_half, first, layout, names)
+    blocks = blocks.derive(partial(_rows, layout=layout, warn=not counted))
+    blocks.empty = empty
     return blocks
+
+
+def _half_points(X: Any, layout: Layout) -> tuple[NDArray, NDArray]:
+    """Return how many points of each row have one coordinate, and the first of them."""
+    return without_half_points(table_to_rows(checked_rows(X), layout))[1:]
+
+
+def _rows(X: Any, layout: Layout, warn: bool) -> NDArray:
+    """Return the rows (n, 2, n_points) of a block; warn without row numbers."""
+    rows, n_half, _ = without_half_points(table_to_rows(checked_rows(X), layout))
+    if warn and n_half.any():
+        warn_caller(
+            "some points have only one of their two coordinates. They count as missing"
+        )
+    return rows
 
 
 def is_read_later(X: Any) -> bool:

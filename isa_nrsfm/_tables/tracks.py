@@ -1,8 +1,10 @@
-"""Tables of landmarks, their tracks, and the visible points of frames.
+"""The forms of a table of landmarks, and the visible points of its frames.
 
 A *table* has one row per frame and two columns per point, shape ``(n_frames,
-2 * n_points)``, in either layout of the columns. *Tracks* are the same numbers as
-``(n_frames, n_points, 2)``. A point that is not seen in a frame is NaN.
+2 * n_points)``, in either layout of the columns. `open_table` turns it into *rows*
+``(n_frames, 2, n_points)``, the form of all stages: a point that is not seen in a
+frame has NaN in both. *Tracks* ``(n_frames, n_points, 2)`` are the form of public
+results.
 """
 
 from typing import Literal, NamedTuple, Self
@@ -47,17 +49,22 @@ def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
     return tracks.reshape(n_frames, 2 * n_points)
 
 
-def without_half_points(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Hide points with one coordinate; return tracks (I, J, 2), counts, first ones."""
-    none = np.zeros(len(tracks), dtype=int)
-    if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
-        return tracks, none, none
-    missing = np.isnan(tracks)
-    half = missing[..., 0] != missing[..., 1]
+def table_to_rows(X: NDArray, layout: Layout) -> NDArray:
+    """Return the rows (n_frames, 2, n_points) of a table, contiguous."""
+    return np.ascontiguousarray(table_to_tracks(X, layout).transpose(0, 2, 1))
+
+
+def without_half_points(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Hide points with one coordinate; return rows (I, 2, J), counts, first ones."""
+    none = np.zeros(len(rows), dtype=int)
+    if not np.isnan(rows.sum()):  # one NaN makes the sum NaN: a fast test
+        return rows, none, none
+    missing = np.isnan(rows)
+    half = missing[:, 0] != missing[:, 1]
     if not half.any():
-        return tracks, none, none
-    tracks = np.where(half[..., None], tracks.dtype.type(np.nan), tracks)
-    return tracks, half.sum(axis=1), half.argmax(axis=1)
+        return rows, none, none
+    rows = np.where(half[:, None], rows.dtype.type(np.nan), rows)
+    return rows, half.sum(axis=1), half.argmax(axis=1)
 
 
 def warn_of_half_points(
@@ -79,9 +86,9 @@ def clean_tracks(
     tracks: NDArray, layout: Layout = "interleaved", names: NDArray | None = None
 ) -> NDArray:
     """Return tracks (I, J, 2) without points that have one coordinate; warn of them."""
-    tracks, n_half, first = without_half_points(tracks)
+    rows, n_half, first = without_half_points(tracks.transpose(0, 2, 1))
     warn_of_half_points(n_half, first, layout, names)
-    return tracks
+    return rows.transpose(0, 2, 1)
 
 
 def describe_point(point: int, layout: Layout, names: NDArray | None) -> str:
@@ -125,12 +132,9 @@ class FrameReport(NamedTuple):
         return type(self)(*(part[frames] for part in self))
 
 
-def seen_points(tracks: NDArray) -> NDArray:
-    """Return which points (I, J) of tracks (I, J, 2) have both coordinates."""
-    if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
-        return np.ones(tracks.shape[:2], dtype=bool)
-    missing = np.isnan(tracks)
-    return ~(missing[..., 0] | missing[..., 1])
+def seen_points(rows: NDArray) -> NDArray:
+    """Return which points (I, J) of rows (I, 2, J) are seen."""
+    return ~np.isnan(rows[:, 0])
 
 
 def of_all_rows(values: NDArray, shown: NDArray) -> NDArray:
@@ -142,34 +146,33 @@ def of_all_rows(values: NDArray, shown: NDArray) -> NDArray:
     return all_rows
 
 
-def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
-    """Return frames (I, J, 2) centred over their visible points in double precision."""
+def centred_frames(rows: NDArray) -> tuple[NDArray, FrameReport]:
+    """Return rows (I, 2, J) centred over their visible points in double precision."""
     # Coordinates are equal up to four units in the last place of the largest one.
-    eps = 4 * np.finfo(tracks.dtype).eps
-    # Keep the memory order, so that sums are the same to the last bit.
-    tracks = np.ascontiguousarray(tracks, dtype=np.float64)
-    seen = seen_points(tracks)
-    hidden = None if seen.all() else ~seen
-    n_seen = seen.sum(axis=1)
-    # Points are complex numbers x + iy: loops over two coordinates would be slow.
-    points = tracks.view(np.complex128)[..., 0]
-    if hidden is not None:
-        points = np.where(seen, points, 0.0)
+    eps = 4 * np.finfo(rows.dtype).eps
+    seen = seen_points(rows)
+    n_seen, complete = seen.sum(axis=1), bool(seen.all())
+    # Points are complex numbers x + iy: each sum is one loop over both coordinates.
+    points = np.empty(seen.shape, dtype=complex)
+    points.real, points.imag = rows[:, 0], rows[:, 1]
+    if not complete:
+        points[~seen] = 0.0
     total = points.sum(axis=1).view(np.float64).reshape(-1, 2)
-    translation = np.full((len(tracks), 2), np.nan)
+    translation = np.full((len(rows), 2), np.nan)
     np.divide(total, n_seen[:, None], where=n_seen[:, None] > 0, out=translation)
-    moved = points - translation.view(np.complex128)
-    if hidden is not None:
-        moved[hidden] = 0.0
-    centred = moved.view(np.float64).reshape(tracks.shape)
-    square = np.einsum("ijc,ijc->i", centred, centred)
+    points -= translation.view(complex)
+    if not complete:
+        points[~seen] = 0.0
+    flat = points.view(np.float64)
+    square = np.einsum("ij,ij->i", flat, flat)
+    centred = np.stack([points.real, points.imag], axis=1)
     place = np.linalg.norm(translation, axis=1)
     in_one_place = (n_seen > 0) & (square <= n_seen * (eps * place) ** 2)
-    on_line = np.zeros(len(tracks), dtype=bool)
-    if hidden is not None:
-        some = hidden.any(axis=1)
+    on_line = np.zeros(len(rows), dtype=bool)
+    if not complete:
+        some = ~seen.all(axis=1)
         on_line[some] = _collinear(centred[some], place[some], n_seen[some], eps)
-        centred[hidden] = np.nan
+        np.copyto(centred, np.nan, where=~seen[:, None])
     size = np.sqrt(square / (2 * np.maximum(n_seen, 1)))
     return centred, FrameReport(translation, size, n_seen, in_one_place, on_line)
 
@@ -177,8 +180,8 @@ def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
 def _collinear(
     centred: NDArray, place: NDArray, n_seen: NDArray, eps: float
 ) -> NDArray:
-    """Return a mask of centred frames (n, J, 2) with visible points on one line."""
-    x, y = centred[..., 0], centred[..., 1]
+    """Return a mask of centred rows (n, 2, J) with visible points on one line."""
+    x, y = centred[:, 0], centred[:, 1]
     # Fit the angle of the principal axis. Eigenvalues of the 2x2 second moment would
     # square the distances from it, and lose half of their digits.
     angle = 0.5 * np.arctan2(2.0 * np.vecdot(x, y), np.vecdot(x, x) - np.vecdot(y, y))
@@ -222,13 +225,13 @@ def refuse_one_place(report: FrameReport, n_points: int) -> None:
 
 def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
     """Return tracks (I, J, 2) centred over their visible points, and centroids."""
-    centred, report = centred_frames(tracks)
+    centred, report = centred_frames(tracks.transpose(0, 2, 1))
     refuse_one_place(report, tracks.shape[1])
-    return centred, report.translation
+    return centred.transpose(0, 2, 1), report.translation
 
 
 def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
-    """Return the sizes (I,) by which centred tracks (I, J, 2) are divided.
+    """Return the sizes (I,) by which centred rows or tracks are divided.
 
     The RMS of the visible coordinates of each frame, or of all if not `scale_frames`.
     """
@@ -238,19 +241,18 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
     return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
 
 
-def weighted_sizes(centred: NDArray, weights: NDArray) -> NDArray:
-    """Return the weighted RMS (I,) of centred tracks (I, J, 2), weights (I, J).
+def weighted_sizes(centred: NDArray, weights: NDArray, sizes: NDArray) -> NDArray:
+    """Return the weighted RMS (I,) of centred rows (I, 2, J), weights (I, J).
 
-    Weights of missing points are zero. If all of the weight is in one place, the RMS is
-    not weighted.
+    Weights of missing points are zero. If all of the weight is in one place, these are
+    the sizes (I,), which are not weighted.
     """
-    tracks, total = np.nan_to_num(centred), weights.sum(axis=1)
-    place = np.einsum("ij,ijc->ic", weights / total[:, None], tracks)
-    off = np.where(weights[..., None] > 0, tracks - place[:, None], 0.0)
-    square = np.einsum("ij,ijc,ijc->i", weights, off, off) / (2 * total)
-    plain = weighting_sizes(centred, True)
+    rows, total = np.nan_to_num(centred), weights.sum(axis=1)
+    place = np.vecdot(rows, (weights / total[:, None])[:, None])
+    off = np.where(weights[:, None] > 0, rows - place[..., None], 0.0)
+    square = np.vecdot(weights, (off**2).sum(axis=1)) / (2 * total)
     eps = 4 * np.finfo(float).eps
-    return np.where(square > (eps * plain) ** 2, np.sqrt(square), plain)
+    return np.where(square > (eps * sizes) ** 2, np.sqrt(square), sizes)
 
 
 def measurement_matrix(centred: NDArray) -> NDArray:

@@ -1,15 +1,20 @@
 """Relate coefficients to labels, people and time, and compare frames."""
 
-from isa_nrsfm.analysis._aligned_frames import AlignedFrames
-from isa_nrsfm.analysis._association import Association, association, predictability
-from isa_nrsfm.analysis._within_groups import BetweenShare, WithinGroups, between_share
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "AlignedFrames",
-    "Association",
-    "BetweenShare",
-    "WithinGroups",
-    "association",
-    "between_share",
-    "predictability",
-]
+from isa_nrsfm._compat.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from isa_nrsfm.analysis._aligned_frames import AlignedFrames as AlignedFrames
+    from isa_nrsfm.analysis._association import (
+        Association as Association,
+        association as association,
+        predictability as predictability,
+    )
+    from isa_nrsfm.analysis._within_groups import (
+        BetweenShare as BetweenShare,
+        WithinGroups as WithinGroups,
+        between_share as between_share,
+    )
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

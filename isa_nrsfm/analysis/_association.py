@@ -20,7 +20,11 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._tables.frame_columns import checked_column, checked_times, group_numbers
+from isa_nrsfm.analysis._frame_columns import (
+    checked_column,
+    checked_times,
+    group_numbers,
+)
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.analysis._permutations import (
     FrameOrder,
@@ -75,9 +79,8 @@ class Association(NamedTuple):
         """
         name = "eta_squared" if self.kind == "classes" else "spearman"
         index = pd.RangeIndex(1, len(self.statistic) + 1, name="component")
-        return pd.DataFrame(
-            {name: self.statistic, "p_value": self.p_value}, index=index
-        )
+        columns = {name: self.statistic, "p_value": self.p_value}
+        return pd.DataFrame(columns, index=index)
 
 
 def association(
@@ -156,9 +159,8 @@ def association(
         alpha = rankdata(alpha, axis=0)
     alpha = _unit_columns(alpha)
     covariances = columns.T @ alpha
-    statistic = covariances[0]
-    if found == "classes":
-        statistic = np.sum(covariances**2, axis=0)
+    classes = found == "classes"
+    statistic = np.sum(covariances**2, axis=0) if classes else covariances[0]
     rng = check_random_state(random_state)
     energies, permuted = permuted_energies(alpha, columns, order, n_permutations, rng)
     p_value = _step_down_p_values(energies)
@@ -229,16 +231,12 @@ def predictability(
         ("number", True): KFold,
         ("number", False): GroupKFold,
     }[found, numbers is None]
+    folds = splitter(n_folds, shuffle=True, random_state=random_state)
     ridge = RidgeCV(np.logspace(-3, 3, 13))
     model = LinearDiscriminantAnalysis() if found == "classes" else ridge
+    model = make_pipeline(StandardScaler(), model)
     return np.asarray(
-        cross_val_score(
-            make_pipeline(StandardScaler(), model),
-            features,
-            labels,
-            groups=numbers,
-            cv=splitter(n_folds, shuffle=True, random_state=random_state),
-        )
+        cross_val_score(model, features, labels, groups=numbers, cv=folds)
     )
 
 

@@ -49,9 +49,8 @@ class FrameOrder(NamedTuple):
         """Number the blocks of `length` ordered frames within groups (n_frames,)."""
         place = np.arange(len(self.rows)) - self.first[self.groups]
         n_blocks = -(-self.sizes // length)
-        return np.asarray(
-            place // length + (np.cumsum(n_blocks) - n_blocks)[self.groups]
-        )
+        first = np.cumsum(n_blocks) - n_blocks
+        return np.asarray(place // length + first[self.groups])
 
 
 def dependent_blocks(
@@ -182,10 +181,7 @@ def _energies(
     """Return squared covariances (n_permutations + 1, n_components) of mean one."""
     energy = np.sum(alpha**2, axis=0)
     alpha = alpha / np.sqrt(np.where(energy > 0, energy, 1.0))
-    found = [np.sum((labels.T @ alpha) ** 2, axis=0)]
-    found += [
-        inflation * np.sum((labels[each].T @ alpha) ** 2, axis=0)
-        for each in permutations
-    ]
-    energies = np.array(found)
+    orders = [np.arange(len(labels)), *permutations]
+    energies = np.array([np.sum((labels[i].T @ alpha) ** 2, axis=0) for i in orders])
+    energies[1:] *= inflation
     return np.asarray(energies / (energies.mean() or 1.0))

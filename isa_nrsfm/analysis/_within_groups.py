@@ -9,9 +9,8 @@ from sklearn.utils import check_array
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.frame_columns import checked_column, group_numbers
-
-CHECKS: dict[str, Any] = {"ensure_all_finite": "allow-nan"}
+from isa_nrsfm._tables.sources import CHECKS
+from isa_nrsfm.analysis._frame_columns import checked_column, group_numbers
 
 
 class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
@@ -73,7 +72,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         ValueError
             If groups are missing, or if a group has no neutral frame.
         """
-        X = validate_data(self, X, dtype=[np.float64, np.float32], **CHECKS)
+        X = validate_data(self, X, **CHECKS)
         self.groups_, self.means_ = _group_means(X, groups, neutral)
         return self
 
@@ -107,9 +106,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
             If a new group has one frame only, whose differences are zero.
         """
         check_is_fitted(self)
-        X = validate_data(
-            self, X, dtype=[np.float64, np.float32], reset=False, **CHECKS
-        )
+        X = validate_data(self, X, reset=False, **CHECKS)
         names = _names(groups, len(X))
         place = np.searchsorted(self.groups_, names)
         place = np.minimum(place, len(self.groups_) - 1)
@@ -265,7 +262,7 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
     groups have a share of about zero, regardless of the number of frames. Negative
     estimates are set to zero.
     """
-    X = check_array(alpha, dtype=np.float64, input_name="alpha", **CHECKS)
+    X = check_array(alpha, input_name="alpha", **CHECKS | {"dtype": np.float64})
     known = np.isfinite(X).all(axis=1)
     numbers = group_numbers(groups, len(X))
     assert numbers is not None

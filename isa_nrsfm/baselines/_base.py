@@ -2,6 +2,9 @@
 
 A method finds an orthographic camera and a 3D shape for each frame of a table. Other
 frames are fitted by the mean and the principal components of these shapes.
+
+With one shape for each frame the sign of a frame is undetermined: the camera -R_i sees
+-S_i as R_i sees S_i.
 """
 
 from abc import abstractmethod
@@ -22,22 +25,17 @@ from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.sources import CHECKS, checked_range, open_table
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
-    centred_tracks,
-    measurement_matrix,
-    table_to_tracks,
+    centred_frames,
+    refuse_one_place,
+    table_to_rows,
     tracks_to_table,
-    weighting_sizes,
-)
-from isa_nrsfm.baselines._shape_sequence import (
-    camera_signs,
-    principal_shapes,
-    shape_signs,
 )
 
 
@@ -120,7 +118,7 @@ class ShapeSequenceNRSfM(
         """
         X = self._checked(X, reset=True)
         table = scaled_table(
-            open_table(X),
+            open_table(X, self.layout),
             self.n_components,
             layout=self.layout,
             names=getattr(self, "feature_names_in_", None),
@@ -138,7 +136,7 @@ class ShapeSequenceNRSfM(
         mean_shape, basis, coefficients = principal_shapes(shapes, self.n_components)
         model = compose(mean_shape, basis, coefficients)
         noise, error = (
-            np.mean((W - measurement_matrix(each @ cameras.transpose(0, 2, 1))) ** 2)
+            np.mean((W - (cameras @ each.transpose(0, 2, 1)).reshape(W.shape)) ** 2)
             for each in (model, shapes)
         )
         self.inverse_snr_ = float(error / np.mean(W**2))
@@ -286,14 +284,16 @@ class ShapeSequenceNRSfM(
 
     def _decompose(self, X: NDArray) -> Decomposition:
         """Return camera and coefficients of each frame of a valid table."""
-        tracks = table_to_tracks(X, self.layout).astype(np.float64)
-        sizes = np.full(len(tracks), self._unit)
+        rows = table_to_rows(X, self.layout).astype(np.float64)
+        sizes = np.full(len(rows), self._unit)
         if self.scale_frames:
-            sizes = weighting_sizes(centred_tracks(tracks)[0], True)
+            _, report = centred_frames(rows)
+            refuse_one_place(report, rows.shape[2])
+            sizes = report.size
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
         search = frame_search("orthographic", shapes.transpose(0, 2, 1).astype(float))
-        fits = search.fit_tracks(
-            tracks / sizes[:, None, None],
+        fits = search.fit_rows(
+            rows / sizes[:, None, None],
             self.noise_variance_ / self._unit**2,
             covariances=False,
         )
@@ -301,3 +301,53 @@ class ShapeSequenceNRSfM(
         translation = sizes[:, None] * fits.translation
         found = (motion, translation, fits.alpha, np.full_like(fits.alpha, np.nan))
         return Decomposition(*(part.astype(X.dtype) for part in found))
+
+
+def shape_signs(shapes: NDArray) -> NDArray:
+    """Return signs z_i of shapes (n_frames, n_points, 3) that make them similar.
+
+    Each z_i S_i has a non-negative inner product with ``sum_i z_i S_i``, from the first
+    left singular vector.
+    """
+    rows = shapes.reshape(len(shapes), -1)
+    tall = len(rows) > rows.shape[1]
+    first = np.linalg.eigh(rows.T @ rows if tall else rows @ rows.T)[1][:, -1]
+    signs = _sign(rows @ first if tall else first)
+    for _ in range(100):  # each round increases the sum, a few are enough
+        changed = _sign(rows @ (signs @ rows))
+        if (changed == signs).all():
+            break
+        signs = changed
+    return signs
+
+
+def camera_signs(cameras: NDArray) -> NDArray:
+    """Return signs of cameras (n_frames, 2, 3) that turn them least between frames."""
+    agreement = np.einsum("irc,irc->i", cameras[1:], cameras[:-1])
+    return np.cumprod(np.concatenate([[1.0], _sign(agreement)]))
+
+
+def _sign(values: NDArray) -> NDArray:
+    """Return 1.0 or -1.0 for each value."""
+    return np.where(values < 0, -1.0, 1.0)
+
+
+def principal_shapes(
+    shapes: NDArray, n_components: int
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return mean, principal components and coefficients of shapes.
+
+    The components (K, J, 3) are orthogonal, decreasing, one standard deviation each.
+    The coefficients (I, K) are white, with non-negative skewness. Zero without
+    variation.
+    """
+    mean_shape = shapes.mean(axis=0)
+    rest = (shapes - mean_shape).reshape(len(shapes), -1)
+    U, S, Vt = np.linalg.svd(rest, full_matrices=False)
+    U, S, Vt = U[:, :n_components], S[:n_components], Vt[:n_components]
+    root = np.sqrt(len(shapes))
+    # Smaller deformations are rounding errors.
+    moving = S > 1e-12 * root * np.linalg.norm(mean_shape)
+    signs = np.where(moving, orientations(U.T), 0.0)
+    basis = (signs * S / root)[:, None] * Vt
+    return mean_shape, basis.reshape(-1, *mean_shape.shape), root * signs * U

@@ -129,9 +129,7 @@ def _reweighted_ridge(
     while n_left:
         products = gram[chosen[:, :, None], chosen[:, None, :]]
         products = products * (weights[:, :, None] * weights[:, None])[..., None, None]
-        equations = products.transpose(0, 1, 3, 2, 4).reshape(
-            n_frames, 3 * size, 3 * size
-        )
+        equations = products.swapaxes(2, 3).reshape(n_frames, 3 * size, 3 * size)
         np.einsum("ijj->ij", equations)[...] += ridge
         weighted = (right * weights[..., None, None]).reshape(n_frames, 3 * size, 2)
         Z = np.linalg.solve(equations, weighted).reshape(right.shape)

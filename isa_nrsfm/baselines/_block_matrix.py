@@ -228,16 +228,14 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         # Accelerated steps are some hundred times as long as the published ones.
         default = 1e-4 if self.accelerated else 1e-6
         tol = default if self.tol is None else self.tol
+        options: dict[str, Any] = {
+            "accelerated": self.accelerated,
+            "max_iter": self.max_iter,
+        }
         self.n_iter_, converged = 0, True
-        for k in range(18):
+        for price in 4.0 ** -np.arange(18):
             shapes, n_iter, settled = nuclear_norm_shapes(
-                W,
-                cameras,
-                4.0**-k,
-                shapes,
-                accelerated=self.accelerated,
-                max_iter=self.max_iter,
-                tol=tol,
+                W, cameras, price, shapes, tol=tol, **options
             )
             self.n_iter_ += n_iter
             converged &= settled

@@ -1,6 +1,6 @@
 """Turn a shape upright and frontal."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -126,24 +126,20 @@ def canonical_pose(
     right = None if left_right is None else _principal_direction(points, left_right)
     down = None if up is None else -_direction("up", points, up)
     away = None if front is None else -_direction("front", points, front)
-    axes = [right, down, away]
+    axes: Any = [right, down, away]
     n_given = sum(axis is not None for axis in axes)
-    if n_given == 0:
-        rotation = _principal_axes(points)
-    elif n_given == 1:
+    if n_given == 1:
         raise ValueError(
             "two of left_right, up and front determine the pose; only one is given"
         )
-    else:
-        rotation = _frame(axes)
-    mirrored = False
-    if away is not None and n_given == 3 and rotation[2] @ away < 0:
+    rotation = _frame(axes) if n_given else _principal_axes(points)
+    mirrored = n_given == 3 and bool(rotation[2] @ axes[2] < 0)
+    if mirrored:
         rotation[2] *= -1
-        mirrored = True
     return CanonicalPose(points @ rotation.T, rotation, mirrored)
 
 
-def _frame(axes: list[NDArray | None]) -> NDArray:
+def _frame(axes: list[Any]) -> NDArray:
     """Return the rotation whose rows are the first two axes that are known."""
     first, second, *_ = (i for i, axis in enumerate(axes) if axis is not None)
     rotation = np.zeros((3, 3))

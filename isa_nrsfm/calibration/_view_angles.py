@@ -70,17 +70,16 @@ def view_angles(rotations: ArrayLike) -> ViewAngles:
         )
     known = np.isfinite(R).all(axis=(1, 2))
     off = np.abs(R[known] @ R[known].swapaxes(1, 2) - np.eye(3)).max(initial=0.0)
-    if off > 1e-6 or (np.linalg.det(R[known]) < 0).any():
+    n_mirrored = np.count_nonzero(np.linalg.det(R[known]) < 0)
+    if off > 1e-6 or n_mirrored:
         raise ValueError(
             "rotations must be orthogonal with determinant 1; the products of their "
-            f"rows are off by {off:.1e}, and "
-            f"{int(np.sum(np.linalg.det(R[known]) < 0))} are mirror images"
+            f"rows are off by {off:.1e}, and {n_mirrored} are mirror images"
         )
     angles = np.full((3, len(R)), np.nan)
     if known.any():
-        euler = Rotation.from_matrix(R[known]).as_euler("ZXY", degrees=True)
-        roll, x, y = euler.T
-        angles[:, known] = -y + 0.0, -x + 0.0, roll + 0.0  # no minus zeros
+        turns = Rotation.from_matrix(R[known]).as_euler("ZXY", degrees=True)
+        angles[:, known] = turns[:, ::-1].T * [[-1], [-1], [1]] + 0.0  # no minus zeros
     return ViewAngles(*angles)
 
 
@@ -134,9 +133,8 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
     known = np.isfinite(angles.yaw) & np.isfinite(C).all(axis=(1, 2))
     if known.any():
         Y = Rotation.from_euler("y", -angles.yaw[known, None], degrees=True).as_matrix()
-        X = Rotation.from_euler(
-            "x", -angles.pitch[known, None], degrees=True
-        ).as_matrix()
+        x = Rotation.from_euler("x", -angles.pitch[known, None], degrees=True)
+        X = x.as_matrix()
         along_x, along_z = Y.swapaxes(1, 2)[:, :, 0], (X @ Y)[:, 2]
         along_y = np.broadcast_to([0.0, 1.0, 0.0], along_x.shape)
         # w = slope (dy, dx, d roll)

@@ -13,11 +13,6 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._tables.frame_columns import (
-    checked_times,
-    group_numbers,
-    sequences_of,
-)
 from isa_nrsfm.analysis import (
     AlignedFrames,
     WithinGroups,
@@ -25,10 +20,15 @@ from isa_nrsfm.analysis import (
     between_share,
     predictability,
 )
+from isa_nrsfm.analysis._frame_columns import (
+    checked_times,
+    group_numbers,
+    sequences_of,
+)
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
-from isa_nrsfm.cli._times import read_times, time_unit, video_times
+from isa_nrsfm.cli._times import read_times, video_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
 
@@ -68,8 +68,7 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
     if args.time is not None:
         with errors_of(f"--time {args.time}"):
             cells = cells_of(table, args.time, "--time")
-            times = read_times(cells, args.time_format)
-            unit_of_times = time_unit(cells, times)
+            times, unit_of_times = read_times(cells, args.time_format)
     elif args.fps is not None:
         images, name = frames.images
         numbers = pd.Series(images, frames.other.index)[frames.usable]
@@ -143,14 +142,10 @@ def column_results(
 
 def class_means(label: Label, alpha: NDArray) -> dict[str, NDArray]:
     """Return the mean of the standardised coefficients in each class."""
-    deviation = alpha.std(axis=0)
-    standard = np.zeros_like(alpha)
-    np.divide(alpha - alpha.mean(axis=0), deviation, where=deviation > 0, out=standard)
+    deviation, y = alpha.std(axis=0), label.values
+    standard = (alpha - alpha.mean(axis=0)) / np.where(deviation > 0, deviation, np.inf)
     known = standard[label.known]
-    return {
-        str(name): known[label.values == name].mean(axis=0)
-        for name in np.unique(label.values)
-    }
+    return {str(name): known[y == name].mean(axis=0) for name in np.unique(y)}
 
 
 def _numbered(

@@ -4,9 +4,8 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
-from isa_nrsfm.cli._outputs import missing_values_of_fit, read_model, refuse_overwriting
+from isa_nrsfm.cli._outputs import read_model, refuse_overwriting
 from isa_nrsfm.cli._reading import (
     as_fitted,
     cells_of,
@@ -23,6 +22,7 @@ from isa_nrsfm.export import (
     write_shapes,
     write_viewer,
 )
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # The options of each content, besides those of the table.
 _POSE = ("camera", "origin", "mirrored")
@@ -40,13 +40,13 @@ def run(args: Namespace, warned: list[str]) -> str:
     output = Path(args.output)
     content = _content(output, args.content)
     options = _given(args, content)
-    estimator = read_model(args.model)
+    estimator, missing = read_model(args.model)
     sources = filter(None, (args.model, args.table, *drawing_files(args)))
     refuse_overwriting(sources, [output])
     sections: dict[str, Any] = {"Model": [args.model]}
     stored = None
     if args.table is not None:
-        args.missing_value = [*args.missing_value, *missing_values_of_fit(args.model)]
+        args.missing_value = [*args.missing_value, *missing]
         frames = read_frames(args, estimator)
         stored = frames.skeleton
         table = table_report(args.table, args.format, frames)

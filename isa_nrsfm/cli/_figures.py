@@ -27,8 +27,14 @@ from isa_nrsfm.plotting import (
     ModeCovarianceDisplay,
     ReprojectionDisplay,
 )
-from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
-from isa_nrsfm.plotting._page import VIEWS, add_legend, block_limits, new_page
+from isa_nrsfm.plotting._axes import (
+    MEAN_COLOUR,
+    VIEWS,
+    add_legend,
+    block_limits,
+    new_page,
+    wrap_title,
+)
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
 # `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.
@@ -120,15 +126,13 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
 
 def _reprojections(fit: Fit) -> ReprojectionDisplay:
     """Draw up to three frames about the median residual, and as many of the largest."""
-    estimator = fit.estimator
-    energy, error, _ = frame_energies(fit.X, fitted_table(estimator), estimator.layout)
+    model = fit.estimator
+    energy, error, _ = frame_energies(fit.X, fitted_table(model), model.layout)
     order = np.argsort(error / energy)
     n_drawn = max(min(3, len(order) // 3), 1)
     start = (len(order) - n_drawn) // 2
     rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
-    display = ReprojectionDisplay.from_estimator(
-        estimator, fit.X, frames=rows, **fit.drawn
-    )
+    display = ReprojectionDisplay.from_estimator(model, fit.X, frames=rows, **fit.drawn)
     for number, axes in enumerate(display.axes_):
         which = "median" if number < n_drawn else "largest"
         title = f"{which} residual: {axes.get_title()}"

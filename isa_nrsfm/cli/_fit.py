@@ -22,10 +22,9 @@ from isa_nrsfm._compat.whole_files import (
     files_together,
     folder_for_writing,
 )
-from isa_nrsfm._fit import joint_camera
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
-from isa_nrsfm._selection.choice import standard_errors
+from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, NONE
@@ -50,6 +49,11 @@ from isa_nrsfm.io._tables import TABLE_SUFFIXES
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
+# Options that are parameters of the same name; none stands for None.
+_PARAMETERS = (
+    *("block_recovery", "refinement", "camera", "independence", "loss"),
+    *("random_state", "n_jobs"),
+)
 
 
 def run(args: Namespace, warned: list[str]) -> str:
@@ -75,9 +79,7 @@ def fit_table(
     frames = read_frames(args, table=table)
     X = frames.X
     if X.empty:
-        out = ", ".join(
-            f"{len(rows)} left out ({reason})" for reason, rows, _ in frames.left_out
-        )
+        out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
     asked = asked_columns(args, frames)
     figures = {} if args.no_figures else figures_of(args, asked)
@@ -181,17 +183,15 @@ def _fitted(
     if args.isa == "fast" or args.n_init is not None:
         strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
         isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
+    given: dict[str, Any] = {
+        name: None if getattr(args, name) == NONE else getattr(args, name)
+        for name in _PARAMETERS
+    }
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=isa,
-        block_recovery=args.block_recovery,
-        refinement=None if args.refinement == NONE else args.refinement,
-        camera=args.camera,
-        independence=None if args.independence == NONE else args.independence,
-        loss=args.loss,
         scale_frames=not args.no_scale_frames,
-        random_state=args.random_state,
-        n_jobs=args.n_jobs,
+        **given,
     )
     search, X = None, frames.X
     if len(args.n_components) > 1:
@@ -272,7 +272,8 @@ def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
         "chosen": search.n_components_,
     }
     fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
-    camera = joint_camera(search.best_estimator_)
+    best = search.best_estimator_
+    camera = best.camera_ if best.refinement in JOINT_REFINEMENTS else None
     most = most_components(fitted, X.shape[1] // 2, camera)
     following = np.arange(tried[-1] + 1, min(tried[-1] + 3, most) + 1)
     if search.n_components_ == tried[-1] and len(following):

@@ -144,9 +144,7 @@ TYPES: dict[str, Callable[[str], Any]] = {
     ),
     "N": int,
     "NAMES": _names,
-    "NUMBER": _reader(
-        "a number above zero", float, lambda number: 0 < number < math.inf
-    ),
+    "NUMBER": _reader("a number above zero", float, lambda n: 0 < n < math.inf),
     "POINT,POINT": _reader(
         "two points with a comma between them, such as 48,54",
         lambda text: tuple(_names(text)),
@@ -159,7 +157,7 @@ TYPES: dict[str, Callable[[str], Any]] = {
 }
 
 
-def _option(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
+def _arg(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
     """Return the arguments of `add_argument` for an option with a value."""
     return {"help": help, "metavar": metavar, "type": TYPES.get(metavar)} | settings
 
@@ -172,7 +170,7 @@ def _flag(help: str) -> dict[str, Any]:
 def _list(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
     """Return the arguments of `add_argument` for an option that may be repeated."""
     settings |= {"action": "append", "default": []}
-    return _option(metavar, f"{help}; may be repeated", **settings)
+    return _arg(metavar, f"{help}; may be repeated", **settings)
 
 
 def _choice(choices: tuple[str, ...], help: str) -> dict[str, Any]:
@@ -185,12 +183,12 @@ def _choice(choices: tuple[str, ...], help: str) -> dict[str, Any]:
 POSITIONAL = ("table", "model")
 SHORT = {"output": ["-o"], "n_components": ["-k"]}
 OPTIONS: dict[str, dict[str, Any]] = {
-    "model": _option("MODEL", "model.npz, written by fit"),
+    "model": _arg("MODEL", "model.npz, written by fit"),
     # The table.
-    "table": _option(
+    "table": _arg(
         "TABLE", "a .csv, .tsv or .parquet file, or a file or folder of another format"
     ),
-    "format": _option(
+    "format": _arg(
         "FORMAT",
         "the program that wrote the table: "
         f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for "
@@ -199,7 +197,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         choices=["auto", *FORMATS],
         default="auto",
     ),
-    "columns": _option(
+    "columns": _arg(
         "PATTERN",
         "patterns of the x and y columns, if their names are ambiguous: # for a "
         "number, * for any text, such as 'x_#,y_#' or '*.px,*.py'",
@@ -212,47 +210,45 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "missing_value": _list(
         "VALUE", "treat points whose x and y are this number, such as -1, as missing"
     ),
-    "min_confidence": _option(
+    "min_confidence": _arg(
         "CONFIDENCE", "treat points with a lower confidence as missing"
     ),
-    "weights": _option(
+    "weights": _arg(
         "WEIGHTS",
         "weight the points of the joint refinement by their confidences in the file "
         "(confidence); points of confidence zero are missing",
         choices=["confidence"],
     ),
-    "image_size": _option(
+    "image_size": _arg(
         "WIDTHxHEIGHT", "size of the images for MediaPipe, in pixels, such as 1920x1080"
     ),
-    "part": _option(
+    "part": _arg(
         "PART",
         "the points of OpenPose to read, if the files have several: "
         f"{', '.join(OPENPOSE_PARTS)}",
         choices=OPENPOSE_PARTS,
     ),
-    "points": _option(
+    "points": _arg(
         "POINTS",
         "fit some of the points: inner (without the visible outline of a face, which "
         "slides over the surface as the head turns), or names, numbers and ranges such "
         "as nose,36-47 or without:0-16",
     ),
     # What is written.
-    "output": _option(
-        "DIR", "folder for the results, created if absent", required=True
-    ),
+    "output": _arg("DIR", "folder for the results, created if absent", required=True),
     "force": _flag("replace files in the folder that are of no earlier run"),
     "no_figures": _flag("write no figures (png), and remove those of an earlier run"),
     "std": _flag(
         "add the standard deviation of each coefficient, in columns such as "
         "alpha_1_std; with calibrated cameras the viewer has error bars of the depths"
     ),
-    "viewer": _option("FILE", "write a page that shows the new frames in 3D (.html)"),
-    "edges": _option(
+    "viewer": _arg("FILE", "write a page that shows the new frames in 3D (.html)"),
+    "edges": _arg(
         "FILE",
         "lines to draw between points: a .csv file with the names or numbers of two "
         "points per line, or of three for a surface; 'none' draws only points",
     ),
-    "skeleton": _option(
+    "skeleton": _arg(
         "LAYOUT",
         "the layout of the points, if names, number and order of the points do not "
         f"determine it: {', '.join(SKELETON_NAMES)}, or the config.yaml of DeepLabCut",
@@ -269,7 +265,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "the dependence of the coefficients on it. Whole numbers are classes unless "
         "given as COLUMN:number",
     ),
-    "group": _option(
+    "group": _arg(
         "COLUMN",
         "people, videos or files: reports the variance between and within groups. "
         "Held-out frames come from other groups; smoothing stops at their borders",
@@ -279,30 +275,30 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "add the distance of two points of the 3D shapes to alpha.csv, in units of the "
         "distance between the outer corners of the eyes",
     ),
-    "unit": _option(
+    "unit": _arg(
         "POINT,POINT",
         "two points whose distance in the mean shape is the unit of --distance",
     ),
-    "length": _option(
+    "length": _arg(
         "NUMBER",
         "the length of that unit, such as 90 for millimetres (default: 1)",
         default=1.0,
     ),
-    "time": _option(
+    "time": _arg(
         "COLUMN", "times of the frames, numbers or dates: adds smoothed coefficients"
     ),
-    "time_format": _option(
+    "time_format": _arg(
         "FORMAT",
         "how the cells of --time are written, if that is ambiguous: %%d/%%m/%%Y (day "
         "first), %%M:%%S (minutes and seconds), or other codes of strptime",
     ),
-    "fps": _option(
+    "fps": _arg(
         "NUMBER",
         "instead of --time, the frames per second of a video; frames "
         "have the numbers of the column frame, or of the rows",
     ),
     # The method.
-    "n_components": _option(
+    "n_components": _arg(
         "K",
         "number of basis shapes (default: 3). Of several, such as 1-8 or 3,6,9, the "
         "best in cross-validation is used; auto uses as many as the table determines, "
@@ -319,7 +315,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         ("pooled", "fast"),
         "independent subspace analysis: FastICA with pooled components, or FastISA",
     ),
-    "n_init": _option(
+    "n_init": _arg(
         "STARTS", "number of random starts (default: 16 of pooled, 30 of fast)"
     ),
     "block_recovery": _choice(
@@ -342,10 +338,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "no_scale_frames": _flag(
         "weight frames by their size in the image, as orthographic cameras always do"
     ),
-    "random_state": _option(
-        "SEED", "seed of the random starts (default: 0)", default=0
-    ),
-    "n_jobs": _option(
+    "random_state": _arg("SEED", "seed of the random starts (default: 0)", default=0),
+    "n_jobs": _arg(
         "N", "processes for the random starts, -1 for all processors (default: 1)"
     ),
     # Export.
@@ -354,15 +348,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "distribution model as .mat (M, V and E) or .npz",
         "choices": list(SUFFIXES),
     },
-    "n_modes": _option(
+    "n_modes": _arg(
         "MODES",
         "for a point distribution model, the number of modes, or the share of the "
         "variance that they explain, such as 0.98 (default: number of basis shapes)",
     ),
-    "names": _option(
-        "NAMES", "for .html and .glb, names of the basis shapes with commas"
-    ),
-    "n_frames": _option("N", "for .html, the largest number of frames (default: 1000)"),
+    "names": _arg("NAMES", "for .html and .glb, names of the basis shapes with commas"),
+    "n_frames": _arg("N", "for .html, the largest number of frames (default: 1000)"),
     "mirrored": _flag("take the mirror image in depth, which has the same images"),
 }
 # Where an option of one command differs from that of the others.
@@ -508,23 +500,20 @@ The folder has the files of 'isa-nrsfm fit', and the table as tracks.csv.""",
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
-    parser.add_argument(
-        "--version", action="version", version=f"{PROGRAM} {__version__}"
-    )
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    top = argparse.ArgumentParser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
+    top.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command, (line, description, examples, groups) in _COMMANDS.items():
         own = commands.add_parser(command, help=line, **_manners(description, examples))
+        own.set_defaults(weights=None, points=None)  # for commands without these
         for title, entries in groups.items():
             group = own.add_argument_group(title)
             for entry in entries:
-                if isinstance(entry, str):
-                    _add(group, command, entry)
-                    continue
-                either = group.add_mutually_exclusive_group()
-                for name in entry:
-                    _add(either, command, name)
-    return parser
+                is_one = isinstance(entry, str)
+                place = group if is_one else group.add_mutually_exclusive_group()
+                for name in [entry] if is_one else entry:
+                    _add(place, command, name)
+    return top
 
 
 def flag_of(name: str) -> str:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, SmoothedCoefficients, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import frames_of
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 PAGE = "report.html"
 REPORT = "report.json"
@@ -162,39 +162,30 @@ def write_results(
     save_model(estimator, folder / "model.npz")
 
 
-def fitted_table(estimator: AffineNRSfM) -> NDArray:
+def fitted_table(model: AffineNRSfM) -> NDArray:
     """Return the table of the model, in the frames that it was fitted to."""
-    return estimator.inverse_transform(
-        estimator.alpha_, estimator.motion_, estimator.translation_
-    )
+    return model.inverse_transform(model.alpha_, model.motion_, model.translation_)
 
 
-def read_model(path: str) -> AffineNRSfM:
-    """Load a model; warn if files beside it are not of the run of the report there."""
-    estimator, folder = load_model(path), Path(path).parent
+def read_model(path: str) -> tuple[AffineNRSfM, list[float]]:
+    """Load a model, and the coordinates of missing points in the table of its fit.
+
+    These are in the report beside the model. Without a report of that model there are
+    none. Warn if files beside it are not of the run of the report.
+    """
+    estimator, folder, name = load_model(path), Path(path).parent, Path(path).name
     recorded = entry_of_report(folder, "sha256")
-    beside = digests_of(folder, [name for name in recorded if Path(name).name == name])
-    differing = [name for name in beside if beside[name] != recorded[name]]
-    # A report that does not know the model is of something else.
-    if differing and Path(path).name in recorded:
+    if name not in recorded:  # a report of something else
+        return estimator, []
+    beside = digests_of(folder, [each for each in recorded if Path(each).name == each])
+    differing = [each for each in beside if beside[each] != recorded[each]]
+    if differing:
         warn_caller(
             f"{folder / REPORT} is of another run than {', '.join(differing)} beside "
             "it, or these were changed since"
         )
-    return estimator
-
-
-def missing_values_of_fit(path: str) -> list[float]:
-    """Return the coordinates of missing points in the table that a model was fitted to.
-
-    They are in the report beside the model. Without a report of that model there are
-    none.
-    """
-    folder, name = Path(path).parent, Path(path).name
-    recorded = entry_of_report(folder, "sha256").get(name)
-    if recorded is None or digests_of(folder, [name])[name] != recorded:
-        return []
-    return list(entry_of_report(folder, "table").get("missing_values", []))
+    table = {} if name in differing else entry_of_report(folder, "table")
+    return estimator, list(table.get("missing_values", []))
 
 
 def entry_of_report(folder: Path, name: str) -> dict[str, Any]:

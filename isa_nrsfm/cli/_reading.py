@@ -14,7 +14,6 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
-from isa_nrsfm._tables.column_names import names_of_points, parse_coordinate
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
@@ -22,7 +21,7 @@ from isa_nrsfm._tables.tracks import (
     clean_tracks,
     tracks_to_table,
 )
-from isa_nrsfm.cli._options import CONFIGURATIONS, NONE
+from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
 from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.export._drawing import edges_of
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
@@ -43,6 +42,7 @@ from isa_nrsfm.skeletons import (
     get_skeleton,
     read_skeleton,
 )
+from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 
 # Options of one format, and that format.
 _OF_FORMATS = {"image_size": "mediapipe", "part": "openpose"}
@@ -86,8 +86,7 @@ class Frames(NamedTuple):
         """The weights of the points of X as an argument of `fit`, if asked for."""
         if self.confidence is None:
             return {}
-        weights = self.confidence.to_numpy(dtype=np.float64)
-        return {"point_weight": weights[self.usable]}
+        return {"point_weight": self.confidence.to_numpy(np.float64)[self.usable]}
 
 
 def read_frames(
@@ -103,11 +102,8 @@ def read_frames(
     not_used: dict[str, int] = {}
     args.format = _format(args) if table is None else TABLE
     if args.format != TABLE:
-        options = {
-            name: getattr(args, name)
-            for name in _OF_FORMATS
-            if getattr(args, name) is not None
-        }
+        given = {name: getattr(args, name) for name in _OF_FORMATS}
+        options = {name: given[name] for name in given if given[name] is not None}
         found = read_landmarks(
             args.table, args.format, min_confidence=args.min_confidence, **options
         )
@@ -133,12 +129,9 @@ def read_frames(
     elif args.points is not None:
         layout = _layout(args, table, columns, layout)
         left = _kept_points(args.points, columns.points, layout)
-        names, x, y = (
-            tuple(each[j] for j in left)
-            for each in (columns.points, columns.x, columns.y)
-        )
+        points, x, y = (tuple(each[j] for j in left) for each in columns[1:4])
         dropped = [name for name in columns.interleaved if name not in {*x, *y}]
-        columns = columns._replace(points=names, x=x, y=y)
+        columns = columns._replace(points=points, x=x, y=y)
         layout = _part_of_layout(layout, left)
         table = table.drop(columns=dropped)
         not_used[f"--points {args.points}"] = len(dropped) // 2
@@ -189,16 +182,10 @@ def _format(args: Namespace) -> str:
         raise ValueError(f"--columns needs --format table; got --format {found}")
     for name, of in _OF_FORMATS.items():
         if getattr(args, name) is not None and name not in FORMATS[found].options:
-            option = "--" + name.replace("_", "-")
             raise ValueError(
-                f"{option} needs --format {of}; {args.table} has format {found}"
+                f"{flag_of(name)} needs --format {of}; {args.table} has format {found}"
             )
     return found
-
-
-def _weights_asked(args: Namespace) -> bool:
-    """Return whether confidences are weights; some commands have no such option."""
-    return getattr(args, "weights", None) is not None
 
 
 def _with_confidences(
@@ -210,7 +197,7 @@ def _with_confidences(
     """
     names = confidence_columns(table.columns, columns.x, columns.y)
     rest = table.drop(columns=names)
-    if args.min_confidence is None and not _weights_asked(args):
+    if args.min_confidence is None and args.weights is None:
         unused = {f"{names[0].strip()}, ... (confidences)": len(names)} if names else {}
         return rest, None, unused
     confidence = confidences_in(table, columns.x, columns.y)
@@ -235,7 +222,7 @@ def _confidence(args: Namespace, found: Landmarks) -> "pd.DataFrame | None":
 
     Points without a confidence have weight one.
     """
-    if not _weights_asked(args):
+    if args.weights is None:
         return None
     if found.confidence is None:
         raise ValueError(
@@ -264,7 +251,7 @@ def _frames(
     if confidence is not None:
         confidence = confidence[list(columns.x)].iloc[rows]
         tracks[confidence.to_numpy() == 0] = np.nan
-    _, report = centred_frames(tracks)
+    _, report = centred_frames(tracks.transpose(0, 2, 1))
     reasons = _reasons(report, None if failed is None else failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     _warn_of_code(tracks[report.usable])
@@ -326,7 +313,7 @@ def _refuse_lost_points(
 
     tracks (n_frames, n_points, 2) are those of all rows, without missing points.
     """
-    if "points" not in args or not _missing_values(args):
+    if args.command != "fit" or not _missing_values(args):
         return
     absent = np.isnan(tracks).all(axis=(0, 2))
     found = zip(columns.points, columns.x, absent, strict=True)
@@ -475,17 +462,17 @@ def _layout(
     """Return the layout of all points of a table: given, stored, or recognised."""
     names = columns.points
     if args.skeleton is not None:
-        given = _given_layout(args.skeleton, names)
-        return given if given.n_points == len(names) else None
+        stored = _given_layout(args.skeleton, names)
+        return stored if stored.n_points == len(names) else None
     if stored is not None:
         return stored
     tracks = _tracks(args, table, columns, _rows_to_keep(args, table)[0])
-    centred, report = centred_frames(tracks[np.isfinite(tracks).all(axis=(1, 2))])
+    complete = tracks[np.isfinite(tracks).all(axis=(1, 2))]
+    centred, report = centred_frames(complete.transpose(0, 2, 1))
     extended = report.size > 0
-    if not extended.any():
-        return find_skeleton(len(names), names)
     images = centred[extended] / report.size[extended, None, None]
-    return find_skeleton(len(names), names, shape=images.mean(axis=0))
+    shape = images.mean(axis=0).T if extended.any() else None
+    return find_skeleton(len(names), names, shape=shape)
 
 
 def _given_layout(skeleton: str, names: Sequence[str]) -> Skeleton:
@@ -562,38 +549,29 @@ def drawing(
     stored: Skeleton | None,
     surfaces: bool = False,
 ) -> dict[str, Any]:
-    """Return the options of displays: lines or surfaces to draw, where y is zero."""
-    edges = _edges(args, names, stored, surfaces)
-    return {"edges": edges, "origin": args.origin or "auto"}
+    """Return the options of displays: lines or surfaces to draw, where y is zero.
 
-
-def _edges(
-    args: Namespace, names: Sequence[str], stored: Skeleton | None, surfaces: bool
-) -> Any:
-    """Return the lines to draw: an option, or the skeleton stored in the table.
-
-    Triangles become lines unless surfaces are drawn.
+    The lines are those of an option, or of the skeleton stored in the table. Triangles
+    become lines unless surfaces are drawn.
     """
+    edges: Any = "auto"
     if args.edges == NONE:
-        return None
-    if args.edges is not None:
-        all_points = getattr(args, "points", None) is None
-        links = _read_edges(args.edges, names, numbered=all_points)
-        return links if surfaces else edges_of(links)
+        edges = None
+    elif args.edges is not None:
+        links = _read_edges(args.edges, names, numbered=args.points is None)
+        edges = links if surfaces else edges_of(links)
     # With --points, --skeleton is the layout of all points, and `stored` of the rest.
-    some_points = stored is not None and getattr(args, "points", None) is not None
-    if args.skeleton is not None and not some_points:
-        skeleton = _given_layout(args.skeleton, names)
-        if skeleton.n_points != len(names):
+    elif args.skeleton is not None and (args.points is None or stored is None):
+        edges = _given_layout(args.skeleton, names)
+        if edges.n_points != len(names):
             raise ValueError(
-                f"--skeleton {args.skeleton} has {skeleton.n_points} points, the table "
+                f"--skeleton {args.skeleton} has {edges.n_points} points, the table "
                 f"{len(names)}"
             )
-        return skeleton
-    if stored is None:
-        return "auto"
-    named = stored.point_names is not None and sorted(stored.point_names)
-    return stored.reordered(names) if named == sorted(names) else stored
+    elif stored is not None:
+        named = stored.point_names is not None and sorted(stored.point_names)
+        edges = stored.reordered(names) if named == sorted(names) else stored
+    return {"edges": edges, "origin": args.origin or "auto"}
 
 
 def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:

@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._diagnostics import (
+from isa_nrsfm._estimator import frames_of
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm.analysis._diagnostics import (
     Diagnostics,
     camera_advice,
     camera_meaning,
     outlier_advice,
 )
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics import inverse_snr
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Rows and points that are listed, and classes whose means are shown, at most.
 MOST_LISTED, MOST_CLASSES = 10, 12
@@ -85,9 +85,8 @@ def model_report(
     certainty = frames_of(estimator).certainty
     advice = certainty.advice.replace('camera="affine"', "--camera affine")
     _, layout, lines, _ = view_and_layout(estimator, edges)
-    found = (
-        estimator.diagnostics(X) if estimator.refinement in JOINT_REFINEMENTS else None
-    )
+    is_joint = estimator.refinement in JOINT_REFINEMENTS
+    found = estimator.diagnostics(X) if is_joint else None
     for message in () if found is None else found.messages:
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)

@@ -18,7 +18,7 @@ import numpy as np
 
 from isa_nrsfm._compat.texts import as_utf8, first_items
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._selection.choice import NO_SHAPE
+from isa_nrsfm._selection import NO_SHAPE
 from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
@@ -63,10 +63,8 @@ Sections = Mapping[str, Section]
 
 def fit_title(report: dict[str, Any]) -> str:
     """Return the title of the report of a fit."""
-    table, shapes = report["table"], _shapes(report["model"])
-    return (
-        f"{shapes} fitted to {table['n_frames']} frames of {table['n_points']} points"
-    )
+    table, basis = report["table"], _shapes(report["model"])
+    return f"{basis} fitted to {table['n_frames']} frames of {table['n_points']} points"
 
 
 def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
@@ -259,10 +257,8 @@ def _fit(report: dict[str, Any]) -> Section:
         floor = _percent(model["rank_floor"])
         remark = f" (no model with {_shapes(model)} is below {floor})"
     parts = quality_section(model, remark)
-    largest = model["largest_error"]
-    parts.append(
-        f"largest error of a row: {largest['rms']:.3g}, of row {largest['row']}"
-    )
+    worst = model["largest_error"]
+    parts.append(f"largest error of a row: {worst['rms']:.3g}, of row {worst['row']}")
     if model["noise_variance"] is not None:
         noise = math.sqrt(model["noise_variance"])
         size = f"{_percent(noise)} of the frame's size"

@@ -23,21 +23,23 @@ _NUMBER = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number
 _IMAGE = r"(?:image|img|photo|frame)(?:[ _.]?(?:id|name|path|file))?"
 
 
-def read_times(column: "pd.Series", format: str | None) -> NDArray:
-    """Return times as numbers, dates, or durations in seconds.
+def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
+    """Return times as numbers, dates, or durations in seconds, and their unit.
 
     All cells are read in one format, which is given, or the only one that reads all.
     """
-    types = pd.api.types
-    if types.is_timedelta64_dtype(column):
-        return np.asarray(column.dt.total_seconds())
-    if types.is_datetime64_any_dtype(column):
-        return np.asarray(pd.to_datetime(column, utc=True).dt.tz_localize(None))
+    if column.dtype.kind == "m":
+        return np.asarray(column.dt.total_seconds()), "seconds"
+    if column.dtype.kind == "M":
+        dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
+        return np.asarray(dates), "seconds"
     column = column.astype(str).where(column.notna())
     known = column[column.notna()]
     numbers = pd.to_numeric(column, errors="coerce")
     if format is None and numbers.notna().equals(column.notna()):
-        return np.asarray(numbers, dtype=float)
+        of_frames = re.fullmatch(_NUMBER, str(column.name).strip(), re.IGNORECASE)
+        unit = "frames" if of_frames else f"in the unit of the column {column.name}"
+        return np.asarray(numbers, dtype=float), unit
     zoned = known.str.fullmatch(f".*{_ZONE}")
     if zoned.any() and not zoned.all():
         raise ValueError(
@@ -72,17 +74,7 @@ def read_times(column: "pd.Series", format: str | None) -> NDArray:
             f"{known[row]!r} in row {row} can be {' or '.join(listed)}, and no other "
             "row decides it: choose one with --time-format"
         )
-    return np.asarray(first.reindex(column.index))
-
-
-def time_unit(column: "pd.Series", times: NDArray) -> str:
-    """Return the unit of the times of a column that `read_times` has read."""
-    numbers = pd.to_numeric(column.astype(str), errors="coerce")
-    if times.dtype.kind == "M" or numbers.isna().all():
-        return "seconds"
-    if re.fullmatch(_NUMBER, str(column.name).strip(), re.IGNORECASE):
-        return "frames"
-    return f"in the unit of the column {column.name}"
+    return np.asarray(first.reindex(column.index)), "seconds"
 
 
 def image_numbers(table: "pd.DataFrame") -> tuple[NDArray, str | None]:
@@ -158,11 +150,9 @@ def _read(cells: "pd.Series", format: str) -> "pd.Series":
 
 def _shown(time: object) -> str:
     """Return a date, or seconds, as they are read by people."""
-    return (
-        f"{time:g} s"
-        if isinstance(time, float)
-        else str(time).removesuffix(" 00:00:00")
-    )
+    if isinstance(time, float):
+        return f"{time:g} s"
+    return str(time).removesuffix(" 00:00:00")
 
 
 def _cell(cells: "pd.Series", which: "pd.Series") -> str:

@@ -9,13 +9,7 @@ import numpy as np
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm.cli._outputs import (
-    missing_values_of_fit,
-    read_model,
-    refuse_overwriting,
-    write_alpha,
-)
+from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, write_alpha
 from isa_nrsfm.cli._reading import (
     as_fitted,
     drawing,
@@ -26,13 +20,14 @@ from isa_nrsfm.cli._reading import (
 from isa_nrsfm.cli._report import quality_report, table_report
 from isa_nrsfm.cli._sections import quality_section, table_section, text_of
 from isa_nrsfm.io._tables import table_suffix
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 
 def run(args: Namespace, warned: list[str]) -> str:
     """Write the coefficients of a table's rows, and return the report."""
     output = Path(args.output)
     table_suffix(output)
-    estimator = read_model(args.model)
+    estimator, missing = read_model(args.model)
     if args.std and not hasattr(estimator, "noise_variance_"):
         raise ValueError(
             f"--std: {args.model} was fitted with refinement={estimator.refinement!r}, "
@@ -40,7 +35,7 @@ def run(args: Namespace, warned: list[str]) -> str:
         )
     if args.viewer is None and drawing_options(args):
         raise ValueError("--edges, --skeleton and --origin need --viewer")
-    args.missing_value = [*args.missing_value, *missing_values_of_fit(args.model)]
+    args.missing_value = [*args.missing_value, *missing]
     frames = read_frames(args, estimator)
     drawn = drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]

@@ -10,8 +10,7 @@ from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
 from isa_nrsfm._tables.tracks import Layout
-from isa_nrsfm.datasets._performers import film, perform, wander
-from isa_nrsfm.datasets._scene import PARAMETERS, Camera, observe
+from isa_nrsfm.datasets._scene import PARAMETERS, Camera, film, observe, perform, wander
 from isa_nrsfm.skeletons import get_skeleton
 
 ACTIONS = ("walk", "reach", "squat")
@@ -152,11 +151,8 @@ def make_body_tracks(
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, ACTIONS, build, rng)
     angles, motion, translation = film(path, (80.0, 20.0, 8.0), (0.2, 0.5), camera, rng)
-    table = observe(
-        shapes, motion, translation, rng, noise=noise, missing=missing, layout=layout
-    )
-    point_names = list(names)
-    return Bunch(**table, **truths, angles=angles, point_names=point_names)
+    table = observe(shapes, motion, translation, rng, noise, missing, layout)
+    return Bunch(**table, **truths, angles=angles, point_names=list(names))
 
 
 def _angles(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDArray]:
@@ -180,10 +176,8 @@ def _angles(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDAr
     angles["right_shoulder"] = angles["right_shoulder"] + 2.4 * reach
     angles["right_spread"] = angles["right_spread"] + 0.3 * reach
     held = HELD * wander(time, len(angles), rng).T
-    return {
-        name: angle + off
-        for (name, angle), off in zip(angles.items(), held, strict=True)
-    }
+    parts = zip(angles.items(), held, strict=True)
+    return {name: angle + off for (name, angle), off in parts}
 
 
 def _joints(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDArray]:
@@ -197,32 +191,26 @@ def _joints(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDAr
     x = np.array([1.0, 0.0, 0.0])
     pelvis = np.zeros((len(time), 3))
     up = -_direction(-angle["lean"])
-    joints = {
-        "pelvis": pelvis,
-        "spine": pelvis + 0.5 * length["trunk"] * up,
-        "thorax": pelvis + length["trunk"] * up,
-    }
-    neck = joints["thorax"] + length["neck"] * up
+    thorax, spine = (pelvis + part * length["trunk"] * up for part in (1.0, 0.5))
+    joints = {"pelvis": pelvis, "spine": spine, "thorax": thorax}
+    neck = thorax + length["neck"] * up
     # The head leans with the trunk, half as much.
     ahead = _direction(np.pi / 2 - angle["lean"] / 2)
     down = _direction(-angle["lean"] / 2)
     for name, (left, low, back) in HEAD.items():
-        offset = size * (low * down - back * ahead)
-        joints[name] = neck + offset + size * left * x
-        if left:
-            other = name.replace("left", "right")
-            joints[other] = neck + offset - size * left * x
+        place = neck + size * (low * down - back * ahead)
+        joints[name.replace("left", "right")] = place - size * left * x
+        joints[name] = place + size * left * x
     for side, sign in (("left", 1), ("right", -1)):
         hip = pelvis + sign * length["hips"] * x
         bend = angle[f"{side}_hip"]
         knee = hip + length["thigh"] * _direction(bend)
         foot = knee + length["shank"] * _direction(bend - angle[f"{side}_knee"])
-        shoulder = joints["thorax"] + sign * length["shoulders"] * x
+        shoulder = thorax + sign * length["shoulders"] * x
         raised, spread = angle[f"{side}_shoulder"], sign * angle[f"{side}_spread"]
         elbow = shoulder + length["upper_arm"] * _direction(raised, spread)
-        wrist = elbow + length["forearm"] * _direction(
-            raised + angle[f"{side}_elbow"], spread
-        )
+        raised = raised + angle[f"{side}_elbow"]
+        wrist = elbow + length["forearm"] * _direction(raised, spread)
         ends = {"hip": hip, "knee": knee, "ankle": foot, "foot": foot}
         ends |= {"shoulder": shoulder, "elbow": elbow, "wrist": wrist}
         joints |= {f"{side}_{name}": joint for name, joint in ends.items()}
@@ -231,8 +219,6 @@ def _joints(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDAr
 
 def _direction(forwards: NDArray, sideways: NDArray | float = 0.0) -> NDArray:
     """Return unit vectors (n, 3) that hang down, raised forwards and sideways."""
-    across = np.broadcast_to(np.sin(sideways), forwards.shape)
-    along = np.cos(sideways)
-    return np.stack(
-        [across, along * np.cos(forwards), -along * np.sin(forwards)], axis=1
-    )
+    along, across = np.cos(sideways), np.sin(sideways) + 0 * forwards
+    parts = across, along * np.cos(forwards), -along * np.sin(forwards)
+    return np.stack(parts, axis=1)

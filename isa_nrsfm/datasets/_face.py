@@ -1,20 +1,24 @@
-"""Draw the tracks of a face with expressions."""
+"""Draw the tracks of a face with expressions.
 
+The symmetric face of 68 points and its expressions are a table in millimetres. The
+origin lies between the nose tip and the ears' plane, x points to the right in the
+image, y down and z away from the camera: the nose tip has the smallest z. Only the half
+on the left of the image (the subject's right) and the middle are written down, at the
+indices of the iBUG-68 scheme; the other half is the mirror image.
+"""
+
+from collections.abc import Sequence
+from importlib.resources import files
 from numbers import Integral
 
 import numpy as np
 from numpy.random import RandomState
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._tables.tracks import Layout
-from isa_nrsfm.datasets._face_model import (
-    COMPONENT_NAMES,
-    SIGNED_COMPONENTS,
-    deformations,
-    neutral_shape,
-)
 from isa_nrsfm.datasets._scene import (
     FRAMES_A_SECOND,
     PARAMETERS,
@@ -24,6 +28,14 @@ from isa_nrsfm.datasets._scene import (
     observe,
     standardise,
 )
+from isa_nrsfm.skeletons import get_skeleton
+
+COMPONENT_NAMES = (
+    *("jaw open", "smile", "brow raise", "blink"),
+    *("lip pucker", "brow lower", "nose wrinkle", "face width"),
+)
+# As often negative as positive; the others are expressions.
+SIGNED_COMPONENTS = ("face width",)
 
 
 @checked_parameters(
@@ -168,8 +180,8 @@ def make_face_tracks(
     if expressions:
         labels = np.array(names)[expressions][strength[:, expressions].argmax(axis=1)]
     alpha = standardise(strength)
-    neutral = centre_shapes(neutral_shape())
-    full = centre_shapes(deformations(n_components))
+    shapes = centre_shapes(_drawn_shapes(["neutral", *names]))
+    neutral, full = shapes[0], shapes[1:]  # deformations at full strength
     mean_shape = neutral + np.tensordot(strength.mean(axis=0), full, 1)
     basis = full * strength.std(axis=0)[:, None, None]
 
@@ -178,9 +190,7 @@ def make_face_tracks(
     motion = draw_motion(rotations, camera, (1.0, 4.0), rng)
     translation = rng.uniform((320.0, 240.0), (960.0, 720.0), size=(n_frames, 2))
     shapes = mean_shape + np.tensordot(alpha, basis, 1)
-    table = observe(
-        shapes, motion, translation, rng, noise=noise, missing=missing, layout=layout
-    )
+    table = observe(shapes, motion, translation, rng, noise, missing, layout)
     return Bunch(
         **table,
         mean_shape=mean_shape,
@@ -194,3 +204,18 @@ def make_face_tracks(
         time=np.arange(n_frames) / FRAMES_A_SECOND,
         angles=angles,
     )
+
+
+def _drawn_shapes(names: Sequence[str]) -> NDArray[np.float64]:
+    """Return shapes (n, 68, 3) of the table; points that it does not list are zero."""
+    face, mirror = get_skeleton("ibug-68"), np.arange(68)
+    mirror[[*face.left, *face.right]] = [*face.right, *face.left]
+    columns = [("name", "U20"), ("point", int), ("place", float, 3)]
+    with (files("isa_nrsfm.datasets") / "face_model.csv").open() as file:
+        table = np.loadtxt(file, delimiter=",", dtype=columns)
+    shapes = np.zeros((len(names), 68, 3))
+    for shape, name in zip(shapes, names, strict=True):
+        rows = table[table["name"] == name]
+        shape[mirror[rows["point"]]] = rows["place"] * (-1.0, 1.0, 1.0)
+        shape[rows["point"]] = rows["place"]
+    return shapes

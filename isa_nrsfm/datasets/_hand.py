@@ -9,8 +9,7 @@ from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._tables.tracks import Layout
-from isa_nrsfm.datasets._performers import film, perform, wander
-from isa_nrsfm.datasets._scene import PARAMETERS, Camera, observe
+from isa_nrsfm.datasets._scene import PARAMETERS, Camera, film, observe, perform, wander
 from isa_nrsfm.skeletons import get_skeleton
 
 POSES = ("open", "fist", "point")
@@ -140,12 +139,9 @@ def make_hand_tracks(
     """
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, POSES, _hand, rng)
-    angles, motion, translation = film(
-        path, (60.0, 35.0, 35.0), (1.0, 3.0), camera, rng
-    )
-    table = observe(
-        shapes, motion, translation, rng, noise=noise, missing=missing, layout=layout
-    )
+    largest = (60.0, 35.0, 35.0)
+    angles, motion, translation = film(path, largest, (1.0, 3.0), camera, rng)
+    table = observe(shapes, motion, translation, rng, noise, missing, layout)
     point_names = list(get_skeleton("hand-21").point_names or ())
     return Bunch(**table, **truths, angles=angles, point_names=point_names)
 

@@ -18,7 +18,6 @@ S. Milborrow, J. Morkel, F. Nicolls: The MUCT Landmarked Face Database. Pattern
 Recognition Association of South Africa, 2010. http://www.milbo.org/muct
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from sklearn.utils import Bunch
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables.tracks import table_to_tracks
-from isa_nrsfm.datasets._remote import DataHome, RemoteFile, fetch_file
+from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, RemoteFile, fetch_file
 
 MUCT = RemoteFile(
     name="muct76-opencv.csv",
@@ -45,13 +44,7 @@ DESCR = f"{__doc__}\nSource: free for academic use, {MUCT.url}\n"
 
 
 @checked_parameters(
-    {
-        "data_home": [str, os.PathLike, None],
-        "download_if_missing": ["boolean"],
-        "mirrored": ["boolean"],
-        "return_X_y": ["boolean"],
-        "as_frame": ["boolean"],
-    }
+    PARAMETERS | {name: ["boolean"] for name in ("mirrored", "return_X_y", "as_frame")}
 )
 def fetch_muct(
     *,
@@ -202,9 +195,6 @@ def _put_in_frames(faces: Bunch) -> None:
     """Make the table and the target of pandas, and add a frame of all columns."""
     faces.data = pd.DataFrame(faces.data, columns=faces.feature_names)
     faces.target = pd.Series(faces.subjects, name="subject")
-    labels = {
-        name: faces[name if name in faces else f"{name}s"]
-        for name in ("name", "tag", "subject", "lighting", "camera", "sex")
-    }
-    labels |= {"glasses": faces.glasses, "mirrored": faces.mirrored}
+    names = "name tag subject lighting camera sex glasses mirrored".split()
+    labels = {name: faces[name if name in faces else f"{name}s"] for name in names}
     faces.frame = pd.concat([pd.DataFrame(labels), faces.data], axis=1)

@@ -163,15 +163,9 @@ def make_nonrigid_tracks(
         basis *= amplitude / size
     rotations = Rotation.from_quat(rng.standard_normal((n_frames, 4))).as_matrix()
     motion = draw_motion(rotations, camera, (2 / 3, 3 / 2), rng)
-    table = observe(
-        mean_shape + np.tensordot(alpha, basis, 1),
-        motion,
-        rng.standard_normal((n_frames, 2)),
-        rng,
-        noise=noise,
-        missing=missing,
-        layout=layout,
-    )
+    translation = rng.standard_normal((n_frames, 2))
+    frames = mean_shape + np.tensordot(alpha, basis, 1)
+    table = observe(frames, motion, translation, rng, noise, missing, layout)
     return Bunch(**table, mean_shape=mean_shape, basis=basis, alpha=alpha)
 
 

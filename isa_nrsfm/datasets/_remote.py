@@ -3,13 +3,19 @@
 import hashlib
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sklearn.datasets import get_data_home
 
 from isa_nrsfm._compat.optional import import_optional
 
 DataHome = str | os.PathLike[str] | None
+
+# Constraints of the parameters that all fetchers have in common.
+PARAMETERS: dict[str, list[Any]] = {
+    "data_home": [str, os.PathLike, None],
+    "download_if_missing": ["boolean"],
+}
 
 
 class RemoteFile(NamedTuple):

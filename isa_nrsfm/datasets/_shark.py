@@ -12,14 +12,12 @@ and Motion with Hierarchical Priors. IEEE Transactions on Pattern Analysis and M
 Intelligence 30 (2008), 878-892.
 """
 
-import os
-
 from scipy.io import loadmat
 from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables.tracks import tracks_to_table
-from isa_nrsfm.datasets._remote import DataHome, RemoteFile, fetch_file
+from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, RemoteFile, fetch_file
 
 JAWS = RemoteFile(
     name="jaws.mat",
@@ -33,9 +31,7 @@ JAWS = RemoteFile(
 DESCR = f"{__doc__}\nSource: free for non-commercial use, {JAWS.url}\n"
 
 
-@checked_parameters(
-    {"data_home": [str, os.PathLike, None], "download_if_missing": ["boolean"]}
-)
+@checked_parameters(PARAMETERS)
 def fetch_shark(
     *, data_home: DataHome = None, download_if_missing: bool = True
 ) -> Bunch:

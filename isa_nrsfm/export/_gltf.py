@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.export._drawing import (
     Links,
     choose_drawing,
@@ -21,7 +20,8 @@ from isa_nrsfm.export._drawing import (
 from isa_nrsfm.export._names import names_of_components, suffix_of
 from isa_nrsfm.export._upright import Camera, upright_basis, upright_space
 from isa_nrsfm.plotting._axes import is_dense
-from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
+from isa_nrsfm.plotting._views import UPSIDE_DOWN, Origin
+from isa_nrsfm.skeletons._column_names import names_of_points
 from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
 
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
@@ -31,15 +31,12 @@ POINTS, LINES, TRIANGLES = 0, 1, 4
 # Matt materials, seen from both sides: for points and edges in the middle, on the left
 # and on the right, and for surfaces.
 SURFACE = 3
+MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.8}
 MATERIALS = [
     {
         "name": name,
         "doubleSided": True,
-        "pbrMetallicRoughness": {
-            "baseColorFactor": [*colour, 1.0],
-            "metallicFactor": 0.0,
-            "roughnessFactor": 0.8,
-        },
+        "pbrMetallicRoughness": {"baseColorFactor": [*colour, 1.0]} | MATT,
     }
     for name, colour in (
         ("points and edges", (0.05, 0.12, 0.25)),
@@ -123,19 +120,17 @@ def write_glb(
     """
     suffix_of(path, [".glb"])
     space = upright_space(model, camera, origin, mirrored, edges)
-    n_components = len(model.basis_)
-    targets = names_of_components(names, n_components)
+    targets = names_of_components(names, len(model.basis_))
     mean, basis = upright_basis(space, model)
     mean = (mean - mean.mean(axis=0)) @ UPSIDE_DOWN
     factor = 1 / np.ptp(mean, axis=0).max()
     mean, basis = factor * mean, factor * (basis @ UPSIDE_DOWN)
     links, sides = choose_drawing(edges, space.layout, len(mean))
-    surface = None
+    surface, is_face = None, space.layout is None or space.layout.kind == "face"
     if links.shape[1] == 3:
         surface, links = links, np.empty((0, 2), np.intp)
-    elif isinstance(edges, str) and edges == "auto":
-        if space.layout is None or space.layout.kind == "face":
-            surface = frontal_triangles(mean)
+    elif isinstance(edges, str) and edges == "auto" and is_face:
+        surface = frontal_triangles(mean)
     of_links = sides_of_edges(sides, links)
     drawn_edges = [links[of_links == side] for side in (MIDDLE, LEFT, RIGHT)]
 
@@ -144,25 +139,18 @@ def write_glb(
     used = sorted({part["material"] for part in primitives})
     for part in primitives:
         part["material"] = used.index(part["material"])
+    extras = {"targetNames": targets, "pointNames": list(names_of_points(model))}
     mesh = {
         "name": "mean shape",
         "primitives": primitives,
-        "weights": [0.0] * n_components,
-        "extras": {
-            "targetNames": targets,
-            "pointNames": list(names_of_points(model)),
-            "factor": factor,
-        },
+        "weights": [0.0] * len(targets),
+        "extras": extras | {"factor": factor},
     }
-    times, weights = _swings(n_components)
-    sampler = {
-        "input": file.add(times, bounds=True),
-        "interpolation": "LINEAR",
-        "output": file.add(weights.ravel()),
-    }
+    times, weights = _swings(len(targets))
+    sampler = {"input": file.add(times, bounds=True), "interpolation": "LINEAR"}
     animation = {
         "name": "basis shapes in turn",
-        "samplers": [sampler],
+        "samplers": [sampler | {"output": file.add(weights.ravel())}],
         "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
     }
     document = {
@@ -181,7 +169,7 @@ class Binary:
     """The arrays of a glTF file, one after the other, and their description."""
 
     def __init__(self) -> None:
-        self.parts: list[bytes] = []
+        self.arrays = b""
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
 
@@ -208,32 +196,24 @@ class Binary:
             rows = array.reshape(len(array), -1).astype(float)
             accessor |= {"min": rows.min(axis=0).tolist()}
             accessor |= {"max": rows.max(axis=0).tolist()}
-        view = {"buffer": 0, "byteOffset": self.size, "byteLength": array.nbytes}
+        view = {"buffer": 0, "byteOffset": len(self.arrays), "byteLength": array.nbytes}
         self.views.append(view | ({} if use is None else {"target": use}))
         self.accessors.append(accessor)
-        self.parts.append(_padded(array.tobytes(), b"\0"))
+        self.arrays += _padded(array.tobytes(), b"\0")
         return len(self.accessors) - 1
-
-    @property
-    def size(self) -> int:
-        """The number of bytes so far."""
-        return sum(map(len, self.parts))
 
     def with_document(self, document: dict[str, Any]) -> bytes:
         """Return the file: header, the document that refers to the arrays, arrays."""
         document = document | {
             "accessors": self.accessors,
             "bufferViews": self.views,
-            "buffers": [{"byteLength": self.size}],
+            "buffers": [{"byteLength": len(self.arrays)}],
         }
         text = json.dumps(document, separators=(",", ":"), allow_nan=False)
-        chunks = b"".join(
-            struct.pack("<I4s", len(content), kind) + content
-            for kind, content in (
-                (b"JSON", _padded(text.encode(), b" ")),
-                (b"BIN\0", b"".join(self.parts)),
-            )
-        )
+        chunks = b""
+        for kind, content in ((b"JSON", text.encode()), (b"BIN\0", self.arrays)):
+            content = _padded(content, b" ")
+            chunks += struct.pack("<I4s", len(content), kind) + content
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
@@ -263,21 +243,11 @@ def _primitives(
         # Viewers add normals with the weights: store their change by one standard
         # deviation.
         turns = [vertex_normals(mean + drift, surface) - normals for drift in basis]
-        parts = [
-            part | {"NORMAL": file.add(normal, VERTICES)}
-            for part, normal in zip(
-                [bare["attributes"], *bare["targets"]], [normals, *turns], strict=True
-            )
-        ]
-        primitives.append(
-            {
-                "attributes": parts[0],
-                "targets": parts[1:],
-                "material": SURFACE,
-                "mode": TRIANGLES,
-                "indices": indices,
-            }
-        )
+        numbers = [file.add(normal, VERTICES) for normal in (normals, *turns)]
+        parts = zip([bare["attributes"], *bare["targets"]], numbers, strict=True)
+        first, *others = (part | {"NORMAL": number} for part, number in parts)
+        shaded = {"attributes": first, "targets": others, "material": SURFACE}
+        primitives.append(shaded | {"mode": TRIANGLES, "indices": indices})
     if surface is None or not is_dense(mean):
         primitives.append(bare | {"mode": POINTS})
     for side, edges in enumerate(drawn_edges):
@@ -295,6 +265,6 @@ def _swings(n_components: int) -> tuple[NDArray, NDArray]:
     # Weights are exactly zero at the start of the next swing.
     swing[-1] = 0.0
     weights = np.kron(np.eye(n_components), swing[:, None])
-    times = (np.arange(n_components)[:, None] + phase).ravel()
-    rest = np.zeros(n_components)
-    return 2.0 * np.append(0.0, times), np.vstack([rest, weights])  # two seconds each
+    times = np.add.outer(np.arange(n_components), phase)
+    # From rest on, two seconds each
+    return 2.0 * np.insert(times, 0, 0.0), np.pad(weights, ((1, 0), (0, 0)))

@@ -8,7 +8,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._tables.column_names import checked_names
+from isa_nrsfm.skeletons._column_names import checked_names
 
 
 def names_of_components(names: Any, n_components: int) -> list[str]:

@@ -16,10 +16,9 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._compat.stored_arrays import array_in, write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm._frames.projection import compose
 from isa_nrsfm.export._names import suffix_of
 from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
-from isa_nrsfm.plotting._edges import Origin
+from isa_nrsfm.plotting._views import Origin
 
 SUFFIXES = (".txt", ".mat", ".npz")
 COMMENTS = (
@@ -156,11 +155,7 @@ def point_distribution_model(
     ((68, 3), (2, 68, 3), (2,))
     """
     space = upright_space(model, camera, origin, mirrored)
-    if space.camera is None:
-        shapes = compose(model.mean_shape_, model.basis_, model.alpha_)
-        shapes = shapes @ space.transform.T
-    else:
-        shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
+    shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
     if space.camera is not None:
         shapes = _aligned(shapes)
@@ -275,12 +270,8 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
 def _check_shapes(pdm: PointDistributionModel) -> None:
     """Raise if the arrays of a model do not fit each other."""
     mean, modes, eigenvalues = map(np.shape, pdm)
-    if (
-        len(mean) != 2
-        or mean[1] != 3
-        or len(eigenvalues) != 1
-        or modes != (*eigenvalues, *mean)
-    ):
+    fitting = len(mean) == 2 and mean[1] == 3 and len(eigenvalues) == 1
+    if not fitting or modes != (*eigenvalues, *mean):
         raise ValueError(
             "mean must have shape (n_points, 3), modes (n_modes, n_points, 3) and "
             f"eigenvalues (n_modes,); got {mean}, {modes} and {eigenvalues}"
@@ -306,10 +297,9 @@ def _numbers(found: Mapping[str, NDArray], names: Sequence[str]) -> list[NDArray
     if absent:
         raise ValueError(f"it has no {', '.join(absent)}")
     for name in names:
-        if found[name].dtype.kind not in "fiu":
-            raise ValueError(
-                f"{name} should have real numbers; got {found[name].dtype}"
-            )
+        dtype = found[name].dtype
+        if dtype.kind not in "fiu":
+            raise ValueError(f"{name} should have real numbers; got {dtype}")
     return [found[name] for name in names]
 
 
@@ -351,9 +341,8 @@ def _number_of_modes(n_modes: Any, n_components: int, variances: NDArray) -> int
 
 def _aligned(shapes: NDArray) -> NDArray:
     """Return centred shapes turned to their mean, and scaled to its tangent space."""
-    shapes = shapes - shapes.mean(axis=1, keepdims=True)
+    shapes = aligned = shapes - shapes.mean(axis=1, keepdims=True)
     mean = shapes.mean(axis=0)
-    aligned = shapes
     for _ in range(100):
         left, stretch, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ mean)
         turned = np.linalg.det(left @ right)

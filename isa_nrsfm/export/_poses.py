@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._names import frames_of_table
 from isa_nrsfm.export._upright import (
@@ -20,7 +19,8 @@ from isa_nrsfm.export._upright import (
     upright_frames,
     upright_space,
 )
-from isa_nrsfm.plotting._edges import Origin
+from isa_nrsfm.plotting._views import Origin
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 
 class FramePoses(NamedTuple):

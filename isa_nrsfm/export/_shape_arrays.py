@@ -11,8 +11,8 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.stored_arrays import write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.export._names import names_of_components, suffix_of
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 
 class ShapeArrays(NamedTuple):

@@ -13,7 +13,7 @@ from sklearn.utils import gen_batches
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._estimator import check_class
+from isa_nrsfm._estimator import check_class, check_frames_kept, frames_of
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm._metric_upgrade.deforming import (
@@ -24,21 +24,18 @@ from isa_nrsfm._metric_upgrade.deforming import (
 )
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import check_frames_kept, frames_of
-from isa_nrsfm.plotting._edges import (
+from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,
     choose_layout,
     choose_origin,
-    upright_turn,
-)
-from isa_nrsfm.plotting._views import (
     euclidean_axes,
+    upright_turn,
     viewing_rotation,
     viewing_transform,
 )
 from isa_nrsfm.skeletons import Skeleton
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 Camera = Literal["weak_perspective"] | None
 
@@ -81,12 +78,11 @@ def upright_space(
     certainty = frames_of(model).certainty
     if camera is not None and not certainty.determined:
         warn_caller(certainty.advice)
+    to_metric = np.eye(3)
     if fitted != "affine":
         transform = euclidean_axes(model)
-        shape = model.mean_shape_ @ transform.T
     elif camera is None:
         transform = viewing_transform(model.motion_, model.reference_motion_)
-        shape = model.mean_shape_ @ transform.T
     else:
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
@@ -96,8 +92,7 @@ def upright_space(
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )
-        shape = model.mean_shape_ @ (transform @ to_metric).T
-
+    shape = model.mean_shape_ @ (transform @ to_metric).T
     image_axes = np.eye(3)
     layout = choose_layout(edges, shape, names_of_points(model))
     if choose_origin(origin, shape, layout) == "lower":
@@ -141,8 +136,7 @@ def upright_basis(
         return model.mean_shape_ @ space.transform.T, model.basis_ @ space.transform.T
     n_frames, n_components = model.alpha_.shape
     size = model.mean_shape_.size
-    gram = np.zeros((1 + n_components, 1 + n_components))
-    product = np.zeros((1 + n_components, size))
+    gram, product = (np.zeros((1 + n_components, n)) for n in (1 + n_components, size))
     for block in gen_batches(n_frames, max(1, block_numbers // size)):
         motion, alpha = model.motion_[block], model.alpha_[block]
         shapes = upright_frames(space, model, motion, alpha).shapes

@@ -15,9 +15,8 @@ from sklearn.utils import check_array
 
 from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._tables.frame_columns import checked_times, is_missing
-from isa_nrsfm._transformer import frames_of
+from isa_nrsfm._estimator import frames_of
+from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
 from isa_nrsfm.export._drawing import Links, choose_drawing, edges_of
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
@@ -26,7 +25,8 @@ from isa_nrsfm.export._upright import (
     upright_frames,
     upright_space,
 )
-from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
+from isa_nrsfm.plotting._views import UPSIDE_DOWN, Origin
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # The colours of more labels than this look alike.
 MOST_LABELS = 30
@@ -157,8 +157,7 @@ def write_viewer(
 
     mean, basis = upright_basis(space, model)
     links, sides = choose_drawing(edges, space.layout, len(mean))
-    centre = mean.mean(axis=0)
-    shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
+    shapes = np.stack([mean - mean.mean(axis=0), *basis]) @ UPSIDE_DOWN
     size = np.linalg.norm(shapes[0], axis=1).max()
     rotations = np.empty((0, 3, 3))
     if space.camera is not None and len(motion):
@@ -202,13 +201,8 @@ def _deviations(values: Any, n_rows: int, model: Any) -> NDArray:
             "depth_std needs a model with calibrated cameras; this one was fitted with "
             'camera="affine"'
         )
-    found = check_array(
-        values,
-        dtype=np.float64,
-        ensure_2d=False,
-        ensure_all_finite="allow-nan",
-        input_name="depth_std",
-    )
+    checks = {"ensure_2d": False, "ensure_all_finite": "allow-nan"}
+    found = check_array(values, dtype=np.float64, input_name="depth_std", **checks)
     shape = (n_rows, len(model.mean_shape_))
     if found.shape not in (shape, shape[1:]):
         raise ValueError(
@@ -223,9 +217,10 @@ def _deviations(values: Any, n_rows: int, model: Any) -> NDArray:
 
 def _page(content: dict[str, Any]) -> str:
     """Return the page with a content."""
-    folder = files("isa_nrsfm.export")
-    page = (folder / "viewer.html").read_text(encoding="utf-8")
-    script = (folder / "viewer.js").read_text(encoding="utf-8")
+    page, script = (
+        (files("isa_nrsfm.export") / name).read_text(encoding="utf-8")
+        for name in ("viewer.html", "viewer.js")
+    )
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     # Escape data that would end its HTML element.
     data = json.dumps(content, separators=(",", ":"), allow_nan=False)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._compat.texts import as_utf8, by_number
-from isa_nrsfm.io._landmarks import Landmarks, assemble
-from isa_nrsfm.io._separated_values import first_lines
+from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
+from isa_nrsfm.io._tables import first_lines
 
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
@@ -17,10 +17,7 @@ _PTS = re.compile(
 )
 _N_WFLW = 98
 _WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
-_WFLW_ATTRIBUTES = (
-    *("pose", "expression", "illumination"),
-    *("make_up", "occlusion", "blur"),
-)
+_WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
 # Fields of a line: points and image, without and with the box and the attributes.
 _WFLW_LENGTHS = (197, 207)
 
@@ -44,17 +41,13 @@ def read_pts(path: Path) -> Landmarks:
         files = sorted(filter(_is_pts_name, path.iterdir()), key=by_number)
         if not files:
             raise ValueError("there are no .pts files in the folder")
-    tracks = []
+    points = []
     for file in files:
         with errors_of(file.name):
-            tracks.append(_points_of(file.read_bytes().decode("utf-8-sig")))
-        if len(tracks[-1]) != len(tracks[0]):
-            raise ValueError(
-                f"{files[0].name} has {len(tracks[0])} points, {file.name} has "
-                f"{len(tracks[-1])}: all files must have the same number"
-            )
+            points.append({0: _points_of(file.read_bytes().decode("utf-8-sig"))})
+    *_, tracks = stacked(points, [file.name for file in files])
     names = {"file": [as_utf8(file.name) for file in files]}
-    return assemble(np.stack(tracks), None, names, format="pts")
+    return assemble(tracks, None, names, format="pts")
 
 
 def is_wflw(path: Path) -> bool:

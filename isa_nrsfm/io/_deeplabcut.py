@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
+from isa_nrsfm.io._hdf5 import Columns, is_hdf5, read_stored_frame, root_groups
 from isa_nrsfm.io._landmarks import Landmarks, assemble_individuals
-from isa_nrsfm.io._separated_values import SEPARATORS, header_rows, read_columns
-from isa_nrsfm.io._stored_frames import StoredFrame, read_stored_frame
+from isa_nrsfm.io._tables import SEPARATORS, header_rows, read_columns
 
 _LEVELS = ["scorer", "bodyparts", "coords"]
 _LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
@@ -36,23 +36,23 @@ def read_deeplabcut(path: Path) -> Landmarks:
     ``likelihood``. The index has the number of the frame or the path of the image. The
     individual "single", for points of no animal, is left out where there are others.
     """
-    table = _read_text(path) if path.suffix.lower() in SEPARATORS else _read_h5(path)
-    scorers = {column[0] for column in table.columns}
+    read = _read_text if path.suffix.lower() in SEPARATORS else _read_h5
+    table, columns, labels = read(path)
+    scorers = {column[0] for column in columns}
     if len(scorers) > 1:
         raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
-    places = _places(table.columns)
-    individuals, (first, *_) = list(places), places.values()
+    places = _places(columns)
+    first = next(iter(places.values()))
     where = np.array([[parts[name] for name in first] for parts in places.values()])
     # A column of NaN stands for likelihoods that are not there.
-    values = np.column_stack([table.values, np.full(len(table.values), np.nan)])
-    found = values[:, where]
+    found = np.column_stack([table, np.full(len(table), np.nan)])[:, where]
     try:
-        frames: dict[str, list[Any]] = {"frame": [int(label) for label in table.labels]}
+        frames: dict[str, list[Any]] = {"frame": [int(label) for label in labels]}
     except (TypeError, ValueError):
-        frames = {"image": [str(label) for label in table.labels]}
+        frames = {"image": [str(label) for label in labels]}
     return assemble_individuals(
         found[..., :2],
-        individuals if len(table.columns[0]) == len(_LEVELS_OF_MANY) else None,
+        list(places) if len(columns[0]) == len(_LEVELS_OF_MANY) else None,
         list(first),
         frames,
         format="deeplabcut",
@@ -60,7 +60,7 @@ def read_deeplabcut(path: Path) -> Landmarks:
     )
 
 
-def _read_text(path: Path) -> StoredFrame:
+def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     """Read a csv or tsv file, whose first lines are the levels of the columns."""
     header = header_rows(path, 4)
     levels = _levels_of(header)
@@ -76,25 +76,23 @@ def _read_text(path: Path) -> StoredFrame:
     n_index = next(i for i, name in enumerate([*header[-1][1:], "x"], 1) if name)
     columns = list(zip(*header, strict=True))
     numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
-    index = list(range(n_index))
     names = [str(i) for i in range(len(columns))]
+    coordinates = [names[i] for i in numbers]
     frame = read_columns(
         path,
-        leave_out=set(names).difference(str(i) for i in (*index, *numbers)),
-        numbers=[str(i) for i in numbers],
-        text=[str(i) for i in index],
+        leave_out=set(names[n_index:]).difference(coordinates),
+        numbers=coordinates,
+        text=names[:n_index],
         n_header=len(levels),
         names=names,
     )
     cells = frame.iloc[:, :n_index].fillna("").to_numpy()
-    return StoredFrame(
-        frame.iloc[:, n_index:].to_numpy(dtype=np.float64),
-        [columns[i] for i in numbers],
-        ["/".join(row) for row in cells],
-    )
+    labels = ["/".join(row) for row in cells]
+    values = frame.iloc[:, n_index:].to_numpy(dtype=np.float64)
+    return values, [columns[i] for i in numbers], labels
 
 
-def _read_h5(path: Path) -> StoredFrame:
+def _read_h5(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     """Read the table that pandas has stored in an h5 file."""
     values, columns, labels = read_stored_frame(path, _KEY)
     numbers = [i for i, column in enumerate(columns) if column[-1] in _COORDS]
@@ -102,7 +100,7 @@ def _read_h5(path: Path) -> StoredFrame:
     for column in columns:
         if len(column) not in (len(_LEVELS), len(_LEVELS_OF_MANY)):
             raise ValueError(f"its columns have {len(column)} levels")
-    return StoredFrame(values[:, numbers], columns, labels)
+    return values[:, numbers], columns, labels
 
 
 def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:

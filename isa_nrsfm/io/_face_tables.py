@@ -14,13 +14,13 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
-from isa_nrsfm.io._landmarks import Landmarks, assemble
-from isa_nrsfm.io._separated_values import header_names, read_columns
+from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
+from isa_nrsfm.io._tables import header_names, read_columns
 
 # OpenFace names points in space, in millimetres, by capital letters.
-_OPENFACE_NOT_READ = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
+_NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
 # The vector that identifies faces, and the mesh beside the 68 points.
-_PYFEAT_NOT_READ = re.compile(r"Identity_\d+|mesh_[xyz]_\d+|z_\d+")
+_NOT_PYFEAT = re.compile(r"Identity_\d+|mesh_[xyz]_\d+|z_\d+")
 _PYFEAT_BOX = ("FaceRectX", "FaceRectY", "FaceRectWidth", "FaceRectHeight")
 
 
@@ -28,10 +28,8 @@ def is_openface(path: Path) -> bool:
     """Return whether the header is one of OpenFace."""
     names = header_names(path)
     of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
-    groups = {"x_0", "pose_Rx", "gaze_0_x", "AU01_r"}
-    return (of_video or names[:2] == ["face", "confidence"]) and not (
-        groups.isdisjoint(names)
-    )
+    groups = {"x_0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
+    return (of_video or names[:2] == ["face", "confidence"]) and bool(groups)
 
 
 def read_openface(path: Path) -> Landmarks:
@@ -52,9 +50,8 @@ def read_openface(path: Path) -> Landmarks:
     scores = ["confidence", "success"] if of_video else ["confidence"]
     _need(names, scores)
     found = find_landmark_columns(names, "x_#,y_#")
-    table = read_columns(
-        path, leave_out=_OPENFACE_NOT_READ, numbers=[*found.interleaved, *scores]
-    )
+    numbers = [*found.interleaved, *scores]
+    table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
     if of_video:
         if not table["success"].isin((0, 1)).all():
             raise ValueError("the column success must hold 0 and 1 only")
@@ -81,9 +78,7 @@ def read_pyfeat(path: Path) -> Landmarks:
     found = find_landmark_columns(names, "x_#,y_#")
     scores = [name for name in names if name == "FaceScore"]
     numbers = [*found.interleaved, *scores]
-    table = read_columns(
-        path, leave_out=_PYFEAT_NOT_READ, numbers=numbers, text=("input",)
-    )
+    table = read_columns(path, leave_out=_NOT_PYFEAT, numbers=numbers, text=["input"])
     return _assembled(table, found, "pyfeat", score=scores[0] if scores else None)
 
 
@@ -102,8 +97,6 @@ def read_mediapipe(
     Coordinates divided by the width and height of the image are multiplied by
     ``image_size``, or the columns ``image_width`` and ``image_height``.
     """
-    if image_size is not None:
-        image_size = _checked_size(image_size)
     names = header_names(path)
     found = find_landmark_columns(names)
     sizes = [name for name in ("image_width", "image_height") if name in names]
@@ -121,9 +114,10 @@ def read_mediapipe(
                 "1920x1080), or columns image_width and image_height"
             )
         _check_inside(tracks)
-        scale = (
-            table[sizes].to_numpy(float) if image_size is None else np.array(image_size)
-        )
+        if image_size is None:
+            scale = table[sizes].to_numpy(float)
+        else:
+            scale = checked_sizes("image_size", image_size, 1)
         with np.errstate(over="ignore"):  # `assemble` refuses infinite numbers
             tracks = tracks * scale.reshape(-1, 1, 2)
     elif image_size is not None:
@@ -184,20 +178,6 @@ def _assembled(
         columns=found.interleaved,
         confidence=confidence,
     )
-
-
-def _checked_size(image_size: tuple[float, float]) -> tuple[float, float]:
-    """Return the width and the height of an image, or raise."""
-    try:
-        width, height = (float(length) for length in image_size)
-    except (TypeError, ValueError):
-        width = height = np.nan
-    if not (0 < width < np.inf and 0 < height < np.inf):
-        raise ValueError(
-            "image_size must be a width and a height in pixels, such as (1920, 1080); "
-            f"got {image_size!r}"
-        )
-    return width, height
 
 
 def _need(names: list[str], needed: Iterable[str]) -> None:

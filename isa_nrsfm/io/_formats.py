@@ -39,9 +39,9 @@ class LandmarkFormat:
     suffixes : tuple of str
         Suffixes of its files in lower case; "/" for a folder of files.
     reader : str
-        Module and name of its two functions, such as ``_coco.coco``. ``is_coco`` takes
-        the path and returns whether the file begins like this format. ``read_coco``
-        returns its `Landmarks`, or raises a ValueError without the path.
+        Module and name of its two functions, such as ``_keypoints.coco``. ``is_coco``
+        takes the path and returns whether the file begins like this format.
+        ``read_coco`` returns its `Landmarks`, or raises a ValueError without the path.
     options : tuple of str
         Names of the options that `read` takes.
     """
@@ -233,9 +233,8 @@ def find_format(path: str | os.PathLike[str]) -> str:
     path = Path(path)
     _check_exists(path)
     possible = [found for found in FORMATS.values() if _suffix(path) in found.suffixes]
-    matching = [
-        found.name for found in possible if found.name != TABLE and found.matches(path)
-    ]
+    others = [each for each in possible if each.name != TABLE]
+    matching = [each.name for each in others if each.matches(path)]
     if len(matching) > 1:
         raise ValueError(
             f"{path} matches more than one format: {', '.join(matching)}. Choose with "
@@ -243,7 +242,7 @@ def find_format(path: str | os.PathLike[str]) -> str:
         )
     if matching:
         return matching[0]
-    if any(found.name == TABLE for found in possible):
+    if len(others) < len(possible):
         return TABLE
     if _suffix(path) in (".xlsx", ".xls", ".ods"):
         raise ValueError(f"{path} is a file of a spreadsheet: save it as .csv there")
@@ -341,7 +340,7 @@ _ALL = (
         "images, annotations and categories with keypoints, or a list of results; "
         "write json of other programs as a table",
         (".json",),
-        "_coco.coco",
+        "_keypoints.coco",
         ("category",),
     ),
     LandmarkFormat(
@@ -350,7 +349,7 @@ _ALL = (
         "people with pose_keypoints_2d, face_keypoints_2d, ...; a folder has a file "
         "..._keypoints.json for each frame",
         (".json", _FOLDER),
-        "_openpose.openpose",
+        "_keypoints.openpose",
         ("part",),
     ),
     LandmarkFormat(
@@ -363,6 +362,4 @@ _ALL = (
     ),
 )
 
-FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
-    {found.name: found for found in _ALL}
-)
+FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType({f.name: f for f in _ALL})

@@ -10,7 +10,7 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.column_names import parse_coordinate, point_names
+from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
 
 # What stands for the axis letter in the names of confidences: nose_conf, conf_0.
 CONFIDENCES = ("confidence", "conf", "likelihood", "score", "visibility", "c")
@@ -203,9 +203,8 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
         raise ValueError(f"the patterns {joined} match {twice!r} twice")
     if not {"#", "*"}.isdisjoint(joined):
         _warn_of_left_out(names, chosen, joined)
-    return LandmarkColumns(
-        joined, point_names(x), tuple(x), tuple(y), _z_of(names, x), tuple(gaps)
-    )
+    points, z = point_names(x), _z_of(names, x)
+    return LandmarkColumns(joined, points, tuple(x), tuple(y), z, tuple(gaps))
 
 
 def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:

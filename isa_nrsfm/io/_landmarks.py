@@ -96,7 +96,7 @@ def assemble(
     *,
     format: str,
     columns: Sequence[str] | None = None,
-    confidence: NDArray[np.float64] | None = None,
+    confidence: Any = None,
     skeleton: Skeleton | None = None,
 ) -> Landmarks:
     """Put landmarks together in the one form that all readers return, and check them.
@@ -126,14 +126,12 @@ def assemble(
     if skeleton is None and (format in LAYOUTS_OF_READERS or not numbered(point_names)):
         skeleton = find_skeleton(n_points, point_names, format)
     return Landmarks(
-        points=pd.DataFrame(
-            tracks.reshape(n_frames, 2 * n_points), columns=list(columns)
-        ),
+        points=pd.DataFrame(tracks.reshape(n_frames, -1), columns=list(columns)),
         # The copy is in one piece, so that further columns can be added quickly.
         frames=frames.set_axis(pd.RangeIndex(n_frames), axis=0).copy(),
         confidence=None
         if confidence is None
-        else pd.DataFrame(confidence, columns=list(point_names)),
+        else pd.DataFrame(np.asarray(confidence), columns=list(point_names)),
         failed=np.asarray(np.isnan(tracks).all(axis=(1, 2))),
         format=format,
         point_names=tuple(point_names),
@@ -183,6 +181,48 @@ def assemble_individuals(
         confidence=None if confidence is None else confidence[frame, individual],
         **known,
     )
+
+
+def stacked(
+    persons: Sequence[Mapping[int, NDArray[np.float64]]], names: Sequence[str]
+) -> tuple[list[int], Any, NDArray[np.float64]]:
+    """Return image, person and values (n_rows, n_points, n_values) of all persons.
+
+    `persons` are those of each image by their numbers, `names` those of the images. An
+    image without persons has a row of NaN.
+    """
+    rows = [
+        (i, number, values)
+        for i, each in enumerate(persons)
+        for number, values in each.items() or [(None, None)]
+    ]
+    shown = [(i, values) for i, _, values in rows if values is not None]
+    first, points = shown[0]
+    for i, values in shown:
+        if len(values) != len(points):
+            raise ValueError(
+                f"{names[first]} has {len(points)} points, {names[i]} has "
+                f"{len(values)}: all must have the same number"
+            )
+    gap = np.full(points.shape, np.nan)
+    images, numbers, found = zip(*rows, strict=True)
+    stack = np.stack([gap if values is None else values for values in found])
+    return list(images), pd.array(numbers, dtype="Int64"), stack
+
+
+def checked_sizes(name: str, sizes: Any, n_images: int) -> NDArray[np.float64]:
+    """Return width and height (n_images, 2) of images in pixels, or raise."""
+    try:
+        found = np.asarray(sizes, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.array(np.nan)
+    fits = found.shape in ((2,), (n_images, 2))
+    if not (fits and np.isfinite(found).all() and (found > 0).all()):
+        raise ValueError(
+            f"{name} must be a width and a height in pixels, such as (1920, 1080), for "
+            f"all images or for each of the {n_images}; got {sizes!r:.60}"
+        )
+    return np.broadcast_to(found, (n_images, 2))
 
 
 def refuse_same_names(names: Sequence[str]) -> None:

@@ -6,8 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
+from isa_nrsfm.io._landmarks import (
+    Landmarks,
+    assemble,
+    assemble_individuals,
+    checked_sizes,
+    stacked,
+)
 
 _MEDIAPIPE_PARTS = ("face_landmarks", "hand_landmarks", "pose_landmarks")
 # movement named the axes keypoints and individuals in its earlier versions.
@@ -62,40 +67,23 @@ def from_mediapipe(results: Iterable[Any], image_sizes: ArrayLike) -> Landmarks:
     parts = {part for result in results for part in _parts(result)}
     if len(parts) > 1:
         raise ValueError(f"the results are of more than one kind: {sorted(parts)}")
-    sizes = _image_sizes(image_sizes, len(results))
-    # A row is (number of the result, individual or None, points, visibility or NaN).
-    rows: list[tuple[int, int | None, Any, Any]] = []
-    n_points = 0
-    for number, result in enumerate(results):
-        found = getattr(result, *parts)
-        for i, landmarks in enumerate(found):
-            points = _shares(landmarks, f"result {number} (counted from 0)")
-            n_points = n_points or len(points)
-            if len(points) != n_points:
-                raise ValueError(
-                    f"the first result has {n_points} points, result {number} "
-                    f"(counted from 0) has {len(points)}"
-                )
-            visible = [getattr(p, "visibility", None) for p in landmarks]
-            rows.append((number, i, points * sizes[number], visible))
-        if not found:
-            rows.append((number, None, np.nan, np.nan))
-    if not n_points:
+    sizes = checked_sizes("image_sizes", image_sizes, len(results))
+    names = [f"result {i} (counted from 0)" for i in range(len(results))]
+    persons = [
+        {k: _values(points, name) for k, points in enumerate(getattr(result, *parts))}
+        for result, name in zip(results, names, strict=True)
+    ]
+    if not any(len(values) for each in persons for values in each.values()):
         raise ValueError(f"none of the {len(results)} results has any landmarks")
-    confidence = None
+    frame, individual, values = stacked(persons, names)
     # Faces and hands have no visibility, though some versions set it to zero.
-    seen = next(visible for _, i, _, visible in rows if i is not None)
-    if parts == {"pose_landmarks"} and None not in seen:
-        confidence = np.array(
-            [np.broadcast_to(visible, n_points) for *_, visible in rows], dtype=float
-        )
-    frame, individual = [row[0] for row in rows], [row[1] for row in rows]
+    seen = parts == {"pose_landmarks"} and not np.isnan(values[..., 2]).all()
     return assemble(
-        np.array([np.broadcast_to(row[2], (n_points, 2)) for row in rows]),
+        values[..., :2] * sizes[frame][:, None],
         None,
-        {"frame": frame, "individual": pd.array(individual, dtype="Int64")},
+        {"frame": frame, "individual": individual},
         format="mediapipe",
-        confidence=confidence,
+        confidence=values[..., 2] if seen else None,
     )
 
 
@@ -135,7 +123,7 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
     """
     axes = ("time", "individual", "keypoint", "space")
     position = _by_axes(dataset, "position", axes)
-    space = _names(position, "space")
+    space = _names(position, 3)
     if sorted(space) != ["x", "y"]:
         raise ValueError(
             "the positions must be in an image, with space x and y; got "
@@ -147,7 +135,7 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
         confidence = np.asarray(found.values, dtype=np.float64)
     tracks = np.asarray(position.values, dtype=np.float64)
     tracks = tracks[..., [space.index("x"), space.index("y")]]
-    names = _names(position, "individual")
+    names = _names(position, 1)
     if individual is not None:
         if individual not in names:
             raise ValueError(
@@ -159,7 +147,7 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
     return assemble_individuals(
         tracks,
         names,
-        _names(position, "keypoint"),
+        _names(position, 2),
         {"frame": range(len(tracks)), "time": position.coords["time"].values},
         format="movement",
         confidence=confidence,
@@ -177,24 +165,11 @@ def _parts(result: Any) -> list[str]:
     return parts
 
 
-def _image_sizes(image_sizes: ArrayLike, n_results: int) -> NDArray[np.float64]:
-    """Return the width and the height of each image."""
-    sizes = np.asarray(image_sizes, dtype=np.float64)
-    if sizes.shape not in ((2,), (n_results, 2)) or not (
-        np.isfinite(sizes).all() and (sizes > 0).all()
-    ):
-        raise ValueError(
-            "image_sizes must be a width and a height in pixels, for all images or for "
-            f"each of the {n_results}; got an array of shape {sizes.shape}"
-            + (f" with {sizes.min():g}" if sizes.size else "")
-        )
-    return np.broadcast_to(sizes, (n_results, 2))
-
-
-def _shares(landmarks: Sequence[Any], where: str) -> NDArray[np.float64]:
-    """Return x and y of landmarks, (n_points, 2)."""
+def _values(landmarks: Sequence[Any], where: str) -> NDArray[np.float64]:
+    """Return x, y and visibility of landmarks, NaN if absent, (n_points, 3)."""
     try:
-        return np.array([(point.x, point.y) for point in landmarks], dtype=np.float64)
+        values = [(p.x, p.y, getattr(p, "visibility", None)) for p in landmarks]
+        return np.array(values, dtype=np.float64).reshape(-1, 3)
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(
             f"{where} should have a list of objects with numbers x and y for each "
@@ -219,10 +194,9 @@ def _by_axes(dataset: Any, name: str, wanted: tuple[str, ...]) -> Any:
     return variable.transpose(*(dims[singular.index(dim)] for dim in wanted))
 
 
-def _names(variable: Any, axis: str) -> list[str]:
+def _names(variable: Any, axis: int) -> list[str]:
     """Return the names along an axis."""
-    plural = {new: old for old, new in _MOVEMENT_DIMS.items()}
-    dim = axis if axis in variable.dims else plural.get(axis, axis)
+    dim = variable.dims[axis]
     if dim not in variable.coords:
         raise ValueError(f"the axis {dim} of the dataset has no names")
     return [str(name) for name in variable.coords[dim].values]

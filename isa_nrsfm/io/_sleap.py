@@ -13,7 +13,7 @@ from isa_nrsfm.io._face_tables import points_of
 from isa_nrsfm.io._hdf5 import content_of, is_hdf5, numbers_of, root_groups
 from isa_nrsfm.io._landmark_columns import find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
-from isa_nrsfm.io._separated_values import header_names, read_columns
+from isa_nrsfm.io._tables import header_names, read_columns
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
 _DIMS = ("frame", "track", "node", "xy")
@@ -140,14 +140,12 @@ def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
     if "edge_names" not in file or not file["edge_names"].size:
         return None
     content = content_of(file, "edge_names")
-    shape = np.shape(content)
-    if len(shape) != 2 or 2 not in shape:
-        raise ValueError(
-            f"edge_names should hold pairs of names; got the shape {shape}"
-        )
-    names = np.reshape(_texts(content), shape)
+    size = np.shape(content)
+    if len(size) != 2 or 2 not in size:
+        raise ValueError(f"edge_names should hold pairs of names; got the shape {size}")
+    names = np.reshape(_texts(content), size)
     # SLEAP writes a row for each edge; all other arrays of MATLAB's order are turned.
-    edges = (names if shape[1] == 2 else names.T).tolist()
+    edges = (names if size[1] == 2 else names.T).tolist()
     return skeleton_of_names(edges, nodes, name="SLEAP", source="its analysis file")
 
 

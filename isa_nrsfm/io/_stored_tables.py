@@ -78,11 +78,8 @@ def open_table(path: str | os.PathLike[str]) -> "StoredTable | NDArray":
         return arrays[0]
     _same_shape(files, [array.dtype for array in arrays], "numbers of type")
     parts = [
-        (
-            len(array),
-            lambda first, last, array=array: read_rows(array, slice(first, last)),
-        )
-        for array in arrays
+        (len(each), lambda first, last, each=each: read_rows(each, slice(first, last)))
+        for each in arrays
     ]
     return StoredTable(parts, arrays[0].shape[1], arrays[0].dtype)
 

@@ -1,12 +1,12 @@
-"""Check the arrays that the measures take."""
+"""Check and normalise the arrays that the measures take."""
 
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from isa_nrsfm._linalg.rounding import OF_STEPS
 from isa_nrsfm._tables.sources import unmasked
-from isa_nrsfm.metrics._alignment import unit_shapes
 
 
 def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
@@ -66,3 +66,17 @@ def as_pair(
             "Remove these frames from S and X"
         )
     return truth, centre(shapes)
+
+
+def unit_shapes(shapes: NDArray) -> NDArray[np.float64]:
+    """Return shapes centred over the points and of unit norm; zero if all are equal."""
+    # Shapes of unit size first: squares of very large or small numbers overflow.
+    size = np.abs(shapes).max(axis=(1, 2), keepdims=True, initial=0.0)
+    shapes = np.divide(shapes, size, out=np.zeros_like(shapes), where=size > 0)
+    return normalise(shapes - shapes.mean(axis=1, keepdims=True), OF_STEPS)
+
+
+def normalise(shapes: NDArray, smallest: float) -> NDArray[np.float64]:
+    """Return shapes of unit norm, and zero for those with a norm up to the smallest."""
+    norms = np.linalg.norm(shapes, axis=(1, 2), keepdims=True)
+    return np.divide(shapes, norms, out=np.zeros_like(shapes), where=norms > smallest)

@@ -1,5 +1,7 @@
 """Measures of the reprojection of a table."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
@@ -10,7 +12,8 @@ from isa_nrsfm._tables.tracks import (
     Layout,
     centred_frames,
     seen_points,
-    table_to_tracks,
+    table_to_rows,
+    without_half_points,
 )
 from isa_nrsfm.metrics._checks import check_same_shape
 
@@ -90,17 +93,15 @@ def frame_energies(
     X: ArrayLike, X_hat: ArrayLike, layout: Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
+    checks: dict[str, Any] = {"dtype": np.float64, "ensure_all_finite": "allow-nan"}
     tables = [
-        check_array(
-            unmasked(table),
-            dtype=np.float64,
-            ensure_all_finite="allow-nan",
-            input_name=name,
-        )
+        check_array(unmasked(table), input_name=name, **checks)
         for table, name in ((X, "X"), (X_hat, "X_hat"))
     ]
     check_same_shape("X", tables[0], "X_hat", tables[1])
-    truth, fitted = (table_to_tracks(table, layout) for table in tables)
+    truth, fitted = (
+        without_half_points(table_to_rows(table, layout))[0] for table in tables
+    )
     seen = seen_points(truth)
     lost = seen & ~seen_points(fitted)
     if lost.any():
@@ -110,7 +111,7 @@ def frame_energies(
             f"{len(lost)} frames (first: row {rows[0]}). Fill them in, or make them "
             "NaN in X"
         )
-    fitted = np.where(seen[..., None], fitted, np.nan)
-    truth, fitted = (centred_frames(tracks)[0] for tracks in (truth, fitted))
+    fitted = np.where(seen[:, None], fitted, np.nan)
+    truth, fitted = (centred_frames(rows)[0] for rows in (truth, fitted))
     energy = np.nansum(truth**2, axis=(1, 2))
     return energy, np.nansum((truth - fitted) ** 2, axis=(1, 2)), seen

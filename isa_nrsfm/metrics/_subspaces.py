@@ -1,5 +1,7 @@
 """Measures of groupings of directions into subspaces."""
 
+from bisect import bisect_left
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
@@ -100,13 +102,10 @@ def _orthonormal_blocks(name: str, components: ArrayLike, size: int) -> NDArray:
 
 def _bottleneck(costs: NDArray) -> float:
     """Return the largest cost of a matching, minimised over all matchings."""
+
+    def sufficient(level: float) -> bool:
+        too_large = costs > level
+        return not too_large[linear_sum_assignment(too_large)].any()
+
     levels = np.unique(costs)
-    low, high = 0, len(levels) - 1
-    while low < high:
-        middle = (low + high) // 2
-        too_large = costs > levels[middle]
-        if too_large[linear_sum_assignment(too_large)].any():
-            low = middle + 1
-        else:
-            high = middle
-    return float(levels[low])
+    return float(levels[bisect_left(levels, True, key=sufficient)])

@@ -9,30 +9,34 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm.plotting._axes import (
     MEAN_COLOUR,
     MINUS_COLOUR,
     PLUS_COLOUR,
-    check_axes,
-    draw_points,
-    draw_segments,
-    hide_frame,
-    is_dense,
-    percent,
-    side_colours,
-    wrap_title,
-)
-from isa_nrsfm.plotting._edges import Edges, Origin, choose_lines, upright_turn
-from isa_nrsfm.plotting._page import (
     VIEWS,
     add_legend,
     block_limits,
     chosen_numbers,
+    draw_points,
+    draw_segments,
+    flat_axes,
+    hide_frame,
+    is_dense,
     new_page,
+    percent,
     show_view,
+    side_colours,
+    wrap_title,
 )
-from isa_nrsfm.plotting._views import depth_note, view_and_layout
+from isa_nrsfm.plotting._views import (
+    Edges,
+    Origin,
+    choose_lines,
+    depth_note,
+    upright_turn,
+    view_and_layout,
+)
+from isa_nrsfm.skeletons._column_names import checked_names
 
 # Arrows in the units of the points, with the same width in all axes.
 ARROW_STYLE = {
@@ -169,14 +173,13 @@ class BasisShapeDisplay:
                 f"n_points, 3); got {shape} and {self.basis.shape}"
             )
         n_components = len(self.basis)
-        self.energy_share = None
-        if energy_share is not None:
-            self.energy_share = np.asarray(energy_share, dtype=float)
-            if self.energy_share.shape != (n_components,):
-                raise ValueError(
-                    f"energy_share must hold {n_components} numbers, one per basis "
-                    f"shape; got shape {self.energy_share.shape}"
-                )
+        share = None if energy_share is None else np.asarray(energy_share, dtype=float)
+        if share is not None and share.shape != (n_components,):
+            raise ValueError(
+                f"energy_share must hold {n_components} numbers, one per basis shape; "
+                f"got shape {share.shape}"
+            )
+        self.energy_share = share
         self.component_names = checked_names(
             "component_names", component_names, range(1, n_components + 1)
         )
@@ -294,12 +297,9 @@ class BasisShapeDisplay:
             shape.
         """
         import_optional("matplotlib", extra="plot")
-        n_components = len(self.basis)
-        self.components_ = np.arange(n_components)
-        if components is not None:
-            self.components_ = chosen_numbers(
-                components, "components", n_components, "numbers of basis shapes"
-            )
+        self.components_ = chosen_numbers(
+            components, "components", len(self.basis), "numbers of basis shapes"
+        )
         n_drawn = len(self.components_)
         amplitudes = np.asarray(n_std, dtype=float)
         if amplitudes.shape not in ((), (n_drawn,)):
@@ -315,36 +315,31 @@ class BasisShapeDisplay:
         axes = ax
         if ax is None:
             axes = new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
-        self.axes_ = check_axes(axes, 2 + 2 * n_drawn, "two views for each shape")
-        self.axes_ = self.axes_.reshape(-1, 2)
-        self.figure_ = self.axes_[0, 0].figure
+        axes = flat_axes(axes, 2 + 2 * n_drawn, "two views for each shape")
+        self.axes_, self.figure_ = axes.reshape(-1, 2), axes[0].figure
 
         below, above = "negative end of the drift", "positive end of the drift"
         if not amplitudes.ndim:
             size = f"{amplitudes:g} standard deviations"
             below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
-        points, edges = point_kw or {}, edge_kw or {}
         arrow_kw = ARROW_STYLE | (arrow_kw or {})
         self.mean_: list[Any] = []
         self.minus_: list[Any] = []
         self.plus_: list[Any] = []
         self.arrows_: list[Any] = []
-        for block, pair in enumerate(self.axes_):
+        for block, (pair, d) in enumerate(zip(self.axes_, [0, *drift], strict=True)):
+            shapes = [(self.mean_, mean, MEAN_COLOUR, "mean shape")]
+            if block:
+                shapes.append((self.minus_, mean - d, MINUS_COLOUR, below))
+                shapes.append((self.plus_, mean + d, PLUS_COLOUR, above))
             for view, axis in zip(VIEWS, pair, strict=True):
-                shapes = [(self.mean_, 0.0 * mean, MEAN_COLOUR, "mean shape")]
-                if block:
-                    shapes += [
-                        (self.minus_, -drift[block - 1], MINUS_COLOUR, below),
-                        (self.plus_, drift[block - 1], PLUS_COLOUR, above),
-                    ]
-                for artists, offset, colour, label in shapes:
-                    style = {"color": colour, "label": label} | points
-                    shape = (mean + offset)[:, view]
-                    artists.append(self._draw(axis, shape, style, edges, not block))
+                for artists, shape, colour, label in shapes:
+                    style = {"color": colour, "label": label} | (point_kw or {})
+                    drawn = self._draw(axis, shape[:, view], style, edge_kw, not block)
+                    artists.append(drawn)
                 if block and not is_dense(mean):
-                    start, offset = mean[:, view], drift[block - 1][:, view]
-                    arrows = axis.quiver(*start.T, *offset.T, **arrow_kw)
-                    self.arrows_.append(arrows)
+                    ends = (*mean[:, view].T, *d[:, view].T)
+                    self.arrows_.append(axis.quiver(*ends, **arrow_kw))
                 hide_frame(axis)
                 show_view(axis, view, limits[block], self.origin)
             title = wrap_title(self._title(block, amplitudes, reduction[block]), pair)
@@ -364,7 +359,7 @@ class BasisShapeDisplay:
                 colours = side_colours(self.skeleton.edge_sides, colour)
                 style = style | {"color": side_colours(self.skeleton.sides, colour)}
             segments = points[self.skeleton.edges]
-            draw_segments(axis, segments, **({"colors": colours} | edge_kw))
+            draw_segments(axis, segments, **({"colors": colours} | (edge_kw or {})))
             style = {"s": 2.0} | style
         return draw_points(axis, points, **style)
 
@@ -374,27 +369,25 @@ class BasisShapeDisplay:
             return "Mean shape, front and side"
         k = self.components_[block - 1]
         name = self.component_names[k]
-        notes = []
+        title, notes = f"Basis shape {name}" if name == str(k + 1) else name, []
         if self.energy_share is not None:
             notes.append(f"{percent(self.energy_share[k])} of energy")
         if amplitudes.ndim:
             notes.append(f"±{amplitudes[block - 1]:g} s.d.")
         if reduction > 1:
             notes.append(f"drawn 1:{reduction:.2g}")
-        title = f"Basis shape {name}" if name == str(k + 1) else name
         return f"{title} ({', '.join(notes)})" if notes else title
 
     def _add_legend(self) -> None:
         """Add the colours of the ends of the drift, and of the sides, below."""
         from matplotlib.lines import Line2D
 
-        shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
-        entries = [(points.get_label(), points.get_facecolor()[0]) for points in shown]
         style: dict[str, Any] = {"linewidth": 1.5}
         if self.edges is None:
             style = {"marker": "o", "linestyle": "none", "markersize": 3}
+        shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
         handles = [
-            Line2D([], [], color=colour, label=label, **style)
-            for label, colour in entries
+            Line2D([], [], color=p.get_facecolor()[0], label=p.get_label(), **style)
+            for p in shown
         ]
         add_legend(self.figure_, handles, self.skeleton)

@@ -9,11 +9,15 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.column_names import checked_names
-from isa_nrsfm._tables.frame_columns import checked_column
+from isa_nrsfm.analysis._frame_columns import checked_column
 from isa_nrsfm.analysis._labels import kind_of
-from isa_nrsfm.plotting._axes import MINUS_COLOUR, OBSERVED_COLOUR, check_axes
-from isa_nrsfm.plotting._page import PAGE_WIDTH, grid
+from isa_nrsfm.plotting._axes import (
+    MINUS_COLOUR,
+    OBSERVED_COLOUR,
+    PAGE_WIDTH,
+    flat_axes,
+)
+from isa_nrsfm.skeletons._column_names import checked_names
 
 Kind = Literal["classes", "number", "time"]
 THIN = {"linewidth": 0.7}
@@ -206,25 +210,25 @@ class CoefficientsDisplay:
         import_optional("matplotlib", extra="plot")
         found = self._kind(kind)
         n_components = self.alpha.shape[1]
-        if ax is None:
-            size = (PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
-            ax = grid(n_components, 1, sharex=True, figsize=size)
-        self.axes_ = check_axes(ax, n_components, "one for each basis shape")
+        size = (PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
+        self.axes_ = flat_axes(
+            ax, n_components, "one for each basis shape", sharex=True, figsize=size
+        )
         self.figure_ = self.axes_[0].figure
-        draw = getattr(self, f"_draw_{found}")
         for k, axes in enumerate(self.axes_):
-            draw(axes, k)
+            getattr(self, f"_draw_{found}")(axes, k)
             axes.set_ylabel(self.component_names[k])
             axes.axhline(0, color="0.85", linewidth=0.6, zorder=0)
             axes.spines[["top", "right"]].set_visible(False)
-        divided = {"classes": self.y, "number": None, "time": self.groups}[found]
+        label, divided = self.label, self.y if found == "classes" else None
+        if found == "time":
+            label, divided = "frame" if self.time is None else "time", self.groups
+        self.axes_[-1].set_xlabel(label)
         n_groups = 0 if divided is None else len(np.unique(divided))
         if n_groups > MOST_GROUPS:
             parts = "groups" if found == "time" else "classes"
             title = f"the {MOST_GROUPS} of {n_groups} {parts} with the most frames"
             self.axes_[0].set_title(title, loc="left", fontsize="medium")
-        time_label = "frame" if self.time is None else "time"
-        self.axes_[-1].set_xlabel(time_label if found == "time" else self.label)
         return self
 
     def _kind(self, kind: str) -> Kind:
@@ -241,12 +245,9 @@ class CoefficientsDisplay:
         classes, members = _rows_of_largest(self.y)
         known = [rows[np.isfinite(self.alpha[rows, k])] for rows in members]
         rng = np.random.default_rng(0)  # horizontal positions have no meaning
-        places = np.repeat(np.arange(len(classes)), [len(rows) for rows in known])
-        _scatter(
-            axes,
-            places + 0.18 * rng.uniform(-1, 1, len(places)),
-            self.alpha[np.concatenate(known), k],
-        )
+        x = np.repeat(np.arange(0.0, len(classes)), [len(rows) for rows in known])
+        x += 0.18 * rng.uniform(-1, 1, len(x))
+        _scatter(axes, x, self.alpha[np.concatenate(known), k])
         axes.boxplot(
             [self.alpha[rows, k] for rows in known],
             positions=range(len(classes)),
@@ -256,10 +257,8 @@ class CoefficientsDisplay:
             **dict.fromkeys(("boxprops", "whiskerprops", "capprops"), THIN),
         )
         names = [str(each) for each in classes]
-        slanted = max(map(len, names)) * len(names) > 60
-        axes.set_xticks(
-            range(len(classes)), names, rotation=30 * slanted, parse_math=False
-        )
+        slope = 30 * (max(map(len, names)) * len(names) > 60)
+        axes.set_xticks(range(len(names)), names, rotation=slope, parse_math=False)
 
     def _draw_number(self, axes: Any, k: int) -> None:
         """Draw the frames as points against their number."""
@@ -284,14 +283,8 @@ class CoefficientsDisplay:
             title = f"band: one standard deviation, {median:.2g} (median)"
             axes.set_title(title, loc="right", fontsize="x-small")
             deviation = np.insert(self.alpha_std[rows, k], gaps, np.nan)
-            axes.fill_between(
-                times,
-                curve - deviation,
-                curve + deviation,
-                color=MINUS_COLOUR,
-                alpha=0.25,
-                linewidth=0,
-            )
+            style = {"color": MINUS_COLOUR, "alpha": 0.25, "linewidth": 0}
+            axes.fill_between(times, curve - deviation, curve + deviation, **style)
 
     def _pieces(self, time: NDArray) -> list[NDArray]:
         """Return the rows of each curve, in the order of the table."""

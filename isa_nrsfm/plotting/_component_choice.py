@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.plotting._axes import MINUS_COLOUR, PLUS_COLOUR, check_axes
+from isa_nrsfm.plotting._axes import MINUS_COLOUR, PLUS_COLOUR, flat_axes
 
 
 class ComponentChoiceDisplay:
@@ -157,10 +157,8 @@ class ComponentChoiceDisplay:
         ValueError
             If `ax` holds several axes.
         """
-        plt = import_optional("matplotlib.pyplot", extra="plot")
-        if ax is None:
-            _, ax = plt.subplots(figsize=(5.2, 3.2), layout="constrained")
-        (self.ax_,) = check_axes(ax, 1, "the curve")
+        import_optional("matplotlib", extra="plot")
+        (self.ax_,) = flat_axes(ax, 1, "the curve", figsize=(5.2, 3.2))
         self.figure_ = self.ax_.figure
         values = -100 * self.scores if self.held_out_error else self.scores
         n_splits = values.shape[1]
@@ -173,16 +171,10 @@ class ComponentChoiceDisplay:
         )
         self.chosen_ = None
         if self.chosen is not None:
-            (self.chosen_,) = self.ax_.plot(
-                self.chosen,
-                mean[np.flatnonzero(self.n_components == self.chosen)[0]],
-                "o",
-                markersize=10,
-                markerfacecolor="none",
-                markeredgecolor=PLUS_COLOUR,
-                linestyle="none",
-                label=f"chosen: {self.chosen}",
-            )
+            point = self.chosen, mean[np.argmax(self.n_components == self.chosen)]
+            style = {"markerfacecolor": "none", "markeredgecolor": PLUS_COLOUR}
+            style |= {"markersize": 10, "label": f"chosen: {self.chosen}"}
+            (self.chosen_,) = self.ax_.plot(*point, "o", **style)
         label = "held-out error, %" if self.held_out_error else "score"
         self.ax_.set(xlabel="number of basis shapes", ylabel=label)
         self.ax_.xaxis.get_major_locator().set_params(integer=True)

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.column_names import checked_names
-from isa_nrsfm.plotting._axes import check_axes, percent
+from isa_nrsfm.plotting._axes import flat_axes, percent
+from isa_nrsfm.skeletons._column_names import checked_names
 
 BLOCK = 3  # directions of space, rows and columns of one basis shape's block
 LINEAR_SHARE = 0.02  # of the largest absolute value, end of the linear colour scale
@@ -196,13 +196,12 @@ class ModeCovarianceDisplay:
         ValueError
             If `ax` holds several axes, or `scale` is not one of those above.
         """
-        plt = import_optional("matplotlib.pyplot", extra="plot")
+        import_optional("matplotlib", extra="plot")
         from matplotlib.collections import LineCollection
         from matplotlib.colors import AsinhNorm, Normalize
 
-        if ax is None:
-            _, ax = plt.subplots(figsize=(4.4, 3.6), layout="compressed")
-        (self.ax_,) = check_axes(ax, 1, "the matrix")
+        options: dict[str, Any] = {"figsize": (4.4, 3.6), "layout": "compressed"}
+        (self.ax_,) = flat_axes(ax, 1, "the matrix", **options)
         self.figure_ = self.ax_.figure
 
         values = self.mode_covariance
@@ -222,41 +221,29 @@ class ModeCovarianceDisplay:
             norm = Normalize(vmin=smallest, vmax=largest)
         else:
             raise ValueError(f'scale must be "asinh" or "linear"; got {scale!r}')
-        style = {
-            "cmap": "Greys" if absolute else "RdBu_r",
-            "norm": norm,
-            "interpolation": "nearest",
-        }
-        self.im_ = self.ax_.imshow(values, **(style | (im_kw or {})))
+        style = {"cmap": "Greys" if absolute else "RdBu_r", "norm": norm}
+        style |= {"interpolation": "nearest"} | (im_kw or {})
+        self.im_ = self.ax_.imshow(values, **style)
 
         n_modes, names = len(values), self.component_names
         # Of 16 labels of two digits some touch in the default figure.
         step = -(-len(names) // 12)
         cuts = np.arange(BLOCK, n_modes, BLOCK) - 0.5
         ends = [-0.5, n_modes - 0.5]
-        self.boundaries_ = self.ax_.add_collection(
-            LineCollection(
-                [[(cut, end) for end in ends] for cut in cuts]
-                + [[(end, cut) for end in ends] for cut in cuts],
-                colors="0.35",
-                linewidths=0.6 / step,
-            )
-        )
+        lines = [[(cut, end) for end in ends] for cut in cuts]
+        lines += [[(end, cut) for end in ends] for cut in cuts]
+        boundaries = LineCollection(lines, colors="0.35", linewidths=0.6 / step)
+        self.boundaries_ = self.ax_.add_collection(boundaries)
         centres = np.arange(0, len(names), step) * BLOCK + (BLOCK - 1) / 2
-        self.ax_.set(
-            xticks=centres,
-            yticks=centres,
-            xticklabels=names[::step],
-            yticklabels=names[::step],
-            xlabel="basis shape",
-            ylabel="basis shape",
-        )
+        for axis in (self.ax_.xaxis, self.ax_.yaxis):
+            axis.set_ticks(centres, labels=names[::step])
+            axis.set_label_text("basis shape")
         if not normalize:
             title = f"{percent(self.off_block_share)} outside the diagonal blocks"
             self.ax_.set_title(f"{title}\n(0 % if uncorrelated)", fontsize="small")
         self.ax_.tick_params(length=0)
         if max(map(len, names)) > 3:
-            plt.setp(self.ax_.get_xticklabels(), rotation=90)
+            self.ax_.tick_params("x", rotation=90)
         self.colorbar_ = None
         if colorbar:
             self.colorbar_ = self.figure_.colorbar(self.im_, ax=self.ax_, label=label)

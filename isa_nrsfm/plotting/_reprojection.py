@@ -11,24 +11,25 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
-from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import FEWEST_POINTS, table_to_tracks, tracks_to_table
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
+    LEGEND_HEIGHT,
     OBSERVED_COLOUR,
     PLUS_COLOUR,
-    check_axes,
+    add_legend,
+    chosen_numbers,
     draw_points,
     draw_segments,
+    flat_axes,
     hide_frame,
     is_dense,
     percent,
     side_colours,
 )
-from isa_nrsfm.plotting._edges import Edges, Origin, choose_lines
-from isa_nrsfm.plotting._page import LEGEND_HEIGHT, add_legend, chosen_numbers, grid
-from isa_nrsfm.plotting._views import view_and_layout
+from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
+from isa_nrsfm.skeletons._column_names import checked_names
 
 
 def choose_frames(
@@ -165,12 +166,9 @@ class ReprojectionDisplay:
         first = self.reprojected[0]
         _, self.skeleton, self.origin = choose_lines(edges, origin, first)
         self.edges = None if self.skeleton is None else self.skeleton.edges
-        self.inverse_snr = np.array(
-            [
-                inverse_snr(tracks_to_table(seen[None]), tracks_to_table(fitted[None]))
-                for seen, fitted in zip(self.observed, self.reprojected, strict=True)
-            ]
-        )
+        tables = map(tracks_to_table, (self.observed, self.reprojected))
+        rows = zip(*tables, strict=True)
+        self.inverse_snr = np.array([inverse_snr([x], [fitted]) for x, fitted in rows])
 
     @classmethod
     def from_estimator(
@@ -287,13 +285,12 @@ class ReprojectionDisplay:
         """
         import_optional("matplotlib", extra="plot")
         n_frames = len(self.frames)
-        new_figure = ax is None
-        if new_figure:
-            n_columns = min(3, n_frames) if n_columns is None else n_columns
-            height = (self._panel_height() + 0.4) * -(-n_frames // n_columns)
-            size = (PANEL_WIDTH * n_columns, height + LEGEND_HEIGHT)
-            ax = grid(n_frames, n_columns, figsize=size)
-        self.axes_ = check_axes(ax, n_frames, "one for each frame")
+        n_columns = min(3, n_frames) if n_columns is None else n_columns
+        height = (self._panel_height() + 0.4) * -(-n_frames // n_columns)
+        size = (PANEL_WIDTH * n_columns, height + LEGEND_HEIGHT)
+        self.axes_ = flat_axes(
+            ax, n_frames, "one for each frame", n_columns, figsize=size
+        )
         self.figure_ = self.axes_[0].figure
         self.observed_: list[Any] = []
         self.reprojected_: list[Any] = []
@@ -302,21 +299,16 @@ class ReprojectionDisplay:
         styles = [style or {} for style in (observed_kw, reprojected_kw, edge_kw)]
         for i, axes in enumerate(self.axes_):
             self._plot_frame(axes, i, *styles)
-        if new_figure:
-            add_legend(
-                self.figure_,
-                [self.observed_[0], self.reprojected_[0]],
-                self.skeleton,
-                markerscale=4.0 if is_dense(self.observed[0]) else 1.0,
-            )
+        if ax is None:
+            entries = [self.observed_[0], self.reprojected_[0]]
+            scale = 4.0 if is_dense(self.observed[0]) else 1.0
+            add_legend(self.figure_, entries, self.skeleton, markerscale=scale)
         return self
 
     def _panel_height(self) -> float:
         """Return the height of panels that suits most frames, in inches."""
         points = np.concatenate([self.observed, self.reprojected], axis=1)
-        width, height = np.moveaxis(
-            np.nanmax(points, axis=1) - np.nanmin(points, axis=1), -1, 0
-        )
+        width, height = (np.nanmax(points, axis=1) - np.nanmin(points, axis=1)).T
         aspect = np.divide(height, width, out=np.ones_like(width), where=width > 0)
         return PANEL_WIDTH * float(np.clip(np.median(aspect), 0.4, 1.3))
 
@@ -329,13 +321,13 @@ class ReprojectionDisplay:
             style = {"colors": colours, "linewidths": 0.8, "alpha": 0.8}
             segments = reprojected[self.skeleton.edges]
             self.edges_.append(draw_segments(axes, segments, **(style | edge_kw)))
-        circles = {"s": 14.0, "facecolors": "none", "edgecolors": OBSERVED_COLOUR}
         style = {"color": OBSERVED_COLOUR}
         if not is_dense(observed):
-            style = circles | {"linewidths": 0.6}
+            style = {"s": 14.0, "facecolors": "none", "edgecolors": OBSERVED_COLOUR}
+            style |= {"linewidths": 0.6}
             error = np.stack([observed, reprojected], axis=1)
-            line_style = {"colors": OBSERVED_COLOUR, "linewidths": 0.6}
-            self.errors_.append(draw_segments(axes, error, **line_style))
+            lines = {"colors": OBSERVED_COLOUR, "linewidths": 0.6}
+            self.errors_.append(draw_segments(axes, error, **lines))
         style |= {"label": "observed"} | observed_kw
         self.observed_.append(draw_points(axes, observed, **style))
         style = {"color": PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
@@ -344,7 +336,5 @@ class ReprojectionDisplay:
         hide_frame(axes)
         axes.set_aspect("equal", adjustable="datalim")
         axes.yaxis.set_inverted(self.origin == "upper")
-        axes.set_title(
-            f"frame {self.frame_names[i]}\ninverse SNR {percent(self.inverse_snr[i])}",
-            fontsize="small",
-        )
+        share = f"inverse SNR {percent(self.inverse_snr[i])}"
+        axes.set_title(f"frame {self.frame_names[i]}\n{share}", fontsize="small")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from isa_nrsfm._diagnostics import camera_meaning
+from isa_nrsfm.analysis._diagnostics import camera_meaning
 
 
 def summary_html(model: Any) -> str:

@@ -1,4 +1,4 @@
-"""Read the keypoints of COCO json files."""
+"""Read the json files of COCO, and those of OpenPose, one for each frame."""
 
 import json
 import re
@@ -9,23 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm.io._landmarks import Landmarks, assemble
+from isa_nrsfm._compat.damaged_files import errors_of
+from isa_nrsfm._compat.texts import as_utf8, by_number
+from isa_nrsfm._parameters.choices import OPENPOSE_PARTS
+from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
 
 # Entries of an instance beside its image and its points.
 _OF_INSTANCE = ("id", "score", "iscrowd", "area", "category")
 _OF_IMAGE = ("file_name", "width", "height")
+_NAME = re.compile(r"(?!\.).*?(\d*)_keypoints\.json", re.IGNORECASE)
 _OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
 
 
 def is_coco(path: Path) -> bool:
     """Return whether a file begins as a json object or list, not of OpenPose."""
     begins = _beginning(path)[:1] in (b"{", b"[")
-    return begins and not begins_as_openpose(path)
-
-
-def begins_as_openpose(path: Path) -> bool:
-    """Return whether a file begins as a json object with people, or with a version."""
-    return _OPENPOSE.match(_beginning(path)) is not None
+    return begins and not is_openpose(path)
 
 
 def _beginning(path: Path) -> bytes:
@@ -44,7 +43,7 @@ def read_coco(path: Path, category: str | None = None) -> Landmarks:
     without any has one without points. ``category`` chooses one of several with
     different keypoints.
     """
-    content = read_json(path)
+    content = _read_json(path)
     if isinstance(content, list):
         if category is not None:
             raise ValueError("results of a detector do not name their categories")
@@ -52,7 +51,7 @@ def read_coco(path: Path, category: str | None = None) -> Landmarks:
     return _annotations(content, category)
 
 
-def read_json(path: Path) -> Any:
+def _read_json(path: Path) -> Any:
     """Return the content of a json file, or raise a ValueError."""
     try:
         with path.open(encoding="utf-8-sig") as file:
@@ -160,26 +159,32 @@ def _keypoints(
     entries: Sequence[dict[str, Any]], what: str, n_points: int | None = None
 ) -> NDArray[np.float64]:
     """Return the keypoints of instances, (n_instances, n_points, 3)."""
+    found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
-        numbers = entry.get("keypoints")
-        if not isinstance(numbers, list) or not all(
-            type(value) in (int, float) for value in numbers
-        ):
+        name = f"{what} {number} (counted from 0)"
+        found.append(_triples(entry.get("keypoints"), f"keypoints of {name}"))
+        n_points = n_points or len(found[0])
+        if len(found[-1]) != max(n_points, 1):
             raise ValueError(
-                f"{what} {number} (counted from 0) should have keypoints, a list of "
-                f"numbers; got {str(numbers)[:40]}"
+                f"{name} should have {max(n_points, 1)} keypoints; got {len(found[-1])}"
             )
-        n_points = n_points or len(numbers) // 3
-        if len(numbers) != max(3 * n_points, 3):
-            raise ValueError(
-                f"{what} {number} (counted from 0) should have x, y and a third number "
-                f"for each keypoint, {max(3 * n_points, 3)} in all; got {len(numbers)}"
-            )
-    try:
-        values = np.array([entry["keypoints"] for entry in entries], dtype=np.float64)
-    except OverflowError as error:
-        raise ValueError(f"a coordinate is too large: {error}") from error
-    return values.reshape(len(entries), n_points or 0, 3)
+    return np.reshape(found, (len(entries), n_points or 0, 3))
+
+
+def _triples(numbers: Any, what: str) -> NDArray[np.float64]:
+    """Return x, y and a third number of points, (n_points, 3), or raise."""
+    if not isinstance(numbers, list) or not all(
+        type(value) in (int, float) and not abs(value) >= 1e300 for value in numbers
+    ):
+        raise ValueError(
+            f"{what} should be a list of finite numbers; got {numbers!r:.40}"
+        )
+    if len(numbers) % 3:
+        raise ValueError(
+            f"{what} should have x, y and a third number for each point; got "
+            f"{len(numbers)} numbers"
+        )
+    return np.array(numbers, dtype=np.float64).reshape(-1, 3)
 
 
 def _columns(
@@ -200,3 +205,88 @@ def _refuse_non_objects(entries: list[Any], what: str) -> None:
     """Raise if a list has something else than objects."""
     if not all(isinstance(entry, dict) for entry in entries):
         raise ValueError(f"all {what} must be objects")
+
+
+def is_openpose(path: Path) -> bool:
+    """Return whether a file begins as those of OpenPose, or a folder has such names."""
+    if path.is_dir():
+        return any(_NAME.fullmatch(file.name) for file in path.iterdir())
+    return _OPENPOSE.match(_beginning(path)) is not None
+
+
+def read_openpose(path: Path, part: str | None = None) -> Landmarks:
+    """Read a file, or all of a folder in the order of their names and numbers.
+
+    A file has the list ``people``, and each person ``pose_keypoints_2d``: x, y and
+    confidence of each point in turn. The confidence of missing points is 0. ``part``
+    chooses between body, face and hands. Each person with points of this part has a
+    row. A file without such people has one row without points.
+    """
+    if part is not None and part not in OPENPOSE_PARTS:
+        raise ValueError(
+            f"part must be one of {', '.join(OPENPOSE_PARTS)}; got {part!r}"
+        )
+    files = [path]
+    if path.is_dir():
+        names = filter(lambda file: _NAME.fullmatch(file.name), path.iterdir())
+        files = sorted(names, key=by_number)
+        if not files:
+            raise ValueError("the folder has no files with names ..._keypoints.json")
+    people = []
+    for file in files:
+        with errors_of(file.name):
+            people.append(_people_in(_read_json(file)))
+    known = {name for persons in people for person in persons for name in person}
+    found = ", ".join(name for name in OPENPOSE_PARTS if name in known)
+    if not known:
+        raise ValueError(
+            "it has no visible points in the lists pose_keypoints_2d, "
+            "face_keypoints_2d, ... of people"
+        )
+    if len(known) > 1 and part is None:
+        raise ValueError(
+            f"it has points of {found}: choose one with part (command line: --part)"
+        )
+    part = part or found
+    if part not in known:
+        raise ValueError(f"it has no points of {part}, but of {found}")
+    chosen = [
+        {k: person[part] for k, person in enumerate(persons) if part in person}
+        for persons in people
+    ]
+    image, numbers, values = stacked(chosen, [file.name for file in files])
+    tracks, scores = np.split(values, [2], axis=2)
+    tracks = np.where(scores == 0, np.nan, tracks)
+    # Points that are cut off can be outside of the image.
+    if np.nanmedian(np.abs(tracks)) <= 1:
+        raise ValueError(
+            "the coordinates are shares of the image's size, which stretch the shapes. "
+            "Run OpenPose with --keypoint_scale 0 for pixels"
+        )
+    of_files = _numbers(files)
+    frames = {
+        "file": [as_utf8(files[i].name) for i in image],
+        "frame": [of_files[i] for i in image],
+        "person": numbers,
+    }
+    return assemble(tracks, None, frames, format="openpose", confidence=scores[..., 0])
+
+
+def _people_in(content: Any) -> list[dict[str, NDArray[np.float64]]]:
+    """Return the visible parts of each person in a file, (n_points, 3) each."""
+    people = content.get("people") if isinstance(content, dict) else None
+    if not isinstance(people, list) or not all(isinstance(p, dict) for p in people):
+        raise ValueError("expected an object with a list of objects called people")
+    keys = {part: f"{part}_keypoints_2d" for part in OPENPOSE_PARTS}
+    found = [
+        {part: _triples(person.get(key, []), key) for part, key in keys.items()}
+        for person in people
+    ]
+    return [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
+
+
+def _numbers(files: list[Path]) -> list[int]:
+    """Return the numbers at the end of the names of files, or else of their order."""
+    found = [_NAME.fullmatch(file.name) for file in files]
+    numbers = [int(match[1]) for match in found if match and match[1]]
+    return numbers if len(set(numbers)) == len(files) else list(range(len(files)))

@@ -8,15 +8,13 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.depth import LARGEST_SHARE
+from isa_nrsfm._joint.sample_posterior import LEAST_RELIABILITY
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
+from isa_nrsfm.skeletons._column_names import names_of_points
 
-# Directions of the coefficients with a lower reliability are not supported by the
-# table. Pure noise has reliability zero.
-LEAST_RELIABILITY = 0.1
 # Entries of V_k with a larger standard deviation count as not determined.
 LARGEST_DEVIATION = 0.1
 # Thresholds of the noise variance with calibrated cameras over that with affine ones.
@@ -324,50 +322,6 @@ def camera_advice(camera: str, ratio: float, determined: bool) -> str:
             "little for them"
         )
     return "keep these cameras"
-
-
-def reliabilities(
-    alpha: NDArray, covariance: NDArray, moments: NDArray, noise: float
-) -> NDArray:
-    """
-    Return the shares of the variance of coefficients that are signal.
-
-    These are squared correlations (K,) of the coefficients alpha (I, K) with the true
-    ones, along uncorrelated directions, decreasing. The covariance is the mean
-    posterior one; moments and noise are sums over the blocks of `shown_frames`.
-
-    With known shapes they are the eigenvalues of ``(S + C)^-1 S``, with S the second
-    moment of the coefficients and C the mean covariance: ``S + C`` is the whole
-    variance. Estimated shapes follow the noise. A shape of ``gamma`` numbers a frame
-    raises the variance along it from ``1 + l`` to ``y = (1 + l) (1 + gamma / l)`` noise
-    variances, and noise alone to ``(1 + sqrt(gamma))^2``. The squared correlation is
-    ``(l^2 - gamma) / (l (l + 1))`` (Benaych-Georges, Nadakuditi, "The singular values
-    and vectors of low rank perturbations of large rectangular random matrices", 2012).
-    Here ``y = 1 / (1 - share)``; gamma is y times the share of S that is chance.
-    """
-    known = alpha / np.sqrt(len(alpha))  # known.T @ known is S
-    variance, axes = np.linalg.eigh(known.T @ known + covariance)
-    kept = variance > 1e-14 * variance[-1]  # others are rounding errors
-    white = axes[:, kept] / np.sqrt(variance[kept])
-    # Squared singular values are the eigenvalues, with less rounding error.
-    _, deviations, turn = np.linalg.svd(known @ white, full_matrices=False)
-    own = white @ turn.T
-    share = deviations**2
-    left = np.einsum("kd,kl,ld->d", own, covariance, own)  # 1 / y
-    caused = np.einsum("kd,kl,ld->d", own, moments, own) / (noise or 1.0)
-    # The factor is a margin for chance. With it all reliabilities are zero on tables of
-    # rigid objects (60 to 1,000 frames, 68 to 478 points, one to four basis shapes).
-    # Without it some are 0.9 (``python -m benchmarks.recovery rigid``).
-    gamma = 1.5 * np.maximum(caused, 0.0)  # gamma share / y
-    gamma = np.divide(gamma, share, where=share > 0, out=np.ones_like(share))
-    rest = share - gamma
-    found = (rest > 0) & (rest**2 > 4 * gamma * left)
-    rest, gamma, left = rest[found], gamma[found], left[found]
-    signal = (rest + np.sqrt(rest**2 - 4 * gamma * left)) / 2  # l / y
-    correlation = (signal**2 - gamma * left) / (signal * (signal + left))
-    shares = np.zeros(len(kept))
-    shares[: len(signal)] = np.sort(correlation)[::-1]
-    return shares
 
 
 def weak_information(

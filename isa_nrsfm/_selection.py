@@ -1,16 +1,25 @@
-"""AffineNRSfMCV: the number of basis shapes by cross-validation along a path."""
+"""AffineNRSfMCV: the number of basis shapes by cross-validation along a path.
 
+All frames are fitted with more and more basis shapes: each fit starts from the one
+before, extended by the leading directions of its residuals. The fit of the rows of a
+split starts from that of all frames with the same number of basis shapes.
+"""
+
+import copy
 import time
-from functools import partial
+import warnings
+from collections.abc import Sequence
 from numbers import Integral
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 from sklearn import get_config
 from sklearn.base import BaseEstimator, MetaEstimatorMixin, TransformerMixin, clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.metrics import check_scoring
-from sklearn.model_selection import check_cv
+from sklearn.model_selection import check_cv, cross_validate
 from sklearn.utils import get_tags, indexable
 from sklearn.utils.metadata_routing import (
     UNUSED,
@@ -20,27 +29,47 @@ from sklearn.utils.metadata_routing import (
 )
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat.callbacks import NoProgress
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
+    CoefficientNamesMixin,
     HasMethods,
     Interval,
     StrOptions,
     fit_context,
-    number_of_rows,
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
+from isa_nrsfm._fit import JOINT_TOL, ready_table
+from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._selection.choice import (
-    SELECTIONS,
-    line,
-    results_of,
-    selected,
-    warn_of_no_shape,
-    warn_of_unconverged,
-)
-from isa_nrsfm._selection.path import ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
-from isa_nrsfm._transformer import CoefficientNamesMixin
+
+# For held-out errors of 100 % and more.
+NO_SHAPE = (
+    "no number of basis shapes predicts held-out points better than the centroid of "
+    "their frame does (an error of 100 %): the fitted frames share no shape with the "
+    "others. Check that each column is the same point in all frames."
+)
+
+
+class StartedNRSfM(AffineNRSfM):
+    """A fit that starts from another one, without warnings and errors of depths."""
+
+    start: TableModel | None = None
+    unconverged = False
+
+    def __sklearn_clone__(self) -> Self:
+        """Return a copy with the same start."""
+        return copy.copy(self)
+
+    def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
+        """Fit a table, and remember whether the fit has not converged."""
+        with warnings.catch_warnings(record=True, action="ignore") as unconverged:
+            warnings.simplefilter("always", ConvergenceWarning)
+            self._fit(X, point_weight, NoProgress(), start=self.start)
+        self.unconverged = bool(unconverged)
+        return self
 
 
 class AffineNRSfMCV(
@@ -141,16 +170,6 @@ class AffineNRSfMCV(
     (90, 2)
     """
 
-    n_components_: int
-    best_estimator_: AffineNRSfM
-    cv_results_: dict[str, Any]
-    best_index_: int
-    best_score_: float
-    refit_time_: float
-    scorer_: Any
-    n_splits_: int
-    feature_names_in_: NDArray
-
     # `groups` go to the splitter, not to this estimator.
     __metadata_request__fit: ClassVar[dict[str, str]] = {"groups": UNUSED}
 
@@ -159,7 +178,7 @@ class AffineNRSfMCV(
         "estimator": [None, HasMethods(["fit", "get_params", "set_params"])],
         "cv": ["cv_object"],
         "scoring": [None, str, callable],
-        "select": [StrOptions(set(SELECTIONS))],
+        "select": [StrOptions({"best", "one_standard_error"})],
         "n_jobs": [None, Integral],
         "verbose": ["verbose"],
     }
@@ -220,48 +239,77 @@ class AffineNRSfMCV(
             As in `AffineNRSfM.fit`, and if fits of the path have not converged or all
             held-out errors are above 100 %.
         """
-        estimator = self._estimator()
+        estimator, scorer = self._estimator(), self._scorer()
         candidates = checked_candidates(self.n_components)
-        refuse_blocks(X)
+        if is_on_dask(X) or isinstance(X, StoredTable):
+            raise ValueError(
+                "choosing n_components needs a table in memory or a memory map; got a "
+                f"{type(X).__name__}: take some thousand of its frames"
+            )
         X, y = indexable(X, y)
         routed = self._routed("fit", params)
-        scorer = self._scorer()
-        table = ready_part(estimator, X, candidates[-1])
-        splits = [
-            (np.asarray(train), np.asarray(held_out))
-            for train, held_out in self._splitter().split(X, y, **routed["splitter"])
-        ]
-        rows = []
-        for row in walk(
-            table,
-            candidates,
-            splits,
-            partial(held_out_score, scorer=scorer, X=X, y=y, params=routed["scorer"]),
-            any_basis=self.scoring is None,
-            n_jobs=self.n_jobs,
-        ):
-            rows.append(row)
+        splits = list(self._splitter().split(X, y, **routed["splitter"]))
+        trial = StartedNRSfM(**estimator.get_params(deep=False))
+        trial.set_params(frames_folder=None)
+        if trial.refinement == "consensus":  # only of the chosen K
+            trial.set_params(refinement="joint")
+        joint = trial.refinement == "joint"
+        if self.scoring is None and joint:  # the score does not depend on the basis
+            trial.set_params(independence=None)
+        check_rows(trial, X, [train for train, _ in splits], candidates[-1])
+        # Fits of all frames are only starts: their tolerance is larger.
+        whole = copy.copy(trial)
+        whole.set_params(tol=4.0 * (JOINT_TOL if trial.tol is None else trial.tol))
+        parts, n_unconverged = [], []
+        for k in candidates:
+            since = time.perf_counter()
+            if joint:
+                whole.set_params(n_components=k).fit(X)
+                whole.start = trial.start = whole._model
+            seconds = time.perf_counter() - since
+            part = cross_validate(
+                trial.set_params(n_components=k),
+                X,
+                y,
+                cv=splits,
+                scoring=scorer,
+                params=routed["scorer"],
+                n_jobs=self.n_jobs,
+                return_estimator=True,
+                error_score="raise",
+            )
+            fits = [whole, *part.pop("estimator")]
+            n_unconverged.append(sum(fit.unconverged for fit in fits))
+            parts.append(part | {"path_time": seconds})
             if self.verbose:
-                print(
-                    f"[{type(self).__name__}] {line(row, self.scoring is None)}",
-                    flush=True,
-                )
-        warn_of_unconverged(rows)
-        scores = np.array([row.scores for row in rows])
+                seconds += sum(part["fit_time"] + part["score_time"])
+                text = line(k, part["test_score"], self.scoring is None)
+                print(f"[{type(self).__name__}] {text}, {seconds:.1f} s", flush=True)
+        if any(n_unconverged):
+            which = [
+                str(k) for k, n in zip(candidates, n_unconverged, strict=True) if n
+            ]
+            warn_caller(
+                "not all fits converged while n_components was chosen: "
+                f"{sum(n_unconverged)} with n_components of {', '.join(which)} did "
+                "not. Increase max_iter or tol",
+                ConvergenceWarning,
+            )
+        self.cv_results_ = results_of(candidates, parts)
+        scores = np.array([part["test_score"] for part in parts])
         best = selected(scores, self.select)
-        if self.scoring is None:
-            warn_of_no_shape(scores)
+        if self.scoring is None and np.nanmax(scores.mean(axis=1)) <= -1:
+            warn_caller(NO_SHAPE)
         since = time.perf_counter()
         fitted = estimator.set_params(n_components=candidates[best]).fit(X)
         self.refit_time_ = time.perf_counter() - since
         self.best_estimator_, self.scorer_ = fitted, scorer
-        self.cv_results_, self.n_splits_ = results_of(rows), len(splits)
         self.best_index_, self.n_components_ = best, candidates[best]
-        self.best_score_ = float(self.cv_results_["mean_test_score"][best])
-        if hasattr(fitted, "feature_names_in_"):
-            self.feature_names_in_ = fitted.feature_names_in_
-        elif hasattr(self, "feature_names_in_"):
-            del self.feature_names_in_
+        self.n_splits_, self.best_score_ = len(splits), float(scores[best].mean())
+        for name in ("n_features_in_", "feature_names_in_", "_n_features_out"):
+            self.__dict__.pop(name, None)
+            if hasattr(fitted, name):
+                setattr(self, name, getattr(fitted, name))
         return self
 
     def fit_transform(self, X: Any, y: Any = None, **params: Any) -> NDArray:
@@ -400,21 +448,6 @@ class AffineNRSfMCV(
         routed = self._routed("score", params)
         return float(self.scorer_(self.best_estimator_, X, y, **routed["scorer"]))
 
-    @property
-    def n_features_in_(self) -> int:
-        """Number of columns of the fitted table."""
-        try:
-            check_is_fitted(self)
-        except ValueError as error:
-            name = type(self).__name__
-            raise AttributeError(f"{name} has no n_features_in_ before fit") from error
-        return self.best_estimator_.n_features_in_
-
-    @property
-    def _n_features_out(self) -> int:
-        """Number of columns of the result of `transform`."""
-        return self.n_components_
-
     def get_metadata_routing(self) -> MetadataRouter:
         """
         Return the metadata routing of this object.
@@ -480,42 +513,103 @@ class AffineNRSfMCV(
 def checked_candidates(n_components: Any) -> list[int]:
     """Return different numbers of basis shapes above zero in ascending order."""
     given = np.atleast_1d(np.asarray(n_components))
-    if given.ndim != 1 or not len(given) or given.dtype.kind not in "iu":
+    candidates = sorted(set(given.ravel().tolist()))
+    whole = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"
+    if not whole or candidates[0] < 1 or len(candidates) < len(given):
         raise ValueError(
-            "n_components must be numbers of basis shapes, such as range(1, 9); got "
-            f"{n_components!r}"
-        )
-    candidates = sorted(given.tolist())
-    if candidates[0] < 1 or len(set(candidates)) < len(candidates):
-        raise ValueError(
-            "n_components must be different numbers of at least 1; got "
-            f"{n_components!r}"
+            "n_components must be numbers of basis shapes, such as range(1, 9), "
+            f"different numbers of at least 1; got {n_components!r}"
         )
     return candidates
 
 
-def refuse_blocks(X: Any) -> None:
-    """Raise an error if the rows of a table cannot be taken one by one."""
-    if is_on_dask(X) or isinstance(X, StoredTable):
-        raise ValueError(
-            "choosing n_components needs a table in memory or a memory map; got a "
-            f"{type(X).__name__}: take some thousand of its frames"
-        )
+def check_rows(
+    estimator: AffineNRSfM, X: Any, splits: Sequence[NDArray], n_components: int
+) -> None:
+    """Refuse a table, or rows of it that are fitted, not enough for K basis shapes."""
+
+    def refused(rows: Any, k: int) -> ValueError | None:
+        with warnings.catch_warnings(action="ignore"):  # the last fit warns
+            try:
+                source, weights, settings = clone(estimator)._ready(rows)
+                ready_table(source, weights, k, settings)
+            except ValueError as error:
+                return error
+        return None
+
+    if error := refused(X, n_components):
+        raise error
+    for number, train in enumerate(splits):
+        rows = taken_rows(X, train)
+        if error := refused(rows, n_components):
+            fewer = (k for k in range(n_components)[:0:-1] if not refused(rows, k))
+            raise ValueError(
+                f"split {number} of cv fits {len(train)} frames, enough for "
+                f"n_components={next(fewer, 0)} at most: {error}"
+            ) from error
 
 
-def held_out_score(
-    model: AffineNRSfM, held_out: NDArray, scorer: Any, X: Any, y: Any, params: Any
-) -> float:
-    """Return the score of a fitted estimator on held-out rows of X and y.
-
-    Metadata `params` with an entry for each row are split in the same way.
-    """
-    n_rows = number_of_rows(X)
-    own = {
-        name: taken_rows(value, held_out)
-        if hasattr(value, "__len__") and len(value) == n_rows
-        else value
-        for name, value in params.items()
+def results_of(
+    candidates: Sequence[int], parts: Sequence[dict[str, NDArray]]
+) -> dict[str, Any]:
+    """Return `cv_results_` as in `GridSearchCV`, from results of `cross_validate`."""
+    results: dict[str, Any] = {
+        "param_n_components": np.array(candidates),
+        "params": [{"n_components": k} for k in candidates],
+        "path_fit_time": np.array([part["path_time"] for part in parts]),
     }
-    y = None if y is None else taken_rows(y, held_out)
-    return float(scorer(model, taken_rows(X, held_out), y, **own))
+    for name in ("fit_time", "score_time", "test_score"):
+        values = np.array([part[name] for part in parts])
+        results |= {f"mean_{name}": values.mean(axis=1)}
+        results |= {f"std_{name}": values.std(axis=1)}
+    # Of the scores. Unknown ones rank last.
+    results |= {f"split{i}_{name}": column for i, column in enumerate(values.T)}
+    known = np.nan_to_num(results["mean_test_score"], nan=-np.inf)
+    results["rank_test_score"] = rankdata(-known, method="min").astype(np.int32)
+    return results
+
+
+def selected(scores: NDArray, select: str) -> int:
+    """Return the index of the chosen number of basis shapes.
+
+    Scores are (n_candidates, n_splits), by ascending number of basis shapes. "best"
+    takes the best mean. "one_standard_error" takes the fewest basis shapes with a mean
+    at most one standard error below the best (Hastie, Tibshirani, Friedman, "The
+    elements of statistical learning", 2009, section 7.10).
+    """
+    mean = scores.mean(axis=1)
+    if np.isnan(mean).all():
+        raise ValueError(
+            "n_components cannot be chosen by held-out points: too few points are "
+            "visible. Give n_components, or take frames with more visible points"
+        )
+    best = int(np.nanargmax(mean))
+    if select == "best":
+        return best
+    n_splits = scores.shape[1]
+    if n_splits < 2:
+        raise ValueError(
+            f"select={select!r} needs the standard error over at least two splits; cv "
+            "has one"
+        )
+    error = standard_errors(scores)[best]
+    return int(np.argmax(mean >= mean[best] - error))
+
+
+def standard_errors(scores: NDArray) -> NDArray:
+    """Return the standard errors of mean scores (..., n_splits); NaN with one split."""
+    n_splits = scores.shape[-1]
+    if n_splits < 2:
+        return np.full(scores.shape[:-1], np.nan)
+    return np.asarray(scores.std(axis=-1, ddof=1) / np.sqrt(n_splits))
+
+
+def line(n_components: int, scores: NDArray, held_out: bool) -> str:
+    """Return scores (n_splits,) as text; a held-out error is minus the score."""
+    mean, error = scores.mean(), standard_errors(scores)
+    score = f"score {mean:.4g}, standard error {error:.2g}"
+    if held_out:
+        score = (
+            f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
+        )
+    return f"n_components={n_components}: {score}"

@@ -41,9 +41,9 @@ from scipy.special import expit
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._frames.camera_models import CameraModel
-from isa_nrsfm._frames.models import LinearisedFrames
+from isa_nrsfm._frames.models import Decomposition, FrameMap, LinearisedFrames
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
-from isa_nrsfm._tables.frame_columns import (
+from isa_nrsfm.analysis._frame_columns import (
     checked_times,
     group_numbers,
     sequences_of,
@@ -147,13 +147,62 @@ class SmoothedFrames(NamedTuple):
     time_scales: NDArray
 
 
+class SmoothedCoefficients(NamedTuple):
+    """
+    Coefficients and cameras of frames, given all frames of their sequence.
+
+    Attributes
+    ----------
+    alpha : ndarray of shape (n_frames, n_components)
+        Posterior means. Without dynamics they are those of `AffineNRSfM.transform`.
+        With dynamics, rows with too few visible points are filled in.
+    alpha_std : ndarray of shape (n_frames, n_components)
+        Posterior standard deviations.
+    time_scales : ndarray of shape (n_components,) or (0,)
+        Time scales T of directions of the coefficients, the longest first, in the units
+        of `time`: the correlation after a time t is ``(1 + t / T) exp(-t / T)``.
+        Infinite for 1000 steps or more. Empty if the coefficients show no dynamics.
+    decomposition : Decomposition
+        Smoothed cameras, positions and coefficients, for `AffineNRSfM.reconstruct` and
+        exports. Cameras are filled in, positions are NaN if too few points are visible.
+    """
+
+    alpha: NDArray
+    alpha_std: NDArray
+    time_scales: NDArray
+    decomposition: Decomposition
+
+
 @one_blas_thread
+def smooth(
+    alone: LinearisedFrames,
+    gauge: FrameMap,
+    camera: CameraModel,
+    time: Any,
+    groups: Any,
+    max_gap: int,
+    max_iter: int,
+    tol: float,
+    dtype: Any,
+) -> SmoothedCoefficients:
+    """Return coefficients and cameras of fits given all frames of their sequences.
+
+    Without dynamics these are the fits. Parameters as of `AffineNRSfM.smooth`, and the
+    type of the numbers of the result.
+    """
+    frames = smoothed_frames(alone, camera, time, groups, max_gap, max_iter, tol)
+    fits, scales = (alone, np.empty(0)) if frames is None else (frames, frames[-1])
+    motion, alpha, deviation = gauge.apply(fits.motion, fits.alpha, fits.covariance)
+    parts = motion, fits.translation, alpha, deviation
+    fit = Decomposition(*(part.astype(dtype) for part in parts))
+    return SmoothedCoefficients(fit.alpha, fit.alpha_std, scales, fit)
+
+
 def smoothed_frames(
     alone: LinearisedFrames,
     camera: CameraModel,
     time: Any,
     groups: Any,
-    *,
     max_gap: int,
     max_iter: int,
     tol: float,
