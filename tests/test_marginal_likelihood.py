@@ -6,8 +6,6 @@ import scenes
 from numpy.testing import assert_allclose
 from scenes import likelihood_of
 
-from isa_nrsfm._linalg.small_matrices import frames_first
-
 NOISE = 0.05
 PENALTY = 7.0
 
@@ -19,7 +17,7 @@ class Scene(scenes.Scene):
         """Return the objective and its derivatives, frames first by coefficients."""
         likelihood = likelihood_of(self.tracks, self.weights, penalty, **options)
         terms = likelihood(self.shapes, self.motion, noise)
-        gradient = frames_first(terms.motion_gradient)
+        gradient = terms.motion_gradient.transpose(2, 0, 1)
         return terms._replace(alpha=terms.alpha.T, motion_gradient=gradient)
 
 

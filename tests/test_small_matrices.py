@@ -11,11 +11,11 @@ from isa_nrsfm._linalg.small_matrices import (
     LANES,
     ROWS,
     diagonal_of,
-    in_lanes,
     inverse3,
     invert_positive,
     of_frames,
     packed_products,
+    padded,
     pair_indices,
     procrustes,
     solve_positive,
@@ -189,7 +189,7 @@ def test_a_matrix_is_solved_alike_whatever_its_neighbours_are():
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 40])
 def test_lanes_are_full(n):
     frames = np.arange(3, 3 + n)
-    filled = in_lanes(frames)
+    filled = padded(frames)
     assert len(filled) % LANES == 0
     assert len(filled) - n < LANES
     assert_array_equal(np.unique(filled), frames)

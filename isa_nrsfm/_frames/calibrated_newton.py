@@ -39,9 +39,9 @@ from isa_nrsfm._frames.search import FrameProblem, FrameSearch, Minimum, State
 from isa_nrsfm._linalg.small_matrices import (
     frames_first,
     frames_last,
-    in_lanes,
     of_frames,
     packed_products,
+    padded,
     pair_indices,
     solve_positive,
     unpack3,
@@ -202,7 +202,7 @@ class CalibratedSearch(FrameSearch):
         """
         limit = value - 1e-10 * problem.energy
         found, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
-        tried = in_lanes(tried)
+        tried = padded(tried)
         if len(tried):
             problem, M, limit = problem.take(tried), of_frames(M, tried), limit[tried]
             start = self.evaluate(problem, M * REVERSED)

@@ -21,7 +21,7 @@ from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch, largest_objective
 from isa_nrsfm._frames.single_frame import SingleSearch
-from isa_nrsfm._linalg.small_matrices import frames_last, in_lanes
+from isa_nrsfm._linalg.small_matrices import frames_last, padded
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.tracks import seen_points
 
@@ -386,7 +386,7 @@ class PosteriorFrames:
             fit.put(lost, fitted(rows[lost], starts=self.starts))
         sizes = robust_sizes(rows)
         deviation = np.sqrt(self.noise_variance)
-        changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
+        changing = padded(np.flatnonzero(np.isfinite(fit.objective)))
         # Then iteratively reweighted, for the frames whose weights still change
         for _ in range(50):
             part = rows[changing]
@@ -395,7 +395,7 @@ class PosteriorFrames:
             change = np.abs(new - weights[changing]).max(axis=1)
             unsettled = change > 1e-4
             weights[changing] = new
-            changing = in_lanes(np.unique(changing[unsettled]))
+            changing = padded(np.unique(changing[unsettled]))
             if not len(changing):
                 break
             refit = fitted(

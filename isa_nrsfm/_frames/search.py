@@ -23,9 +23,9 @@ from isa_nrsfm._frames.point_sums import (
 from isa_nrsfm._linalg.rounding import OF_STEPS
 from isa_nrsfm._linalg.small_matrices import (
     frames_first,
-    in_lanes,
     invert_positive,
     of_frames,
+    padded,
     solve_positive,
     unpacked,
 )
@@ -129,7 +129,7 @@ class State(NamedTuple):
     def inverse(self) -> NDArray:
         """Return inverse Hessians (p, p, n), or of `definite` where indefinite."""
         inverse, positive = invert_positive(self.hessian)
-        bad = in_lanes(np.flatnonzero(~positive))
+        bad = padded(np.flatnonzero(~positive))
         if len(bad):
             inverse[:, bad] = invert_positive(self.definite[:, bad])[0]
         return unpacked(inverse)
@@ -196,7 +196,7 @@ class FrameSearch:
         # Complete frames share one Gram matrix.
         for chosen in np.flatnonzero(complete), np.flatnonzero(~complete):
             if len(chosen):
-                frames = in_lanes(chosen)
+                frames = padded(chosen)
                 own = None if complete[frames[0]] else weights[frames]
                 whole = len(chosen) == len(frames) == n_frames
                 part = rows if whole else rows[frames]
@@ -274,12 +274,12 @@ class FrameSearch:
         # Enough frames to be worth the calls, few enough for the cache
         length = 2048 if frames.weights is None else 1024
         for first in range(0, len(chosen), length):
-            block = in_lanes(np.arange(first, min(first + length, len(chosen))))
+            block = padded(np.arange(first, min(first + length, len(chosen))))
             products = frame_sums(frames.take(chosen[block]), self.shared)
             if frames.weights is not None:
                 determined = determines_camera(products, self.shared.shapes[0])
                 if not determined.all():
-                    usable = in_lanes(np.flatnonzero(determined))
+                    usable = padded(np.flatnonzero(determined))
                     block, products = block[usable], products.take(usable)
             problem = self.problem(products, noise[chosen[block]])
             start = self.evaluate(problem, self.start(problem, initial[block].T))
@@ -371,7 +371,7 @@ class FrameSearch:
                 converged[running[leaving]] = small[leaving]
                 if leaving.all():
                     return found, converged
-                left = in_lanes(np.flatnonzero(~leaving))
+                left = padded(np.flatnonzero(~leaving))
                 running, damping, state = running[left], damping[left], state.take(left)
                 step, problem = of_frames(step, left), problem.take(left)
                 known = known and known.take(left)
@@ -397,14 +397,14 @@ class FrameSearch:
         if damping.any():
             matrix = matrix + damping * state.definite
         step, positive = solve_positive(matrix, state.slope)
-        failing = in_lanes(np.flatnonzero(~positive))
+        failing = padded(np.flatnonzero(~positive))
         while len(failing):
             damping[failing] = raised(damping[failing])
             part = state.take(failing)
             matrix = part.hessian + damping[failing] * part.definite
             step[:, failing], positive = solve_positive(matrix, part.slope)
             still = ~positive & (damping[failing] < LARGEST_DAMPING)
-            failing = in_lanes(np.unique(failing[still]))
+            failing = padded(np.unique(failing[still]))
         return self.limited(step), damping
 
 

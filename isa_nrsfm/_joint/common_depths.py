@@ -26,13 +26,10 @@ from isa_nrsfm._linalg.small_matrices import (
     procrustes,
 )
 
-# Steps, and the share of the noise floor in the last one. With 10, 20 and 30 steps the
-# depths of yoga are wrong by 2.45, 2.34 and 2.28 %, of a dance by 5.3, 4.4 and 4.1 %.
-# With the share 0.1 the error of drink falls by 6 %, that of large motion rises by 6 %.
+# Steps, and the share of the noise floor in the last one (docs/benchmarks/consensus.md)
 STEPS, LAST_SHARE = 30, 0.2
 # Weight of the first coordinates, or of the joint fit, among the groups. It matters
-# for points that no group determines. With 1e-2, 1e-3 and 1e-4 the error of yoga is
-# .0118, .0116, .0115.
+# for points that no group determines.
 WEIGHT_OF_WHOLE = 1e-3
 
 
@@ -153,5 +150,5 @@ def _aligning(own: NDArray) -> NDArray:
     mean = own[0]
     for _ in range(5):
         R = procrustes(own @ mean.T)
-        mean = (R.transpose(0, 2, 1) @ own).mean(axis=0)
+        mean = (R.mT @ own).mean(axis=0)
     return frames_last(R)

@@ -151,10 +151,10 @@ def consensus(
         change[:, :2, others] = off[:, :, others]
         change = centred(change)
     # Shapes in the axes of the object, and their principal components
-    S = shapes + rotations.transpose(0, 2, 1) @ change / scales[:, None, None]
+    S = shapes + rotations.mT @ change / scales[:, None, None]
     if groups:
         R = aligning_rotations(centred(S[:, :, chosen]), noise)
-        S = R.transpose(0, 2, 1) @ S
+        S = R.mT @ S
     if n_components is None:
         merged_shapes, alpha, rest = principal_shapes(S, most, LEFT * noise)
     else:
@@ -355,7 +355,7 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     images = np.where(visible, scene.rows, fitted)
     depths = np.linalg.solve(A, b[:, :, None])
     images = images + share * (fitted - images)
-    return np.concatenate([images, depths.transpose(0, 2, 1)], axis=1)
+    return np.concatenate([images, depths.mT], axis=1)
 
 
 def place(group: Group) -> tuple[NDArray, ...]:

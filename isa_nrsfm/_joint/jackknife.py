@@ -57,23 +57,23 @@ def depth_certainty(
     chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
     part = np.asarray(rows.take(chosen), dtype=np.float64)
     w = None if weights is None else weights[chosen]
-    part, found = inlying_rows(frames, part, w)
+    part, fit = inlying_rows(frames, part, w)
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
     seen = np.asarray(np.isfinite(part).all(axis=1))
     least = np.min([seen[:, ~group].sum(axis=1) for group in left_out], axis=0)
-    known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
+    known = np.isfinite(fit.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
     if known.sum() < 2:
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
-    shapes, motion = frames.shapes[:, :, points], found.motion[known]
-    fit = partial(_Refit, frames, part[known], w, shapes, motion)
-    whole = fit(np.ones(len(points), dtype=bool))
-    errors = [fit(~group).errors(whole) for group in left_out]
+    shapes, motion = frames.shapes[:, :, points], fit.motion[known]
+    refit = partial(_Refit, frames, part[known], w, shapes, motion)
+    whole = refit(np.ones(len(points), dtype=bool))
+    errors = [refit(~group).errors(whole) for group in left_out]
     total, turns, variances = (
-        (N_GROUPS - 1) / N_GROUPS * np.sum(each, axis=0)
-        for each in zip(*errors, strict=True)
+        (N_GROUPS - 1) / N_GROUPS * np.sum(terms, axis=0)
+        for terms in zip(*errors, strict=True)
     )
     # Each point is left out of one of the fits
     variances *= N_GROUPS / (N_GROUPS - 1)

@@ -25,12 +25,12 @@ def inlying_rows(
     model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
 ) -> tuple[NDArray, FramePosterior]:
     """Return frames (n, 2, J) of size one with outliers as NaN, and their fit."""
-    found = model.posterior(rows, covariances=False, weights=weights)
+    fit = model.posterior(rows, covariances=False, weights=weights)
     if model.loss != "linear":
-        off = distances(rows, model.shapes, *found[:3])
+        off = distances(rows, model.shapes, *fit[:3])
         outlying = off > OUTLYING * np.sqrt(model.noise_variance)
         rows = np.where(outlying[:, None], np.nan, rows)
-    return rows, found
+    return rows, fit
 
 
 def posterior_blocks(
@@ -137,8 +137,8 @@ def reliabilities(
     gamma = 1.5 * np.maximum(caused, 0.0)  # gamma share / y
     gamma = np.divide(gamma, share, where=share > 0, out=np.ones_like(share))
     rest = share - gamma
-    found = (rest > 0) & (rest**2 > 4 * gamma * left)
-    rest, gamma, left = rest[found], gamma[found], left[found]
+    real = (rest > 0) & (rest**2 > 4 * gamma * left)
+    rest, gamma, left = rest[real], gamma[real], left[real]
     signal = (rest + np.sqrt(rest**2 - 4 * gamma * left)) / 2  # l / y
     correlation = (signal**2 - gamma * left) / (signal * (signal + left))
     shares = np.zeros(len(kept))

@@ -137,8 +137,17 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
 
     If A holds the rows from `first` on, ``[[C, G^T], [G, A]]`` becomes
     ``[[C - G^T A^-1 G, G^T A^-1], [A^-1 G, -A^-1]]`` (Goodnight, "A tutorial on the
-    SWEEP operator", The American Statistician 33, 1979). Returns ``log det A`` (n,) of
-    the positive pivots, and whether all pivots are positive (n,).
+    SWEEP operator", The American Statistician 33, 1979). For one matrix S that is not
+    packed this is ::
+
+        for i in range(first, len(S)):
+            column, pivot = S[:, i].copy(), S[i, i]
+            S -= np.outer(column, column) / pivot
+            S[i] = S[:, i] = column / pivot
+            S[i, i] = -1.0 / pivot
+
+    Returns ``log det A`` (n,) of the positive pivots, and whether all pivots are
+    positive (n,).
     """
     rows, n = packed_rows(packed), packed.shape[1]
     k = len(rows)
@@ -183,17 +192,16 @@ def energies(rows: NDArray) -> NDArray[np.float64]:
     return np.vecdot(flat, flat)
 
 
-# If the number of frames is not a multiple of this, the sums of the last frames are
-# rounded differently: by NumPy's einsum for one frame, by BLAS at the edges of tiles.
+# BLAS and einsum round the sums of the last frames differently if the number of frames
+# is not a multiple of this.
 LANES = 16
 
 
-def in_lanes(frames: NDArray) -> NDArray:
-    """Return numbers of frames (n,), the last one repeated up to a multiple of `LANES`.
+def padded(frames: NDArray) -> NDArray:
+    """Return indices of frames (n,), the last one repeated up to a multiple of `LANES`.
 
-    With the frame as the last index, the results of a frame then do not depend on the
-    number of frames, to the last bit. Copies of a frame may be written to the same
-    place.
+    The results of a frame are then the same in any batch, to the last bit. Copies of a
+    frame may be written to the same place.
     """
     return np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % LANES)])
 

@@ -225,22 +225,22 @@ def euclidean_frames(
     # exp(1 / 2).
     stretch, axes = np.linalg.eigh(np.tensordot(weights, metric.strain, 1))
     stretch = np.clip(stretch, -1.0, 1.0)
-    strain = (axes * stretch[:, None]) @ axes.transpose(0, 2, 1)
+    strain = (axes * stretch[:, None]) @ axes.mT
     Q = metric.Q @ exponential(strain / 2)
     shapes = mean + np.tensordot(weights, directions, 1)
-    shapes = shapes @ np.linalg.inv(Q).transpose(0, 2, 1)
+    shapes = shapes @ np.linalg.inv(Q).mT
     rotations, stretches = nearest_rotations(cameras @ Q)
     scales = np.trace(stretches, axis1=1, axis2=2) / 2
     # A camera is a stretch times a rotation. In the axes of the image, the stretch is
     # moved to the shape, and the scaled rotation remains.
-    seen = shapes @ rotations.transpose(0, 2, 1)
+    seen = shapes @ rotations.mT
     seen[:, :, :2] = seen[:, :, :2] @ (stretches / scales[:, None, None])
     shapes = seen @ rotations
     # The rotation nearest to the mean shape.
     mean = (mean - mean.mean(axis=0)) @ np.linalg.inv(metric.Q).T
-    turns = procrustes(shapes.transpose(0, 2, 1) @ mean)
-    found = shapes @ turns, rotations @ turns, scales
-    return EuclideanFrames(*(of_all_rows(values, usable) for values in found))
+    turns = procrustes(shapes.mT @ mean)
+    parts = shapes @ turns, rotations @ turns, scales
+    return EuclideanFrames(*(of_all_rows(values, usable) for values in parts))
 
 
 def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:

@@ -1,6 +1,7 @@
 """Mixtures of the columns of a motion factor whose rows are orthonormal: cameras."""
 
 from itertools import combinations
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +44,8 @@ def orthonormal_mixture(
         # The best of about twenty starts after some steps leads to the least cost, or
         # close to it.
         triples = [np.column_stack(triple) for triple in combinations(np.eye(n), 3)]
-        rough = [minimised(each, 8) for each in (start, *triples)]
-        start, _ = min(rough, key=lambda found: found[1])
+        rough = [minimised(Q, 8) for Q in (start, *triples)]
+        start, _ = min(rough, key=itemgetter(1))
     return minimised(start, max_iter)
 
 

@@ -127,9 +127,9 @@ def linearised(
     equal = half_gap == 0
     divided = np.where(equal, 1.0, np.sinh(half_gap) / np.where(equal, 1.0, half_gap))
     divided *= np.exp((values[:, :, None] + values[:, None]) / 2)
-    seen, back = MQ @ axes, axes.swapaxes(1, 2)
+    seen, back = MQ @ axes, axes.mT
     grown = (seen * np.exp(values)[:, None]) @ back  # M_i Q exp(E)
-    gram = grown @ MQ.swapaxes(1, 2)
+    gram = grown @ MQ.mT
     residuals = orthonormality(gram, camera)
 
     def slopes(changes: NDArray) -> NDArray:
@@ -158,7 +158,7 @@ def linearised(
 
 def _between(A: NDArray, matrices: NDArray, B: NDArray) -> NDArray:
     """Return ``A_i D_n B_i^T`` (I, p, n, q), for matrices D_n side by side (3, 3 n)."""
-    products = (A @ matrices).reshape(len(A), -1, 3) @ B.swapaxes(1, 2)
+    products = (A @ matrices).reshape(len(A), -1, 3) @ B.mT
     return products.reshape(len(A), A.shape[1], -1, B.shape[1])
 
 
@@ -259,4 +259,4 @@ def refine_metric(
 def exponential(matrices: NDArray) -> NDArray:
     """Return the exponentials of symmetric matrices (..., 3, 3)."""
     values, axes = np.linalg.eigh(matrices)
-    return (axes * np.exp(values)[..., None, :]) @ np.swapaxes(axes, -1, -2)
+    return (axes * np.exp(values)[..., None, :]) @ axes.mT

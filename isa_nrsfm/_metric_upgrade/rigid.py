@@ -92,7 +92,7 @@ def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
     """Return rotations (I, 3, 3) and stretches P (I, 2, 2): cameras are ``P R[:2]``."""
     rows, values, axes = polar(cameras)
     depth = np.cross(rows[:, 0], rows[:, 1])
-    stretches = (axes * values[:, None]) @ axes.transpose(0, 2, 1)
+    stretches = (axes * values[:, None]) @ axes.mT
     return np.concatenate([rows, depth[:, None]], axis=1), stretches
 
 

@@ -151,7 +151,7 @@ class MotionProducts(NamedTuple):
 def motion_products(rigid_motion: NDArray, motion: NDArray) -> MotionProducts:
     """Return the products for M_0 (2 n_frames, 3) and M (2 n_frames, n_signals)."""
     M_0 = rigid_motion.reshape(-1, 2, 3)
-    transposed = M_0.transpose(0, 2, 1)
+    transposed = M_0.mT
     cross = transposed @ motion.reshape(len(M_0), 2, -1)
     return MotionProducts(cross, (transposed @ M_0).reshape(-1, 9), motion.T @ motion)
 
@@ -173,7 +173,7 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
         if not np.trace(gram) > 0:
             continue
         # m_i is M_ik^T M_0^i, row by row: <M_ik D, M_0^i> = m_i . vec(D).
-        m = P.reshape(-1, 3, 3).transpose(0, 2, 1).reshape(-1, 9)
+        m = P.reshape(-1, 3, 3).mT.reshape(-1, 9)
         moved = np.kron(gram, np.eye(3))  # sum_i ||M_ik D||^2 as a form in vec(D)
         if method == "eigen":
             # The exact minimiser under ||D|| = 1. It may be a direction in which the
