@@ -53,7 +53,7 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
 )
 from isa_nrsfm._prepare.checks import check_table, validated_table
-from isa_nrsfm._prepare.point_weights import weighted_rows
+from isa_nrsfm._prepare.point_weights import check_weightable, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
 from isa_nrsfm._tables.sources import (
@@ -450,7 +450,6 @@ class AffineNRSfM(
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep:
-            self._forget()
             stages = stages_of(self.refinement)
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, errors=True)
@@ -551,15 +550,15 @@ class AffineNRSfM(
         Sets the attributes of the columns.
         """
         joint = self.refinement in JOINT_REFINEMENTS
-        only_joint = {
-            "n_components": self.n_components == "auto",
-            "loss": self.loss != "linear",
-            "independence": self.independence == "coefficients",
-        }
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
-            for name, asked_for in only_joint.items():
-                if asked_for:
+            only_joint = {
+                "n_components": ["auto"],
+                "loss": [*LOSSES[1:]],
+                "independence": ["coefficients"],
+            }
+            for name, values in only_joint.items():
+                if getattr(self, name) in values:
                     raise ValueError(f"{name}={getattr(self, name)!r} {got}")
             if is_on_dask(X) or isinstance(X, StoredTable):
                 raise ValueError(f"a table that is not in memory {got}")
@@ -577,22 +576,16 @@ class AffineNRSfM(
                 "whose groups of points are fitted without weights. Set "
                 "refinement='joint', or give no point_weight"
             )
-        source, weights = self._weighted(X, point_weight, reset=True)
+        source, weights = self._opened(X, point_weight, reset=True)
+        params = self.get_params(deep=False)
         settings = FitSettings(
-            self.refinement,
-            self.camera,
-            self.loss,
-            self.independence,
-            self.block_recovery,
-            self.layout,
-            self.scale_frames and self.camera != "orthographic",
-            self.max_iter,
-            self.tol,
-            self.n_jobs,
+            **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),
             silent_isa=joint and self.isa is None,
             limits=self._limits,
         )
+        if self.camera == "orthographic":  # one scale
+            settings = settings._replace(scale_frames=False)
         return source, weights[0] if weights else None, settings
 
     def _strategy(self, joint: bool) -> Any:
@@ -666,7 +659,7 @@ class AffineNRSfM(
             Coefficients; `alpha_` for the fitted table. NaN for rows with too few
             visible points.
         """
-        table, weights = self._weighted(X, point_weight)
+        table, weights = self._opened(X, point_weight)
         coefficients = partial(self._model.decompose, deviations=False)
         return table.collect(coefficients, *weights).alpha
 
@@ -687,7 +680,7 @@ class AffineNRSfM(
             Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
             alpha_std (n_frames, n_components).
         """
-        table, weights = self._weighted(X, point_weight)
+        table, weights = self._opened(X, point_weight)
         return table.collect(self._model.decompose, *weights)
 
     def smooth(
@@ -757,7 +750,7 @@ class AffineNRSfM(
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)
         check_scalar(tol, "tol", Real, min_val=0.0)
-        table, weights = self._weighted(X, point_weight)
+        table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("smooth")
         alone = table.joined(self._model.linearised, *weights)
         camera, limits = CAMERAS[self.camera_], (max_gap, max_iter, tol)
@@ -788,7 +781,7 @@ class AffineNRSfM(
         ValueError
             If the model has affine cameras, or was not refined jointly.
         """
-        table, weights = self._weighted(X, point_weight)
+        table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("rotation_covariance", calibrated=True)
         space, certainty = frames.gauge.rotation, frames.certainty
         found = table.joined(self._model.posterior, *weights)
@@ -900,7 +893,7 @@ class AffineNRSfM(
         scaled = metric is not None and camera == "orthographic"
         if decomposed:
             return self._model.shapes(X, metric, scaled)
-        table, weights = self._weighted(X, point_weight)
+        table, weights = self._opened(X, point_weight)
         if return_std:
             return tuple(table.collect(self._model.uncertain_shapes, *weights))
         shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
@@ -962,7 +955,7 @@ class AffineNRSfM(
             Points of the fitted shapes in the fitted cameras. NaN for rows with too
             few visible points.
         """
-        return self._opened(X).collect(self._model.reproject)
+        return self._opened(X)[0].collect(self._model.reproject)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1032,7 +1025,7 @@ class AffineNRSfM(
             points it is also left out if the camera of the others adds more than
             twice the noise variance to its prediction.
         """
-        table, weights = self._weighted(X, point_weight)
+        table, weights = self._opened(X, point_weight)
         noise, signal = table.joined(self._model.held_out, *weights).sum(axis=0)
         return -float(noise / signal) if signal > 0 else float("nan")
 
@@ -1065,7 +1058,7 @@ class AffineNRSfM(
         check_frames_kept(self, "diagnostics")
         distance = None
         if X is not None:
-            distance = self._opened(X).joined(self._model.distances)
+            distance = self._opened(X)[0].joined(self._model.distances)
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
         return diagnose(self, distance, rows)
 
@@ -1081,52 +1074,23 @@ class AffineNRSfM(
             raise ValueError(f"{name} {_NEEDS_CALIBRATED}")
         return frames
 
-    def _weighted(
-        self, X: Any, point_weight: Any, reset: bool = False
+    def _opened(
+        self, X: Any, point_weight: Any = None, reset: bool = False
     ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
-        """Return the rows of a table, as `_opened`, and the weights (n, J) of points.
+        """Return the rows (n, 2, J) of a table, and the weights (n, J) of their points.
 
-        There are none if all visible points have weight one. Points of weight zero are
-        missing.
+        There are no weights if all visible points have weight one. Unless `reset`, the
+        table must match the fit: parameters that are set after it have no effect.
         """
-        if point_weight is None:
-            return self._opened(X, reset), ()
+        layout, loss = self.layout, self.loss
+        joint = self.refinement in JOINT_REFINEMENTS
         if not reset:
             check_is_fitted(self)
-        # Parameters that are set after a fit have no effect on its model.
-        frames = None if reset else self._model.frames
-        if not (
-            self.refinement in JOINT_REFINEMENTS
-            if reset
-            else isinstance(frames, PosteriorFrames)
-        ):
-            raise ValueError(
-                "point_weight needs a fit with refinement='joint', because the "
-                "refinement of the paper has no weights. Set refinement='joint', or "
-                "set points of low weight to NaN"
-            )
-        loss = self.loss if reset else getattr(frames, "loss", "linear")
-        if loss != "linear":
-            raise ValueError(
-                "point_weight needs loss='linear', because robust losses find weights "
-                f"of their own; got loss={loss!r}. Set loss='linear', or set points of "
-                "low weight to NaN"
-            )
-        if is_read_later(X):
-            raise ValueError(
-                "point_weight needs a table in memory, because weights are not read "
-                f"block by block; got a {type(X).__name__}. Give a NumPy array or a "
-                "dataframe, or no point_weight"
-            )
-        table = self._opened(X, reset)
-        visible, weights = weighted_rows(table, point_weight)
-        return visible, () if weights is None else (weights,)
-
-    def _opened(self, X: Any, reset: bool = False) -> FrameBlocks:
-        """Return checked rows of a table; unless `reset`, it must match the fit."""
-        if not reset:
-            check_is_fitted(self)
-        layout = self.layout if reset else self._model.layout
+            layout, frames = self._model.layout, self._model.frames
+            joint = isinstance(frames, PosteriorFrames)
+            loss = frames.loss if isinstance(frames, PosteriorFrames) else "linear"
+        if point_weight is not None:
+            check_weightable(X, joint, loss)
         if is_read_later(X):
             check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
@@ -1134,14 +1098,14 @@ class AffineNRSfM(
             least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
             X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
             checked_range(X)
-        return open_table(
-            X,
-            layout,
-            getattr(self, "feature_names_in_", None),
-            counted=reset,
-            n_jobs=self.n_jobs,
-            working_memory=self.working_memory,
+        names = getattr(self, "feature_names_in_", None)
+        n_jobs, memory = self.n_jobs, self.working_memory
+        table = open_table(
+            X, layout, names, counted=reset, n_jobs=n_jobs, working_memory=memory
         )
+        if point_weight is None:
+            return table, ()
+        return weighted_rows(table, point_weight)
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from sklearn.utils import check_array
 
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.sources import is_read_later, unmasked
 from isa_nrsfm._tables.tracks import seen_points
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
@@ -16,17 +16,39 @@ LARGEST_WEIGHT = 1e100
 
 def weighted_rows(
     rows: FrameBlocks, point_weight: Any
-) -> tuple[FrameBlocks, NDArray | None]:
+) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
     """Return rows (n, 2, J) with NaN for points of weight zero, and the weights (n, J).
 
-    Weights of missing points are zero. None if all visible points have weight one.
+    Weights of missing points are zero. There are none if all visible ones are one.
     """
     weights = checked_weights(point_weight, (rows.n_frames, rows.empty.shape[2]))
     visible = rows.derive(_visible_rows, weights)
     visible.empty = rows.empty
     seen = visible.joined(seen_points)
     weights = np.where(seen, weights, 0.0)
-    return visible, None if (weights == seen).all() else weights
+    return visible, () if (weights == seen).all() else (weights,)
+
+
+def check_weightable(X: Any, joint: bool, loss: str) -> None:
+    """Raise if weights of points are not supported by a fit, or for a table."""
+    if not joint:
+        raise ValueError(
+            "point_weight needs a fit with refinement='joint', because the refinement "
+            "of the paper has no weights. Set refinement='joint', or set points of low "
+            "weight to NaN"
+        )
+    if loss != "linear":
+        raise ValueError(
+            "point_weight needs loss='linear', because robust losses find weights of "
+            f"their own; got loss={loss!r}. Set loss='linear', or set points of low "
+            "weight to NaN"
+        )
+    if is_read_later(X):
+        raise ValueError(
+            "point_weight needs a table in memory, because weights are not read block "
+            f"by block; got a {type(X).__name__}. Give a NumPy array or a dataframe, "
+            "or no point_weight"
+        )
 
 
 def checked_weights(point_weight: Any, shape: tuple[int, int]) -> NDArray:
