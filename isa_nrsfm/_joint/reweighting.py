@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CameraModel
-from isa_nrsfm._frames.projection import distances
+from isa_nrsfm._frames.projection import compose, distances
 from isa_nrsfm._joint.frames import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointFit, regular
@@ -106,10 +106,11 @@ def _positions(
 ) -> NDArray:
     """Return the positions (n, 2) of frames, the weighted means of residuals."""
     rows, weights = block
-    model = motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
-    rest = np.nan_to_num(rows - model)
+    stacked = shapes.mT
+    model = compose(stacked[0], stacked[1:], alpha) @ motion.mT
+    rest = np.nan_to_num(rows.mT - model)
     total = weights.sum(axis=1, keepdims=True)  # zero where no point counts
-    position = np.einsum("ij,icj->ic", weights, rest)
+    position = np.einsum("ij,ijc->ic", weights, rest)
     return position / np.where(total > 0, total, 1.0)
 
 
