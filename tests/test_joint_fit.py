@@ -91,7 +91,7 @@ def fit_of(camera, seed=0, gaps=False, deviation=DEVIATION):
 
 class TestStarts:
     def test_make_no_difference_where_there_is_one_optimum(self):
-        tracks, truth = random_table()
+        tracks, truth = random_table(n_frames=40, n_points=30)
         models = [fitted(tracks), fitted(tracks, isa=FastISA(n_init=1))]
         ends = [model.objective_history_[-1] for model in models]
         assert np.ptp(ends) < 0.05 * len(tracks)
@@ -189,13 +189,16 @@ class TestNoiseVariance:
     # "cauchy" most of all.
     @pytest.mark.parametrize(
         ("loss", "n_frames", "n_points", "n_components", "largest"),
-        [
-            ("huber", 150, 40, 2, 0.15),
-            ("cauchy", 150, 40, 2, 0.15),
-            ("huber", 150, 30, 5, 0.1),
-            ("huber", 300, 8, 1, 0.2),
-            ("cauchy", 300, 8, 1, 0.2),
-        ],
+        slow_after(
+            2,
+            [
+                ("huber", 150, 40, 2, 0.15),
+                ("cauchy", 300, 8, 1, 0.2),
+                ("cauchy", 150, 40, 2, 0.15),
+                ("huber", 150, 30, 5, 0.1),
+                ("huber", 300, 8, 1, 0.2),
+            ],
+        ),
     )
     def test_with_a_robust_loss(self, loss, n_frames, n_points, n_components, largest):
         sizes = {"n_frames": n_frames, "n_points": n_points}
@@ -283,8 +286,8 @@ class TestRobustLoss:
         assert error_of(fitted(moved, loss=loss), tracks, truth) < 1e-3
 
     def test_a_point_that_is_an_outlier_in_all_frames(self):
-        tracks, _ = random_table()
-        tracks[:, 7] = 5.0 * np.random.default_rng(0).normal(size=(60, 2))
+        tracks, _ = random_table(n_frames=40, n_points=25)
+        tracks[:, 7] = 5.0 * np.random.default_rng(0).normal(size=(40, 2))
         assert np.isfinite(fitted(tracks, loss="huber").basis_).all()
 
 
@@ -292,7 +295,7 @@ class TestDegenerate:
     @CALIBRATED
     @pytest.mark.parametrize("deviation", [0.0, DEVIATION])
     def test_flat_objects_seen_by_calibrated_cameras(self, camera, deviation):
-        truth = make_nonrigid_tracks(60, 40, 2, camera=camera, random_state=0)
+        truth = make_nonrigid_tracks(40, 25, 2, camera=camera, random_state=0)
         flat = truth.shapes * [1.0, 1.0, 0.0]
         tracks = noisy(flat @ truth.motion.swapaxes(1, 2), deviation, unit=True)
         model = fitted(tracks, camera=camera)
@@ -302,7 +305,8 @@ class TestDegenerate:
     @EACH
     @pytest.mark.parametrize("deviation", [0.0, DEVIATION])
     def test_rigid_objects(self, camera, deviation):
-        tracks, truth = random_table(camera, deviation=deviation, n_components=0)
+        options = {"n_frames": 40, "n_points": 25, "n_components": 0}
+        tracks, truth = random_table(camera, deviation=deviation, **options)
         model = fitted(tracks, 2, camera=camera)
         assert error_of(model, tracks, truth) < max(3 * deviation, 1e-4)
 

@@ -8,7 +8,7 @@ from refusals import refused
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._metric_upgrade.quadric import (
+from isa_nrsfm._metric_upgrade.metric import (
     LARGEST_STRETCH,
     metric_quadric,
     strain_basis,

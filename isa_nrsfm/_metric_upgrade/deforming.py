@@ -7,12 +7,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._linalg.small_matrices import procrustes
-from isa_nrsfm._metric_upgrade.quadric import CalibratedCamera, strain_basis
-from isa_nrsfm._metric_upgrade.refinement import (
+from isa_nrsfm._metric_upgrade.metric import (
+    CalibratedCamera,
     MetricFit,
     exponential,
     fit_at,
     refine_metric,
+    strain_basis,
 )
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,

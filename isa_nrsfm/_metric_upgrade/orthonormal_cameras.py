@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm._metric_upgrade.refinement import levenberg_marquardt
+from isa_nrsfm._metric_upgrade.metric import levenberg_marquardt
 
 # Number of columns that are added at a time: a basis shape has three.
 STEP = 3

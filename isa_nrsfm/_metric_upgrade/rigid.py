@@ -7,17 +7,15 @@ from scipy import linalg
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._metric_upgrade.quadric import (
+from isa_nrsfm._metric_upgrade.metric import (
     CalibratedCamera,
-    mean_gram,
-    metric_quadric,
-    unit_cameras,
-)
-from isa_nrsfm._metric_upgrade.refinement import (
     MetricFit,
     fit_at,
+    mean_gram,
+    metric_quadric,
     refine_metric,
     safe_start,
+    unit_cameras,
 )
 
 # Above this condition number the cameras hardly determine the metric. It is that of

@@ -98,16 +98,14 @@ def _independent_subspaces(
     as it would depend on the rotation of single images. A parameter `criterion` is
     `structure_energies`.
     """
-    fit_params: dict[str, Any] = {}
-    if has_fit_parameter(isa, "covariance"):
-        fit_params["covariance"] = covariance
-    if has_fit_parameter(isa, "criterion"):
-        fit_params["criterion"] = partial(structure_energies, moments)
+    energies = partial(structure_energies, moments)
+    given: dict[str, Any] = {"covariance": covariance, "criterion": energies}
+    accepted = {name: given[name] for name in given if has_fit_parameter(isa, name)}
     # Fixed-point iterations from random starts magnify rounding errors, so that another
     # order of frames or points could lead to another optimum. Five decimals are far
     # coarser than rounding errors, and far finer than the errors of the signals.
     samples = np.round(signals, 5).T
-    isa.fit(samples[np.lexsort(samples.T)], **fit_params)
+    isa.fit(samples[np.lexsort(samples.T)], **accepted)
     n_signals = len(signals)
     if isa.components_.shape != (n_signals, n_signals):
         raise ValueError(

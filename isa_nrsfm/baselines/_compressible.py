@@ -15,7 +15,7 @@ from sklearn.utils import check_random_state
 from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._metric_upgrade.quadric import (
+from isa_nrsfm._metric_upgrade.metric import (
     LARGEST_STRETCH,
     conformal_equations,
     strain_basis,

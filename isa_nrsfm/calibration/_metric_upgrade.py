@@ -5,7 +5,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._metric_upgrade.quadric import CalibratedCamera
+from isa_nrsfm._metric_upgrade.metric import CalibratedCamera
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,
     nearest_rotations,

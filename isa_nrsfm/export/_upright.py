@@ -22,7 +22,7 @@ from isa_nrsfm._metric_upgrade.deforming import (
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm._metric_upgrade.quadric import unit_cameras
+from isa_nrsfm._metric_upgrade.metric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
 from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,

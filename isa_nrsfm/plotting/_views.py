@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._estimator import frames_of
-from isa_nrsfm._metric_upgrade.quadric import (
+from isa_nrsfm._metric_upgrade.metric import (
     mean_gram,
     metric_quadric,
     symmetric_power,
