@@ -198,6 +198,7 @@ class TestNoiseVariance:
                 ("huber", 150, 30, 5, 0.1),
                 ("huber", 300, 8, 1, 0.2),
             ],
+            together=True,
         ),
     )
     def test_with_a_robust_loss(self, loss, n_frames, n_points, n_components, largest):
