@@ -84,6 +84,15 @@ def measurement_matrix(X, scale_frames=True):
     return (tracks / sizes).transpose(0, 2, 1).reshape(2 * len(X), -1), sizes
 
 
+def spoiled(X, rng, noise=0.0, missing=0.0):
+    """Return a table with noise, a share of the size, and missing points, a share."""
+    tracks = X.reshape(len(X), -1, 2)
+    size = np.sqrt(np.mean(centred_tracks(X) ** 2))
+    noisy = tracks + noise * size * rng.standard_normal(tracks.shape)
+    hidden = rng.random(tracks.shape[:2])[..., None] < missing
+    return as_table(np.where(hidden, np.nan, noisy))
+
+
 def rotations_and_scales(motion):
     """Return the rotations (n, 3, 3) and scales (n,) nearest to cameras (n, 2, 3)."""
     U, _, Vt = np.linalg.svd(np.nan_to_num(motion), full_matrices=False)
