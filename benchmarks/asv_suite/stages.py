@@ -4,8 +4,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-
 from benchmarks.asv_suite._measured import TABLES, Measured, Table, load
+
 from benchmarks.speed import measured as measurement_matrix, with_holes
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._gauge.independent import independent_gauge
