@@ -157,8 +157,8 @@ def deeplabcut_frame(tracks, likelihood=0.9, *, bodyparts=BODYPARTS, individuals
 
 def write_deeplabcut(path, frame, *, how="table"):
     """Write what deeplabcut_frame has returned, as csv or h5."""
-    if path.suffix == ".csv":
-        frame.to_csv(path)
+    if path.suffix in (".csv", ".tsv"):
+        frame.to_csv(path, sep={".csv": ",", ".tsv": "\t"}[path.suffix])
     else:
         pytest.importorskip("tables", reason="needs the extra h5")
         frame.to_hdf(path, key="df_with_missing", format=how, mode="w")
@@ -307,6 +307,7 @@ WRITERS = {
     "wflw": lambda d: write_wflw(d / "a.txt", WFLW),
     "wflw-test": lambda d: write_wflw(d / "a.txt", WFLW, rest=False),
     "deeplabcut": lambda d: write_deeplabcut(d / "a.csv", FRAME),
+    "deeplabcut-tsv": lambda d: write_deeplabcut(d / "a.tsv", FRAME),
     "deeplabcut-table": lambda d: write_deeplabcut(d / "a.h5", FRAME),
     "deeplabcut-fixed": lambda d: write_deeplabcut(d / "a.h5", FRAME, how="fixed"),
     "sleap": lambda d: write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),
