@@ -75,7 +75,7 @@ def docs(session: nox.Session) -> None:
 @nox.session
 def benchmarks(session: nox.Session) -> None:
     """Measure all methods; arguments are those of ``python -m benchmarks``."""
-    session.install("-e", ".[benchmarks,io]")
+    session.install("-e", ".[benchmarks]")
     if "ISA_NRSFM_DATA" not in os.environ:
         session.warn("without ISA_NRSFM_DATA there are generated tables only")
     session.run("python", "-m", "benchmarks", *session.posargs)
@@ -83,6 +83,6 @@ def benchmarks(session: nox.Session) -> None:
 
 @nox.session
 def mutation(session: nox.Session) -> None:
-    """Change the code in many places, and list changes that no test notices."""
-    session.install("-e", ".[test]")
+    """Change the core in random places, and list changes that no test notices."""
+    session.install("-e", ".[mutation]")
     session.run("python", "-m", "benchmarks.mutation", *session.posargs, env=THREADS)

@@ -1,47 +1,29 @@
 """Section agreement: how far fits with different seeds are the same."""
 
 from itertools import combinations, product
-from typing import NamedTuple
 
-from benchmarks._jobs import Job
-from benchmarks._markdown import cell, remarks, select, table, value
+from benchmarks._results import grid, remarks
+from benchmarks._run import Section
 from benchmarks._sets import SET_TITLES, SETS, load
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity, subspace_distance
 
 ISA1 = {"refinement": "alternating", "isa": FastISA()}
 ISA2 = {"refinement": "alternating"}
-
-
-class Comparison(NamedTuple):
-    """
-    Two kinds of fits that are compared; of one kind, if they are the same.
-
-    Attributes
-    ----------
-    title : str
-        What it is called.
-    one, other : dict
-        Parameters of AffineNRSfM.
-    """
-
-    title: str
-    one: dict
-    other: dict
-
-
+COEFFICIENTS = {"independence": "coefficients"}
+# Title and parameters of two kinds of fits that are compared.
 COMPARISONS = {
-    "isa1": Comparison("ISA1", ISA1, ISA1),
-    "isa2": Comparison("ISA2", ISA2, ISA2),
-    "isa1_isa2": Comparison("ISA1 and ISA2", ISA1, ISA2),
-    "joint": Comparison("joint, independent shapes", {}, {}),
-    "joint_coefficients": Comparison(
+    "isa1": ("ISA1", ISA1, ISA1),
+    "isa2": ("ISA2", ISA2, ISA2),
+    "isa1_isa2": ("ISA1 and ISA2", ISA1, ISA2),
+    "joint": ("joint, independent shapes", {}, {}),
+    "joint_coefficients": (
         "joint, independent coefficients",
-        {"independence": "coefficients"},
-        {"independence": "coefficients"},
+        COEFFICIENTS,
+        COEFFICIENTS,
     ),
 }
-TITLES = {name: comparison.title for name, comparison in COMPARISONS.items()}
+TITLES = {name: title for name, (title, _, _) in COMPARISONS.items()}
 # By name: what is said of it, and significant digits.
 MEASURES = {
     "subspaces": (
@@ -57,56 +39,32 @@ MEASURES = {
 }
 
 
-def jobs(section, sets, methods, repeats):
-    """Return a job for each set and comparison."""
-    n_seeds = max(repeats, 2)
-    return [
-        Job(
-            section,
-            name,
-            method,
-            0,
-            measure_agreement,
-            {"name": name, "method": method, "n_seeds": n_seeds},
-            {"n_seeds": n_seeds},
-        )
-        for name in sets
-        for method in methods
-    ]
+def runs(sets, methods, repeats):
+    """Return a run for each set and comparison."""
+    seeds = {"n_seeds": max(repeats, 2)}
+    return [(name, method, 0, seeds) for name in sets for method in methods]
 
 
-def measure_agreement(measured, name, method, n_seeds):
+def measure_agreement(measured, name, method, seed, n_seeds):
     """Fit a table with several seeds, and compare the fits pair by pair."""
-    comparison = COMPARISONS[method]
-    X = load(name).X
-    case = SETS[name].case
+    X, case = load(name).X, SETS[name].case
 
     def fits(parameters):
-        models = [
-            AffineNRSfM(
-                case.n_components,
-                scale_frames=case.scale_frames,
-                random_state=seed,
-                **parameters,
-            )
-            for seed in range(n_seeds)
-        ]
-        for model in models:
+        settings = {"scale_frames": case.scale_frames, **parameters}
+        for seed in range(n_seeds):
+            model = AffineNRSfM(case.n_components, random_state=seed, **settings)
             with measured():
                 model.fit(X)
-        return models
+            yield model
 
-    ones = fits(comparison.one)
-    if comparison.one == comparison.other:
-        pairs = list(combinations(ones, 2))
-    else:
-        pairs = list(product(ones, fits(comparison.other)))
+    _, one, other = COMPARISONS[method]
+    ones = list(fits(one))
+    pairs = combinations(ones, 2) if one == other else product(ones, fits(other))
     compared = [compare(a, b, X) for a, b in pairs]
-    if comparison.one.get("refinement") != "alternating":
-        for distances in compared:
-            del distances["subspaces"]  # those of the start
-    values = {key: [pair[key] for pair in compared] for key in compared[0]}
-    return values, {}
+    names = set(compared[0])
+    if one.get("refinement") != "alternating":
+        names -= {"subspaces"}  # those of the start
+    return {name: [pair[name] for pair in compared] for name in names}
 
 
 def compare(a, b, X):
@@ -118,47 +76,35 @@ def compare(a, b, X):
         mean_shape=b.mean_shape_,
         modulo_mean_shape=True,
     )
-    shapes = affine_shape_error(a.reconstruct(X), b.reconstruct(X))
-    subspaces = subspace_distance(a.isa_.components_, b.isa_.components_)
     return {
-        "subspaces": subspaces,
+        "subspaces": subspace_distance(a.isa_.components_, b.isa_.components_),
         "basis": similarity.min(),
         "mean_basis": similarity.mean(),
-        "shapes": shapes,
+        "shapes": affine_shape_error(a.reconstruct(X), b.reconstruct(X)),
     }
 
 
 def page(records):
     """Return the tables of the section."""
-    sets = [name for name in SET_TITLES if select(records, set=name)]
     parts = [
         "Fits of the same table with different seeds, compared pair by pair: median "
         "over the pairs and range. Basis shapes without their multiples of the mean "
         "shape. ISA1 and ISA2 with the paper's refinement.\n"
     ]
     for measure, (title, digits) in MEASURES.items():
-        rows = [
-            [
-                TITLES[method],
-                *(
-                    _cell(select(records, method=method, set=s), measure, digits)
-                    for s in sets
-                ),
-            ]
-            for method in TITLES
-            if select(records, method=method)
-        ]
-        rows = [row for row in rows if any(row[1:])]
-        if rows:
-            parts += [title + "\n", table(["", *(SET_TITLES[s] for s in sets)], rows)]
+        known = records[records[measure].notna()].explode(measure)
+        table = grid(known, TITLES, SET_TITLES, measure, corner="", digits=digits)
+        if table:
+            parts += [title + "\n", table]
     return "\n".join([*parts, remarks(records, TITLES)])
 
 
-def _cell(records, measure, digits):
-    """Return the spread of a list of values of the one record there is."""
-    one_each = [
-        record._replace(values={measure: item})
-        for record in records
-        for item in record.values.get(measure, [None])
-    ]
-    return cell(one_each, value(measure), digits)
+AGREEMENT = Section(
+    "Agreement across seeds",
+    measure_agreement,
+    page,
+    ("ict_68", "drink", "faces_wild", "synthetic"),
+    tuple(COMPARISONS),
+    tuple(SETS),
+    runs=runs,
+)

@@ -7,9 +7,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from benchmarks._figures import draw_bars
-from benchmarks._jobs import Job
-from benchmarks._markdown import grid, remarks, value
 from benchmarks._methods import CALIBRATED, METHOD_TITLES, METHODS
+from benchmarks._results import grid, remarks
+from benchmarks._run import Section, every_seed
 from benchmarks._sets import SET_TITLES, SETS, load
 from isa_nrsfm.analysis import AlignedFrames
 
@@ -33,30 +33,20 @@ def features(method, chosen, seed):
     """Return the transformer of a method for a set."""
     K = chosen.case.n_components
     if method == MORE:
-        return METHODS["joint"].make(2 * K, chosen.case.scale_frames, False, seed)
+        return METHODS["joint"].make(chosen, 2 * K, seed)
     if method in METHODS:
-        return METHODS[method].make(K, chosen.case.scale_frames, chosen.ordered, seed)
+        return METHODS[method].make(chosen, K, seed)
     pca = PCA(3 * K + 3 if method.endswith("_more") else K, random_state=seed)
     if method.startswith("true"):
         return pca
     return make_pipeline(AlignedFrames(turn=method.startswith("aligned")), pca)
 
 
-def jobs(section, sets, methods, repeats):
-    """Return a job for each set, features and seed, which says the folds."""
+def runs(sets, methods, repeats):
+    """Return a run for each set, features and seed, which says the folds."""
     return [
-        Job(
-            section,
-            name,
-            method,
-            seed,
-            measure_accuracy,
-            {"name": name, "method": method, "seed": seed},
-            {},
-        )
-        for seed in range(repeats)
-        for name in sets
-        for method in methods
+        (name, method, *rest)
+        for name, method, *rest in every_seed(sets, methods, repeats)
         if SETS[name].truth or not method.startswith("true")
     ]
 
@@ -73,25 +63,16 @@ def measure_accuracy(measured, name, method, seed):
         StandardScaler(),
         LinearDiscriminantAnalysis(),
     )
+    cv = kind(FOLDS, shuffle=True, random_state=seed)
+    options = {"groups": data.subjects, "cv": cv, "error_score": "raise"}
     with measured():
-        scores = cross_val_score(
-            classifier,
-            X,
-            data.labels,
-            groups=data.subjects,
-            cv=kind(FOLDS, shuffle=True, random_state=seed),
-            error_score="raise",
-        )
-    values = {
-        "accuracy": 100 * scores.mean(),
-        "spread": 100 * scores.std(ddof=1),
-        "folds": 100 * scores,
-    }
-    return values, {}
+        scores = 100 * cross_val_score(classifier, X, data.labels, **options)
+    return {"accuracy": scores.mean(), "spread": scores.std(ddof=1), "folds": scores}
 
 
 def page(records):
     """Return the tables of the section."""
+    titles = {"titles": FEATURES, "headings": SET_TITLES, "corner": "features"}
     return "\n".join(
         [
             "Accuracy in percent, mean of five folds, median over the seeds that draw "
@@ -100,33 +81,30 @@ def page(records):
             "fitted inside of the folds. Folds hold different subjects on ICT-68. Of "
             "expressions the subjects are not known: a person may be on both sides of "
             "a fold, which helps all features.\n",
-            _grid(records, value("accuracy")),
+            grid(records, measure="accuracy", **titles),
             "Standard deviation between the folds, percent.\n",
-            _grid(records, value("spread"), digits=2),
+            grid(records, measure="spread", digits=2, **titles),
             "Seconds of the five folds.\n",
-            _grid(records, lambda record: record.seconds),
+            grid(records, measure="seconds", **titles),
             remarks(records, FEATURES),
         ]
     )
 
 
-def _grid(records, measure, digits=3):
-    """Return a table with a row for each kind of features."""
-    return grid(
-        records, FEATURES, SET_TITLES, measure, corner="features", digits=digits
-    )
-
-
 def draw(records, folder):
     """Draw the accuracy, and return the name of the file."""
-    file = "classification.png"
-    draw_bars(
-        records,
-        FEATURES,
-        SET_TITLES,
-        value("accuracy"),
-        folder / file,
-        label="accuracy, %",
-        log=False,
-    )
+    file, label = "classification.png", "accuracy, %"
+    titles = FEATURES, SET_TITLES
+    draw_bars(records, *titles, "accuracy", folder / file, label, log=False)
     return [file]
+
+
+CLASSIFICATION = Section(
+    "Classification of expressions",
+    measure_accuracy,
+    page,
+    ("ict_68", "expressions"),
+    tuple(FEATURES),
+    draw=draw,
+    runs=runs,
+)

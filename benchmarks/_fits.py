@@ -3,16 +3,16 @@
 import numpy as np
 
 from benchmarks._figures import draw_bars
-from benchmarks._jobs import Job
-from benchmarks._markdown import found, grid, number, remarks, select, value
 from benchmarks._methods import CALIBRATED, METHOD_TITLES, METHODS
-from benchmarks._sets import SET_TITLES, SETS, load, shapes_in_camera, true_shapes
+from benchmarks._results import found, grid, number, remarks, select
+from benchmarks._run import Section
+from benchmarks._sets import SET_TITLES, SETS, load, shapes_in_camera
 from isa_nrsfm.metrics import affine_shape_error, inverse_snr, mean_shape_error_3d
 
 # Where in a table the frames are that pictures show.
 SHOWN = (0.1, 0.35, 0.6, 0.85)
 # What no method can be below.
-BOUNDS = ("floor",)
+BOUND = "floor"
 # The joint refinement with each camera.
 JOINT = ("joint", *CALIBRATED)
 ERRORS = {
@@ -59,19 +59,11 @@ and, where they differ, range.
 """
 
 
-def jobs(section, sets, methods, repeats):
+def runs(sets, methods, repeats):
     """Return the fits of each set by each method, seed by seed, long ones first."""
     sets = sorted(sets, key=lambda name: SETS[name].most_repeats is None)
     return [
-        Job(
-            section,
-            name,
-            method,
-            seed,
-            measure_fit,
-            {"name": name, "method": method, "seed": seed},
-            {},
-        )
+        (name, method, seed, {})
         for seed in range(repeats)
         for name in sets
         for method in methods
@@ -88,39 +80,37 @@ def runs_of(name, method, repeats):
 
 
 def measure_fit(measured, name, method, seed):
-    """Fit a table, and judge what was found."""
+    """Fit a table, and judge what was found; some frames are shown in pictures."""
     chosen, kind = SETS[name], METHODS[method]
-    X = load(name, seed).X
-    K, scale_frames = chosen.case.n_components, chosen.case.scale_frames
-    model = kind.make(K, scale_frames, chosen.ordered, seed)
+    table, K = load(name, seed), chosen.case.n_components
+    X = table.X
+    model = kind.make(chosen, K, seed)
     with measured():
         model.fit(X)
     result = kind.found(model, X)
-    values = {
+    frames = (np.array(SHOWN) * len(X)).astype(int)
+    return {
         "n_frames": len(X),
         "n_points": X.shape[1] // 2,
         "n_components": K,
-        "inverse_snr": inverse_snr(X, result.X, scale_frames=scale_frames),
+        "inverse_snr": inverse_snr(X, result.X, scale_frames=chosen.case.scale_frames),
         "n_iter": getattr(model, "n_iter_", None),
+        **truth_errors(name, seed, table, result),
+        "shown": {
+            "frames": frames,
+            "observed": X[frames].reshape(len(frames), -1, 2),
+            "reprojected": result.X[frames].reshape(len(frames), -1, 2),
+        },
     }
-    values |= truth_errors(name, seed, result)
-    frames = (np.array(SHOWN) * len(X)).astype(int)
-    shown = {
-        "frames": frames,
-        "observed": X[frames].reshape(len(frames), -1, 2),
-        "reprojected": result.X[frames].reshape(len(frames), -1, 2),
-    }
-    return values, shown
 
 
-def truth_errors(name, seed, result):
+def truth_errors(name, seed, table, result):
     """Return the errors in 3D of what was found, by name; none without a truth."""
     chosen, values = SETS[name], {}
     if not chosen.truth or result.affine is None:
         return values
     if chosen.truth == "object":
-        truth = true_shapes(name, seed)
-        values["affine_shape_error"] = affine_shape_error(truth, result.affine)
+        values["affine_shape_error"] = affine_shape_error(table.shapes, result.affine)
     if chosen.camera != "affine":
         values |= errors_3d(chosen, shapes_in_camera(name, seed), result)
     return values
@@ -134,45 +124,27 @@ def errors_3d(chosen, truth, result):
     image tells. Where images have the scale of the truth no scale is fitted for all
     frames.
     """
-    shapes = result.euclidean @ result.rotations.transpose(0, 2, 1)
-    if chosen.camera == "orthographic":
-        shapes = result.scales[:, None, None] * shapes
+    unscaled = chosen.camera != "orthographic"
+    shapes = result.in_camera(scaled=not unscaled)
     return {
-        "sequence_error": mean_shape_error_3d(
-            truth, shapes, scale=chosen.camera != "orthographic"
-        ),
+        "sequence_error": mean_shape_error_3d(truth, shapes, scale=unscaled),
         "frame_error": mean_shape_error_3d(truth, shapes, convention="frame"),
     }
 
 
-def percent(record):
-    """Return the inverse SNR in percent."""
-    share = record.values.get("inverse_snr")
-    return None if share is None else 100 * share
-
-
-def seconds(record):
-    """Return the seconds of a fit."""
-    return record.seconds
-
-
-def memory(record):
-    """Return the memory of a fit in megabytes."""
-    return record.memory
-
-
 def reprojection_page(records):
     """Return the tables of the section reprojection."""
+    titles = METHOD_TITLES, SET_TITLES
     return "\n".join(
         [
             "Inverse SNR in percent, lower is better: median over the seeds and, where "
             "they differ, range.\n",
-            _grid(records, percent),
+            grid(records, *titles, "inverse_snr"),
             "Seconds of the fit.\n",
-            _grid(records, seconds),
+            grid(records, *titles, "seconds"),
             "Memory of the fit, MB: by how much memory in use rose at most.\n",
-            _grid(records, memory, digits=2),
-            not_lowest(records, {"inverse SNR": percent}),
+            grid(records, *titles, "memory", digits=2),
+            not_lowest(records, {"inverse_snr": "inverse SNR"}),
             remarks(records, METHOD_TITLES),
         ]
     )
@@ -180,29 +152,23 @@ def reprojection_page(records):
 
 def truth_page(records):
     """Return the tables of the section truth."""
-    parts = [TRUTH]
+    titles, parts = (METHOD_TITLES, SET_TITLES), [TRUTH]
+    judged = records[records["method"] != BOUND]
     for name, title in ERRORS.items():
-        chosen = [r for r in records if r.status != "ok" or name in r.values]
-        chosen = [r for r in chosen if r.method not in BOUNDS]
-        parts += [f"{title}. Lower is better.\n", _grid(chosen, value(name))]
-    measures = {"inverse SNR": percent}
-    measures |= {name: value(name) for name in ERRORS}
+        if name in records:
+            has_it = judged[name].notna() | (judged["status"] != "ok")
+            parts += [f"{title}. Lower is better.\n"]
+            parts += [grid(judged[has_it], *titles, name)]
+    measures = {"inverse_snr": "inverse SNR"} | {name: name for name in ERRORS}
     parts += [
         "Inverse SNR of the same fits in percent.\n",
-        _grid(records, percent),
+        grid(records, *titles, "inverse_snr"),
         "Seconds of the fit.\n",
-        _grid(records, seconds),
+        grid(records, *titles, "seconds"),
         *(not_lowest(records, measures, method) for method in JOINT),
         remarks(records, METHOD_TITLES),
     ]
     return "\n".join(parts)
-
-
-def _grid(records, measure, digits=3):
-    """Return a table with a row a method and a column a set."""
-    return grid(
-        records, METHOD_TITLES, SET_TITLES, measure, corner="method", digits=digits
-    )
 
 
 def not_lowest(records, measures, method="joint"):
@@ -211,27 +177,26 @@ def not_lowest(records, measures, method="joint"):
 
     The joint refinement with other cameras does not count.
     """
-    others = [m for m in METHODS if m == method or m not in (*BOUNDS, *JOINT)]
+    others = [m for m in METHODS if m == method or m not in (BOUND, *JOINT)]
     lines = []
     for name, title in SET_TITLES.items():
         of_set = select(records, set=name)
-        for measure_title, measure in measures.items():
+        for measure, measure_title in measures.items():
             medians = {
                 other: float(np.median(values))
                 for other in others
-                if (values := found(select(of_set, method=other), measure))
+                if len(values := found(select(of_set, method=other), measure))
             }
-            if method not in medians:
-                continue
-            lower = [o for o in medians if medians[o] < medians[method]]
-            if lower:
+            own = medians.get(method, -np.inf)
+            if lower := [o for o in medians if medians[o] < own]:
                 listed = ", ".join(
                     f"{METHOD_TITLES[o]} {number(medians[o])}" for o in lower
                 )
-                own = number(medians[method])
-                lines.append(f"- {title}, {measure_title}: {own}; lower are {listed}\n")
+                lines.append(
+                    f"- {title}, {measure_title}: {number(own)}; lower are {listed}\n"
+                )
     name = METHOD_TITLES[method]
-    if not select(records, method=method, status="ok"):
+    if select(records, method=method, status="ok").empty:
         return ""
     if not lines:
         return f"{name} is the lowest on every set here.\n"
@@ -240,27 +205,45 @@ def not_lowest(records, measures, method="joint"):
 
 def draw_reprojection(records, folder):
     """Draw the inverse SNR, and return the name of the file."""
-    file = "reprojection_errors.png"
-    label = "inverse SNR, %"
-    draw_bars(records, METHOD_TITLES, SET_TITLES, percent, folder / file, label=label)
+    file, label = "reprojection_errors.png", "inverse SNR, %"
+    titles = METHOD_TITLES, SET_TITLES
+    draw_bars(records, *titles, "inverse_snr", folder / file, label)
     return [file]
 
 
 def draw_truth(records, folder):
     """Draw the errors in 3D, and return the names of the files."""
-    titles = {name: t for name, t in METHOD_TITLES.items() if name not in BOUNDS}
+    titles = {name: t for name, t in METHOD_TITLES.items() if name != BOUND}
     files = []
     for name, text in ERRORS.items():
-        if any(record.values.get(name) is not None for record in records):
+        if len(found(records, name)):
             files.append(f"truth_{name}.png")
             label = text.replace("`", "").partition(":")[0]
-            draw_bars(
-                records,
-                titles,
-                SET_TITLES,
-                value(name),
-                folder / files[-1],
-                label=f"{label}, {text.rpartition(', ')[2]}",
-                log=False,
-            )
+            label = f"{label}, {text.rpartition(', ')[2]}"
+            path = folder / files[-1]
+            draw_bars(records, titles, SET_TITLES, name, path, label, log=False)
     return files
+
+
+REPROJECTION = Section(
+    "Reprojection",
+    measure_fit,
+    reprojection_page,
+    ("shark", "flag", "faces_wild", "ict_dense"),
+    tuple(name for name in METHODS if name not in CALIBRATED),
+    tuple(SETS),
+    CALIBRATED,
+    draw_reprojection,
+    runs,
+)
+TRUTH_3D = Section(
+    "3D truth",
+    measure_fit,
+    truth_page,
+    tuple("shark flag ict_68 drink pickup yoga synthetic synthetic_affine".split()),
+    tuple(name for name in METHODS if name != "consensus"),
+    ("ict_dense", "drink_k11", "pickup_k11", "yoga_k9"),
+    ("consensus",),
+    draw_truth,
+    runs,
+)

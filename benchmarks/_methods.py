@@ -5,19 +5,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse.linalg import svds
 from sklearn.base import BaseEstimator
 
+from benchmarks._sets import as_table, measurement_matrix, rotations_and_scales
 from isa_nrsfm import AffineNRSfM, FastISA, baselines
-from isa_nrsfm._frames.projection import compose, project
-from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
-from isa_nrsfm._paper.factors import leading_triplets
-from isa_nrsfm._tables.tracks import (
-    centred_tracks,
-    measurement_matrix,
-    table_to_tracks,
-    tracks_to_table,
-    weighting_sizes,
-)
 from isa_nrsfm.calibration import (
     deformation_metric,
     euclidean_frames,
@@ -50,6 +42,11 @@ class Found(NamedTuple):
     rotations: np.ndarray | None = None
     scales: np.ndarray | None = None
 
+    def in_camera(self, scaled=True):
+        """Return the Euclidean shapes in the axes of the cameras."""
+        shapes = self.euclidean @ self.rotations.transpose(0, 2, 1)
+        return self.scales[:, None, None] * shapes if scaled else shapes
+
 
 class Method(NamedTuple):
     """
@@ -60,8 +57,7 @@ class Method(NamedTuple):
     title : str
         What it is called in tables and figures.
     make : callable
-        Returns the estimator for a number of basis shapes, whether frames are scaled,
-        whether they are ordered, and a seed.
+        Returns the estimator for a `Set`, a number of basis shapes and a seed.
     found : callable
         Returns what the fitted estimator has found in its table.
     is_random : bool
@@ -101,45 +97,52 @@ class TruncatedTable(BaseEstimator):
 
     def fit(self, X, y=None):
         """Factorise a table."""
-        centred, translation = centred_tracks(table_to_tracks(X))
-        sizes = weighting_sizes(centred, self.scale_frames)[:, None, None]
-        W = measurement_matrix(centred / sizes)
-        V = leading_triplets(W, self.rank)[1].T
+        W, sizes = measurement_matrix(X, self.scale_frames)
+        V = svds(W, self.rank, random_state=0)[2].T
         self.motion_ = sizes * (W @ V).reshape(len(X), 2, -1)
         self.mean_shape_ = V
         images = V @ self.motion_.transpose(0, 2, 1)
-        self.X_ = tracks_to_table(images + translation[:, None])
+        centroids = X.reshape(len(X), -1, 2).mean(axis=1, keepdims=True)
+        self.X_ = as_table(images + centroids)
         return self
 
 
-def ours(n_components, scale_frames, ordered, seed, **parameters):
+def ours(kind, n_components, seed, **parameters):
     """Return our estimator; it takes no notice of the order of frames."""
+    scaled = kind.case.scale_frames
     return AffineNRSfM(
-        n_components, scale_frames=scale_frames, random_state=seed, **parameters
+        n_components, scale_frames=scaled, random_state=seed, **parameters
     )
 
 
-def theirs(name, n_components, scale_frames, ordered, seed):
+def theirs(name, kind, n_components, seed):
     """Return a baseline by the name of its class."""
     model = getattr(baselines, name)(n_components)
-    known = {"scale_frames": scale_frames, "ordered": ordered, "random_state": seed}
+    known = {"scale_frames": kind.case.scale_frames, "ordered": kind.ordered}
+    known["random_state"] = seed
     return model.set_params(**{k: known[k] for k in known if k in model.get_params()})
 
 
-def rigid(n_components, scale_frames, ordered, seed):
+def rigid(kind, n_components, seed):
     """Return the rigid factorisation."""
-    return TruncatedTable(3, scale_frames)
+    return TruncatedTable(3, kind.case.scale_frames)
 
 
-def floor(n_components, scale_frames, ordered, seed):
+def floor(kind, n_components, seed):
     """Return the best table of the rank that the model can have."""
-    return TruncatedTable(3 * n_components + 3, scale_frames)
+    return TruncatedTable(3 * n_components + 3, kind.case.scale_frames)
+
+
+def images_of(model, shapes):
+    """Return the table of shapes that the cameras of a model see."""
+    images = shapes @ model.motion_.transpose(0, 2, 1)
+    return as_table(images + model.translation_[:, None])
 
 
 def found_by_ours(model, X):
     """Return what AffineNRSfM has found in its table."""
-    shapes = compose(model.mean_shape_, model.basis_, model.alpha_)
-    images = tracks_to_table(project(shapes, model.motion_, model.translation_))
+    shapes = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
+    images = images_of(model, shapes)
     if model.camera != "affine":
         return Found(images, shapes, shapes, model.rotations_, model.scales_)
     metric = deformation_metric(model.motion_, model.alpha_)
@@ -151,10 +154,10 @@ def found_by_ours(model, X):
 
 def found_by_baseline(model, X):
     """Return what a baseline has found in its table: its own shapes and cameras."""
-    images = project(model.shapes_, model.motion_, model.translation_)
-    scales = np.linalg.norm(model.motion_, axis=(1, 2)) / np.sqrt(2)
-    X_found, shapes = tracks_to_table(images), model.shapes_
-    return Found(X_found, shapes, shapes, nearest_rotations(model.motion_)[0], scales)
+    cameras = rotations_and_scales(model.motion_)
+    return Found(
+        images_of(model, model.shapes_), model.shapes_, model.shapes_, *cameras
+    )
 
 
 def found_by_rigid(model, X):
@@ -165,6 +168,13 @@ def found_by_rigid(model, X):
     return Found(model.X_, shapes, shapes, upgrade.rotations, upgrade.scales)
 
 
+def our_method(title, **parameters):
+    """Return the method of our estimator with some parameters."""
+    return Method(title, partial(ours, **parameters), found_by_ours, True)
+
+
+PAPERS = {"refinement": "alternating"}
+WEAK = {"camera": "weak_perspective"}
 METHODS = {
     "floor": Method("rank floor", floor, lambda model, X: Found(model.X_)),
     "rigid": Method("rigid mean shape", rigid, found_by_rigid),
@@ -173,34 +183,12 @@ METHODS = {
     "kong_lucey": Method(
         "Kong-Lucey", partial(theirs, "CompressibleNRSfM"), found_by_baseline, True
     ),
-    "isa1": Method(
-        "ISA1, paper's refinement",
-        partial(ours, refinement="alternating", isa=FastISA()),
-        found_by_ours,
-        True,
-    ),
-    "isa2": Method(
-        "ISA2, paper's refinement",
-        partial(ours, refinement="alternating"),
-        found_by_ours,
-        True,
-    ),
-    "joint": Method("ISA, joint refinement", ours, found_by_ours, True),
-    "weak_perspective": Method(
-        "ISA, weak perspective",
-        partial(ours, camera="weak_perspective"),
-        found_by_ours,
-        True,
-    ),
-    "orthographic": Method(
-        "ISA, orthographic", partial(ours, camera="orthographic"), found_by_ours, True
-    ),
-    "consensus": Method(
-        "ISA, consensus",
-        partial(ours, camera="weak_perspective", refinement="consensus"),
-        found_by_ours,
-        True,
-    ),
+    "isa1": our_method("ISA1, paper's refinement", isa=FastISA(), **PAPERS),
+    "isa2": our_method("ISA2, paper's refinement", **PAPERS),
+    "joint": our_method("ISA, joint refinement"),
+    "weak_perspective": our_method("ISA, weak perspective", **WEAK),
+    "orthographic": our_method("ISA, orthographic", camera="orthographic"),
+    "consensus": our_method("ISA, consensus", refinement="consensus", **WEAK),
 }
 # Those that know something of the cameras.
 CALIBRATED = ("weak_perspective", "orthographic", "consensus")

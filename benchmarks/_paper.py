@@ -1,27 +1,17 @@
 """Section paper: the experiments of Brandt, Ackermann and Grasshof (2018)."""
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from scipy.stats import ortho_group
 
-from benchmarks._fits import measure_fit, percent, runs_of
-from benchmarks._jobs import Job
-from benchmarks._markdown import (
-    cell,
-    found,
-    grid,
-    remarks,
-    select,
-    spread,
-    table,
-    value,
-)
+from benchmarks._fits import measure_fit, runs_of
 from benchmarks._methods import METHOD_TITLES, METHODS
+from benchmarks._results import cell, grid, remarks, select, table
+from benchmarks._run import Section
 from benchmarks._sets import SET_TITLES, SETS, load
 from isa_nrsfm import FastISA
-from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 from isa_nrsfm.plotting import ModeCovarianceDisplay
 
 
@@ -90,15 +80,7 @@ PRINTED = {
     ),
 }
 BASELINES = ("pi", "bmm", "kong_lucey")
-COMPARED = (
-    "floor",
-    "rigid",
-    *BASELINES,
-    *ISA,
-    "joint",
-    "weak_perspective",
-    "consensus",
-)
+OURS = (*ISA, "joint", "weak_perspective", "consensus", "floor")
 # More points than a baseline or the consensus of groups of points is made for.
 DENSE, NOT_DENSE = "ict_dense", (*BASELINES, "consensus")
 # Of which more than one seed is taken.
@@ -107,16 +89,9 @@ REPEATED = (*ISA, "joint")
 SEVERAL = ("flag", "faces_wild", "ict_68")
 NUMBERS = {"shark": (1, 2, 3), **dict.fromkeys(SEVERAL, (1, 3, 5, 7, 9))}
 STARTS = (1, 3, 10, 30)
+RECOVERIES = ("generalized_eigen", "eigen", "irls")
 TURNS = 20
-OURS = (*ISA, "joint", "weak_perspective", "consensus", "floor")
 RANDOM = "random mixing"
-BY_NUMBER = {
-    ("isa2", "floor"): METHOD_TITLES["floor"],
-    ("isa2", "inverse_snr"): METHOD_TITLES["isa2"],
-    ("joint", "inverse_snr"): METHOD_TITLES["joint"],
-}
-BY_STARTS = {("isa1", "inverse_snr"): METHOD_TITLES["isa1"]}
-BY_RECOVERY = {("isa2", "inverse_snr"): METHOD_TITLES["isa2"]}
 
 TABLE = """\
 Inverse SNR in percent, median over the seeds and range. "Printed" is the figure of
@@ -149,109 +124,74 @@ way in which the blocks are found.
 """
 
 
-def jobs(section, sets, methods, repeats):
+def runs(sets, methods, repeats):
     """Return the fits of all methods, and by number of basis shapes and of starts."""
-    listed = []
+    listed = [
+        (name, method, seed, {"part": "fit"})
+        for name in sets
+        for method in methods
+        if name != DENSE or method not in NOT_DENSE
+        for seed in range(runs_of(name, method, repeats if method in REPEATED else 1))
+    ]
     for name in sets:
-        for method in methods:
-            if name == DENSE and method in NOT_DENSE:
-                continue
-            n_seeds = runs_of(name, method, repeats if method in REPEATED else 1)
-            for seed in range(n_seeds):
-                arguments = {"name": name, "method": method, "seed": seed}
-                parts = {"part": "fit"}
-                listed.append(
-                    Job(section, name, method, seed, measure_fit, arguments, parts)
-                )
-        for part, function, kinds in (
-            ("blocks", blocks, ISA),
-            ("numbers", by_number, ("isa2", "joint")),
-            ("starts", by_starts, ("isa1",)),
-            ("recoveries", by_recovery, ("isa2",)),
-        ):
+        by_part = {
+            "blocks": (ISA, [None], repeats),
+            "numbers": (("isa2", "joint"), NUMBERS.get(name, ()), 1),
+            "starts": (("isa1",), STARTS, repeats),
+            "recoveries": (("isa2",), RECOVERIES, 1),
+        }
+        for part, (kinds, choices, n_seeds) in by_part.items():
             known = SEVERAL if part in ("blocks", "starts") else NUMBERS
-            for method in kinds if name in known else ():
-                if method in methods:
-                    arguments = {"name": name, "method": method, "repeats": repeats}
-                    parts = {"part": part}
-                    listed.append(
-                        Job(section, name, method, 0, function, arguments, parts)
-                    )
+            listed += [
+                (name, method, seed, {"part": part, "choice": choice})
+                for method in kinds
+                if name in known and method in methods
+                for choice in choices
+                for seed in range(n_seeds)
+            ]
     return listed
 
 
-def fits(measured, name, method, choices):
-    """Yield the fits of a table for choices of K, seed and parameters."""
+def measure_paper(measured, name, method, seed, part, choice=None):
+    """Fit a table as the part says, for a choice of K, starts or block recovery."""
+    if part == "fit":
+        return measure_fit(measured, name, method, seed)
     X, chosen = load(name).X, SETS[name]
-    for n_components, seed, parameters in choices:
-        model = METHODS[method].make(
-            n_components, chosen.case.scale_frames, chosen.ordered, seed
-        )
-        with measured():
-            model.set_params(**parameters).fit(X)
-        yield model
+    K = choice if part == "numbers" else chosen.case.n_components
+    model = METHODS[method].make(chosen, K, seed)
+    if part == "starts":
+        model.set_params(isa=FastISA(n_init=choice))
+    if part == "recoveries":
+        model.set_params(block_recovery=choice)
+    with measured():
+        model.fit(X)
+    values = {"inverse_snr": model.inverse_snr_, "floor": 100 * model.rank_floor_}
+    if part == "blocks":
+        values["outside"] = outside_blocks(model.mode_covariance_)
+        values["random"] = turned_at_random(model.singular_values_[3:])
+    return values
 
 
 def outside_blocks(covariance):
-    """Return the share of the energy outside the 3x3 blocks on the diagonal."""
-    return ModeCovarianceDisplay(mode_covariance=covariance).off_block_share
+    """Return the energy outside the 3x3 blocks on the diagonal, percent."""
+    return 100 * ModeCovarianceDisplay(mode_covariance=covariance).off_block_share
 
 
 def turned_at_random(singular_values, n_turns=TURNS):
-    """Return the median share outside the blocks after random orthogonal mixing."""
+    """Return the median of `outside_blocks` after random orthogonal mixing."""
     turns = ortho_group.rvs(len(singular_values), n_turns, random_state=0)
     energies = np.diag(np.square(singular_values))
     return np.median([outside_blocks(turn @ energies @ turn.T) for turn in turns])
 
 
-def blocks(measured, name, method, repeats):
-    """Measure the block structure of the mode covariance matrix."""
-    K = SETS[name].case.n_components
-    choices = [(K, seed, {}) for seed in range(repeats)]
-    models = list(fits(measured, name, method, choices))
-    return {
-        "outside": [outside_blocks(model.mode_covariance_) for model in models],
-        "random": turned_at_random(models[0].singular_values_[3:]),
-    }, {}
-
-
-def by_number(measured, name, method, repeats, numbers=None):
-    """Measure the inverse SNR and the rank floor by number of basis shapes."""
-    choices = [(K, 0, {}) for K in numbers or NUMBERS[name]]
-    models = list(fits(measured, name, method, choices))
-    errors = {len(model.basis_): model.inverse_snr_ for model in models}
-    floors = {len(model.basis_): model.rank_floor_ for model in models}
-    return {"inverse_snr": errors, "floor": floors}, {}
-
-
-def by_starts(measured, name, method, repeats, starts=STARTS):
-    """Measure the inverse SNR by number of random starts of FastISA."""
-    K = SETS[name].case.n_components
-    choices = [
-        (K, seed, {"isa": FastISA(n_init=n)}) for n in starts for seed in range(repeats)
-    ]
-    errors = [model.inverse_snr_ for model in fits(measured, name, method, choices)]
-    by_start = np.reshape(errors, (len(starts), repeats))
-    return {"inverse_snr": dict(zip(starts, by_start, strict=True))}, {}
-
-
-def by_recovery(measured, name, method, repeats):
-    """Measure the inverse SNR by the way in which blocks are found."""
-    K = SETS[name].case.n_components
-    choices = [(K, 0, {"block_recovery": way}) for way in BLOCK_RECOVERIES]
-    models = fits(measured, name, method, choices)
-    errors = {model.block_recovery: model.inverse_snr_ for model in models}
-    return {"inverse_snr": errors}, {}
-
-
 def page(records):
     """Return the tables of the section."""
     made = select(records, part="fit")
-    sets = [name for name in PRINTED if select(made, set=name)]
+    sets = [name for name in PRINTED if (made["set"] == name).any()]
     tables = [name for name in sets if PRINTED[name].errors]
 
     def error(name, method):
-        return cell(select(made, set=name, method=method), percent) or "-"
+        return cell(select(made, set=name, method=method), "inverse_snr") or "-"
 
     rows = [
         [
@@ -279,64 +219,52 @@ def page(records):
         table(["method", *(SET_TITLES[name] for name in tables)], others),
         SHAPES,
         grid(
-            [record for record in made if record.method != "floor"],
+            made[made["method"] != "floor"],
             METHOD_TITLES,
             {name: SET_TITLES[name] for name in sets if SETS[name].truth},
-            value("frame_error"),
-            corner="method",
+            "frame_error",
         ),
         BLOCKS,
-        lists(select(records, part="blocks"), {"outside": "", "random": RANDOM}),
+        blocks(select(records, part="blocks")),
         NUMBER,
-        *columns(records, sets, "numbers", "K", BY_NUMBER),
+        *by_choice(records, sets, "numbers", "K"),
         STARTED,
-        *columns(records, sets, "starts", "starts", BY_STARTS),
-        *columns(records, sets, "recoveries", "blocks", BY_RECOVERY),
+        *by_choice(records, sets, "starts", "starts"),
+        *by_choice(records, sets, "recoveries", "blocks"),
         remarks(records, METHOD_TITLES),
     ]
     return "\n".join(part for part in parts if part)
 
 
-def lists(records, measures):
-    """Return a row for each method and measure, in percent, and a column for a set."""
-    names = [name for name in SET_TITLES if select(records, set=name)]
-    rows = []
-    for measure, title in measures.items():
-        for method in ISA if not title else ISA[:1]:
-            of_method = [select(records, set=n, method=method) for n in names]
-            rows.append(
-                [
-                    title or METHOD_TITLES[method].partition(",")[0],
-                    *(in_percent(value(measure), of) for of in of_method),
-                ]
-            )
-    return table(["", *(SET_TITLES[name] for name in names)], rows) if names else ""
+def blocks(records):
+    """Return the table of the block structure."""
+    titles = {name: METHOD_TITLES[name].partition(",")[0] for name in ISA}
+    mixed = select(records, method=ISA[0])
+    mixed = mixed.assign(method=RANDOM, outside=mixed.get("random"))
+    titles[RANDOM] = RANDOM
+    return grid(pd.concat([records, mixed]), titles, SET_TITLES, "outside", corner="")
 
 
-def in_percent(measure, records):
-    """Return the spread of all numbers that records have of a measure, in percent."""
-    values = [100 * np.ravel(numbers) for numbers in found(records, measure)]
-    return spread(np.concatenate(values).tolist()) if values else ""
-
-
-def columns(records, sets, part, corner, measures):
-    """Yield a table for each set: a column for a choice, a row for a measure."""
+def by_choice(records, sets, part, corner):
+    """Yield a table for each set: a row for a method, a column for a choice."""
+    records = select(records, part=part)
+    if part == "numbers":
+        floors = select(records, method="isa2")
+        floors = floors.assign(method="floor", inverse_snr=floors["floor"])
+        records = pd.concat([records, floors])
     for name in sets:
-        chosen = select(records, part=part, set=name, status="ok")
-        choices = list(chosen[0].values["inverse_snr"]) if chosen else []
-        rows = [
-            [title]
-            + [
-                in_percent(partial(entry, measure, choice), select(chosen, method=m))
-                for choice in choices
-            ]
-            for (m, measure), title in measures.items()
-        ]
-        title = SET_TITLES[name].partition(",")[0]
-        if choices:
-            yield table([f"{title}: {corner}", *choices], rows)
+        chosen = select(records, set=name)
+        headings = {choice: str(choice) for choice in chosen["choice"].unique()}
+        title = f"{SET_TITLES[name].partition(',')[0]}: {corner}"
+        options = {"column": "choice", "corner": title}
+        yield grid(chosen, METHOD_TITLES, headings, "inverse_snr", **options)
 
 
-def entry(measure, choice, record):
-    """Return what a record has of a measure for a choice, None where it has none."""
-    return record.values[measure].get(choice)
+PAPER = Section(
+    "The paper's experiments",
+    measure_paper,
+    page,
+    tuple(PRINTED),
+    ("floor", "rigid", *BASELINES, *OURS[:-1]),
+    runs=runs,
+)

@@ -1,124 +1,44 @@
-"""Records of runs, and the json file that keeps them."""
+"""Records of runs in a json file, and tables of them in markdown."""
 
 import json
 import os
 import platform
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import scipy
 import sklearn
 
 import isa_nrsfm
 
-FILE = "results.json"
-DIGITS = 6  # that are kept of each number
+# Numbers below this, of errors that would be 1 or 100 without a method, are shown as 0.
+ROUNDING = 1e-12
 
 
-class Record(NamedTuple):
-    """
-    A run, as it is stored.
-
-    Attributes
-    ----------
-    section, set, method : str
-        What was measured, on what, of what.
-    seed : int
-        Random seed.
-    status : {"ok", "over time", "error"}
-        What became of it.
-    values : dict
-        Figures by name, None where there is none.
-    parameters : dict
-        What else distinguishes it from other runs of the same section, set and method.
-    seconds : float or None
-        Of what was measured.
-    memory : float or None
-        Megabytes by which memory in use rose at most.
-    message : str
-        What went wrong.
-    warnings : sequence of str
-        What it warned of.
-    environment : str
-        Key of the environment in which it ran.
-    """
-
-    section: str
-    set: str
-    method: str
-    seed: int
-    status: str
-    values: dict
-    parameters: dict
-    seconds: float | None = None
-    memory: float | None = None
-    message: str = ""
-    warnings: tuple = ()
-    environment: str = ""
-
-    @property
-    def group(self):
-        """What is replaced as a whole when it is measured again."""
-        return self.section, self.set, self.method
+def read(path):
+    """Return the environments by key and the records of a file that need not exist."""
+    if not Path(path).is_file():
+        return {"environments": {}, "records": []}
+    return json.loads(Path(path).read_text(encoding="utf-8"))
 
 
-class Results:
-    """
-    All records of a file, in the order in which they were measured.
-
-    Parameters
-    ----------
-    path : path-like
-        The json file; it need not exist.
-    """
-
-    def __init__(self, path):
-        self.path = Path(path)
-        self.environments = {}
-        self.records = []
-        self._replaced = set()
-        if self.path.is_file():
-            stored = json.loads(self.path.read_text(encoding="utf-8"))
-            self.environments = stored["environments"]
-            self.records = [Record(**record) for record in stored["records"]]
-
-    def begin(self, **settings):
-        """Return the key of the present environment, with settings of the run."""
-        key = datetime.now().astimezone().isoformat(timespec="seconds")
-        self.environments[key] = environment() | settings
-        return key
-
-    def add(self, record):
-        """Add a record; the first of a group replaces those of earlier calls."""
-        if record.group not in self._replaced:
-            self._replaced.add(record.group)
-            self.records = [r for r in self.records if r.group != record.group]
-        self.records.append(record._replace(values=rounded(record.values)))
-
-    def of(self, section):
-        """Return the records of a section."""
-        return [record for record in self.records if record.section == section]
-
-    def save(self):
-        """Write the file, without environments of which no record is left."""
-        used = {record.environment for record in self.records}
-        kept = {key: self.environments[key] for key in self.environments if key in used}
-        stored = {
-            "environments": kept,
-            "records": [record._asdict() for record in self.records],
-        }
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = self.path.with_suffix(".tmp")
-        text = json.dumps(stored, indent=1, ensure_ascii=False, allow_nan=False)
-        unfinished.write_text(text + "\n", encoding="utf-8")
-        os.replace(unfinished, self.path)
+def write(path, stored):
+    """Write environments and records, without environments that have no record."""
+    used = {record["environment"] for record in stored["records"]}
+    kept = {key: facts for key, facts in stored["environments"].items() if key in used}
+    text = json.dumps(stored | {"environments": kept}, indent=1, allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".tmp")
+    unfinished.write_text(text + "\n", encoding="utf-8")
+    os.replace(unfinished, path)
 
 
-def environment():
-    """Return versions and machine."""
-    return {
+def environment(**settings):
+    """Return the key of the present environment, and what it is."""
+    key = datetime.now().astimezone().isoformat(timespec="seconds")
+    return key, {
         "isa_nrsfm": isa_nrsfm.__version__,
         "python": platform.python_version(),
         "numpy": np.__version__,
@@ -126,19 +46,136 @@ def environment():
         "scikit-learn": sklearn.__version__,
         "system": f"{platform.system()} {platform.machine()}",
         "cpus": os.cpu_count(),
+        **settings,
     }
 
 
-def rounded(value):
-    """Return numbers with a few significant digits, None where not finite."""
-    if isinstance(value, dict):
-        return {str(key): rounded(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [rounded(item) for item in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
-    return value
+def section_of(stored, section):
+    """Return the records of a section: a column a parameter and a value.
+
+    The inverse SNR is in percent.
+    """
+    records = [r for r in stored["records"] if r["section"] == section]
+    flat = [record | record["parameters"] | record["values"] for record in records]
+    table = pd.DataFrame(flat)
+    if "inverse_snr" in table:
+        table["inverse_snr"] *= 100
+    return table
+
+
+def select(records, **columns):
+    """Return the records with given values in columns; all, if it is None."""
+    for name, wanted in columns.items():
+        records = records[records[name] == wanted]
+    return records
+
+
+def found(records, measure):
+    """Return what records that succeeded have of a measure, as an array."""
+    if measure not in records:
+        return np.array([])
+    values = records.loc[records["status"] == "ok", measure]
+    return values.dropna().to_numpy(dtype=float)
+
+
+def table(headings, rows):
+    """Return a markdown table of texts, columns other than the first to the right."""
+    rule = ["---", *("--:" for _ in headings[1:])]
+    lines = ["| " + " | ".join(cells) + " |" for cells in (headings, rule, *rows)]
+    return "\n".join(lines) + "\n"
+
+
+def number(value, digits=3):
+    """Return a number with some significant digits, without an exponent if it can."""
+    if abs(value) < ROUNDING:
+        return "0"
+    if not 1e-5 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    decimals = max(digits - 1 - int(np.floor(np.log10(abs(value)))), 0)
+    return f"{value:.{decimals}f}"
+
+
+def cell(records, measure, digits=3):
+    """Return median and range of a measure, "over 600 s", "error", or nothing."""
+    values, failed = found(records, measure), records[records["status"] != "ok"]
+    if len(values):
+        least, median, most = (
+            number(v, digits) for v in np.percentile(values, (0, 50, 100))
+        )
+        text = median if least == most else f"{median} ({least} to {most})"
+        return text + (f", {len(failed)} failed" if len(failed) else "")
+    if len(failed) < len(records) or failed.empty:
+        return ""
+    late = failed.loc[failed["status"] == "over time", "message"]
+    return late.iloc[0] if len(late) else "error"
+
+
+def grid(
+    records,
+    titles,
+    headings,
+    measure,
+    *,
+    row="method",
+    column="set",
+    corner="method",
+    digits=3,
+):
+    """
+    Return a table with a row a method and a column a set, or of other columns.
+
+    Parameters
+    ----------
+    records : DataFrame
+        Of a section.
+    titles, headings : dict of str
+        Titles of the values of `row` and `column`, in order. Those without a record
+        are left out.
+    measure : str
+        A column.
+    row, column : str
+        Columns.
+    corner : str, default="method"
+        Heading of the first column.
+    digits : int, default=3
+        Significant digits.
+
+    Returns
+    -------
+    str
+        The table, empty without records.
+    """
+    if records.empty:
+        return ""
+    cells = {
+        key: cell(group, measure, digits)
+        for key, group in records.groupby([row, column])
+    }
+    columns = [name for name in headings if (records[column] == name).any()]
+    rows = [
+        [title, *(cells.get((name, other), "") for other in columns)]
+        for name, title in titles.items()
+        if (records[row] == name).any()
+    ]
+    return table([corner, *(headings[name] for name in columns)], rows)
+
+
+def remarks(records, titles):
+    """Return the errors of records as a list, each with its method and set."""
+    lines = [
+        f"- {titles.get(r.method, r.method)}, {r.set}, seed {r.seed}: {r.message}\n"
+        for r in records[records["status"] == "error"].itertuples()
+    ]
+    return "".join(dict.fromkeys(lines))
+
+
+def footnote(environments, records):
+    """Return in what environments records were measured."""
+    days = {}
+    for key in records["environment"].unique():
+        facts = ", ".join(f"{name} {fact}" for name, fact in environments[key].items())
+        days.setdefault(facts, []).append(key.partition("T")[0])
+    return "\n".join(
+        f"Measured {', '.join(dict.fromkeys(dates))}: {facts}.\n"
+        for facts, dates in days.items()
+    )

@@ -1,24 +1,22 @@
 """Section held_out: points that were held out, and the number of basis shapes."""
 
 import numpy as np
-from sklearn.model_selection import KFold, cross_val_score
+from sklearn.model_selection import GridSearchCV, KFold, cross_val_score
 
-from benchmarks._data import halves_of
-from benchmarks._jobs import Job
-from benchmarks._markdown import cell, grid, remarks, select, table, value
 from benchmarks._methods import METHOD_TITLES, METHODS
+from benchmarks._results import cell, found, grid, remarks, select, table
+from benchmarks._run import Section
 from benchmarks._sets import (
     SET_TITLES,
     SETS,
     SYNTHETIC_NOISE,
     SYNTHETIC_POINTS,
+    halves_of,
+    instance,
     load,
 )
-from benchmarks.accuracy import held_out
-from benchmarks.recovery import chosen_components, instance
+from isa_nrsfm import AffineNRSfM
 
-# Of `AffineNRSfM`: the other methods say nothing of points that they do not see.
-METHODS_WITH_SCORE = ("isa1", "isa2", "joint")
 # Numbers of basis shapes to choose from, and what chooses.
 CHOICES = {"ict_68": range(1, 14, 2), "drink": range(1, 9)}
 CHOOSES = "joint"
@@ -26,66 +24,62 @@ FOLDS = 3
 TRUE_NUMBERS = range(1, 6)
 
 
-def jobs(section, sets, methods, repeats):
-    """Return the jobs of both parts."""
-    listed = []
-    for seed in range(repeats):
-        for name in sets:
-            for method in methods if name != "synthetic" else ():
-                arguments = {"name": name, "method": method, "seed": seed}
-                parameters = {"part": "halves"}
-                listed.append(
-                    Job(section, name, method, seed, halves, arguments, parameters)
-                )
-            if CHOOSES not in methods:
-                continue
-            if name == "synthetic":
-                for K in TRUE_NUMBERS:
-                    arguments = {"n_components": K, "seed": seed}
-                    parameters = {"part": "choice", "n_components": K}
-                    listed.append(
-                        Job(section, name, CHOOSES, seed, choice, arguments, parameters)
-                    )
-            for K in CHOICES.get(name, ()) if seed == 0 else ():
-                arguments = {"name": name, "n_components": K}
-                parameters = {"part": "curve", "n_components": K}
-                listed.append(
-                    Job(section, name, CHOOSES, seed, curve, arguments, parameters)
-                )
-    return listed
+def runs(sets, methods, repeats):
+    """Return the runs of the three parts: halves, choice and curve."""
+    halves = {"part": "halves"}
+    listed = [
+        (name, method, seed, halves)
+        for seed in range(repeats)
+        for name in sets
+        for method in methods
+        if name != "synthetic"
+    ]
+    if CHOOSES not in methods:
+        return listed
+    listed += [
+        ("synthetic", CHOOSES, seed, {"part": "choice", "n_components": K})
+        for seed in range(repeats)
+        for K in TRUE_NUMBERS
+        if "synthetic" in sets
+    ]
+    return listed + [
+        (name, CHOOSES, 0, {"part": "curve", "n_components": K})
+        for name in sets
+        for K in CHOICES.get(name, ())
+    ]
 
 
-def halves(measured, name, method, seed):
-    """Fit half of the frames, and predict held-out points of the other half."""
-    chosen = SETS[name]
-    X = load(name).X
-    train, test = (X[rows] for rows in halves_of(len(X), seed))
-    K, scale_frames = chosen.case.n_components, chosen.case.scale_frames
-    model = METHODS[method].make(K, scale_frames, chosen.ordered, seed)
-    with measured():
-        model.fit(train)
-    return {"held_out": held_out(model, test)}, {}
+def measure_unseen(measured, name, method, seed, part, n_components=None):
+    """
+    Return the error at held-out points, or the number of basis shapes that is found.
 
-
-def choice(measured, n_components, seed):
-    """Let a search find the number of basis shapes of a synthetic table."""
-    tracks = instance(seed, SYNTHETIC_POINTS, n_components, SYNTHETIC_NOISE)
-    with measured():
-        found, _ = chosen_components(tracks.data)
-    return {"found": found}, {}
-
-
-def curve(measured, name, n_components):
-    """Return the cross-validated error at held-out points for one choice."""
-    chosen = SETS[name]
-    model = METHODS[CHOOSES].make(
-        n_components, chosen.case.scale_frames, chosen.ordered, 0
-    )
+    Fit half of the frames and predict the other half ("halves"), let a search find the
+    number of a synthetic table ("choice"), or cross-validate one number ("curve").
+    """
+    if part == "choice":
+        size = SYNTHETIC_POINTS, n_components, SYNTHETIC_NOISE
+        tracks = instance(seed, *size)
+        with measured():
+            return {"found": chosen_components(tracks.data)}
+    X, chosen = load(name).X, SETS[name]
+    K = n_components or chosen.case.n_components
+    model = METHODS[method].make(chosen, K, seed)
+    if part == "halves":
+        train, test = (X[rows] for rows in halves_of(len(X), seed))
+        with measured():
+            model.fit(train)
+        return {"held_out": -100 * model.score(test)}
     cv = KFold(FOLDS, shuffle=True, random_state=0)
-    X = load(name).X
     with measured():
         scores = cross_val_score(model, X, cv=cv, error_score="raise")
-    return {"held_out": -100 * float(np.mean(scores))}, {}
+    return {"held_out": -100 * np.mean(scores)}
+
+
+def chosen_components(X):
+    """Return the n_components that GridSearchCV finds."""
+    numbers = {"n_components": range(1, 9)}
+    search = GridSearchCV(AffineNRSfM(random_state=0), numbers, cv=KFold(FOLDS))
+    return search.fit(X).best_params_["n_components"]
 
 
 def page(records):
@@ -98,14 +92,13 @@ def page(records):
             select(records, part="halves"),
             METHOD_TITLES,
             SET_TITLES,
-            value("held_out"),
-            corner="method",
+            "held_out",
         ),
         choices_table(select(records, part="choice")),
     ]
     for name in CHOICES:
         rows = select(records, set=name, part="curve")
-        if rows:
+        if len(rows):
             parts.append(curve_table(name, rows))
     return "\n".join([*parts, remarks(records, METHOD_TITLES)])
 
@@ -113,12 +106,10 @@ def page(records):
 def choices_table(records):
     """Return how often a search finds the number of basis shapes."""
     rows = []
-    for K in TRUE_NUMBERS:
-        of_number = select(records, n_components=K)
-        numbers = [r.values["found"] for r in of_number if r.status == "ok"]
-        if of_number:
-            right = f"{sum(n == K for n in numbers)} of {len(of_number)}"
-            rows.append([f"{K}", right, ", ".join(map(str, numbers))])
+    for K, of_number in records.groupby("n_components"):
+        numbers = found(of_number, "found").astype(int)
+        right = f"{sum(numbers == K)} of {len(of_number)}"
+        rows.append([f"{K:g}", right, ", ".join(map(str, numbers))])
     if not rows:
         return ""
     title = (
@@ -130,16 +121,29 @@ def choices_table(records):
 
 def curve_table(name, records):
     """Return the error by number of basis shapes, the lowest in bold."""
-    cells = {K: select(records, n_components=K) for K in CHOICES[name]}
-    errors = {K: r[0].values.get("held_out") for K, r in cells.items() if r}
-    known = [error for error in errors.values() if error is not None]
-    row = []
-    for K in errors:
-        text = cell(cells[K], value("held_out"))
-        row.append(f"**{text}**" if known and errors[K] == min(known) else text)
+    groups = dict(list(records.groupby("n_components")))
+    lowest = records["held_out"].min()
+    cells = [
+        f"**{cell(group, 'held_out')}**"
+        if group["held_out"].min() == lowest
+        else cell(group, "held_out")
+        for group in groups.values()
+    ]
     title = SET_TITLES[name].partition(",")[0]
     heading = (
         f"{title}: error at held-out points by n_components, {FOLDS} folds of the "
         f"frames, {METHOD_TITLES[CHOOSES]}, the lowest in bold.\n\n"
     )
-    return heading + table(["K", *map(str, errors)], [["held-out error, %", *row]])
+    headings = ["K", *(f"{K:g}" for K in groups)]
+    return heading + table(headings, [["held-out error, %", *cells]])
+
+
+HELD_OUT = Section(
+    "Held-out points and choice of K",
+    measure_unseen,
+    page,
+    ("shark", "ict_68", "drink", "muct_68", "faces_wild", "synthetic"),
+    # Of `AffineNRSfM`: the others say nothing of points that they do not see.
+    ("isa1", "isa2", "joint"),
+    runs=runs,
+)

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from sklearn.model_selection import KFold, cross_val_score
 
-from benchmarks._command import run
-from benchmarks._data import Case, load_table
+from benchmarks._run import run_sections
+from benchmarks._sets import Case, load_table
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -125,4 +125,4 @@ SECTIONS = {"affine": affine, "weak_perspective": weak_perspective}
 
 if __name__ == "__main__":
     pairs = {"type": int, "default": 2, "help": "pairs that are timed (default 2)"}
-    run(__doc__, SECTIONS, n_seeds=1, options={"pairs": pairs})
+    run_sections(__doc__, SECTIONS, pairs=pairs)

@@ -14,11 +14,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from benchmarks._command import run
-from benchmarks._sets import SETS, is_present, load, shapes_in_camera
-from benchmarks.recovery import instance
+from benchmarks._run import run_sections
+from benchmarks._sets import (
+    SETS,
+    instance,
+    is_present,
+    load,
+    rotations_and_scales,
+    shapes_in_camera,
+    spoiled as spoiled_table,
+)
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 CAPTURED = ("yoga", "pickup", "drink")
@@ -44,12 +50,14 @@ def in_camera(model, X):
     """Return shapes of frames, and deviations of depths, in the axes of cameras."""
     shapes, deviations = model.reconstruct(X, return_std=True)
     fit = model.decompose(X)
-    return turned(shapes, fit), full_rotations(fit.motion)[1][:, None] * deviations
+    return turned(shapes, fit), rotations_and_scales(fit.motion)[1][
+        :, None
+    ] * deviations
 
 
 def turned(shapes, fit):
     """Return shapes of frames in the axes of the cameras of a fit."""
-    rotations, scales = full_rotations(fit.motion)
+    rotations, scales = rotations_and_scales(fit.motion)
     return scales[:, None, None] * shapes @ rotations.transpose(0, 2, 1)
 
 
@@ -135,14 +143,10 @@ def complete(options):
 
 def poor_tables(X, seed):
     """Return a table with 40 % of the points missing, and with noise of 2 %."""
-    tracks, rng = X.reshape(len(X), -1, 2), np.random.default_rng(seed)
-    size = np.sqrt(np.mean((tracks - tracks.mean(axis=1, keepdims=True)) ** 2))
-    noise = 0.02 * size * rng.standard_normal(tracks.shape)
-    hidden = rng.random(tracks.shape[:2])[:, :, None] < 0.4
-    holes = np.where(hidden, np.nan, tracks)
+    poor = {"40 % missing": {"missing": 0.4}, "2 % noise": {"noise": 0.02}}
     return {
-        "40 % missing": holes.reshape(X.shape),
-        "2 % noise": (tracks + noise).reshape(X.shape),
+        title: spoiled_table(X, np.random.default_rng(seed), **how)
+        for title, how in poor.items()
     }
 
 
@@ -243,4 +247,4 @@ SECTIONS = {
 
 if __name__ == "__main__":
     jobs = {"type": int, "default": None, "help": "processes of the groups"}
-    run(__doc__, SECTIONS, n_seeds=1, options={"jobs": jobs})
+    run_sections(__doc__, SECTIONS, jobs=jobs)

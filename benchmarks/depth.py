@@ -6,9 +6,9 @@ import warnings
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks._data import ICT, load_arrays
+from benchmarks._sets import ICT, load_arrays
+from benchmarks.accuracy import common_rotation
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._linalg.small_matrices import procrustes
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses
 
@@ -55,8 +55,9 @@ def rotation_ratio(model, X, rotations):
     found = []
     for mirror in (np.eye(3), np.diag([1.0, 1.0, -1.0])):
         turned = mirror @ model.rotations_ @ mirror
-        common = procrustes(np.einsum("iab,iac->bc", rotations, turned))
-        off = (rotations @ common).transpose(0, 2, 1) @ turned
+        off = (rotations @ common_rotation(rotations, turned)).transpose(
+            0, 2, 1
+        ) @ turned
         off = Rotation.from_matrix(off).as_rotvec() @ mirror
         ratio = np.sqrt(np.einsum("ia,iab,ib->i", off, precision, off).mean() / 3)
         found.append((np.degrees(np.median(np.linalg.norm(off, axis=1))), ratio))

@@ -7,39 +7,20 @@ affine), the number of frames (300, 400, 500) and the amplitude (15 to 20 %).
 """
 
 import numpy as np
-from sklearn.model_selection import GridSearchCV, KFold
 
-from benchmarks._command import run
-from benchmarks._data import as_table
+from benchmarks._run import run_sections
+from benchmarks._sets import CAMERAS, as_table, instance
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import (
     affine_shape_error,
     basis_similarity,
     mean_shape_error_3d,
 )
 
-CAMERAS = ("weak_perspective", "affine")
-FRAMES = (300, 400, 500)
-AMPLITUDES = (0.15, 0.175, 0.2)
 # The error of an efficient estimator is proportional to the noise: at so little noise
 # the answer is linear in it. It is run closer to convergence, which the bound means.
 SMALL = 1e-3
 BOUND_TOL = 1e-4
-
-
-def instance(seed, n_points, n_components, noise, **options):
-    """Return the tracks of a seed: the same truth and noise pattern for each noise."""
-    settings = {
-        "camera": CAMERAS[seed % 2],
-        "n_frames": FRAMES[seed % 3],
-        "amplitude": AMPLITUDES[(seed // 2) % 3],
-        "random_state": seed,
-    }
-    settings.update(options)
-    return make_nonrigid_tracks(
-        n_points=n_points, n_components=n_components, noise=noise, **settings
-    )
 
 
 def fitted(tracks, n_components, **parameters):
@@ -184,27 +165,6 @@ def rigid(options):
                 )
 
 
-def chosen_components(X, choices=range(1, 9), folds=3):
-    """Return the n_components that GridSearchCV finds, and the score of each choice."""
-    search = GridSearchCV(
-        AffineNRSfM(random_state=0), {"n_components": choices}, cv=KFold(folds)
-    )
-    search.fit(X)
-    scores = search.cv_results_["mean_test_score"]
-    return search.best_params_["n_components"], scores
-
-
-def grid(options):
-    """GridSearchCV over n_components 1 to 8 at 2 % noise: how often it finds K."""
-    for K in (1, 2, 3, 4, 5):
-        found = []
-        for seed in range(options.seeds):
-            tracks = instance(seed, 68, K, 0.02)
-            found.append(chosen_components(tracks.data)[0])
-        right = sum(k == K for k in found)
-        print(f"K={K}: found {right} of {len(found)}, {found}", flush=True)
-
-
 def coefficient_kinds(rng, n_frames, n_components):
     """Return coefficients of several distributions, by name."""
     normal = rng.standard_normal((n_frames, n_components))
@@ -333,24 +293,21 @@ SECTIONS = {
     "calibrated": calibrated,
     "components": components,
     "rigid": rigid,
-    "grid": grid,
     "independence": independence,
     "calibration": calibration,
 }
 
 if __name__ == "__main__":
     numbers = {"type": int, "nargs": "+"}
-    run(
+    run_sections(
         __doc__,
         SECTIONS,
         n_seeds=2,
-        options={
-            "points": {**numbers, "default": [68, 500]},
-            "components": {**numbers, "default": [2, 4, 6, 9]},
-            "camera": {
-                "choices": ["affine", "weak_perspective", "orthographic"],
-                "default": "affine",
-                "help": "of the fits of `exact`",
-            },
+        points={**numbers, "default": [68, 500]},
+        components={**numbers, "default": [2, 4, 6, 9]},
+        camera={
+            "choices": ["affine", "weak_perspective", "orthographic"],
+            "default": "affine",
+            "help": "of the fits of `exact`",
         },
     )

@@ -16,7 +16,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from benchmarks._command import run
+from benchmarks._run import run_sections
 from benchmarks._sets import is_present, load
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
@@ -199,4 +199,4 @@ def section(name):
 SECTIONS = {name: section(name) for name in STAGES}
 
 if __name__ == "__main__":
-    run(__doc__, SECTIONS, n_seeds=1)
+    run_sections(__doc__, SECTIONS)

@@ -1,9 +1,9 @@
 """
 Time fits as ratios to an SVD in the same run, new frames, and starts; one BLAS thread.
 
-Run ``python -m benchmarks.speed [section ...] [--seeds N] [--pairs N]``. Each ratio is
-taken pair by pair, reference and candidate in turn, so that it holds on a machine whose
-speed drifts.
+Run ``python -m benchmarks.speed [section ...] [--pairs N]``. Each ratio is taken pair
+by pair, reference and candidate in turn, so that it holds on a machine whose speed
+drifts.
 """
 
 import copy
@@ -24,30 +24,14 @@ import pandas as pd
 from sklearn.utils.extmath import randomized_svd
 from threadpoolctl import threadpool_limits
 
-from benchmarks._command import run
-from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
-from benchmarks._isolated import run_isolated
+from benchmarks._run import run_isolated, run_sections
+from benchmarks._sets import CASES, YOGA, load_table, measurement_matrix
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm._estimator import frames_of
-from isa_nrsfm._frames.models import frame_search
-from isa_nrsfm._paper.factors import factorise
-from isa_nrsfm._tables.tracks import (
-    centred_tracks,
-    measurement_matrix,
-    table_to_tracks,
-    weighting_sizes,
-)
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.export import pose_function
 from isa_nrsfm.io import save_model, write_table
 
-# Random starts against which the fit of a frame is held, and how far they are spread,
-# in standard deviations of the coefficients.
-N_STARTS = 20
-SPREAD = 1.5
-# A start finds something better if it lowers the objective by this share.
-BETTER = 1e-6
 # Section frames: new frames, how many are taken one by one to time one, frames of a
 # stream, and the least number of pairs.
 N_FRAMES, SINGLE, STREAM, FRAME_PAIRS = 8000, 100, 10_000, 10
@@ -61,16 +45,8 @@ def seconds(function, repeats=1):
     return (time.perf_counter() - start) / repeats
 
 
-def processor_seconds(function, repeats=1):
-    """Return the mean seconds of processor time of a call."""
-    start = time.process_time()
-    for _ in range(repeats):
-        function()
-    return (time.process_time() - start) / repeats
-
-
-def process_seconds(arguments, repeats=1):
-    """Return mean seconds of processor time, user and system, of runs of Python."""
+def process_seconds(arguments):
+    """Return the seconds of processor time, user and system, of a run of Python."""
 
     def used():
         usage = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -79,24 +55,15 @@ def process_seconds(arguments, repeats=1):
     before = used()
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
-    for _ in range(repeats):
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
-    return (used() - before) / repeats
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
+    return used() - before
 
 
-def paired_ratio(candidate, reference, n_pairs, repeats=1, measure=seconds):
-    """Return ratios candidate / reference: minimum, median, maximum; and seconds."""
-    measure(candidate), measure(reference)  # not counted
-    pairs = [(measure(candidate), measure(reference, repeats)) for _ in range(n_pairs)]
-    ratios = [a / b for a, b in pairs]
-    return (*np.percentile(ratios, [0, 50, 100]), *np.median(pairs, axis=0))
-
-
-def measured(X, scale_frames):
-    """Return the measurement matrix of a table, as the fit sees it."""
-    centred, _ = centred_tracks(table_to_tracks(X))
-    sizes = weighting_sizes(centred, scale_frames)
-    return measurement_matrix(centred / sizes[:, None, None])
+def processor_seconds(function):
+    """Return the seconds of processor time of a call."""
+    start = time.process_time()
+    function()
+    return time.process_time() - start
 
 
 def heading(rows, candidate, reference):
@@ -104,16 +71,34 @@ def heading(rows, candidate, reference):
     print(f"{rows:30}{'min':>8}{'median':>8}{'max':>8}{candidate:>10}{reference:>9}")
 
 
-def compare(title, candidate, reference, n_pairs, against="", measure=seconds):
-    """Print the ratios of a candidate to a reference, and their milliseconds."""
-    least, median, most, own, other = paired_ratio(
-        candidate, reference, n_pairs, measure=measure
-    )
+def compare(title, candidate, reference, n_pairs, against="", measure=seconds, per=1):
+    """Print the ratios of a candidate to a reference, and milliseconds of one of both.
+
+    Each is done so many times in a call, and measured in turn; the first call of each
+    is not counted.
+    """
+    measure(candidate), measure(reference)
+    pairs = [(measure(candidate), measure(reference)) for _ in range(n_pairs)]
+    least, median, most = np.percentile([a / b for a, b in pairs], [0, 50, 100])
+    own, other = 1e3 * np.median(pairs, axis=0) / per
+    digits = 1 if per == 1 else 3
     print(
         f"{title:30}{least:8.2f}{median:8.2f}{most:8.2f}"
-        f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {against}".rstrip(),
+        f"{own:10.{digits}f}{other:9.{digits}f}  {against}".rstrip(),
         flush=True,
     )
+
+
+def svd_of(X, scale_frames=True):
+    """Return a function that takes the thin SVD of a table."""
+    W, _ = measurement_matrix(X, scale_frames)
+    return partial(np.linalg.svd, W, full_matrices=False)
+
+
+def drawn(n_frames, n_points, n_components, **options):
+    """Return a table with 2 % noise."""
+    size = n_frames, n_points, n_components
+    return make_nonrigid_tracks(*size, noise=0.02, random_state=0, **options).data
 
 
 def fits(options):
@@ -124,37 +109,20 @@ def fits(options):
             X = load_table(case)
             if X is None:
                 continue
-            W = measured(X, case.scale_frames)
-            model = AffineNRSfM(
-                case.n_components,
-                refinement=refinement,
-                scale_frames=case.scale_frames,
-                random_state=0,
-            )
-            compare(
-                case.title,
-                lambda model=model, X=X: model.fit(X),
-                lambda W=W: np.linalg.svd(W, full_matrices=False),
-                options.pairs,
-            )
+            settings = {"scale_frames": case.scale_frames, "random_state": 0}
+            model = AffineNRSfM(case.n_components, refinement=refinement, **settings)
+            svd = svd_of(X, case.scale_frames)
+            compare(case.title, partial(model.fit, X), svd, options.pairs)
 
 
 def large(options):
     """Fits of large tables: many frames, and many points with and without gaps."""
     heading("", "fit ms", "ms of")
-    X = make_nonrigid_tracks(8000, 68, n_components=9, noise=0.02, random_state=0).data
-    W, model = measured(X, True), AffineNRSfM(9, random_state=0)
-    compare(
-        "8000 x 68, K=9",
-        partial(model.fit, X),
-        partial(np.linalg.svd, W, full_matrices=False),
-        options.pairs,
-        "thin SVD",
-    )
-    X = make_nonrigid_tracks(
-        2500, 7308, n_components=8, noise=0.02, random_state=0
-    ).data
-    W, model = measured(X, True), AffineNRSfM(8, random_state=0)
+    X, model = drawn(8000, 68, 9), AffineNRSfM(9, random_state=0)
+    fit, svd = partial(model.fit, X), svd_of(X)
+    compare("8000 x 68, K=9", fit, svd, options.pairs, "thin SVD")
+    X, model = drawn(2500, 7308, 8), AffineNRSfM(8, random_state=0)
+    W, _ = measurement_matrix(X)
     for dtype in (np.float64, np.float32):
         compare(
             f"2500 x 7308, {np.dtype(dtype)}",
@@ -163,13 +131,8 @@ def large(options):
             options.pairs,
             "randomized_svd",
         )
-    compare(
-        "5 % missing",
-        partial(model.fit, with_holes(X, 0.05)),
-        partial(model.fit, X),
-        options.pairs,
-        "complete",
-    )
+    fit, other = partial(model.fit, with_holes(X, 0.05)), partial(model.fit, X)
+    compare("5 % missing", fit, other, options.pairs, "complete")
 
 
 def with_holes(X, share, seed=0):
@@ -177,27 +140,6 @@ def with_holes(X, share, seed=0):
     tracks = X.reshape(len(X), -1, 2).astype(float)
     hidden = np.random.default_rng(seed).random(tracks.shape[:2]) < share
     return np.where(hidden[..., None], np.nan, tracks).reshape(X.shape)
-
-
-def half_fitted(case, seed=0):
-    """Return a fit of half of the frames of a table and the other half, or None."""
-    X = load_table(case)
-    if X is None:
-        return None
-    train, test = halves_of(len(X), seed)
-    model = AffineNRSfM(case.n_components, random_state=seed).fit(X[train])
-    return model, X[test]
-
-
-def frames_per_second(model, X, n_times):
-    """Return the most frames a second of some calls of transform."""
-    return len(X) / min(seconds(lambda: model.transform(X)) for _ in range(n_times))
-
-
-def seconds_of_a_frame(model, X):
-    """Return the median seconds of transform for single frames."""
-    rows = (X[i : i + 1] for i in range(100))
-    return np.median([seconds(partial(model.transform, row)) for row in rows])
 
 
 def each(function, rows):
@@ -235,13 +177,10 @@ def frames(options):
 
     heading(f"{N_FRAMES}", "ms", "ms of")
     for camera in ("weak_perspective", "affine"):
-        X = make_nonrigid_tracks(
-            N_FRAMES, 68, n_components=9, noise=0.02, camera=camera, random_state=0
-        ).data
+        X = drawn(N_FRAMES, 68, 9, camera=camera)
         tables = {"complete": X, "20 % missing": with_holes(X, 0.2)}
         model = AffineNRSfM(9, camera=camera, random_state=0).fit(X[:3000])
-        two = copy.copy(model).set_params(n_jobs=2)
-        svd = partial(np.linalg.svd, measured(X, True), full_matrices=False)
+        two, svd = copy.copy(model).set_params(n_jobs=2), svd_of(X)
         for title, table in tables.items():
             title, transform = f"{camera[:6]} {title}", partial(model.transform, table)
             compare(title, transform, svd, n_pairs, "SVD")
@@ -258,28 +197,25 @@ def frames(options):
 
 
 def live(options):
-    """One complete frame, relative to the search without checks, and to transform.
+    """One frame: transform relative to small SVDs, pose and shape to transform.
 
-    68 points and 9 basis shapes. The search in plain NumPy includes centre, scale and
-    change to the public coefficients. Seconds of processor time, for 200 frames.
+    68 points, of which none or 20 % are missing, and 9 basis shapes. The SVDs are ten
+    of matrices (68, 30). Seconds of processor time.
     """
     heading("", "ms", "ms of")
+    matrix = np.random.default_rng(0).normal(size=(68, 30))
+    svds = partial(each, np.linalg.svd, [matrix] * 20 * SINGLE)
+    options = {
+        "n_pairs": options.pairs,
+        "measure": processor_seconds,
+        "per": 2 * SINGLE,
+    }
     for camera in ("affine", "weak_perspective"):
-        X = make_nonrigid_tracks(
-            1500, 68, n_components=9, noise=0.02, camera=camera, random_state=0
-        ).data
+        X = drawn(1500, 68, 9, camera=camera)
         model = AffineNRSfM(9, camera=camera, random_state=0).fit(X[:1000])
         rows = [X[i : i + 1] for i in range(1000, 1000 + 2 * SINGLE)]
-        frames, pose = frames_of(model), pose_function(model, edges=None)
-        alone, mixing = frames.single_search, frames.gauge.mixing
-
-        def bare(row, alone=alone, mixing=mixing, noise=frames.noise_variance):
-            points = row.reshape(-1, 2)
-            points = points - points.mean(axis=0)
-            size = np.sqrt(np.vdot(points, points) / points.size)
-            fit = alone.fit(points.T / size, noise, np.inf)
-            mixed = mixing @ np.append(1.0, fit.alpha)
-            return mixed[1:] / mixed[0]
+        holed = [with_holes(row, 0.2) for row in rows]
+        pose = pose_function(model, edges=None)
 
         def everything(row, model=model, pose=pose):
             frame = model.decompose(row)
@@ -287,108 +223,35 @@ def live(options):
 
         transform = partial(each, model.transform, rows)
         for title, candidate, reference, what in (
-            ("transform", transform, partial(each, bare, rows), "bare"),
+            ("transform", transform, svds, "ten SVDs"),
+            (
+                "20 % missing",
+                partial(each, model.transform, holed),
+                transform,
+                "transform",
+            ),
             ("pose and shape", partial(each, everything, rows), transform, "transform"),
         ):
-            least, median, most, own, other = paired_ratio(
-                candidate, reference, options.pairs, measure=processor_seconds
-            )
-            own, other = 1e3 * own / len(rows), 1e3 * other / len(rows)
-            print(
-                f"{camera[:9]:10}{title:16}{least:4.2f}{median:8.2f}{most:8.2f}"
-                f"{own:10.2f}{other:9.2f}  {what}",
-                flush=True,
-            )
-
-
-def new_frames(options):
-    """Frames a second of transform for frames that were not in the fit."""
-    print(
-        f"{'':22}{'complete':>10}{'20 % missing':>14}{'one frame, ms':>15}{'holed':>8}"
-    )
-    for case in (FACES, MUCT, DRINK, YOGA):
-        fitted = half_fitted(case)
-        if fitted is None:
-            continue
-        model, X = fitted
-        holes = with_holes(X, 0.2)
-        model.transform(X), model.transform(holes)  # not counted
-        whole, holed = (
-            frames_per_second(model, table, options.pairs) for table in (X, holes)
-        )
-        single, some = (seconds_of_a_frame(model, table) for table in (X, holes))
-        print(
-            f"{case.title:22}{whole:10.0f}{holed:14.0f}{1e3 * single:15.2f}"
-            f"{1e3 * some:8.2f}",
-            flush=True,
-        )
-
-
-def found_by_search(model, tracks, seed):
-    """
-    Return the objective of frames in their fit, and the least from random starts.
-
-    Both are in units of the noise variance: minus twice the log posterior.
-    """
-    frames = frames_of(model)
-    fit = frames.posterior(tracks.transpose(0, 2, 1)).objective
-    found = np.full(len(tracks), np.inf)
-    rng = np.random.default_rng(seed)
-    for _ in range(N_STARTS):
-        alpha = SPREAD * rng.normal(size=(len(tracks), model.n_components))
-        search = frame_search("affine", frames.shapes)
-        other = search.fit_rows(
-            tracks.transpose(0, 2, 1), frames.noise_variance, initial=alpha
-        )
-        found = np.minimum(found, other.objective)
-    return fit / frames.noise_variance, found / frames.noise_variance
-
-
-def optima(options):
-    """Share of new frames where 20 random starts find no better fit than transform."""
-    print(f"{'':34}{'frames':>8}{'share %':>9}{'largest gain':>14}")
-    for case in (FACES, MUCT, DRINK, YOGA):
-        for seed in range(options.seeds):
-            fitted = half_fitted(case, seed)
-            if fitted is None:
-                break
-            model, X = fitted
-            X = X[:1000]
-            for share in (0.0, 0.2, 0.4):
-                tracks = with_holes(X, share, seed).reshape(len(X), -1, 2)
-                centred, _ = centred_tracks(tracks)
-                unit = centred / weighting_sizes(centred, True)[:, None, None]
-                fit, found = found_by_search(model, unit, seed)
-                best = found >= fit - BETTER * np.abs(fit)
-                print(
-                    f"{case.title:16}{100 * share:4.0f} % missing    {len(X):8}"
-                    f"{100 * best.mean():9.2f}{np.max(fit - found):14.3g}",
-                    flush=True,
-                )
+            title = f"{camera[:9]:10}{title}"
+            compare(title, candidate, reference, against=what, **options)
 
 
 def fastisa_iteration(options):
     """FastISA, 68 x 27: a step of one start, relative to an SVD of a 27 x 27 matrix."""
-    heading("signals", "step us", "SVD us")
+    heading("signals", "step ms", "SVD ms")
     random = np.random.default_rng(0)
     matrix = random.normal(size=(27, 27))
     tables = {"Laplace, artificial": random.laplace(size=(68, 27))}
     for case in CASES:
         if case.n_components == 9 and (X := load_table(case)) is not None:
-            tables[case.title] = factorise(measured(X, True), 9).signals.T
+            _, _, Vt = svd_of(X)()
+            tables[case.title] = np.sqrt(len(Vt.T)) * Vt[3:30].T
     for title, signals in tables.items():
         isa = FastISA(random_state=0)
         steps = isa.fit(signals).n_iters_.sum()
-        least, median, most, fit, svd = paired_ratio(
-            lambda isa=isa, signals=signals: isa.fit(signals),
-            lambda: np.linalg.svd(matrix),
-            options.pairs,
-            repeats=2000,
-        )
-        print(
-            f"{title:22}{least / steps:8.2f}{median / steps:8.2f}{most / steps:8.2f}"
-            f"{1e6 * fit / steps:10.1f}{1e6 * svd:9.1f}"
-        )
+        svds = partial(each, np.linalg.svd, [matrix] * steps)
+        fit = partial(isa.fit, signals)
+        compare(title, fit, svds, options.pairs, per=steps)
 
 
 def write_long_table(path, n_frames):
@@ -429,11 +292,10 @@ def fit_long_table(measured, path, how, n_jobs=1):
             table = dask.array.concatenate(parts)
         model = AffineNRSfM(9, random_state=0, keep_frames=False, n_jobs=n_jobs)
         with measured():
-            model.fit(table)
-            alpha = model.transform(table)
+            alpha = model.fit(table).transform(table)
             if how == "dask":
-                alpha = alpha.compute()
-        return model.noise_variance_, float(np.abs(alpha).mean())
+                alpha.compute()
+        return {"noise": model.noise_variance_}
 
 
 def long(options):
@@ -452,14 +314,14 @@ def long(options):
             for how, n_jobs in ways:
                 arguments = {"path": path, "how": how, "n_jobs": n_jobs}
                 found = run_isolated(fit_long_table, arguments, time_limit=1800)
-                if found.status != "ok":
-                    print(f"{n_frames:>9} {how}: {found.status} {found.message}")
+                if found["status"] != "ok":
+                    print(f"{n_frames:>9} {how}: {found['status']} {found['message']}")
                     continue
-                seconds = found.seconds
+                seconds, noise = found["seconds"], found["values"]["noise"]
                 ratio = seconds / before.setdefault((how, n_jobs), seconds)
                 print(
                     f"{n_frames:>9} {how:8} {n_jobs} job(s) {seconds:8.1f}"
-                    f"{found.memory:8.0f}{ratio:8.2f}  {found.values[0]:.6g}",
+                    f"{found['memory']:8.0f}{ratio:8.2f}  {noise:.6g}",
                     flush=True,
                 )
 
@@ -494,7 +356,7 @@ def start(options):
 
 def threads(options):
     """Two BLAS threads beside another program, relative to one."""
-    X = make_nonrigid_tracks(2000, 68, 6, noise=0.02, random_state=0).data
+    X = drawn(2000, 68, 6)
     body = make_body_tracks(400, random_state=0).data
     model = AffineNRSfM(6, random_state=0).fit(X)
 
@@ -524,8 +386,7 @@ def threads(options):
 def jobs(options):
     """Two jobs, relative to one."""
     heading("", "two, ms", "one, ms")
-    X = make_nonrigid_tracks(8000, 68, n_components=9, noise=0.02, random_state=0).data
-    dense = make_nonrigid_tracks(2500, 7308, 8, noise=0.02, random_state=0).data
+    X, dense = drawn(8000, 68, 9), drawn(2500, 7308, 8)
     long, model = np.tile(X, (40, 1)), AffineNRSfM(9, random_state=0)
     cases = [
         ("transform, 320,000 x 68", model.fit(X), "transform", long),
@@ -534,12 +395,11 @@ def jobs(options):
     ]
     yoga = load_table(YOGA)
     if yoga is not None:
-        body = AffineNRSfM(
-            "auto", camera="orthographic", refinement="consensus", random_state=0
-        )
+        settings = {"camera": "orthographic", "refinement": "consensus"}
+        body = AffineNRSfM("auto", random_state=0, **settings)
         cases.append(("consensus, yoga", body, "fit", yoga))
-    for title, one, method, table in cases:
-        one, two = (copy.copy(one).set_params(n_jobs=number) for number in (1, 2))
+    for title, model, method, table in cases:
+        one, two = (copy.copy(model).set_params(n_jobs=number) for number in (1, 2))
         compare(
             title,
             partial(getattr(two, method), table),
@@ -555,8 +415,6 @@ SECTIONS = {
     "large": large,
     "long": long,
     "live": live,
-    "new_frames": new_frames,
-    "optima": optima,
     "fastisa": fastisa_iteration,
     "threads": threads,
     "jobs": jobs,
@@ -564,4 +422,4 @@ SECTIONS = {
 
 if __name__ == "__main__":
     pairs = {"type": int, "default": 5, "help": "pairs that are timed (default 5)"}
-    run(__doc__, SECTIONS, n_seeds=1, options={"pairs": pairs})
+    run_sections(__doc__, SECTIONS, pairs=pairs)

@@ -31,6 +31,9 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 NO_DATA = "tables that are no part of this project (docs/benchmarks/README.md, Sets)"
 
 
+SHIPPED = Path(__file__).parent / "data"
+
+
 def _data_folder():
     named = os.environ.get("ISA_NRSFM_DATA")
     checkout = Path(__file__).resolve().parents[1]
@@ -62,7 +65,8 @@ def data_path():
     """Return a function from a file name to its path; skip where it is absent."""
 
     def path(name):
-        file = _data_folder() / name
+        shipped = SHIPPED / name
+        file = shipped if shipped.is_file() else _data_folder() / name
         if not file.is_file():
             pytest.skip(f"{NO_DATA}: set ISA_NRSFM_DATA to the folder that has them")
         return file
@@ -76,7 +80,9 @@ def load_data(data_path):
 
     def load(name):
         with np.load(data_path(f"{name}.npz"), allow_pickle=False) as file:
-            return dict(file)
+            arrays = dict(file)
+        floats = (n for n, values in arrays.items() if values.dtype.kind == "f")
+        return arrays | {name: arrays[name].astype(float) for name in floats}
 
     return load
 

@@ -40,28 +40,19 @@ def openface_names(n_points=68, *, video=True, face_id=True):
 
 
 def write_openface(
-    path, tracks, *, success=None, confidence=0.98, video=True, separator=","
+    path, tracks, *, success=1, confidence=0.98, video=True, separator=","
 ):
     """Write the csv file of FeatureExtraction, or of FaceLandmarkImg."""
     n_frames, n_points, _ = tracks.shape
-    success = np.ones(n_frames, dtype=int) if success is None else success
     names = openface_names(n_points, video=video, face_id=separator == ",")
-    first = [f"x_{j}" for j in range(n_points)] + [f"y_{j}" for j in range(n_points)]
-    place = names.index("x_0")
-    assert names[place : place + 2 * n_points] == first
-    confidence = np.broadcast_to(confidence, n_frames)
-    lines = [separator.join(names)]
-    for i, row in enumerate(planar(tracks)):
-        head = [str(i), f"{confidence[i]:.3f}"]
-        if video:
-            head = [str(i + 1), f"{i / 30:.3f}", f"{confidence[i]:.2f}"]
-            head.append(str(success[i]))
-            if separator == ",":
-                head.insert(1, "0")
-        before = [f"{0.1 * (i + k):.1f}" for k in range(place - len(head))]
-        after = ["-7.5"] * (len(names) - place - 2 * n_points)
-        lines.append(",".join([*head, *before, *(f"{v:.1f}" for v in row), *after]))
-    path.write_text("\n".join(lines) + "\n")
+    frame = pd.DataFrame(-7.5, index=range(n_frames), columns=names)
+    numbers, i = frame.index, names.index("x_0")
+    own = {"face": numbers, "frame": numbers + 1, "face_id": 0, "success": success}
+    own |= {"timestamp": (numbers / 30).round(3), "confidence": confidence}
+    frame = frame.assign(**{name: own[name] for name in own if name in names})
+    frame.iloc[:, i : i + 2 * n_points] = planar(tracks)
+    header, _, rows = frame.to_csv(index=False).partition("\n")
+    path.write_text(header.replace(",", separator) + f"\n{rows}")
     return path
 
 
@@ -157,8 +148,8 @@ def deeplabcut_frame(tracks, likelihood=0.9, *, bodyparts=BODYPARTS, individuals
 
 def write_deeplabcut(path, frame, *, how="table"):
     """Write what deeplabcut_frame has returned, as csv or h5."""
-    if path.suffix == ".csv":
-        frame.to_csv(path)
+    if path.suffix in (".csv", ".tsv"):
+        frame.to_csv(path, sep={".csv": ",", ".tsv": "\t"}[path.suffix])
     else:
         pytest.importorskip("tables", reason="needs the extra h5")
         frame.to_hdf(path, key="df_with_missing", format=how, mode="w")
@@ -307,6 +298,7 @@ WRITERS = {
     "wflw": lambda d: write_wflw(d / "a.txt", WFLW),
     "wflw-test": lambda d: write_wflw(d / "a.txt", WFLW, rest=False),
     "deeplabcut": lambda d: write_deeplabcut(d / "a.csv", FRAME),
+    "deeplabcut-tsv": lambda d: write_deeplabcut(d / "a.tsv", FRAME),
     "deeplabcut-table": lambda d: write_deeplabcut(d / "a.h5", FRAME),
     "deeplabcut-fixed": lambda d: write_deeplabcut(d / "a.h5", FRAME, how="fixed"),
     "sleap": lambda d: write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),

@@ -178,7 +178,6 @@ class TestAssociation:
         assert found.p_value[2] == 1
 
     def test_table(self):
-        pytest.importorskip("pandas")
         found = association(*related(), random_state=0)
         frame = found.to_frame()
         assert list(frame.columns) == ["eta_squared", "p_value"]

@@ -1,21 +1,19 @@
 """Progress of fits: what callbacks are told, alone and inside other estimators."""
 
-import importlib.util
 import pickle
+import subprocess
 import sys
 
 import joblib
 import pytest
 from numpy.testing import assert_array_equal
-from refusals import warned
+from refusals import refused, warned
 from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat import callbacks as _callbacks
-from isa_nrsfm._fit import JOINT_STAGE, stages_of
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 
@@ -24,6 +22,11 @@ callback = pytest.importorskip("sklearn.callback", reason="new in scikit-learn 1
 pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
 
 TABLE = make_nonrigid_tracks(40, 16, 1, noise=0.02, random_state=0).data
+JOINT, LAST = "joint refinement", "gauge and coefficients"
+PAPER_STAGES = [
+    *("table", "factorisation", "independent subspaces"),
+    "block structure and refinement",
+]
 
 
 def estimator(**params):
@@ -54,6 +57,16 @@ class Recorder:
     def tasks(self, kind="end", of="AffineNRSfM"):
         return [task for told, name, task in self.told if (told, name) == (kind, of)]
 
+    def assert_nested(self):
+        """Assert that each task ends after those that began in it."""
+        open_tasks = []
+        for told, name, task in self.told:
+            if told in ("setup", "begin"):
+                open_tasks.append((name, task))
+            else:
+                assert open_tasks.pop() == (name, task)
+        assert open_tasks == []
+
 
 def recorded(model, X=TABLE):
     """Fit with a recorder, and return both."""
@@ -61,70 +74,43 @@ def recorded(model, X=TABLE):
     return model.set_callbacks(recorder).fit(X), recorder
 
 
-def assert_nested(recorder):
-    """Assert that each task ends after those that began in it."""
-    open_tasks = []
-    for told, name, task in recorder.told:
-        if told in ("setup", "begin"):
-            open_tasks.append((name, task))
-        else:
-            assert open_tasks.pop() == (name, task)
-    assert open_tasks == []
-
-
 class TestAlone:
-    def test_stages_are_told_in_order(self):
-        _, recorder = recorded(estimator(max_iter=200))
-        assert_nested(recorder)
+    def test_stages_and_steps_of_the_joint_refinement(self):
+        model, recorder = recorded(estimator(max_iter=200))
+        recorder.assert_nested()
         stages = [task for task in recorder.tasks() if task != "step"]
-        assert stages == [*stages_of("joint"), "fit"]
+        assert stages == [*PAPER_STAGES, JOINT, LAST, "fit"]
+        begun = recorder.tasks("begin")
+        steps = begun[begun.index(JOINT) + 1 : begun.index(LAST)]
+        assert set(steps) == {"step"}
+        assert begun.count("step") == len(steps) >= model.n_iter_
+        # Callbacks make no difference to the fit.
+        assert_array_equal(model.alpha_, estimator(max_iter=200).fit(TABLE).alpha_)
 
     def test_the_papers_refinement_has_no_joint_stage(self):
         _, recorder = recorded(estimator(refinement="alternating"))
-        assert_nested(recorder)
-        expected = stages_of("alternating")
-        assert recorder.tasks() == [*expected, "fit"]
-
-    def test_steps_are_told_of_the_joint_refinement(self):
-        model, recorder = recorded(estimator())
-        begun = recorder.tasks("begin")
-        start = begun.index(JOINT_STAGE) + 1
-        steps = begun[start : begun.index("gauge and coefficients")]
-        assert set(steps) == {"step"}
-        assert begun.count("step") == len(steps)
-        assert len(steps) >= model.n_iter_
-
-    def test_the_end_comes_with_a_fitted_estimator(self):
-        model, recorder = recorded(estimator(refinement=None))
-        X, fitted = recorder.last
-        assert X is TABLE
-        assert_array_equal(fitted.transform(X), model.alpha_)
-
-    def test_callbacks_make_no_difference_to_the_fit(self):
-        model, _ = recorded(estimator())
-        assert_array_equal(model.alpha_, estimator().fit(TABLE).alpha_)
+        recorder.assert_nested()
+        assert recorder.tasks() == [*PAPER_STAGES, LAST, "fit"]
 
     def test_callbacks_are_dismissed_when_a_fit_fails(self):
         recorder = Recorder()
-        with pytest.raises(ValueError, match="loss='huber' needs"):
-            estimator(loss="huber", refinement=None).set_callbacks(recorder).fit(TABLE)
+        model = estimator(loss="huber", refinement=None).set_callbacks(recorder)
+        refused("loss='huber' needs", model.fit, TABLE)
         assert recorder.told[-1][:2] == ("teardown", "AffineNRSfM")
 
-    def test_clones_have_the_callbacks(self):
-        recorder = Recorder()
-        clone(estimator(refinement=None).set_callbacks(recorder)).fit(TABLE)
-        assert "table" in recorder.tasks()
-
-    def test_files_hold_no_callbacks(self, tmp_path):
+    def test_clones_have_the_callbacks_and_files_do_not(self, tmp_path):
         model, recorder = recorded(estimator(refinement=None))
-        loaded = pickle.loads(pickle.dumps(model))
-        assert_array_equal(loaded.transform(TABLE), model.alpha_)
+        # The end comes with a fitted estimator.
+        X, fitted = recorder.last
+        assert X is TABLE
         save_model(model, tmp_path / "model.npz")
         loaded = load_model(tmp_path / "model.npz")
-        assert_array_equal(loaded.transform(TABLE), model.alpha_)
-        n_told = len(recorder.told)
-        model.fit(TABLE)
-        assert len(recorder.told) > n_told
+        for other in (fitted, loaded, pickle.loads(pickle.dumps(model))):
+            assert_array_equal(other.transform(TABLE), model.alpha_)
+        for again in (model, clone(model)):
+            n_told = len(recorder.told)
+            again.fit(TABLE)
+            assert len(recorder.told) > n_told
 
 
 class TestInside:
@@ -139,7 +125,7 @@ class TestInside:
         search = GridSearchCV(estimator(refinement=None), grid, cv=2, n_jobs=2)
         with joblib.parallel_config("threading"):
             _, recorder = recorded(search)
-        for task in ("table", "gauge and coefficients"):
+        for task in ("table", LAST):
             assert recorder.tasks().count(task) == 5
 
 
@@ -148,24 +134,22 @@ def test_progress_bars_of_scikit_learn(capsys):
     estimator(max_iter=200).set_callbacks(callback.ProgressBar()).fit(TABLE)
     fit, joint = capsys.readouterr().out.strip().splitlines()
     assert fit.startswith("AffineNRSfM - fit")
-    assert joint.strip().startswith(f"AffineNRSfM - {JOINT_STAGE}")
+    assert joint.strip().startswith(f"AffineNRSfM - {JOINT}")
     assert all("100%" in bar for bar in (fit, joint))
 
 
-def test_before_callbacks_lines_tell_of_the_progress(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "sklearn.callback", None)  # not to be imported
-    spec = importlib.util.spec_from_file_location("before", _callbacks.__file__)
-    before = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(before)
-
-    class Estimator(before.CallbackSupportMixin):
-        verbose = 1
-
-    progress = before.FitProgress(Estimator(), ["one", "two"], stepwise="two", X=TABLE)
-    progress("one")
-    progress.step()
-    progress("two")
-    progress.end()
-    lines = capsys.readouterr().out.splitlines()
-    assert lines == ["[Estimator] one: 0.00 s", "[Estimator] two: 0.00 s"]
-    assert not hasattr(Estimator(), "set_callbacks")
+@pytest.mark.subprocess
+def test_before_callbacks_lines_tell_of_the_progress():
+    code = (
+        "import sys, sklearn.datasets, sklearn.decomposition, sklearn.pipeline\n"
+        "sys.modules['sklearn.callback'] = None  # no more to be imported\n"
+        "from isa_nrsfm import AffineNRSfM\n"
+        "from isa_nrsfm.datasets import make_nonrigid_tracks\n"
+        "X = make_nonrigid_tracks(40, 16, 1, noise=0.02, random_state=0).data\n"
+        "AffineNRSfM(1, random_state=0, verbose=1).fit(X)\n"
+        "assert not hasattr(AffineNRSfM(), 'set_callbacks')\n"
+    )
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    lines = subprocess.check_output(command, text=True).splitlines()
+    stages = [line.rsplit(":", 1)[0] for line in lines]
+    assert stages == [f"[AffineNRSfM] {name}" for name in (*PAPER_STAGES, JOINT, LAST)]

@@ -449,17 +449,6 @@ def test_transform_names_the_difference_between_points(fails, fitted, faces, tmp
     assert "the model has 20 points, the table has 68 (x_#,y_#)" in message
 
 
-def test_columns_choose_among_several_sets(fits, fails, faces, tmp_path):
-    path, eyes = tmp_path / "faces.csv", faces[LANDMARKS].add_prefix("eye_")
-    pd.concat([faces, eyes], axis=1).to_csv(path, index=False)
-    message = fails("fit", path, "-o", tmp_path / "results")
-    assert "more than one set of landmark columns: 'x_#,y_#' (68 points: " in message
-    assert not (tmp_path / "results").exists()
-    out = fits(path, "--columns", "eye_x_#,eye_y_#", *UNREFINED).out
-    assert "eye_x_0, eye_y_0, eye_x_1, eye_y_1, ..., eye_x_67, eye_y_67" in out
-    assert "coordinates not used: x_#,y_# (68)" in out
-
-
 def test_named_index_of_a_parquet_file_is_a_column(fits, faces, tmp_path):
     path = tmp_path / "faces.parquet"
     # An index without a name, such as the numbers of chosen rows, is none.

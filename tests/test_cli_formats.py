@@ -10,7 +10,7 @@ from layers import slow_after
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import read_landmarks
+from isa_nrsfm.io import find_format, read_landmarks
 
 N_FRAMES = 40
 LOST, EMPTY = 3, 7
@@ -120,7 +120,10 @@ def test_options_without_effect_are_refused(fails, tmp_path, write, options, mes
 
 def test_columns_make_any_file_a_table(fits, tmp_path):
     path, *_ = write_openface(tmp_path)
-    assert "fitted to 40 frames" in fits(path, "--columns", "x_#,y_#", *QUICK).out
+    out = fits(path, "--columns", "x_#,y_#", *QUICK).out
+    assert "fitted to 40 frames" in out
+    assert "x_0, y_0, x_1, y_1, ..., x_67, y_67" in out
+    assert "eye_lmk_x_#,eye_lmk_y_# (56)" in out.partition("coordinates not used: ")[2]
 
 
 def test_a_model_of_other_points_is_refused(fails, fits, transforms, tmp_path):
@@ -249,7 +252,9 @@ def test_points_outside_of_the_image_are_counted(fits, fails, tmp_path):
         return shares
 
     options = ["--format", "mediapipe", "--image-size", "1920x1080", *QUICK]
-    err = fits(write_shares(tmp_path, change), *options).err
+    path = write_shares(tmp_path, change)
+    assert find_format(path) == "table"
+    err = fits(path, *options).err
     expected = "warning: 2 of 840 points are outside the image, by at most 0.25 of its "
     expected += "width or height (point 5 in row 3)\n"
     assert expected in err

@@ -106,6 +106,7 @@ def test_the_text_is_as_expected(answers):
     assert re.sub(" +", " ", text) == expected
 
 
+@pytest.mark.slow
 def test_the_arguments_repeat_the_run(answers, tmp_path):
     report = answers[0].report
     arguments = report["arguments"]

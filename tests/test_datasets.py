@@ -109,8 +109,8 @@ class TestEveryMaker:
 
 
 COMMON = {
-    "n_frames": (1, 10.5),
-    "noise": (-0.1, np.nan),
+    "n_frames": (1, 10.5, True),
+    "noise": (-0.1, np.nan, False),
     "missing": (1.0, -0.1),
     "camera": ("perspective",),
     "layout": ("columns",),

@@ -187,10 +187,10 @@ class TestKeepFrames:
         assert_array_equal(kept, alpha)
 
     def test_bad_folders_are_refused_before_the_fit(self, tmp_path, table, monkeypatch):
-        def never(*_args):
+        def never(*_args, **_keywords):
             raise AssertionError("the fit has begun")
 
-        monkeypatch.setattr(AffineNRSfM, "_checked", never)
+        monkeypatch.setattr(FastISA, "fit", never)
         refused(r"frames_folder should be .* got ''", self.estimator("").fit, table)
         (tmp_path / "file").write_bytes(OLD)
         for bad in (tmp_path / "file", tmp_path / "file" / "folder"):

@@ -1,3 +1,6 @@
+import io
+from zipfile import ZipFile
+
 import numpy as np
 import pytest
 from export_models import N_COMPONENTS, aligned, calibrated_model, face_model, faces
@@ -227,3 +230,29 @@ def test_other_files_are_refused(pdm, tmp_path):
     misfit = PointDistributionModel(pdm.mean, pdm.modes, pdm.eigenvalues[1:])
     refused("eigenvalues", write_pdm, misfit, tmp_path / "a.txt")
     assert not (tmp_path / "a.txt").exists()
+
+
+def stored(array, version=None):
+    """Return the bytes of an array in NumPy's format."""
+    content = io.BytesIO()
+    np.lib.format.write_array(content, array, version, allow_pickle=True)
+    return content.getvalue()
+
+
+def test_arrays_have_the_size_of_their_file(tmp_path):
+    path, mean = tmp_path / "a.npz", stored(np.arange(6.0).reshape(2, 3), (2, 0))
+    objects = stored(np.array([None, None]))
+    head = objects[: objects.index(b"\n") + 1]
+
+    def read(mean):
+        with ZipFile(path, "w") as file:
+            file.writestr("mean.npy", mean)
+            file.writestr("modes.npy", stored(np.ones((1, 2, 3)), (1, 0)))
+            file.writestr("eigenvalues.npy", stored(np.ones(1)))
+        return read_pdm(path).mean
+
+    assert_array_equal(read(mean), [[0, 1, 2], [3, 4, 5]])
+    for changed, n_bytes in ((mean[:-1], 47), (mean + b"0", 49)):
+        refused(f"48 bytes; got {n_bytes}", read, changed)
+    for size in (0, 8, 16, 24):
+        refused("type object should have 16 bytes", read, head + bytes(size))

@@ -146,14 +146,6 @@ def test_shares_of_the_image_become_pixels(tmp_path):
     refused("these are in pixels", read_landmarks, pixels, image_size=files.IMAGE_SIZE)
 
 
-def test_hands_are_read_as_mediapipe_when_named(tmp_path):
-    hands = files.scene(n_points=21)
-    path = files.write_mesh(tmp_path / "a.csv", hands)
-    assert find_format(path) == "table"
-    landmarks = read_landmarks(path, "mediapipe", image_size=(640, 480))
-    assert_allclose(tracks_of(landmarks), hands)
-
-
 def test_pts_files_are_read_in_the_order_of_names(tmp_path):
     folder = files.write_pts(tmp_path / "faces", TRACKS)
     (folder / "image_000.pts").rename(folder / "last.PTS")
@@ -308,16 +300,6 @@ def assert_rows(landmarks, names):
     assert list(np.flatnonzero(landmarks.failed)) == [frame.index(4)]
     assert landmarks.point_names == tuple(files.BODYPARTS)
     assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
-
-
-def test_deeplabcut_is_read_from_tsv_as_from_csv(tmp_path):
-    path = files.write_deeplabcut(tmp_path / "a.csv", FRAME)
-    expected, again = read_landmarks(path), tmp_path / "a.tsv"
-    again.write_text(path.read_text().replace(",", "\t"))
-    found = read_landmarks(again)
-    assert found.format == "deeplabcut"
-    pd.testing.assert_frame_equal(found.points, expected.points)
-    pd.testing.assert_frame_equal(found.confidence, expected.confidence)
 
 
 def test_deeplabcut_finds_each_animal(tmp_path):

@@ -49,46 +49,41 @@ OWN = {
     "OwnDensity": FastISA(n_init=2, density=OwnDensity()),
 }
 STRATEGY = FastISA(n_init=2, density=SqrtDensity(0.2), random_state=5)
-# Parameters and tables of fits; the parameter `folder` stands for a folder.
+# Parameters of fits; the parameter `folder` stands for a folder.
+CALIBRATED = {"camera": "weak_perspective"}
+ALTERNATING = {"refinement": "alternating"}
 CASES = {
-    "default": ({}, TABLE),
-    "names": ({}, pd.DataFrame(TABLE, columns=NAMES)),
-    "planar": (
-        {"layout": "planar", "independence": None, "scale_frames": False},
-        np.concatenate([TABLE[:, ::2], TABLE[:, 1::2]], axis=1),
-    ),
-    "alternating": ({"refinement": "alternating", "isa": STRATEGY}, TABLE),
-    "alternating, calibrated": (
-        {"refinement": "alternating", "camera": "weak_perspective"},
-        TABLE,
-    ),
-    "not refined": (
-        {"refinement": None, "isa": PooledFastICA(n_init=2), "keep_frames": False},
-        TABLE,
-    ),
-    "single precision": ({}, TABLE.astype(np.float32)),
-    "single precision, alternating": (
-        {"refinement": "alternating", "block_recovery": "eigen"},
-        TABLE.astype(np.float32),
-    ),
-    "missing points": ({}, HOLED),
-    "huber": ({"loss": "huber", "independence": "coefficients"}, TABLE),
-    "weak perspective": ({"camera": "weak_perspective", "loss": "cauchy"}, TABLE),
-    "orthographic": ({"camera": "orthographic", "keep_frames": False}, TABLE),
-    "folder": ({"frames_folder": "folder"}, TABLE),
-    "path of a folder": ({"frames_folder": Path("folder")}, TABLE),
-    "mirrored": ({"camera": "weak_perspective", "mirror": True}, TABLE),
-    "numbers of numpy": (
-        {
-            "n_components": np.int64(2),
-            "tol": np.float32(0.05),
-            "scale_frames": np.bool_(True),
-            "loss": np.str_("linear"),
-        },
-        TABLE,
-    ),
-    "OwnISA": ({"refinement": None, "isa": OWN["OwnISA"]}, TABLE),
-    "OwnDensity": ({"refinement": None, "isa": OWN["OwnDensity"]}, TABLE),
+    "default": {},
+    "names": {},
+    "planar": {"layout": "planar", "independence": None, "scale_frames": False},
+    "alternating": ALTERNATING | {"isa": STRATEGY},
+    "alternating, calibrated": ALTERNATING | CALIBRATED,
+    "not refined": {
+        "refinement": None,
+        "isa": PooledFastICA(n_init=2),
+        "keep_frames": False,
+    },
+    "single precision": {},
+    "single precision, alternating": ALTERNATING | {"block_recovery": "eigen"},
+    "missing points": {},
+    "huber": {"loss": "huber", "independence": "coefficients"},
+    "weak perspective": CALIBRATED | {"loss": "cauchy"},
+    "orthographic": {"camera": "orthographic", "keep_frames": False},
+    "folder": {"frames_folder": "folder"},
+    "path of a folder": {"frames_folder": Path("folder")},
+    "mirrored": CALIBRATED | {"mirror": True},
+    "numbers of numpy": {"n_components": np.int64(2), "tol": np.float32(0.05)}
+    | {"scale_frames": np.bool_(True), "loss": np.str_("linear")},
+    "OwnISA": {"refinement": None, "isa": OWN["OwnISA"]},
+    "OwnDensity": {"refinement": None, "isa": OWN["OwnDensity"]},
+}
+# Their tables; those of others are `TABLE`.
+TABLES = {
+    "names": pd.DataFrame(TABLE, columns=NAMES),
+    "planar": np.concatenate([TABLE[:, ::2], TABLE[:, 1::2]], axis=1),
+    "single precision": TABLE.astype(np.float32),
+    "single precision, alternating": TABLE.astype(np.float32),
+    "missing points": HOLED,
 }
 pytestmark = [
     pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning"),
@@ -102,8 +97,8 @@ def fitted(tmp_path_factory):
 
     @functools.cache
     def fit(case):
-        parameters, table = CASES[case]
-        parameters = {"n_components": 2, "random_state": 0, "max_iter": 3} | parameters
+        table = TABLES.get(case, TABLE)
+        parameters = {"n_components": 2, "random_state": 0, "max_iter": 3} | CASES[case]
         mirror = parameters.pop("mirror", False)
         if str(parameters.get("frames_folder")) == "folder":
             kind = type(parameters["frames_folder"])

@@ -17,7 +17,6 @@ from refusals import refused
 
 import isa_nrsfm
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.lazy import lazy_names
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import FORMATS, save_model, write_table
@@ -93,23 +92,6 @@ def test_a_name_is_asked_for_once(monkeypatch):
     monkeypatch.delitem(vars(isa_nrsfm), "FastISA", raising=False)
     assert isa_nrsfm.FastISA is FastISA
     assert vars(isa_nrsfm)["FastISA"] is FastISA
-
-
-def test_the_error_of_an_import_comes_through(tmp_path, monkeypatch):
-    package = tmp_path / "of_absent_names"
-    package.mkdir()
-    text = "if __name__ == '':\n    from of_absent_names._absent import Absent\n"
-    (package / "__init__.py").write_text(text)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delenv("EAGER_IMPORT", raising=False)
-    importlib.import_module(package.name)
-    find, _, names = lazy_names(package.name)
-    assert names == ["Absent"]
-    absent = r"of_absent_names\._absent"
-    refused(absent, find, "Absent", error=ModuleNotFoundError)
-    monkeypatch.setenv("EAGER_IMPORT", "1")
-    refused(absent, lazy_names, package.name, error=ModuleNotFoundError)
-    del sys.modules[package.name]
 
 
 @pytest.mark.subprocess

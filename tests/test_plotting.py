@@ -1,17 +1,26 @@
-"""The contract of all displays: axes, refusals, styles, and what all have in common."""
+"""Displays: the contract of all, and that each draws the numbers of its estimator."""
 
 import subprocess
 import sys
+from itertools import pairwise
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pytest
+from cameras import lorentz_cameras
+from layers import slow_after
+from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
+from scipy.spatial.transform import Rotation
+from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
+from isa_nrsfm.calibration import canonical_pose
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
+from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import (
     BasisShapeDisplay,
     CoefficientsDisplay,
@@ -21,6 +30,8 @@ from isa_nrsfm.plotting import (
 )
 from isa_nrsfm.skeletons import get_skeleton
 
+# The figures do not depend on how far the iterations of the fit got.
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
 SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
@@ -143,6 +154,11 @@ def test_styles_can_be_changed():
         (BasisShapeDisplay, {"energy_share": [1.0]}, r"3 numbers.*got shape \(1,\)"),
         (BasisShapeDisplay, {"component_names": ["a"]}, "must hold 3 names.*got 1"),
         (BasisShapeDisplay, {"edges": [[0, 20]]}, "points 0 to 19; got 0 to 20"),
+        (BasisShapeDisplay, {"edges": [[-1, 0]]}, "points 0 to 19; got -1 to 0"),
+        (BasisShapeDisplay, {"edges": [0, 1]}, r"shape \(n_pairs, 2\).*shape \(2,\)"),
+        (BasisShapeDisplay, {"edges": [[0.0, 1.0]]}, "must be integers"),
+        (BasisShapeDisplay, {"edges": "tree"}, "the skeletons are .*; got 'tree'"),
+        (BasisShapeDisplay, {"edges": "hand-21"}, "has 21 points, the shape 20"),
         (BasisShapeDisplay, {"origin": "left"}, "got 'left'"),
         (CoefficientsDisplay, {"alpha": [1.0, 2.0]}, r"got shape \(2,\)"),
         (CoefficientsDisplay, {"alpha_std": np.eye(3)}, r"of alpha; got \(3, 3\)"),
@@ -268,22 +284,6 @@ def test_layouts_are_recognised_named_or_given():
     assert not found.sides.any()
 
 
-@pytest.mark.parametrize(
-    ("edges", "message"),
-    [
-        ("tree", "the skeletons are ibug-68, .*; got 'tree'"),
-        ("hand-21", "'hand-21' has 21 points, the shape 5"),
-        ([0, 1], r"shape \(n_pairs, 2\).* got shape \(2,\)"),
-        ([[0.0, 1.0]], "must be integers"),
-        ([[0, 1, 2]], "got shape"),
-        ([[0, 5]], "points 0 to 4; got 0 to 5"),
-        ([[-1, 0]], "points 0 to 4; got -1 to 0"),
-    ],
-)
-def test_bad_edges(edges, message):
-    refused(message, drawn_shapes, np.zeros((5, 3)), edges=edges)
-
-
 # The layout is known whatever is drawn. Hands are in any direction.
 @pytest.mark.parametrize(
     ("shape", "edges", "flipped"),
@@ -302,3 +302,542 @@ def test_layouts_determine_which_way_is_up(shape, edges, flipped):
         assert display.origin == origin
         assert display.axes_[0, 0].yaxis_inverted() == (origin == "upper")
         assert drawn_shapes(given, edges=edges, origin="lower").origin == "lower"
+
+
+PLUS_COLOUR, MINUS_COLOUR = "#D55E00", "#0072B2"
+ALPHA = np.random.default_rng(0).normal(size=(30, 2))
+FLIPPED = np.tile([1.0, -1.0], 68)
+
+
+@pytest.fixture(scope="module")
+def faces():
+    return make_face_tracks(n_frames=80, n_components=2, noise=0.0, random_state=0)
+
+
+@pytest.fixture(scope="module")
+def estimator(faces):
+    return AffineNRSfM(2, random_state=0).fit(faces.data)
+
+
+@pytest.fixture(scope="module")
+def upside_down(faces):
+    return AffineNRSfM(2, random_state=0).fit(faces.data * FLIPPED)
+
+
+def random_shapes(n_points=20, **kw):
+    rng = np.random.default_rng(0)
+    mean_shape = rng.standard_normal((n_points, 3))
+    basis = 0.1 * rng.standard_normal((3, n_points, 3))
+    return BasisShapeDisplay(mean_shape=mean_shape, basis=basis, **kw)
+
+
+def random_frames(n_points=10, **kw):
+    rng = np.random.default_rng(0)
+    observed = rng.standard_normal((4, n_points, 2))
+    noise = 0.1 * rng.standard_normal(observed.shape)
+    return ReprojectionDisplay(observed=observed, reprojected=observed + noise, **kw)
+
+
+def view_of(estimator, display):
+    """Return the transform from the space of a model to that of a display."""
+    return np.linalg.lstsq(estimator.mean_shape_, display.mean_shape)[0].T
+
+
+def percent(fraction):
+    """Return a share between 0.1 and 100 % with two digits."""
+    return f"{100 * fraction:#.2g}".rstrip(".") + " %"
+
+
+def texts(display):
+    return [ax.get_title(loc="left") for ax in display.axes_[:, 0]]
+
+
+def legend_of(display):
+    (legend,) = display.figure_.legends
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_shapes_are_those_of_the_estimator_in_natural_proportions(faces, estimator):
+    display = BasisShapeDisplay.from_estimator(estimator)
+    T = view_of(estimator, display)
+    assert_allclose(display.mean_shape, estimator.mean_shape_ @ T.T)
+    # alpha has unit variance: a basis shape is the drift by a standard deviation.
+    scale = np.abs(display.basis).max()
+    assert_allclose(display.basis, estimator.basis_ @ T.T, atol=1e-6 * scale)
+    # Faces of known layouts are turned upright.
+    pose = canonical_pose(display.mean_shape, scheme="ibug-68")
+    assert_allclose(pose.rotation, np.eye(3), atol=1e-9)
+    # The median of the cameras has rows of length one.
+    sizes = np.linalg.norm(estimator.motion_ @ np.linalg.inv(T), axis=(1, 2))
+    assert np.median(sizes) == pytest.approx(np.sqrt(2))
+    # Up to a rotation and its mirror image the mean shape is the true face. Rigid
+    # cameras of a deforming face are only nearly right.
+    seen, truth = display.mean_shape, faces.mean_shape
+    values = (np.linalg.svd(s, compute_uv=False) for s in (seen, truth))
+    sizes = (each / np.linalg.norm(each) for each in values)
+    assert_allclose(*sizes, atol=0.02)
+    # Not turned in the front view, and not in depth but for the mirror image.
+    for axis, least in enumerate((0.99, 0.99, 0.97)):
+        alike = np.corrcoef(seen[:, axis], truth[:, axis])[0, 1]
+        assert (alike if axis < 2 else abs(alike)) > least
+
+
+@pytest.mark.parametrize("camera", slow_after(1, ["weak_perspective", "orthographic"]))
+def test_shapes_of_calibrated_cameras_are_only_turned(camera):
+    faces = make_face_tracks(n_frames=80, n_components=2, camera=camera, random_state=0)
+    model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
+    display = BasisShapeDisplay.from_estimator(model)
+    error = f"depth error {100 * model.depth_uncertainty_:.2g} %"
+    assert [side.get_xlabel() for side in display.axes_[:, 1]] == 3 * [error]
+    scale = np.median(model.scales_)
+    shown = [display.mean_shape, *display.basis]
+    shapes = [model.mean_shape_, *model.basis_]
+    for drawn, shape in zip(shown, shapes, strict=True):
+        drawn, shape = (each / np.linalg.norm(scale * shape) for each in (drawn, shape))
+        assert_allclose(drawn @ drawn.T, scale**2 * shape @ shape.T, atol=1e-6)
+    # Points in no known order are seen as the mean camera does.
+    order = np.random.RandomState(0).permutation(68)
+    model.fit(faces.tracks[:, order].reshape(80, -1))
+    seen = model.reference_motion_ @ model.mean_shape_.T
+    front = BasisShapeDisplay.from_estimator(model).mean_shape[:, :2].T
+    unit = np.linalg.norm(model.reference_motion_[0]) / np.median(model.scales_)
+    assert_allclose(unit * front, seen, atol=1e-6 * np.abs(seen).max())
+
+
+def rigid_view(motion, shape):
+    """Return a model of a rigid table, and its display."""
+    tracks = shape @ motion.swapaxes(1, 2)
+    model = AffineNRSfM(1, refinement=None, scale_frames=False, random_state=0)
+    model.fit(tracks.reshape(len(tracks), -1))
+    return model, BasisShapeDisplay.from_estimator(model)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_turntable_is_seen_upright_from_its_broad_side(seed):
+    rng = np.random.default_rng(seed)
+    turns = Rotation.from_euler("y", 2 * np.pi * np.arange(40)[:, None] / 40)
+    # Points with y down, broad along a direction between x and z.
+    points = rng.standard_normal((50, 3)) * [3, 5, 1]
+    points = (points - points.mean(axis=0)) @ Rotation.from_euler("y", 1).as_matrix()
+    seen = rigid_view(turns.as_matrix()[:, :2], points)[1].mean_shape
+    assert_allclose(seen[:, 1], points[:, 1], atol=1e-6)
+    assert seen[:, 0].std() > 2 * seen[:, 2].std()
+    assert_allclose(seen @ seen.T, points @ points.T, atol=1e-5)
+
+
+def test_without_a_metric_the_mean_camera_is_made_isotropic(rng):
+    model, display = rigid_view(lorentz_cameras(rng), rng.standard_normal((30, 3)))
+    unit = model.motion_ / np.linalg.norm(model.motion_, axis=(1, 2), keepdims=True)
+    rows = (unit @ np.linalg.inv(view_of(model, display))).reshape(-1, 3)
+    second = rows.T @ rows
+    assert_allclose(second / second[0, 0], np.eye(3), atol=1e-6)
+
+
+def test_points_and_arrows_are_the_shapes(estimator):
+    display = BasisShapeDisplay.from_estimator(estimator, n_std=1.5)
+    assert display.axes_.shape == (3, 2)
+    for side in display.axes_[:, 1]:
+        assert side.get_xlabel() == "depth up to an affinity"
+    assert len(display.mean_) == 6
+    assert len(display.plus_) == len(display.minus_) == len(display.arrows_) == 4
+    for view, columns in enumerate(([0, 1], [2, 1])):
+        mean = display.mean_shape[:, columns]
+        for block in range(3):
+            drawn = display.mean_[2 * block + view]
+            assert drawn.axes is display.axes_[block, view]
+            assert_allclose(drawn.get_offsets(), mean)
+        for k in range(2):
+            drift = 1.5 * display.basis[k][:, columns]
+            drawn = display.plus_, display.minus_, display.arrows_
+            plus, minus, arrows = (artists[2 * k + view] for artists in drawn)
+            assert plus.axes is display.axes_[k + 1, view]
+            assert_allclose(plus.get_offsets(), mean + drift)
+            assert_allclose(minus.get_offsets(), mean - drift)
+            assert_allclose(arrows.get_offsets(), mean)
+            assert_allclose(np.column_stack([arrows.U, arrows.V]), drift)
+            assert (arrows.angles, arrows.scale_units, arrows.scale) == ("xy", "xy", 1)
+            assert_array_equal(plus.get_facecolor(), [to_rgba(PLUS_COLOUR)])
+            assert_array_equal(minus.get_facecolor(), [to_rgba(MINUS_COLOUR)])
+
+
+def test_faces_are_joined_and_upright(estimator, upside_down):
+    display = BasisShapeDisplay.from_estimator(estimator)
+    edges = get_skeleton("ibug-68").edges
+    assert_array_equal(display.edges, edges)
+    lines = display.axes_[0, 1].collections[0]
+    expected = display.mean_shape[:, [2, 1]][edges]
+    assert_allclose(lines.get_segments(), expected, atol=1e-12)
+    for ax in display.axes_.ravel():
+        assert ax.yaxis_inverted()
+        assert not ax.xaxis_inverted()
+        assert ax.get_aspect() == 1
+    # On the page the brows are above the chin, and the nose is at one side.
+    for ax, columns in zip(display.axes_[0], ([0, 1], [2, 1]), strict=True):
+        height = ax.transData.transform(display.mean_shape[:, columns])[:, 1]
+        assert height[17:27].min() > height[27:36].max() > height[8]
+    depth = display.mean_shape[:, 2]
+    assert depth[30] in (depth.min(), depth.max())
+    display = BasisShapeDisplay.from_estimator(upside_down)
+    assert display.origin == "lower"
+    assert not display.axes_[0, 0].yaxis_inverted()
+    display = BasisShapeDisplay.from_estimator(upside_down, origin="upper")
+    assert display.axes_[0, 0].yaxis_inverted()
+
+
+def test_titles_have_names_energies_and_drifts(estimator):
+    display = BasisShapeDisplay.from_estimator(estimator)
+    assert texts(display)[0] == "Mean shape, front and side"
+    assert display.energy_share.sum() == pytest.approx(1)
+    assert display.energy_share[0] > display.energy_share[1]
+    share = percent(display.energy_share[0])
+    assert texts(display)[1] == f"Basis shape 1 ({share} of energy)"
+    named = BasisShapeDisplay.from_estimator(estimator, component_names=["jaw", "lip"])
+    assert texts(named)[1] == f"jaw ({share} of energy)"
+    display = random_shapes().plot(n_std=3)
+    assert texts(display)[1:] == [f"Basis shape {k}" for k in (1, 2, 3)]
+    drift = "3 standard deviations"
+    shown = ["mean shape", f"\N{MINUS SIGN}{drift}", f"+{drift}"]
+    assert legend_of(display) == shown
+    display = random_shapes().plot(components=[2, 0])
+    assert_array_equal(display.components_, [2, 0])
+    assert texts(display)[1:] == ["Basis shape 3", "Basis shape 1"]
+    drift = display.plus_[0].get_offsets() - display.mean_[0].get_offsets()
+    assert_allclose(drift, 2 * display.basis[2][:, :2], atol=1e-12)
+    # A drift for each basis shape; the last one is out of all proportion.
+    display = random_shapes().plot(n_std=[1, 2, 30])
+    assert texts(display)[1:3] == ["Basis shape 1 (±1 s.d.)", "Basis shape 2 (±2 s.d.)"]
+    assert texts(display)[3].startswith("Basis shape 3 (±30 s.d., drawn 1:")
+    for k, n_std in enumerate([1, 2, 30]):
+        drift = display.plus_[2 * k].get_offsets() - display.mean_[0].get_offsets()
+        assert_allclose(drift, n_std * display.basis[k][:, :2], atol=1e-12)
+    widths = [np.ptp(ax.get_xlim()) for ax in display.axes_[:, 0]]
+    assert widths[0] == widths[1] == widths[2] < widths[3] / 2
+
+
+def test_notes_of_narrow_side_views_end_within_the_figure(rng):
+    narrow = np.array([0.2, 1.0, 0.2])
+    display = BasisShapeDisplay(
+        mean_shape=narrow * rng.normal(size=(20, 3)),
+        basis=0.1 * narrow * rng.normal(size=(12, 20, 3)),
+        depth_note="depth not determined",
+    ).plot()
+    display.figure_.canvas.draw()
+    for side in display.axes_[:, 1]:
+        assert side.get_xlabel() == "depth not determined"
+        note = side.xaxis.label.get_window_extent()
+        assert note.x1 <= display.figure_.bbox.x1
+
+
+def test_dense_shapes_are_clouds():
+    display = random_shapes(n_points=401).plot()
+    assert display.arrows_ == []
+    assert len(display.plus_) == len(display.minus_) == 6
+    assert display.plus_[0].get_rasterized()
+    assert len(random_shapes(n_points=400).plot().arrows_) == 6
+    display = random_frames(n_points=500).plot()
+    assert display.errors_ == []
+    assert display.observed_[0].get_rasterized()
+
+
+def test_shapes_without_deformation_are_drawn():
+    shapes = {"mean_shape": np.eye(3), "basis": np.zeros((1, 3, 3))}
+    display = BasisShapeDisplay(**shapes, energy_share=[0.0]).plot()
+    display.figure_.canvas.draw()
+    assert texts(display)[1] == "Basis shape 1 (0 % of energy)"
+
+
+def test_classes_have_boxes_of_their_frames():
+    y = np.array(["b", "a", "c"])[np.arange(30) % 3]
+    display = CoefficientsDisplay(alpha=ALPHA, y=y, label="mood").plot()
+    names = [text.get_text() for text in display.axes_[-1].get_xticklabels()]
+    assert names == ["a", "b", "c"]
+    for k, axes in enumerate(display.axes_):
+        thick = [line for line in axes.lines if line.get_linewidth() == 1.4]
+        medians = [line.get_ydata()[0] for line in thick]
+        assert_allclose(medians, [np.median(ALPHA[y == c, k]) for c in "abc"])
+    assert display.axes_[-1].get_xlabel() == "mood"
+    missing = np.where(np.arange(30)[:, None] == 3, np.nan, ALPHA)
+    display = CoefficientsDisplay(alpha=missing, y=y).plot()
+    assert len(display.axes_[0].collections[0].get_offsets()) == 29
+
+
+def test_numbers_are_points():
+    age = np.linspace(20.5, 60, 30)
+    display = CoefficientsDisplay(alpha=ALPHA, y=age).plot()
+    points = display.axes_[1].collections[0].get_offsets()
+    assert_allclose(points, np.column_stack([age, ALPHA[:, 1]]))
+
+
+def test_curves_have_bands_and_stop_at_gaps_and_groups():
+    time = np.r_[0:10, 20:30, 0:10].astype(float)
+    groups = np.repeat(["x", "y"], [20, 10])
+    given = {"alpha": ALPHA, "alpha_std": 0.1 + 0 * ALPHA}
+    display = CoefficientsDisplay(**given, time=time, groups=groups).plot()
+    axes = display.axes_[0]
+    line, (band,) = axes.lines[0], axes.collections
+    drawn = np.isfinite(line.get_ydata())
+    assert_array_equal(np.flatnonzero(~drawn), [10, 21])
+    assert_array_equal(line.get_xdata()[drawn], time)
+    assert_array_equal(line.get_ydata()[drawn], ALPHA[:, 0])
+    assert len(band.get_paths()) == 3
+    assert_allclose(band.get_paths()[1].get_extents().intervalx, [20, 29])
+    title = axes.get_title("right")
+    assert title == "band: one standard deviation, 0.1 (median)"
+    low, high = band.get_datalim(axes.transData).intervaly
+    assert low == pytest.approx(ALPHA[:, 0].min() - 0.1)
+    assert high == pytest.approx(ALPHA[:, 0].max() + 0.1)
+    # Single frames of groups are dots.
+    display = CoefficientsDisplay(alpha=ALPHA[:3], groups=[0, 0, 1]).plot()
+    dots = display.axes_[0].lines[1]
+    assert dots.get_marker() == "."
+    assert_array_equal(dots.get_ydata(), ALPHA[2:3, 0])
+
+
+def test_of_many_groups_the_largest_are_drawn_in_one_line():
+    groups = np.r_[np.repeat(np.arange(50), 3), np.arange(50, 1000)]
+    alpha = np.zeros((len(groups), 2))
+    alpha[:150] = 1.0
+    display = CoefficientsDisplay(alpha=alpha, alpha_std=alpha, groups=groups).plot()
+    (line, _), title = display.axes_[0].lines, display.axes_[0].get_title("left")
+    assert title == "the 50 of 1000 groups with the most frames"
+    assert_array_equal(np.unique(line.get_ydata()), [1.0, np.nan])
+    assert np.sum(line.get_ydata() == 1) == 150
+    names = np.char.mod("%03d", groups)
+    display = CoefficientsDisplay(alpha=alpha, y=names).plot(kind="classes")
+    assert display.axes_[0].get_title("left").startswith("the 50 of 1000 classes")
+    labels = [text.get_text() for text in display.axes_[1].get_xticklabels()]
+    assert labels == [f"{number:03d}" for number in range(50)]
+
+
+def test_coefficients_are_those_of_the_estimator(faces, estimator):
+    display = CoefficientsDisplay.from_estimator(estimator)
+    assert_array_equal(display.alpha, estimator.alpha_)
+    assert_array_equal(display.alpha_std, estimator.alpha_std_)
+    assert display.axes_[-1].get_xlabel() == "frame"
+    other = CoefficientsDisplay.from_estimator(estimator, faces.data[:5], kind="time")
+    assert_allclose(other.alpha, estimator.alpha_[:5], atol=1e-9)
+
+
+def test_errors_of_the_choice_are_in_percent_with_standard_errors():
+    display = ComponentChoiceDisplay(n_components=[2, 4], scores=SCORES, chosen=4)
+    display.plot()
+    curve = display.errorbar_.lines[0]
+    assert_array_equal(curve.get_xdata(), [2, 4])
+    assert_allclose(curve.get_ydata(), [2.5, 0.3])
+    # Deviations of 0.5 and 0.1 %, of three parts each
+    mean, half = np.array([[2.5], [0.3]]), np.array([[0.5], [0.1]]) / np.sqrt(3)
+    bars = [each[:, 1] for each in display.errorbar_.lines[2][0].get_segments()]
+    assert_allclose(bars, mean + half * [-1, 1])
+    assert display.ax_.get_yscale() == "log"
+    assert_allclose(display.chosen_.get_xydata(), [[4, 0.3]])
+    # Other scores are drawn as they are; one part has no standard error.
+    given = {"scores": SCORES[:, :1], "held_out_error": False}
+    display = ComponentChoiceDisplay(n_components=[2, 4], **given).plot()
+    assert_allclose(display.errorbar_.lines[0].get_ydata(), SCORES[:, 0])
+    assert display.ax_.get_yscale() == "linear"
+    assert display.chosen_ is None
+    assert not display.errorbar_.has_yerr
+
+
+def covariance(n_components=2):
+    rows = np.random.default_rng(0).standard_normal((50, 3 * n_components))
+    return rows.T @ rows * np.outer(*2 * [np.repeat(np.arange(n_components) + 1, 3)])
+
+
+@pytest.mark.parametrize("scale", ["asinh", "linear"])
+def test_colours_of_the_matrix_are_symmetric(scale):
+    matrix = covariance()
+    display = ModeCovarianceDisplay(mode_covariance=matrix).plot(scale=scale)
+    assert_array_equal(display.im_.get_array(), matrix)
+    low, high = display.im_.get_clim()
+    assert low == -high
+    assert high == np.abs(matrix).max()
+    middle = display.im_.cmap(display.im_.norm([0.0]))[0, :3]
+    assert_allclose(middle, middle[0], atol=0.01)  # a grey
+    assert middle[0] > 0.95
+    display.plot(scale=scale, absolute=True)
+    assert_array_equal(display.im_.get_array(), np.abs(matrix))
+    assert display.im_.get_clim() == (0, high)
+    small = ModeCovarianceDisplay(mode_covariance=np.diag([1.0, 1, 1, 0.05, 1, 1]))
+    shade = small.plot(scale=scale).im_.norm(0.05)
+    assert (shade > 0.6) == (scale == "asinh")
+
+
+def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
+    display = ModeCovarianceDisplay.from_estimator(estimator)
+    assert_array_equal(display.mode_covariance, estimator.mode_covariance_)
+    share = f"{percent(display.off_block_share)} outside the diagonal blocks"
+    assert display.ax_.get_title() == f"{share}\n(0 % if uncorrelated)"
+    display = ModeCovarianceDisplay(mode_covariance=covariance(3)).plot()
+    lines = [[[c, -0.5], [c, 8.5]] for c in (2.5, 5.5)]
+    lines += [[[-0.5, c], [8.5, c]] for c in (2.5, 5.5)]
+    assert_array_equal(display.boundaries_.get_segments(), lines)
+    for axis in (display.ax_.xaxis, display.ax_.yaxis):
+        assert_array_equal(axis.get_ticklocs(), [1, 4, 7])
+        assert [label.get_text() for label in axis.get_ticklabels()] == ["1", "2", "3"]
+    # The first row is at the top.
+    assert display.ax_.get_ylim() == (8.5, -0.5)
+    display = ModeCovarianceDisplay(mode_covariance=covariance(1)).plot()
+    assert display.boundaries_.get_segments() == []
+    assert display.colorbar_.mappable is display.im_
+    assert display.colorbar_.ax.get_ylabel() == "covariance"
+    display.plot(normalize=True, absolute=True)
+    assert display.colorbar_.ax.get_ylabel() == "absolute correlation"
+    assert display.plot(colorbar=False).colorbar_ is None
+    assert len(display.figure_.axes) == 1
+
+
+@pytest.mark.parametrize("n_components", [12, 13, 99])
+def test_labels_of_the_matrix_do_not_touch(n_components):
+    display = ModeCovarianceDisplay(mode_covariance=covariance(n_components)).plot()
+    display.figure_.canvas.draw()
+    for axis in (display.ax_.xaxis, display.ax_.yaxis):
+        labels = [each for each in axis.get_ticklabels() if each.get_text()]
+        assert labels[0].get_text() == "1"
+        assert len(labels) >= min(n_components, 7)
+        boxes = [label.get_window_extent() for label in labels]
+        assert not any(a.overlaps(b) for a, b in pairwise(boxes))
+        place = int(labels[-1].get_text()) * 3 - 2
+        assert axis.get_ticklocs()[-1] == place
+
+
+@pytest.mark.parametrize("largest", [3e-7, 0.017, 1.0, 99.0])
+def test_ticks_of_the_asinh_scale(largest):
+    display = ModeCovarianceDisplay(mode_covariance=largest * np.eye(6)).plot()
+    display.figure_.canvas.draw()
+    axis = display.colorbar_.ax
+    ticks = axis.get_yticks()
+    assert_array_equal(ticks, -ticks[::-1])
+    assert 0 in ticks
+    assert largest / 10 < ticks.max() <= largest
+    boxes = [tick.get_window_extent() for tick in axis.get_yticklabels()]
+    assert len(boxes) == len(ticks)
+    assert not any(a.overlaps(b) for a, b in pairwise(boxes))
+    display.plot(absolute=True)
+    assert_array_equal(display.colorbar_.ax.get_yticks(), ticks[ticks >= 0])
+
+
+def test_correlations():
+    matrix = covariance()
+    expected = matrix / np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+    expected[2] = expected[:, 2] = matrix[2] = matrix[:, 2] = 0
+    display = ModeCovarianceDisplay(mode_covariance=matrix).plot(normalize=True)
+    assert_allclose(display.im_.get_array(), expected)
+    assert display.im_.get_clim() == pytest.approx((-1, 1))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "share"),
+    [
+        (np.kron(np.eye(2), np.ones((3, 3))), 0),
+        (np.ones((6, 6)), 0.5),
+        (np.zeros((6, 6)), 0),
+    ],
+)
+def test_share_outside_of_the_blocks(matrix, share):
+    display = ModeCovarianceDisplay(mode_covariance=matrix)
+    assert display.off_block_share == pytest.approx(share)
+    display.plot().figure_.canvas.draw()
+
+
+def test_points_of_frames_are_the_numbers(faces, estimator):
+    show, rows = ReprojectionDisplay.from_estimator, [7, 3, 50]
+    display = show(estimator, faces.data, frames=rows)
+    assert_array_equal(display.frames, [7, 3, 50])
+    table = estimator.reproject(faces.data).reshape(-1, 68, 2)
+    for i, row in enumerate([7, 3, 50]):
+        seen, fitted = faces.tracks[row], table[row]
+        assert_allclose(display.observed_[i].get_offsets(), seen)
+        assert_allclose(display.reprojected_[i].get_offsets(), fitted)
+        errors = np.stack([seen, fitted], axis=1)
+        assert_allclose(display.errors_[i].get_segments(), errors)
+        edges = get_skeleton("ibug-68").edges
+        assert_allclose(display.edges_[i].get_segments(), fitted[edges])
+        assert display.observed_[i].axes is display.axes_[i]
+        error = inverse_snr(faces.data[[row]], table[row].reshape(1, -1))
+        assert display.inverse_snr[i] == pytest.approx(error)
+        title = f"frame {row}\ninverse SNR {percent(error)}"
+        assert display.axes_[i].get_title() == title
+    # Planar tables show the same.
+    planar = faces.tracks.transpose(0, 2, 1).reshape(len(table), -1)
+    other = clone(estimator).set_params(layout="planar").fit(planar)
+    other = ReprojectionDisplay.from_estimator(other, planar, frames=[7, 3, 50])
+    assert_array_equal(display.observed, other.observed)
+    assert_allclose(display.reprojected, other.reprojected)
+
+
+def test_random_frames(faces, estimator):
+    show = ReprojectionDisplay.from_estimator
+    drawn = (show(estimator, faces.data, random_state=seed) for seed in (0, 0, 1))
+    one, same, other = drawn
+    assert len(one.frames) == 6
+    assert_array_equal(one.frames, np.unique(one.frames))
+    assert_array_equal(one.frames, same.frames)
+    assert set(one.frames) != set(other.frames)
+    assert_array_equal(show(estimator, faces.data[:4]).frames, range(4))
+    message = "between 1 and the 4 rows of X with at least 4 points; got 6"
+    refused(message, show, estimator, faces.data[:4], n_frames=6)
+    for frames in ([80], [-1], 3, [], [0.5]):
+        refused("frames must be", show, estimator, faces.data, frames=frames)
+
+
+def test_random_rows_can_be_fitted(estimator, faces):
+    X = faces.data[:6].copy()
+    X[1] = np.nan
+    X[4, 2:] = np.nan
+    display = ReprojectionDisplay.from_estimator(estimator, X)
+    assert_array_equal(display.frames, [0, 2, 3, 5])
+    message, show = "the 4 rows of X with at least", ReprojectionDisplay.from_estimator
+    refused(message, show, estimator, X, n_frames=5)
+
+
+def test_rows_of_dataframes_may_have_names(faces):
+    names = [f"photo{i}.jpg" for i in range(80)]
+    X = pd.DataFrame(faces.data, columns=faces.feature_names, index=names)
+    estimator = AffineNRSfM(2, refinement=None, random_state=0).fit(X)
+    display = ReprojectionDisplay.from_estimator(estimator, X, frames=[5, 2])
+    assert display.frame_names == [names[5], names[2]]
+    assert display.axes_[1].get_title().startswith(f"frame {names[2]}\n")
+    assert_array_equal(display.observed, faces.tracks[[5, 2]])
+
+
+def test_frames_of_faces_are_upright(faces, estimator, upside_down):
+    for model, X in ((estimator, faces.data), (upside_down, faces.data * FLIPPED)):
+        display = ReprojectionDisplay.from_estimator(model, X, random_state=0)
+        display.figure_.canvas.draw()
+        for ax, points in zip(display.axes_, display.observed, strict=True):
+            height = ax.transData.transform(points)[:, 1]
+            assert height[17:27].mean() > height[8]
+            assert ax.get_aspect() == 1
+        assert display.origin == ("upper" if model is estimator else "lower")
+
+
+def test_frames_have_equal_units_in_both_directions():
+    display = random_frames().plot()
+    display.figure_.canvas.draw()
+    sizes = [ax.bbox.size for ax in display.axes_]
+    assert_allclose(sizes, sizes[:1] * 4)
+    for ax, points in zip(display.axes_, display.observed, strict=True):
+        pixels = ax.transData.transform(points)
+        ratio = np.ptp(pixels, axis=0) / np.ptp(points, axis=0)
+        assert ratio[0] == pytest.approx(ratio[1])
+        assert (ax.bbox.get_points()[0] <= pixels.min(axis=0)).all()
+        assert (pixels.max(axis=0) <= ax.bbox.get_points()[1]).all()
+    assert legend_of(display) == ["observed", "reprojected"]
+    assert len(display.figure_.axes) == 4
+    grid = random_frames().plot(n_columns=2).axes_[0].get_subplotspec().get_gridspec()
+    assert grid.get_geometry() == (2, 2)
+
+
+def test_missing_points_are_left_out():
+    display = random_frames()
+    observed = display.observed.copy()
+    observed[0, 3] = np.nan
+    hidden = ReprojectionDisplay(observed=observed, reprojected=display.reprojected)
+    others = np.arange(10) != 3
+    seen, fitted = observed[:1, others], display.reprojected[:1, others]
+    alone = ReprojectionDisplay(observed=seen, reprojected=fitted)
+    assert hidden.inverse_snr[0] == pytest.approx(alone.inverse_snr[0])
+    hidden.plot().figure_.canvas.draw()
+    assert np.isfinite(hidden.axes_[0].get_xlim()).all()
+    assert len(hidden.reprojected_[0].get_offsets()) == 10

@@ -22,6 +22,10 @@ FRAME = "new Promise((done) => requestAnimationFrame("
 DRAWN = FRAME + "() => requestAnimationFrame(done)))"
 
 
+# The frames of the page that shows 60.
+SHOWN = np.linspace(0, N_FRAMES - 1, 60).astype(int)
+
+
 def show(browser, frame):
     """Move the slider of frames."""
     browser.run(
@@ -72,7 +76,7 @@ def test_sliders_move_the_points(browser, page):
 def test_a_page_asks_for_nothing_and_has_no_errors(browser, page):
     browser.open(page)
     for name in ("play", "ghost", "mirror", "over", "pose", "front"):
-        browser.run(f"document.getElementById('{name}').click()")
+        browser.click(name)
         browser.run(DRAWN)
     browser.run("document.querySelector('.weight button').click()")
     browser.run(DRAWN)
@@ -156,7 +160,7 @@ def test_frames_play_and_stop(browser, page):
     state = browser.run("viewer.state()")
     assert not state["playing"]
     model = face_model()
-    row = int(np.linspace(0, N_FRAMES - 1, 60)[state["frame"]])
+    row = SHOWN[state["frame"]]
     assert_allclose(state["weights"], model.alpha_[row], atol=1e-5)
     browser.run(DRAWN)
     seen = browser.run("document.getElementById('seen').textContent")
@@ -169,8 +173,7 @@ def test_a_frame_is_seen_as_by_its_camera(browser, page):
     before = browser.array("viewer.projected()")[:, :2]
     browser.click("pose")
     seen = browser.array("viewer.projected()")[:, :2]
-    row = int(np.linspace(0, N_FRAMES - 1, 60)[7])
-    image = faces().clean[row]
+    image = faces().clean[SHOWN[7]]
 
     def distance(points):
         points, target = points - points.mean(axis=0), image - image.mean(axis=0)
@@ -187,7 +190,7 @@ def test_a_click_in_the_plane_of_coefficients_shows_the_nearest_frame(browser, p
     where = "document.getElementById('plane').getBoundingClientRect().toJSON()"
     box = browser.run(where)
     # The frame with the largest first coefficient is farthest to the right.
-    alpha = face_model().alpha_[np.linspace(0, N_FRAMES - 1, 60).astype(int)]
+    alpha = face_model().alpha_[SHOWN]
     right = int(np.argmax(alpha[:, 0]))
     share = (alpha[right, 1] - alpha[:, 1].min()) / np.ptp(alpha[:, 1])
     x = box["x"] + box["width"] - 10
@@ -244,7 +247,7 @@ def test_error_bars_are_along_the_viewing_direction(browser, tmp_path):
     for frame in (0, 7):
         show(browser, frame)
         browser.run("document.getElementById('pose').checked = true")
-        browser.run("document.getElementById('front').click()")
+        browser.click("front")
         # In the view of its camera a bar is a point, but for the perspective.
         size = np.ptp(browser.array("viewer.projected()")[:, :2])
         lengths = []

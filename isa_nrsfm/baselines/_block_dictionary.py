@@ -195,7 +195,6 @@ def block_ksvd(
     frames: NDArray,
     atoms: NDArray,
     sparsity: int,
-    *,
     ridge: float,
     max_iter: int,
     tol: float,

@@ -23,8 +23,7 @@ def nuclear_norm_shapes(
     cameras: NDArray,
     price: float,
     start: NDArray,
-    *,
-    accelerated: bool = True,
+    accelerated: bool,
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, int, bool]:
@@ -228,14 +227,10 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         # Accelerated steps are some hundred times as long as the published ones.
         default = 1e-4 if self.accelerated else 1e-6
         tol = default if self.tol is None else self.tol
-        options: dict[str, Any] = {
-            "accelerated": self.accelerated,
-            "max_iter": self.max_iter,
-        }
         self.n_iter_, converged = 0, True
         for price in 4.0 ** -np.arange(18):
             shapes, n_iter, settled = nuclear_norm_shapes(
-                W, cameras, price, shapes, tol=tol, **options
+                W, cameras, price, shapes, self.accelerated, self.max_iter, tol
             )
             self.n_iter_ += n_iter
             converged &= settled

@@ -298,13 +298,8 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         frames = (W @ basis.T).reshape(n_frames, 2, -1) / unit
         random_state = check_random_state(self.random_state)
         _, atoms = group_sparse_factors(frames, n_atoms, self.penalty, random_state)
-        options: dict[str, Any] = {
-            "ridge": self.ridge,
-            "max_iter": self.max_iter,
-            "tol": self.tol,
-        }
         atoms, blocks, active, self.dictionary_residual_, self.n_iter_ = block_ksvd(
-            frames, atoms, self.sparsity, **options
+            frames, atoms, self.sparsity, self.ridge, self.max_iter, self.tol
         )
         self.n_users_ = active.sum(axis=0)
         cameras, coefficients, atoms = chain_atoms(atoms, blocks, active)

@@ -20,9 +20,7 @@ from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 def run(args: Namespace, warned: list[str]) -> str:
     """Fit artificial faces, and compare the result with the truth."""
-    faces = make_face_tracks(
-        400, n_components=3, camera="weak_perspective", random_state=0
-    )
+    faces = make_face_tracks(400, n_components=3, random_state=0)
     table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)
     table.insert(0, "frame", [f"face{i:03d}" for i in range(len(table))])
     folder = Path(args.output)

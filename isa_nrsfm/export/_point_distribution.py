@@ -21,6 +21,8 @@ from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
 from isa_nrsfm.plotting._views import Origin
 
 SUFFIXES = (".txt", ".mat", ".npz")
+NUMBER_OF_MODES = Interval(Integral, 1, None, closed="left")
+SHARE_OF_VARIANCE = Interval(Real, 0, 1, closed="neither")
 COMMENTS = (
     "The mean values of the components: x, y and z of all points",
     "The principal components (eigenvectors), one per column",
@@ -70,15 +72,7 @@ class PointDistributionModel(NamedTuple):
         )
 
 
-@checked_parameters(
-    {
-        "n_modes": [
-            Interval(Integral, 1, None, closed="left"),
-            Interval(Real, 0, 1, closed="neither"),
-            None,
-        ]
-    }
-)
+@checked_parameters({"n_modes": [NUMBER_OF_MODES, SHARE_OF_VARIANCE, None]})
 def point_distribution_model(
     model: Any,
     *,

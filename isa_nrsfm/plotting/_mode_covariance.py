@@ -16,13 +16,6 @@ BLOCK = 3  # directions of space, rows and columns of one basis shape's block
 LINEAR_SHARE = 0.02  # of the largest absolute value, end of the linear colour scale
 
 
-def correlations(covariance: NDArray) -> NDArray:
-    """Return the matrix of correlations; zero where a variance is zero."""
-    scale = np.sqrt(np.diag(covariance))
-    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
-    return covariance * np.outer(inverse, inverse)
-
-
 def asinh_ticks(largest: float, *, signed: bool) -> NDArray:
     """Return zero and the powers of ten within the range of an asinh scale."""
     # The lowest one is far enough from zero for both numbers to be readable.
@@ -205,9 +198,11 @@ class ModeCovarianceDisplay:
         self.figure_ = self.ax_.figure
 
         values = self.mode_covariance
-        if normalize:
-            values = correlations(values)
         label = "correlation" if normalize else "covariance"
+        if normalize:  # zero where a variance is zero
+            scales = np.sqrt(np.diag(values))
+            inverse = np.divide(1.0, scales, np.zeros(len(scales)), where=scales > 0)
+            values = values * np.outer(inverse, inverse)
         if absolute:
             values, label = np.abs(values), f"absolute {label}"
         largest = np.abs(values).max() or 1.0

@@ -210,9 +210,7 @@ def _named(skeletons: Sequence[Skeleton], names: Sequence[str]) -> Skeleton | No
     """Return the layout that has these names, in whatever order."""
     plain = [_plain(name) for name in names]
     for skeleton in skeletons:
-        if skeleton.point_names is None:
-            continue
-        known = {_plain(name): name for name in skeleton.point_names}
+        known = {_plain(name): name for name in skeleton.point_names or ()}
         if known.keys() == set(plain):
             return skeleton.reordered([known[name] for name in plain])
     return None

@@ -97,9 +97,8 @@ class Skeleton:
             raise ValueError(f"kind must be one of {KINDS}; got {self.kind!r}")
         if any(len(curve) < 2 for curve in self.curves):
             raise ValueError("a curve needs at least two points")
-        pairs = chain(self.up, self.front, self.across)
-        named = [*chain(*self.curves, *pairs), *self.left, *self.right]
-        named += self.contour
+        parts = *self.curves, *self.up, *self.front, *self.across
+        named = chain(*parts, self.left, self.right, self.contour)
         strange = [j for j in named if not 0 <= j < self.n_points]
         if strange:
             raise ValueError(

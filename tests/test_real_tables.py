@@ -1,0 +1,79 @@
+"""Fits of the tables in tests/data, compared with the truth and with stored numbers."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.metrics import mean_shape_error_3d
+
+FITS = {
+    "calibrated": {"camera": "weak_perspective", "n_components": 4},
+    "missing": {"n_components": 4},
+    "robust": {"loss": "cauchy", "n_components": 3},
+    "consensus": {"camera": "orthographic", "n_components": 4},
+}
+FITS["consensus"]["refinement"] = "consensus"
+# Noise variance, inverse SNR, score, mean magnitude of the coefficients.
+NUMBERS = {
+    "calibrated": [1.057758573e-3, 9.198214961e-4, -1.141188059e-3, 0.7730915423],
+    "missing": [9.801392716e-4, 7.506639066e-4, -1.357330301e-3, 0.7643345523],
+    "robust": [9.927971000e-3, 1.390439467e-2, -4.797831290e-2, 0.8675502040],
+    "consensus": [1.435656244e-2, 1.113716499e-3, -1.970364542e-3, 0.7743476784],
+}
+# Relative RMS errors of the shapes, a little above what is reached.
+ERRORS = {"calibrated": 0.045, "missing": 0.044, "consensus": 0.054}
+
+
+@pytest.fixture(scope="module")
+def fits(load_data):
+    """Return a table, its true shapes if known and the model, by the kind of fit."""
+    faces, hands = load_data("ict_bu3dfe_like_68"), load_data("hands_kazuhito_21")
+    tracks, shapes = faces["W2d"], faces["S3d"]
+    hidden = np.random.RandomState(0).rand(228, 68, 1) > 0.8
+    tables = {
+        "calibrated": (tracks[::2], shapes[::2]),
+        "missing": (np.where(hidden, np.nan, tracks)[:, ::2], shapes[:, ::2]),
+        "robust": (hands["W2d"][::3], None),
+        "consensus": (tracks[::4, ::3], shapes[::4, ::3]),
+    }
+    found = {}
+    for kind, (points, truth) in tables.items():
+        X = points.reshape(len(points), -1)
+        model = AffineNRSfM(random_state=0, **FITS[kind])
+        found[kind] = X, truth, model.fit(X)
+    return found
+
+
+@pytest.mark.parametrize("kind", FITS)
+def test_numbers_of_fits(fits, kind):
+    X, _, model = fits[kind]
+    energies = model.noise_variance_, model.inverse_snr_, model.score(X[::8])
+    numbers = *energies, np.abs(model.alpha_).mean()
+    assert_allclose(numbers, NUMBERS[kind], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ERRORS)
+def test_true_shapes(fits, kind):
+    X, shapes, model = fits[kind]
+    camera = "orthographic" if model.camera == "affine" else None
+    found = model.reconstruct(X, camera=camera)
+    assert mean_shape_error_3d(shapes, found, convention="frame") < ERRORS[kind]
+
+
+@pytest.mark.parametrize("kind", ["calibrated", "consensus"])
+def test_deviations_of_rotations_are_the_errors(fits, load_data, kind):
+    X, _, model = fits[kind]
+    true = load_data("ict_bu3dfe_like_68")["R"][:: 228 // len(X)]
+    errors = []
+    for mirror in (np.eye(3), np.diag([1.0, 1.0, -1.0])):
+        rotations = mirror @ model.rotations_ @ mirror
+        U, _, Vt = np.linalg.svd(np.einsum("iab,iac->bc", true, rotations))
+        common = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        off = Rotation.from_matrix((true @ common).swapaxes(1, 2) @ rotations)
+        errors.append(off.as_rotvec() @ mirror)
+    w = min(errors, key=np.linalg.norm)
+    precision = np.linalg.inv(model.rotation_covariance(X))
+    ratio = np.sqrt(np.einsum("ia,iab,ib->i", w, precision, w).mean() / 3)
+    assert 0.8 < ratio < 1.25
