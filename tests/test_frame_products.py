@@ -14,6 +14,7 @@ from isa_nrsfm._frames.point_sums import (
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     ROWS,
+    of_frames,
     pair_indices,
     unpack3,
     unpacked,
@@ -116,7 +117,8 @@ class TestProducts:
         w = weights if weighted else None
         taken = frame_sums(
             frame_tracks(tracks.transpose(0, 2, 1), w), ShapeProducts(shapes)
-        ).take(some)
+        )
+        taken = of_frames(taken, some)
         w = weights[some] if weighted else None
         expected = frame_sums(
             frame_tracks(tracks[some].transpose(0, 2, 1), w), ShapeProducts(shapes)
