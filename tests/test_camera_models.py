@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     AffineCameras,
     full_rotations,
+    mean_view,
     nearest_calibrated,
+    reference_camera,
     rotated,
 )
 from isa_nrsfm._linalg.small_matrices import (
@@ -59,28 +62,6 @@ def curvature_along(D, A):
     return np.array(
         [np.einsum("cra,ab,drb->cd", D[..., i], A[i], D[..., i]) for i in range(N)]
     )
-
-
-class TestMoved:
-    @EACH
-    def test_cameras_stay_of_their_model(self, name):
-        rng = np.random.default_rng(2)
-        M, cameras = random_cameras(name=name), CAMERAS[name]
-        moved = cameras.moved(M, rng.normal(size=(cameras.n_parameters, N)))
-        assert np.abs(moved - M).max() > 0.1
-        if name == "affine":
-            return
-        for before, after in zip(M.T, moved.T, strict=True):
-            gram, size = after.T @ after, np.sum(before**2) / 2
-            assert_allclose(gram, gram[0, 0] * np.eye(2), atol=1e-13 * gram[0, 0])
-            if name == "orthographic":
-                assert gram[0, 0] == pytest.approx(size, rel=1e-13)
-
-    def test_affine_cameras_are_their_entries(self):
-        M, step = random_cameras(name="affine"), np.arange(6.0 * N).reshape(6, N)
-        moved = CAMERAS["affine"].moved(M, step)
-        for i in range(N):
-            assert_allclose(moved[..., i], M[..., i] + step[:, i].reshape(2, 3))
 
 
 class TestRotated:
@@ -152,15 +133,6 @@ class TestInverseCurvature:
         for found in inverse.T:
             least = np.linalg.eigvalsh(found)[0]
             assert least >= -1e-6 * np.abs(found).max()
-
-    @CALIBRATED
-    @pytest.mark.parametrize("unit", [1e-12, 1e12])
-    def test_unit_of_the_curvature(self, name, unit):
-        M, (_, packed) = random_cameras(name=name), random_curvatures()
-        cameras = CAMERAS[name]
-        expected = cameras.inverse_curvature(M, packed) / unit
-        found = cameras.inverse_curvature(M, unit * packed)
-        assert_allclose(found, expected, rtol=1e-9)
 
     @CALIBRATED
     def test_cameras_of_zero(self, name):
@@ -263,3 +235,60 @@ class TestFullRotations:
         rotations, scales = full_rotations(np.zeros((1, 2, 3)))
         assert np.isfinite(rotations).all()
         assert_array_equal(scales, [0.0])
+
+
+class TestMeanView:
+    def test_is_the_mean(self, rng):
+        motion = np.eye(2, 3) + 0.1 * rng.normal(size=(20, 2, 3))
+        assert_allclose(mean_view(motion), motion.mean(axis=0))
+
+    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    def test_uniform_rotations_have_none(self, unit):
+        motion = np.array([random_rotation(seed)[:2] for seed in range(400)])
+        assert mean_view(unit * motion) is None
+
+    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    def test_in_plane_rotations_have_none(self, unit):
+        angle = np.arange(8) * np.pi / 4
+        motion = np.zeros((8, 2, 3))
+        motion[:, 0, 0] = motion[:, 1, 1] = np.cos(angle)
+        motion[:, 0, 1], motion[:, 1, 0] = -np.sin(angle), np.sin(angle)
+        assert mean_view(unit * motion) is None
+
+    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    def test_where_the_limit_is(self, unit):
+        # Mirrored y in a share p of the frames: the mean of y is 1 - 2 p.
+        for p, none in ((0.38, False), (0.42, True)):
+            motion = np.tile(np.eye(2, 3), (100, 1, 1))
+            motion[: round(100 * p), 1, 1] = -1
+            assert (mean_view(unit * motion) is None) == none
+
+    def test_does_not_depend_on_the_axes_of_space_or_image(self, rng):
+        motion = np.eye(2, 3) + 0.3 * rng.normal(size=(20, 2, 3))
+        R, Q = random_rotation(1), random_rotation(2, 2)
+        view = mean_view(motion)
+        assert_allclose(mean_view(Q @ motion @ R), Q @ view @ R, atol=1e-14)
+
+
+class TestReferenceCamera:
+    def test_common_view(self, rng):
+        motion = np.eye(2, 3) + 0.1 * rng.normal(size=(20, 2, 3))
+        sizes = rng.uniform(1, 3, 20)
+        expected = motion.mean(axis=0) * np.sqrt(np.mean(sizes**2))
+        assert_allclose(reference_camera(motion, sizes), expected)
+
+    def test_no_common_view(self):
+        motion = np.array([random_rotation(seed)[:2] for seed in range(400)])
+        motion = motion * [3.0, 2.0, 1.0]
+        camera = reference_camera(motion, np.full(400, 5.0))
+        # The image of a unit vector along an axis has the mean square length 2/3.
+        expected = 5 * np.sqrt(2 / 3) * np.array([[3.0, 0, 0], [0, 2.0, 0]])
+        assert_allclose(camera, expected, rtol=0.1, atol=1e-12)
+
+    def test_sizes_are_those_of_the_table(self):
+        # Cameras divided by the size of their frame, sizes given apart: the view of
+        # a table in other units is the same view in other units.
+        motion = np.array([random_rotation(seed)[:2] for seed in range(50)])
+        sizes = np.random.default_rng(0).uniform(1, 3, 50)
+        camera = reference_camera(motion, sizes)
+        assert_allclose(reference_camera(motion, 1e9 * sizes), 1e9 * camera)

@@ -14,9 +14,6 @@ class Frames(NamedTuple):
     a: np.ndarray
     energy: np.ndarray
 
-    def take(self, frames):
-        return Frames(self.a[frames], self.energy[frames])
-
 
 class Wells(FrameSearch):
     """The functions ``x^4 / 4 - a x^2 / 2`` of frames, with minima ``+- sqrt(a)``."""

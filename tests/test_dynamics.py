@@ -174,20 +174,20 @@ class TestEstimation:
     @pytest.mark.parametrize("noise", [0.2, 1e-6])
     def test_finds_the_rates(self, noise):
         rng, true = np.random.default_rng(0), some_dynamics(1, n_shares=0)
-        data = [observed(simulated(300, rng, true), rng, noise) for _ in range(3)]
-        found = estimated_dynamics(data, K, False, 100, 0.1)
-        assert_allclose(found.rates, true.rates, atol=0.3)
-        assert_allclose(found.walks, true.walks, atol=0.3)
+        data = [observed(simulated(150, rng, true), rng, noise) for _ in range(2)]
+        found = estimated_dynamics(data, K, False, 30, 1.0)
+        assert_allclose(found.rates, true.rates, atol=0.5)
+        assert_allclose(found.walks, true.walks, atol=0.5)
 
-    @pytest.mark.parametrize("seed", range(8))
+    @pytest.mark.parametrize("seed", range(3))
     def test_independent_frames_have_none(self, seed):
         rng = np.random.default_rng(seed)
-        data = observed(rng.normal(size=(150, K)), rng, 1.0)
+        data = observed(rng.normal(size=(100, K)), rng, 1.0)
         assert estimated_dynamics([data], K, False, 100, 0.1) is None
 
 
 class TestPeople:
-    @pytest.mark.parametrize(("n_people", "n_frames"), [(60, 3), (20, 8), (4, 60)])
+    @pytest.mark.parametrize(("n_people", "n_frames"), [(30, 3), (4, 30)])
     def test_photos_in_any_order_have_no_dynamics(self, n_people, n_frames):
         rng = np.random.default_rng(0)
         person = np.repeat(np.arange(n_people), n_frames)
@@ -208,10 +208,10 @@ class TestPeople:
 
     def test_videos_of_people_are_smoothed(self):
         rng = np.random.default_rng(0)
-        person = np.repeat(np.arange(20), 60)
+        person = np.repeat(np.arange(12), 40)
         true = Dynamics(np.full(K, np.log(0.3)), np.empty(0), np.empty(0))
-        x = np.concatenate([simulated(60, rng, true) for _ in range(20)])
-        x = np.sqrt(0.5) * (x + rng.normal(size=(20, K))[person])
+        x = np.concatenate([simulated(40, rng, true) for _ in range(12)])
+        x = np.sqrt(0.5) * (x + rng.normal(size=(12, K))[person])
         frames = alone(x, rng, 0.5)
         found = smoothed_frames(frames, without_cameras(), None, person, **OPTIONS)
         assert_allclose(found.time_scales, 1 / 0.3, rtol=0.3)
@@ -237,14 +237,14 @@ def test_steps_between_cameras_move_one_to_the_other(name):
 def test_likelihood_of_frames_is_linearised(name, loss):
     rng = np.random.default_rng(0)
     scene = make_nonrigid_tracks(
-        80, 12, n_components=2, camera=name, noise=0.02, random_state=0
+        60, 12, n_components=2, camera=name, noise=0.02, random_state=0
     )
-    tracks = scene.data.reshape(80, 12, 2) + 50
-    tracks[rng.random((80, 12)) < 0.2] = np.nan
-    table, row = tracks.reshape(80, -1), 7
+    tracks = scene.data.reshape(60, 12, 2) + 50
+    tracks[rng.random((60, 12)) < 0.2] = np.nan
+    table, rows, row = tracks.reshape(60, -1), tracks.transpose(0, 2, 1), 7
     options = {"camera": name, "loss": loss, "random_state": 0}
     model = AffineNRSfM(2, **options, scale_frames=False).fit(table)
-    alone, frames = model._model.linearised(table), model._model.frames
+    alone, frames = model._model.linearised(rows), model._model.frames
     points = np.isfinite(tracks[row, :, 0])
     start = np.append(alone.alpha[row], np.zeros(CAMERAS[name].n_parameters))
 
@@ -335,25 +335,19 @@ class TestSmooth:
         assert_allclose(found.alpha, expected.alpha, atol=1e-12)
         assert_allclose(found.alpha_std, expected.alpha_std, atol=1e-12)
 
-    def test_times_say_where_the_gaps_are(self, waving):
+    def test_times_or_dates_say_where_the_gaps_are(self, waving):
         model, table = waving
         kept = np.r_[0:60, 66:160]
         blank = table.copy()
         blank[60:66] = np.nan
-        expected = model.smooth(blank, time=np.arange(160) / 30)
-        found = model.smooth(table[kept], time=kept / 30)
+        dates = np.datetime64("2026-01-01") + kept * np.timedelta64(40, "ms")
+        expected = model.smooth(blank, time=0.04 * np.arange(160))
+        found = model.smooth(table[kept], time=dates)
         assert_allclose(found.alpha, expected.alpha[kept], atol=1e-12)
         assert_allclose(found.time_scales, expected.time_scales)
         # Rows that nobody saw are filled in, and less certain.
         assert np.isfinite(expected.alpha).all()
         assert (expected.alpha_std[63] > expected.alpha_std[30]).all()
-
-    def test_dates_are_seconds(self, waving):
-        model, table = waving
-        dates = np.datetime64("2026-01-01") + np.arange(160) * np.timedelta64(40, "ms")
-        found = model.smooth(table, time=dates)
-        expected = model.smooth(table, time=0.04 * np.arange(160))
-        assert_allclose(found.time_scales, expected.time_scales, rtol=1e-6)
 
     def test_nothing_goes_from_group_to_group(self, waving):
         model, table = waving

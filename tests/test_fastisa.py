@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from joblib import parallel_config
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import warned
+from refusals import refused, warned
 from scenes import random_rotation, spherical_sources
+from scipy.optimize import approx_fprime, check_grad
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import FastISA
@@ -138,6 +139,35 @@ class TestEdges:
         with pytest.raises(ValueError, match="The 'density' parameter of FastISA"):
             FastISA(density=density).fit(few_samples())
 
-    def test_density_with_a_negative_eps(self):
-        with pytest.raises(ValueError, match=r"eps must be above zero; got -1.0"):
-            FastISA(n_init=1, density=SqrtDensity(eps=-1.0)).fit(few_samples())
+
+ENERGIES = [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0, 1e4]
+
+
+@pytest.mark.parametrize("eps", [0.01, 0.1, 2.0])
+@pytest.mark.parametrize("energy", ENERGIES)
+class TestDerivatives:
+    def test_first(self, eps, energy):
+        density = SqrtDensity(eps=eps)
+        error = check_grad(
+            lambda u: density.log_density(u)[0],
+            lambda u: density.derivatives(u)[0],
+            np.array([energy]),
+            epsilon=1e-6 * (energy + eps),
+        )
+        assert error < 1e-5 * abs(density.derivatives(energy)[0])
+
+    def test_second(self, eps, energy):
+        density = SqrtDensity(eps=eps)
+        step = 1e-6 * (energy + eps)
+        numerical = approx_fprime(
+            np.array([energy]), lambda u: density.derivatives(u)[0][0], step
+        )
+        assert_allclose(density.derivatives(energy)[1], numerical[0], rtol=1e-5)
+
+
+class TestSqrtDensity:
+    @pytest.mark.parametrize("eps", [0.0, -0.5, np.nan])
+    def test_eps_must_be_positive(self, eps):
+        density = SqrtDensity(eps=eps)
+        for method in (density.log_density, density.derivatives):
+            refused(f"eps must be above zero; got {eps}", method, np.ones(3))

@@ -92,15 +92,6 @@ class TestRigidFrames:
             assert_allclose(fitted.translation[i], t, atol=1e-11)
             assert_allclose(fitted.alpha[i], alpha, atol=1e-10)
 
-    def test_basis_shape_of_zeros(self):
-        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        padded = np.concatenate([basis, np.zeros_like(basis[:1])])
-        for each in (tracks, with_gaps(tracks, 0.3)):
-            fitted = rigid(each, mean_shape, padded)
-            expected = rigid(each, mean_shape, basis)
-            assert_array_equal(fitted.alpha[:, 2], 0)
-            assert_allclose(fitted.alpha[:, :2], expected.alpha)
-
     def test_flat_mean_shape(self):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
         mean_shape = mean_shape.copy()
@@ -360,19 +351,3 @@ class TestSamplePosterior:
         )
         assert_allclose(found, moments, rtol=1e-9)
         assert_allclose(total, sum(noises), rtol=1e-9)
-
-
-class TestComposeAndProject:
-    def test_by_plain_loops(self):
-        rng = np.random.default_rng(0)
-        mean_shape, basis = rng.normal(size=(7, 3)), rng.normal(size=(2, 7, 3))
-        alpha, motion = rng.normal(size=(4, 2)), rng.normal(size=(4, 2, 3))
-        translation = rng.normal(size=(4, 2))
-        shapes = compose(mean_shape, basis, alpha)
-        tracks = project(shapes, motion, translation)
-        assert shapes.shape == (4, 7, 3)
-        for i in range(4):
-            S = mean_shape + alpha[i, 0] * basis[0] + alpha[i, 1] * basis[1]
-            assert_allclose(shapes[i], S)
-            for j in range(7):
-                assert_allclose(tracks[i, j], motion[i] @ S[j] + translation[i])

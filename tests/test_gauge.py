@@ -1,13 +1,15 @@
-"""The canonical space, order, scale and sign."""
+"""The canonical space, order, scale and sign, and the independent basis."""
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import mean_view
-from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import (
     canonical_gauge,
     canonical_rotation,
@@ -15,6 +17,9 @@ from isa_nrsfm._gauge.canonical import (
     euclidean_space,
     reorder_blocks,
 )
+from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._parameters.choices import INDEPENDENCE
+from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 
 class Scene:
@@ -54,12 +59,6 @@ def coefficients(scene, gauge):
 
 
 class TestSpace:
-    def test_mean_shape_is_white_and_centred(self):
-        gauge, _ = Scene().canonical()
-        B = gauge.mean_shape
-        assert_allclose(B.mean(axis=0), 0, atol=1e-13)
-        assert_allclose(B.T @ B / len(B), np.eye(3), atol=1e-13)
-
     def test_rows_of_the_mean_camera_are_in_the_plane_of_x_and_y(self):
         _, motion = Scene().canonical()
         view = mean_view(motion)
@@ -151,15 +150,6 @@ class TestEuclideanSpace:
             shape = unit * scene.mean_shape @ A.T
             assert np.mean(shape**2) == pytest.approx(1.0)
 
-    @pytest.mark.parametrize("spread", [0.3, 3.0])
-    def test_any_rotation_before_leads_to_the_same_space(self, spread):
-        scene = self.scene(spread)
-        A = euclidean_space(scene.mean_shape, scene.motion, None)
-        for turn in (random_rotation(1), -random_rotation(2)):
-            shape, motion = scene.mean_shape @ turn.T, scene.motion @ turn.T
-            B = euclidean_space(shape, motion, None)
-            assert_allclose(shape @ B.T, scene.mean_shape @ A.T, atol=1e-11)
-
     def test_mean_shape_of_zeros(self):
         scene = self.scene()
         A = euclidean_space(0 * scene.mean_shape, scene.motion, None)
@@ -167,43 +157,6 @@ class TestEuclideanSpace:
 
 
 class TestBasis:
-    def test_images_stay_as_they_are(self):
-        scene = Scene()
-        gauge, motion = scene.canonical()
-        alpha = coefficients(scene, gauge)
-        before = compose(scene.mean_shape, scene.basis, scene.alpha)
-        after = compose(gauge.mean_shape, gauge.basis, alpha)
-        expected = project(before, scene.motion, np.zeros(2))
-        assert_allclose(project(after, motion, np.zeros(2)), expected, atol=1e-10)
-
-    def test_coefficients_have_unit_variance_and_are_skewed_to_the_positive_side(self):
-        scene = Scene()
-        gauge, _ = scene.canonical()
-        alpha = coefficients(scene, gauge)
-        assert_allclose(alpha.std(axis=0), 1)
-        assert np.all(np.sum(alpha**3, axis=0) > 0)
-
-    def test_ordered_by_energy_in_the_images(self):
-        scene = Scene()
-        gauge, motion = scene.canonical()
-        alpha = coefficients(scene, gauge)
-        moved = (motion @ gauge.basis[k].T for k in range(3))
-        pairs = zip(alpha.T, moved, strict=True)
-        energies = [np.sum((a[:, None, None] * images) ** 2) for a, images in pairs]
-        assert_array_equal(np.argsort(energies)[::-1], [0, 1, 2])
-        assert sorted(gauge.order) == [0, 1, 2]
-
-    def test_order_signs_and_scales_before_do_not_matter(self):
-        scene = Scene()
-        expected, _ = scene.canonical()
-        factors = np.array([-3.0, 1e-6, 1e6])
-        order = np.array([2, 0, 1])
-        scene.basis = (factors[:, None, None] * scene.basis)[order]
-        scene.alpha = (scene.alpha / factors)[:, order]
-        gauge, _ = scene.canonical()
-        assert_allclose(gauge.basis, expected.basis, rtol=1e-9, atol=1e-10)
-        assert_array_equal(order[gauge.order], expected.order)
-
     def test_coefficients_that_do_not_vary_have_unit_mean_square(self):
         scene = Scene()
         scene.alpha[:, 1] = -7.0
@@ -237,3 +190,357 @@ class TestReorderBlocks:
                 rows, columns = (np.arange(3) + 3 * order[each] for each in (a, b))
                 expected = matrix[np.ix_(rows, columns)]
                 assert_array_equal(got[3 * a : 3 * a + 3, 3 * b : 3 * b + 3], expected)
+
+
+ALL = [*INDEPENDENCE, None]
+EACH = pytest.mark.parametrize("independence", ALL)
+
+
+class Fit(NamedTuple):
+    shapes: NDArray  # (n_components + 1, 3, n_points), centred
+    motion: NDArray  # (n_frames, 2, 3)
+    alpha: NDArray  # (n_frames, n_components)
+
+    def images(self):
+        """Return the images of the shapes (n_frames, 2, n_points)."""
+        return self.motion @ self.frames()
+
+    def frames(self):
+        """Return the shapes of the frames (n_frames, 3, n_points)."""
+        return self.shapes[0] + np.tensordot(self.alpha, self.shapes[1:], 1)
+
+
+def random_fit(seed=0, n_frames=60, n_points=80, n_components=3):
+    """Return a fit with independent heavy-tailed basis shapes and coefficients."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(n_components + 1, 3, n_points))
+    shapes[1:] *= 0.3 * rng.normal(size=(n_components, 1, n_points))
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    motion = rng.normal(size=(n_frames, 2, 3)) + 2 * np.eye(2, 3)
+    alpha = rng.laplace(size=(n_frames, n_components)) / np.sqrt(2)
+    return Fit(shapes, motion, alpha)
+
+
+def random_mixing(seed, n_shapes, shift=0.05):
+    """
+    Return a mixing of the mean shape and the basis shapes.
+
+    The basis is mixed and shifted a little along the mean shape, so that the scales of
+    all frames stay positive, and the mean shape is shifted along the basis.
+    """
+    mixing = np.random.default_rng(seed).normal(size=(n_shapes, n_shapes))
+    mixing[0] *= 0.3
+    mixing[0, 0] = 1.0
+    mixing[1:, 0] *= shift
+    return mixing
+
+
+def remixed(alpha, mixing):
+    """Return the coefficients (..., n_components) of mixed shapes, and the scales."""
+    c = np.insert(alpha, 0, 1.0, axis=-1) @ np.linalg.inv(mixing)
+    assert (c[..., 0] > 0).all()
+    return c[..., 1:] / c[..., :1], c[..., 0]
+
+
+def regauged(fit, seed=1, shift=0.05):
+    """Return another fit that is as good: mixed, in a space that is sheared."""
+    mixing = random_mixing(seed, len(fit.shapes), shift)
+    rng = np.random.default_rng(seed)
+    space = random_rotation(seed) + 0.3 * rng.normal(size=(3, 3))
+    alpha, scale = remixed(fit.alpha, mixing)
+    motion = scale[:, None, None] * fit.motion @ np.linalg.inv(space)
+    return Fit(space @ np.tensordot(mixing, fit.shapes, 1), motion, alpha)
+
+
+def canonical(fit, *options):
+    """Return the canonical fit, and the standard deviations for unit covariances."""
+    gauge, frames = independent_gauge(*fit, *(options or ["shapes"]))
+    n_frames, n_components = fit.alpha.shape
+    covariance = np.broadcast_to(
+        np.eye(n_components), (n_frames,) + 2 * (n_components,)
+    )
+    motion, alpha, deviation = frames.apply(fit.motion, fit.alpha, covariance)
+    shapes = np.concatenate([gauge.mean_shape[None], gauge.basis])
+    return Fit(shapes.transpose(0, 2, 1), motion, alpha), deviation
+
+
+def assert_same(got, expected, atol=1e-7):
+    for name, one, other in zip(Fit._fields, got, expected, strict=True):
+        assert_allclose(one, other, atol=atol, err_msg=name)
+
+
+class TestSameFit:
+    """What a fit says of the table and of the shapes is not changed."""
+
+    @EACH
+    @pytest.mark.parametrize("n_components", [1, 3])
+    def test_images(self, independence, n_components):
+        fit = random_fit(n_components=n_components)
+        result, _ = canonical(fit, independence)
+        assert_allclose(result.images(), fit.images(), atol=1e-11)
+
+    @EACH
+    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(self, independence):
+        fit = random_fit()
+        result, _ = canonical(fit, independence)
+        frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
+        assert affine_shape_error(*frames) < 1e-10
+        # The affinity is that of the map.
+        space = independent_gauge(*fit, independence)[1].space
+        scales = np.linalg.norm(space @ fit.frames(), axis=(1, 2))
+        scales /= np.linalg.norm(result.frames(), axis=(1, 2))
+        expected = scales[:, None, None] * result.frames()
+        assert_allclose(space @ fit.frames(), expected, atol=1e-11)
+
+
+class TestConditions:
+    @EACH
+    @pytest.mark.parametrize("seed", range(3))
+    def test_hold(self, independence, seed):
+        result, _ = canonical(regauged(random_fit(seed)), independence)
+        mean_shape, basis = result.shapes[0], result.shapes[1:]
+        n_points = mean_shape.shape[1]
+        assert_allclose(result.shapes.mean(axis=2), 0, atol=1e-12)
+        assert_allclose(mean_shape @ mean_shape.T / n_points, np.eye(3), atol=1e-12)
+        along = np.einsum("kaj,aj->k", basis, mean_shape)
+        assert_allclose(along, 0, atol=1e-10 * n_points)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        assert_allclose(result.alpha.std(axis=0), 1, rtol=1e-12)
+        assert (np.sum(result.alpha**3, axis=0) >= 0).all()
+        moved = result.motion[:, None] @ basis
+        energy = np.sum((result.alpha[..., None, None] * moved) ** 2, axis=(0, 2, 3))
+        assert (np.diff(energy) <= 0).all()
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_shapes_recovers_independent_basis_shapes(self, seed):
+        fit = random_fit(seed, n_points=400)
+        result, _ = canonical(regauged(fit), "shapes")
+        truth = whitened(fit)
+        cosines = basis_similarity(truth, result.shapes[1:].transpose(0, 2, 1))
+        assert np.min(cosines) > 0.97
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_coefficients_recovers_independent_coefficients(self, seed):
+        fit = random_fit(seed, n_frames=3000, n_points=20)
+        result, _ = canonical(regauged(fit, shift=0.02), "coefficients")
+        # Up to the scales of the frames, which change a little with the basis.
+        correlation = np.corrcoef(fit.alpha.T, result.alpha.T)[:3, 3:]
+        assert_array_equal(np.sort(np.abs(correlation).argmax(axis=1)), range(3))
+        assert np.abs(correlation).max(axis=1).min() > 0.95
+
+    def test_none_takes_principal_axes(self):
+        # Uncorrelated coefficients, and basis shapes that are orthogonal in the space
+        # in which the mean shape is white, by decreasing energy there.
+        result, _ = canonical(regauged(random_fit()), None)
+        assert_allclose(result.alpha.T @ result.alpha / 60, np.eye(3), atol=1e-11)
+        flat = result.shapes[1:].reshape(3, -1)
+        gram = flat @ flat.T
+        assert_allclose(gram, np.diag(np.diag(gram)), atol=1e-10 * np.trace(gram))
+
+
+def whitened(fit):
+    """Return the basis shapes where the mean shape is white, without part along it."""
+    B = fit.shapes[0]
+    variance, axes = np.linalg.eigh(B @ B.T / B.shape[1])
+    white = (axes / np.sqrt(variance)).T @ fit.shapes
+    along = np.einsum("kaj,aj->k", white[1:], white[0]) / np.sum(white[0] ** 2)
+    return (white[1:] - along[:, None, None] * white[0]).transpose(0, 2, 1)
+
+
+class TestInvariance:
+    @EACH
+    @pytest.mark.parametrize("n_components", [1, 3, 5])
+    def test_gauge_of_the_fit(self, independence, n_components):
+        fit = random_fit(n_components=n_components, n_points=150)
+        expected, _ = canonical(fit, independence)
+        for seed in (1, 2, 3):
+            other = regauged(fit, seed, shift=0.01)
+            assert_allclose(other.images(), fit.images(), atol=1e-10)
+            got, _ = canonical(other, independence)
+            assert_same(got, expected)
+
+
+def calibrated(fit, camera):
+    """Return a fit with calibrated cameras."""
+    U, S, Vt = np.linalg.svd(fit.motion, full_matrices=False)
+    rows = U @ Vt
+    if camera == "weak_perspective":
+        rows = S.mean(axis=1)[:, None, None] * rows
+    return fit._replace(motion=rows)
+
+
+BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+
+
+class TestCalibratedCameras:
+    """Space may only be turned, and orthographic cameras absorb no scales."""
+
+    @BOTH
+    @EACH
+    @pytest.mark.parametrize("unit", [None, 3.0])
+    def test_images_stay_and_cameras_stay_calibrated(self, camera, independence, unit):
+        fit = calibrated(random_fit(), camera)
+        options = independence, camera, unit
+        result, _ = canonical(fit, *options)
+        space = independent_gauge(*fit, *options)[1].space
+        assert_allclose(result.images(), fit.images(), atol=1e-10)
+        size = np.linalg.norm(space, axis=0)
+        assert_allclose(space @ space.T, size[0] ** 2 * np.eye(3), atol=1e-10)
+        gram = result.motion @ result.motion.swapaxes(1, 2)
+        scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+        unit_gram = np.broadcast_to(np.eye(2), gram.shape)
+        assert_allclose(gram / scale, unit_gram, atol=1e-10)
+        if camera == "orthographic":
+            assert_allclose(scale, 1 / size[0] ** 2, rtol=1e-10)
+        if unit is None:
+            assert np.mean(result.shapes[0] ** 2) == pytest.approx(1.0)
+        else:
+            assert size[0] == pytest.approx(unit)
+
+    @BOTH
+    @EACH
+    def test_conditions(self, camera, independence):
+        fit = calibrated(random_fit(), camera)
+        result, _ = canonical(fit, independence, camera)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        assert_allclose(result.alpha.std(axis=0), 1, rtol=1e-12)
+        if camera == "weak_perspective":
+            # Without part along the mean shape, in the space of the cameras.
+            along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
+            assert_allclose(along, 0, atol=1e-10)
+
+    @BOTH
+    @EACH
+    def test_another_fit_that_is_as_good_leads_to_the_same(self, camera, independence):
+        fit = calibrated(random_fit(), camera)
+        mixing = random_mixing(1, 4, shift=0.01)
+        if camera == "orthographic":
+            mixing[1:, 0] = 0.0
+        space = random_rotation(1)
+        alpha, scale = remixed(fit.alpha, mixing)
+        motion = scale[:, None, None] * fit.motion @ space.T
+        other = Fit(space @ np.tensordot(mixing, fit.shapes, 1), motion, alpha)
+        assert_allclose(other.images(), fit.images(), atol=1e-10)
+        expected, _ = canonical(fit, independence, camera)
+        assert_same(canonical(other, independence, camera)[0], expected)
+
+
+class TestStandardDeviations:
+    @EACH
+    def test_are_those_of_random_coefficients(self, independence):
+        fit = random_fit()
+        frames = independent_gauge(*fit, independence)[1]
+        rng = np.random.default_rng(3)
+        root = 0.03 * rng.normal(size=(60, 3, 3))
+        covariance = root @ root.swapaxes(1, 2)
+        _, _, got = frames.apply(fit.motion, fit.alpha, covariance)
+        n_draws = 2000
+        noise = rng.normal(size=(n_draws, 60, 3))
+        drawn = fit.alpha + np.einsum("ikl,nil->nik", root, noise)
+        results = [frames.apply(fit.motion, each, covariance) for each in drawn]
+        alpha = np.array([result[1] for result in results])
+        assert_allclose(got, alpha.std(axis=0), rtol=5 / np.sqrt(2 * n_draws))
+
+    def test_do_not_depend_on_the_gauge_of_the_fit(self):
+        # The covariance of the coefficients of a fit that is as good, to first order.
+        fit = random_fit()
+        mixing = random_mixing(1, 4)
+        root = np.random.default_rng(3).normal(size=(60, 3, 3))
+        step = 1e-6
+        ends = (fit.alpha + sign * step * e for e in np.eye(3) for sign in (1, -1))
+        ends = [remixed(alpha, mixing)[0] for alpha in ends]
+        slopes = np.subtract(ends[::2], ends[1::2])
+        moved = np.stack(slopes, axis=2) / (2 * step) @ root
+        other = regauged(fit)
+        deviations = [
+            independent_gauge(*one, "shapes")[1].apply(
+                one.motion, one.alpha, each @ each.swapaxes(1, 2)
+            )[2]
+            for one, each in ((fit, root), (other, moved))
+        ]
+        assert_allclose(deviations[1], deviations[0], rtol=1e-5)
+
+
+class TestDegenerate:
+    @EACH
+    @pytest.mark.parametrize("n_zero", [1, 3])
+    def test_basis_shapes_of_zero(self, independence, n_zero):
+        fit = random_fit()
+        fit.shapes[4 - n_zero :] = 0.0
+        fit.alpha[:, 3 - n_zero :] = 0.0
+        result, deviation = canonical(fit, independence)
+        assert np.isfinite(deviation).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-10)
+        norms = np.linalg.norm(result.shapes[1:], axis=(1, 2))
+        assert (norms[: 3 - n_zero] > 0.1).all()
+        assert_allclose(norms[3 - n_zero :], 0, atol=1e-9)
+
+    @EACH
+    def test_flat_objects(self, independence):
+        fit = random_fit()
+        fit.shapes[:, 2] = 0.0
+        other = regauged(fit)
+        result, deviation = canonical(other, independence)
+        assert np.isfinite(deviation).all()
+        assert_allclose(result.images(), other.images(), atol=1e-10)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
+        assert_allclose(along, 0, atol=1e-9)
+
+    @EACH
+    @pytest.mark.parametrize("depth", [0.0, 0.02])
+    def test_thin_objects_that_bend(self, independence, depth):
+        fit = random_fit()
+        fit.shapes[0, 2] *= depth
+        self.check_extreme(fit, independence)
+
+    @EACH
+    @pytest.mark.parametrize("still", [1, slice(None)])
+    @pytest.mark.parametrize("value", [0.0, 0.3])
+    def test_coefficients_that_do_not_vary(self, independence, value, still):
+        fit = random_fit()
+        fit.alpha[:, still] = value
+        result, deviation = canonical(fit, independence)
+        for each in (*result, deviation):
+            assert np.isfinite(each).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-9)
+
+    def stretched(self, far):
+        """Return a fit with a part along the mean shape, and a frame far out on it."""
+        fit = random_fit()
+        shapes = fit.shapes.copy()
+        shapes[1] -= 0.3 * shapes[0]
+        fit.alpha[7, 0] = far
+        return fit._replace(shapes=shapes)
+
+    @EACH
+    def test_frames_whose_scale_would_be_negative(self, independence):
+        self.check_extreme(self.stretched(4.5), independence)
+
+    @pytest.mark.parametrize("far", [1.5, 2.75])
+    def test_frames_whose_scale_is_small(self, far):
+        result, _ = canonical(self.stretched(far))
+        along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
+        assert_allclose(along, 0, atol=1e-8)
+
+    @pytest.mark.parametrize(("far", "removed"), [(2.9, True), (3.05, False)])
+    def test_scales_stay_above_a_tenth_of_their_mean(self, far, removed):
+        fit = random_fit(n_frames=600, n_points=30, n_components=1)
+        fit.shapes[1] -= 0.3 * fit.shapes[0]
+        alpha = np.clip(fit.alpha, -2, 2)
+        alpha[7] = far
+        result, _ = canonical(fit._replace(alpha=alpha))
+        along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
+        assert (np.abs(along) < 1e-8).all() == removed
+
+    @staticmethod
+    def check_extreme(fit, independence):
+        """Assert that the basis shapes keep their parts along the mean shape."""
+        result, deviation = canonical(fit, independence)
+        assert np.isfinite(deviation).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-9)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        assert_allclose(result.alpha.std(axis=0), 1)
+        # No frame is turned inside out, and none changes its scale.
+        space = independent_gauge(*fit, independence)[1].space
+        assert_allclose(space @ fit.frames(), result.frames(), atol=1e-9)

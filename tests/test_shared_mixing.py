@@ -270,20 +270,6 @@ class TestSteps:
         assert place[-1] == 5999
         assert set(np.diff(place)) <= {3, 4, 5}
 
-    def test_fixed_point_by_plain_loops(self):
-        Z = white(sources(["student", "uniform"], 0, 50, 3))
-        W = _shared_mixing._starts(Z, 3)
-        found = _shared_mixing._fixed_point(W, Z, 1)
-        for start, end in zip(W, found, strict=True):
-            Y = np.tensordot(start, Z, 1)
-            u = np.sum(Y**2, axis=2)
-            g, dg = _shared_mixing._slopes(u, np.array(8.0), 3)
-            for k in range(2):
-                up = np.mean(np.sum(Z * (g[k][:, None] * Y[k]), axis=2), axis=1)
-                start[k] = up - np.mean(3 * g[k] + 2 * u[k] * dg[k]) * start[k]
-            U, _, Vt = np.linalg.svd(start)
-            assert_allclose(end, U @ Vt, atol=1e-10)
-
     def test_ascent_maximises_the_quadratic_model_or_there_is_none(self, rng):
         n, size, shift = 5, 3, 0.5
         root, gradient = rng.normal(size=(n, n, n)), rng.normal(size=(n, n))

@@ -204,7 +204,7 @@ class CalibratedSearch(FrameSearch):
         found, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
         tried = padded(tried)
         if len(tried):
-            problem, M, limit = problem.take(tried), of_frames(M, tried), limit[tried]
+            problem, M, limit = (of_frames(p, tried) for p in (problem, M, limit))
             start = self.evaluate(problem, M * REVERSED)
             # The reversed camera and M differ in the third column.
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])

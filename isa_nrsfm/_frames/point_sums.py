@@ -74,7 +74,7 @@ class Gram:
         """Return ``H_kl = <G_kl, Q>`` (n_pairs, n), packed; Q (6, n) is packed."""
         return self._times(self.pairs, TWICE[:, None] * Q)
 
-    def take(self, frames: NDArray) -> Self:
+    def of_frames(self, frames: NDArray) -> Self:
         """Return the Gram matrices of some of the frames."""
         if self.pairs.ndim == 2:
             return self
@@ -101,14 +101,7 @@ class FrameTracks(NamedTuple):
         total = len(self.weight)
         for start in range(0, total, n_frames):
             frames = slice(start, min(start + n_frames, total))
-            yield frames, self if total <= n_frames else self.take(frames)
-
-    def take(self, frames: NDArray | slice) -> Self:
-        """Return some of the frames."""
-        parts: Any = (
-            each if each is None else of_frames(each, frames) for each in self
-        )
-        return type(self)(*parts)
+            yield frames, self if total <= n_frames else of_frames(self, frames)
 
 
 class FrameSums(NamedTuple):
@@ -133,15 +126,6 @@ class FrameSums(NamedTuple):
         """
         middle = np.einsum("kai,ki->ai", self.shape_centroid, with_one(alpha.T))
         return (self.centroid - np.einsum("ira,ai->ri", motion, middle)).T
-
-    def take(self, frames: NDArray) -> Self:
-        """Return the sums of some of the frames."""
-        cross, gram, *others = self
-        return type(self)(
-            of_frames(cross, frames),
-            gram.take(frames),
-            *(of_frames(each, frames) for each in others),
-        )
 
 
 def with_one(alpha: NDArray) -> NDArray:

@@ -102,10 +102,6 @@ class FrameProblem(NamedTuple):
         """``||W||^2 + s2`` (n,), the scale of gains and rounding errors."""
         return self.products.energy + self.noise
 
-    def take(self, frames: NDArray) -> Self:
-        """Return some of the frames."""
-        return type(self)(self.products.take(frames), self.noise[frames])
-
 
 class State(NamedTuple):
     """
@@ -121,10 +117,6 @@ class State(NamedTuple):
     slope: NDArray
     definite: NDArray
     hessian: NDArray
-
-    def take(self, frames: NDArray) -> Self:
-        """Return the state of some of the frames."""
-        return type(self)(*(of_frames(each, frames) for each in self))
 
     def inverse(self) -> NDArray:
         """Return inverse Hessians (p, p, n), or of `definite` where indefinite."""
@@ -151,10 +143,6 @@ class Minimum(NamedTuple):
         square = (state.position - self.position) ** 2
         near = square.sum(axis=tuple(range(square.ndim - 1))) < self.radius**2
         return near | (state.value - 10.0 * gain > self.value)
-
-    def take(self, frames: NDArray) -> Self:
-        """Return the minima of some of the frames."""
-        return type(self)(*(of_frames(each, frames) for each in self))
 
 
 class FrameSearch:
@@ -275,12 +263,12 @@ class FrameSearch:
         length = 2048 if frames.weights is None else 1024
         for first in range(0, len(chosen), length):
             block = padded(np.arange(first, min(first + length, len(chosen))))
-            products = frame_sums(frames.take(chosen[block]), self.shared)
+            products = frame_sums(of_frames(frames, chosen[block]), self.shared)
             if frames.weights is not None:
                 determined = determines_camera(products, self.shared.shapes[0])
                 if not determined.all():
                     usable = padded(np.flatnonzero(determined))
-                    block, products = block[usable], products.take(usable)
+                    block, products = block[usable], of_frames(products, usable)
             problem = self.problem(products, noise[chosen[block]])
             start = self.evaluate(problem, self.start(problem, initial[block].T))
             position, converged = self.descend(problem, start, max_steps)
@@ -372,9 +360,10 @@ class FrameSearch:
                 if leaving.all():
                     return found, converged
                 left = padded(np.flatnonzero(~leaving))
-                running, damping, state = running[left], damping[left], state.take(left)
-                step, problem = of_frames(step, left), problem.take(left)
-                known = known and known.take(left)
+                problem, state, step, running, damping, known = (
+                    of_frames(part, left)
+                    for part in (problem, state, step, running, damping, known)
+                )
             if not n_left:
                 break
             # Trial step, refused where the objective rises. Less damping after a good
@@ -400,7 +389,7 @@ class FrameSearch:
         failing = padded(np.flatnonzero(~positive))
         while len(failing):
             damping[failing] = raised(damping[failing])
-            part = state.take(failing)
+            part = of_frames(state, failing)
             matrix = part.hessian + damping[failing] * part.definite
             step[:, failing], positive = solve_positive(matrix, part.slope)
             still = ~positive & (damping[failing] < LARGEST_DAMPING)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
-from isa_nrsfm._linalg.small_matrices import energies
+from isa_nrsfm._linalg.small_matrices import energies, of_frames
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 from isa_nrsfm._tables.tracks import seen_points
 
@@ -93,7 +93,7 @@ class JointFrames:
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
         parts = self.blocks.map(
-            lambda block, kept: block.take(np.flatnonzero(kept)), chosen
+            lambda block, kept: of_frames(block, np.flatnonzero(kept)), chosen
         )
         taken = [part for part in parts if len(part.weight)]
         blocks = FrameBlocks.of_blocks(taken, [len(part.weight) for part in taken])

@@ -11,6 +11,7 @@ results are finite for any matrix.
 
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,11 +207,16 @@ def padded(frames: NDArray) -> NDArray:
     return np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % LANES)])
 
 
-def of_frames(values: NDArray, frames: NDArray | slice) -> NDArray:
-    """Return values (..., n_taken) of frames, which stay the last axis in memory."""
-    if isinstance(frames, slice):
-        return values[..., frames]
-    return np.take(values, frames, axis=-1)
+def of_frames(values: Any, frames: NDArray | slice) -> Any:
+    """Return some frames of an array (..., n), or of each part of a named tuple.
+
+    The frames stay the last axis in memory. None stays None.
+    """
+    if isinstance(values, tuple):
+        return type(values)(*(of_frames(part, frames) for part in values))
+    if not isinstance(values, np.ndarray):
+        return values if values is None else values.of_frames(frames)
+    return values[..., frames] if isinstance(frames, slice) else values.take(frames, -1)
 
 
 def frames_last(motion: NDArray) -> NDArray:

@@ -62,19 +62,6 @@ class ScaledTable(NamedTuple):
         """Whether all points are seen."""
         return bool((self.n_seen == self.n_points).all())
 
-    def part(self, rows: NDArray) -> "ScaledTable":
-        """Return the table of some rows, by a mask (n_rows,), with the same scaling."""
-        kept = rows[self.shown]
-        return self._replace(
-            shown=self.shown[rows],
-            source=self.source.subset(kept),
-            rows=self.rows.subset(kept),
-            sizes=self.sizes[kept],
-            translation=self.translation[kept],
-            n_seen=self.n_seen[kept],
-            weights=None if self.weights is None else self.weights[kept],
-        )
-
 
 def scaled_table(
     blocks: FrameBlocks,
