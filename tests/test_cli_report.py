@@ -204,6 +204,7 @@ def test_means_of_twelve_classes_are_listed(answers, n_classes):
     assert line.endswith("(all in report.json).") == (n_classes == 13)
 
 
+@pytest.mark.slow
 def test_figures_show_twelve_basis_shapes(tmp_path):
     scene = make_nonrigid_tracks(60, 45, 13, noise=0.01, random_state=0)
     table = pd.DataFrame(scene.data, columns=scene.feature_names)

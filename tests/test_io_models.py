@@ -208,7 +208,7 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
         assert sorted(["header", *header["arrays"]]) == sorted(file)
 
 
-@pytest.mark.parametrize("case", ["names", "alternating", "not refined"])
+@pytest.mark.parametrize("case", slow_after(1, ["not refined", "names", "alternating"]))
 def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     model, table = fitted(case)
     save_model(model, path)
