@@ -7,9 +7,6 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._prepare.completion import (
-    CompletionModel,
-    _em_step,
-    _Frames,
     completion_model,
     filled_in,
 )
@@ -126,21 +123,6 @@ def test_the_fit_is_a_stationary_point_of_the_likelihood(small, rng):
     assert max(up, down) < best
 
 
-def test_the_mean_square_of_a_step_is_that_of_least_squares_with_a_ridge(small):
-    centred, seen, sizes = small
-    frames = _Frames.of_rows(unit_rows(centred, sizes))
-    B = np.random.default_rng(0).normal(size=(3, 9))
-    _, mean_square = _em_step(CompletionModel(B, 0.1), frames)
-    residuals = []
-    for tracks, mask, size in zip(centred, seen, sizes, strict=True):
-        design = np.vstack([B[:, mask], np.ones(mask.sum())]).T
-        ridge = np.diag([0.1, 0.1, 0.1, 0.0])
-        target = tracks[mask] / size
-        fit = design @ np.linalg.solve(design.T @ design + ridge, design.T @ target)
-        residuals.append((target - fit).ravel())
-    assert_allclose(mean_square, np.mean(np.concatenate(residuals) ** 2))
-
-
 # --- exact tables -------------------------------------------------------------------
 
 
@@ -221,19 +203,6 @@ def test_faces_that_hide_a_side(load_data):
     mask = np.ones(known.shape[:2], dtype=bool)
     mask[:: len(known) // len(patterns)][: len(patterns)] = patterns
     assert 100 * held_out_error(known, mask, 9) < 0.4
-
-
-# --- invariances --------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def faces():
-    return make_face_tracks(80, missing=0.25, random_state=0).tracks
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1e9])
-def test_units(faces, unit):
-    assert_allclose(completed(unit * faces, 3), unit * completed(faces, 3), rtol=1e-8)
 
 
 # --- degenerate tables --------------------------------------------------------------
