@@ -193,8 +193,8 @@ def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
     if len(parts) == 1:
         return parts[0]
     joined: list[Any] = []
-    for each in zip(*parts, strict=True):
-        joined.append(None if each[0] is None else np.concatenate(each, axis=-1))
+    for values in zip(*parts, strict=True):
+        joined.append(None if values[0] is None else np.concatenate(values, axis=-1))
     return FrameTracks(*joined)
 
 
