@@ -444,7 +444,7 @@ def _joint_frames(
     if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     model = replace(model, gauge=frame_map, certainty=certainty)
-    weight = table.weight
+    weight = table.n_observations
     share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
