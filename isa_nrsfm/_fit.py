@@ -379,7 +379,7 @@ def _paper_frames(
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
     gauge, frames = rigid_gauge(
         shapes[0].T,
-        shapes[1:].transpose(0, 2, 1),
+        shapes[1:].mT,
         table.sizes,
         lambda mean_shape, basis: table.source.joined(
             partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
@@ -491,7 +491,7 @@ def _measures(
         "energy_share_": energy / (energy.sum() or 1.0),
         "inverse_snr_": reprojection_error(
             table.rows,
-            np.concatenate([mean_shape[None], basis]).transpose(0, 2, 1),
+            np.concatenate([mean_shape[None], basis]).mT,
             cameras,
             (frames.translation - table.translation) / table.sizes[:, None],
             frames.alpha,

@@ -313,7 +313,7 @@ class PosteriorFrames:
         T -= slope[..., None]
         T *= np.sqrt(weights / self.noise_variance)[:, None, None]
         T = T.reshape(*T.shape[:2], 2 * rows.shape[2]) / sizes[:, None, None]
-        precision = T @ T.transpose(0, 2, 1)
+        precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         return LinearisedFrames(
             motion,
