@@ -117,7 +117,7 @@ def fit_table(
                 "command": "fit",
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-                "table": table_report(args.table, args.format, frames),
+                "table": table_report(args, frames),
                 **({} if search is None else {"choice": choice_report(search, X)}),
                 "model": model_report(estimator, X, frames.weighting, drawn["edges"]),
                 **answers,

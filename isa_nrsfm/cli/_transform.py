@@ -27,7 +27,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     """Write the coefficients of a table's rows, and return the report."""
     output = Path(args.output)
     table_suffix(output)
-    estimator, missing = read_model(args.model)
+    estimator = read_model(args)
     if args.std and not hasattr(estimator, "noise_variance_"):
         raise ValueError(
             f"--std: {args.model} was fitted with refinement={estimator.refinement!r}, "
@@ -35,7 +35,6 @@ def run(args: Namespace, warned: list[str]) -> str:
         )
     if args.viewer is None and drawing_options(args):
         raise ValueError("--edges, --skeleton and --origin need --viewer")
-    args.missing_value = [*args.missing_value, *missing]
     frames = read_frames(args, estimator)
     drawn = drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]
@@ -56,7 +55,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
-    table = table_report(args.table, args.format, frames)
+    table = table_report(args, frames)
     sections = {
         "Table": table_section(table, unusable="without coefficients"),
         "Model": [args.model],
