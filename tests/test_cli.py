@@ -317,18 +317,6 @@ def test_standard_deviations_are_written(
     assert "was fitted with refinement=None" in message
 
 
-def test_points_at_zero_cause_a_warning(fits, changed):
-    def change(faces):
-        faces.loc[[3, 9], ["x_5", "y_5"]] = 0.0
-
-    found = fits(changed(change), *NO_FIGURES, "-k", 1)
-    zeros, few = texts = found.report["warnings"]
-    assert found.err == "".join(f"isa-nrsfm: warning: {text}\n" for text in texts)
-    assert zeros.startswith("in 2 of 60 rows points are at exactly (0, 0) (2 in all).")
-    assert "--zeros-missing" in zeros
-    assert re.search(r"alpha_1 \(.* row [39]\)", few)
-
-
 def test_origin_is_not_a_missing_point(fits, fails, changed, tmp_path):
     def centre(faces):
         nose = faces[["x_30", "y_30"]].to_numpy()

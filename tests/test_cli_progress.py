@@ -11,21 +11,10 @@ from isa_nrsfm.cli._progress import show_stage, shown_progress
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 
-class Stream(io.StringIO):
-    """A stream that may be a terminal."""
-
-    def __init__(self, terminal):
-        super().__init__()
-        self.terminal = terminal
-
-    def isatty(self):
-        """Return whether it is a terminal."""
-        return self.terminal
-
-
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_latest_line_is_repeated(terminal, capsys, monkeypatch):
-    monkeypatch.setattr("sys.stderr", stream := Stream(terminal))
+    monkeypatch.setattr("sys.stderr", stream := io.StringIO())
+    monkeypatch.setattr(stream, "isatty", lambda: terminal)
     with shown_progress("program", time.perf_counter(), shortest=0.02):
         print("a stage: 1 s")
         assert stream.getvalue().count("a stage: 1 s\n") >= terminal
@@ -40,7 +29,7 @@ def test_the_latest_line_is_repeated(terminal, capsys, monkeypatch):
 
 
 def test_lines_become_rarer(monkeypatch):
-    monkeypatch.setattr("sys.stderr", stream := Stream(terminal=False))
+    monkeypatch.setattr("sys.stderr", stream := io.StringIO())
     with shown_progress("program", time.perf_counter() - 3600, shortest=0.02):
         time.sleep(0.2)
     assert stream.getvalue() == ""
