@@ -8,7 +8,6 @@ import argparse
 import math
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from isa_nrsfm import __version__
@@ -110,11 +109,6 @@ def _row_rule(text: str) -> tuple[str, re.Pattern[str]]:
         ) from error
 
 
-def _is_skeleton(text: str) -> bool:
-    """Return whether a text names a layout, or a configuration of DeepLabCut."""
-    return text in choices.SKELETON_NAMES or Path(text).suffix.lower() in CONFIGURATIONS
-
-
 def _names(text: str) -> list[str]:
     """Read names with commas between them."""
     return [name.strip() for name in text.split(",")]
@@ -129,7 +123,9 @@ TYPES: dict[str, Callable[[str], Any]] = {
     "LAYOUT": _reader(
         f"one of {', '.join(choices.SKELETON_NAMES)}, or a .yaml file",
         str,
-        _is_skeleton,
+        lambda text: (
+            text in choices.SKELETON_NAMES or text.lower().endswith(CONFIGURATIONS)
+        ),
     ),
     "MODES": _reader(
         "a whole number or a share between 0 and 1",
@@ -507,19 +503,15 @@ def build_parser() -> argparse.ArgumentParser:
                 is_one = isinstance(entry, str)
                 place = group if is_one else group.add_mutually_exclusive_group()
                 for name in [entry] if is_one else entry:
-                    _add(place, command, name)
+                    settings = OPTIONS[name] | DIFFERENT.get((command, name), {})
+                    flag = name if name in POSITIONAL else flag_of(name)
+                    place.add_argument(*SHORT.get(name, []), flag, **settings)
     return top
 
 
 def flag_of(name: str) -> str:
     """Return how an argument is written in the command line."""
     return name.upper() if name in POSITIONAL else f"--{name.replace('_', '-')}"
-
-
-def _add(group: argparse._ActionsContainer, command: str, name: str) -> None:
-    """Add an option of a command."""
-    flags = [name] if name in POSITIONAL else [*SHORT.get(name, []), flag_of(name)]
-    group.add_argument(*flags, **OPTIONS[name] | DIFFERENT.get((command, name), {}))
 
 
 def _manners(description: str, epilog: str) -> dict[str, Any]:

@@ -265,7 +265,10 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             "the coordinates are shares of the image's size, which stretch the shapes. "
             "Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    of_files = _numbers(files)
+    matches = [_NAME.fullmatch(file.name) for file in files]
+    of_files = [int(match[1]) for match in matches if match and match[1]]
+    if len(set(of_files)) < len(files):
+        of_files = list(range(len(files)))
     frames = {
         "file": [as_utf8(files[i].name) for i in image],
         "frame": [of_files[i] for i in image],
@@ -285,10 +288,3 @@ def _people_in(content: Any) -> list[dict[str, NDArray[np.float64]]]:
         for person in people
     ]
     return [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
-
-
-def _numbers(files: list[Path]) -> list[int]:
-    """Return the numbers at the end of the names of files, or else of their order."""
-    found = [_NAME.fullmatch(file.name) for file in files]
-    numbers = [int(match[1]) for match in found if match and match[1]]
-    return numbers if len(set(numbers)) == len(files) else list(range(len(files)))
