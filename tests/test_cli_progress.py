@@ -15,14 +15,14 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 def test_the_latest_line_is_repeated(terminal, capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr", stream := io.StringIO())
     monkeypatch.setattr(stream, "isatty", lambda: terminal)
-    with shown_progress("program", time.perf_counter(), shortest=0.02):
+    with shown_progress(time.perf_counter(), shortest=0.02):
         print("a stage: 1 s")
         assert stream.getvalue().count("a stage: 1 s\n") >= terminal
         show_stage("smoothing")
         time.sleep(0.5)
     lines = stream.getvalue().splitlines()
     assert ("a stage: 1 s" in lines) == terminal
-    assert 2 <= lines.count("program: 0 s: smoothing") <= 25
+    assert 2 <= lines.count("isa-nrsfm: 0 s: smoothing") <= 25
     time.sleep(0.1)
     assert stream.getvalue().splitlines() == lines
     assert capsys.readouterr().out == ""
@@ -30,7 +30,7 @@ def test_the_latest_line_is_repeated(terminal, capsys, monkeypatch):
 
 def test_lines_become_rarer(monkeypatch):
     monkeypatch.setattr("sys.stderr", stream := io.StringIO())
-    with shown_progress("program", time.perf_counter() - 3600, shortest=0.02):
+    with shown_progress(time.perf_counter() - 3600, shortest=0.02):
         time.sleep(0.2)
     assert stream.getvalue() == ""
 

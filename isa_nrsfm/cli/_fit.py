@@ -210,7 +210,7 @@ def _fitted(
 def _old_figures(folder: Path, new: list[str]) -> list[str]:
     """Return the figures that the report of an earlier run lists; warn of others."""
     old = [name for name in entry_of_report(folder, "files") if name.endswith(".png")]
-    others = [name for name in sorted(ALWAYS) if name not in (*old, *new)]
+    others = sorted({*ALWAYS}.difference(old, new))
     others = [name for name in others if (folder / name).exists()]
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
@@ -228,10 +228,7 @@ def _first_classes(asked: Columns, X: "pd.DataFrame") -> "pd.Series | None":
 
 
 def choose_n_components(
-    estimator: AffineNRSfM,
-    X: "pd.DataFrame",
-    candidates: Sequence[int],
-    groups: NDArray | None = None,
+    estimator: AffineNRSfM, X: Any, candidates: Sequence[int], groups: NDArray | None
 ) -> AffineNRSfMCV:
     """Return the fitted search for the number that best predicts held-out frames.
 
@@ -292,6 +289,5 @@ def extrapolated(tried: NDArray, seconds: NDArray, following: NDArray) -> NDArra
     """
     if len(tried) > 2:
         tried, seconds = tried[1:], seconds[1:]
-    degree = min(len(tried) - 1, 1)
-    line = np.polyfit(tried, seconds, degree)
+    line = np.polyfit(tried, seconds, min(len(tried) - 1, 1))
     return np.maximum(np.polyval(line, following), seconds[-1])

@@ -73,11 +73,7 @@ def refuse_replacing(folder: Path, names: Iterable[str]) -> None:
 
 
 def write_alpha(
-    path: Path,
-    frames: Frames,
-    alpha: NDArray,
-    std: NDArray | None,
-    further: "pd.DataFrame | None" = None,
+    path: Path, frames: Frames, alpha: NDArray, std: NDArray | None, further: Any = None
 ) -> None:
     """Write coefficients after the row number and the other columns of the table.
 

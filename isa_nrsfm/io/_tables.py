@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -377,44 +377,51 @@ def read_columns(
     if path.suffix.lower() == ".parquet":
         frame = read_parquet(path).rename(columns=lambda name: str(name).strip())
         frame = frame.drop(columns=[name for name in frame if name in leave_out])
+        frame = pd.DataFrame(
+            {n: frame[n] if n in text else _numbers_if_all(frame[n]) for n in frame}
+        )
     else:
         separator = SEPARATORS[path.suffix.lower()]
         if sum(1 for _ in checked_rows(path, separator)) <= n_header:
             raise ValueError("it has a header but no rows")
-        frame = pd.read_csv(
-            path,
-            sep=separator,
-            header=None,
-            names=names,
-            usecols=[name for name in names if name not in leave_out],
-            dtype=dict.fromkeys({*names}.difference(numbers), str),
-            skiprows=n_header,
-            index_col=False,
-            skipinitialspace=True,
-            encoding="utf-8-sig",
+        given: dict[str, Any] = {
+            "sep": separator,
+            "header": None,
+            "names": names,
+            "skiprows": n_header,
+            "index_col": False,
+            "skipinitialspace": True,
+            "encoding": "utf-8-sig",
             # As C and C++ programs on Windows write a number that is none.
-            na_values=["nan(ind)", "-nan(ind)"],
-            low_memory=False,
-        )
-    columns = {}
-    for name, cells in frame.items():
-        if name not in numbers:
-            cells = cells if name in text else _numbers_if_all(cells)
-        elif cells.dtype.kind not in "iuf":
-            cells = _as_numbers(cells)
-        columns[name] = cells
-    return pd.DataFrame(columns)
+            "na_values": ["nan(ind)", "-nan(ind)"],
+            "low_memory": False,
+        }
+        used = [name for name in names if name not in leave_out]
+        frame = pd.read_csv(path, dtype=dict.fromkeys(text, str), usecols=used, **given)
+        whole = frame.select_dtypes("integer").columns.difference(numbers)
+        for name, cells in pd.read_csv(path, dtype=str, usecols=whole, **given).items():
+            if _of_codes(cells):
+                frame[name] = cells
+    kinds = dict(frame.dtypes)
+    for name in numbers:
+        if kinds[name].kind not in "iuf":
+            frame[name] = _as_numbers(frame[name])
+    return frame
 
 
 def _numbers_if_all(column: "pd.Series") -> "pd.Series":
-    """Return a column of texts as numbers, if all are and none is a code as 007."""
+    """Return a column of texts as numbers, if all are and none is a code."""
     if not pd.api.types.is_string_dtype(column):
         return column
     column = column.replace("", None)
     numbers = pd.to_numeric(column, errors="coerce")
-    is_code = column.str.match(r"\s*[+-]?0\d+\s*$").any()
-    is_number = numbers.notna().equals(column.notna()) and not is_code
+    is_number = numbers.notna().equals(column.notna()) and not _of_codes(column)
     return numbers if is_number else column
+
+
+def _of_codes(cells: "pd.Series") -> bool:
+    """Return whether texts of whole numbers begin with zeros, as codes do."""
+    return bool(cells.str.match(r"\s*[+-]?0\d+\s*$").any())
 
 
 def _without_nulls(lines: Iterator[str]) -> Iterator[str]:
