@@ -14,14 +14,9 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
-from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.whole_files import (
-    check_replaceable,
-    files_together,
-    folder_for_writing,
-)
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._selection import standard_errors
@@ -89,11 +84,11 @@ def fit_table(
         inputs.append(args.table)
     else:
         results = results | {Path(args.table).name: "the table"}
-    with folder_for_writing(folder):
+    with whole_files.folder_for_writing(folder):
         files = [*results, *figures, REPORT]
         refuse_overwriting(inputs, [folder / name for name in files])
         for name in files:
-            check_replaceable(folder / name)
+            whole_files.check_replaceable(folder / name)
         if not args.force:
             refuse_replacing(folder, files)
         removed = {*_old_figures(folder, files), *figures}
@@ -102,7 +97,7 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, asked, estimator, frames)
         show_stage("tables")
-        with files_together(folder, removed=removed) as new:
+        with whole_files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             std = estimator.alpha_std_ if args.std else None
@@ -131,7 +126,7 @@ def fit_table(
         if not figures:
             return report
         # A figure that fails, or takes long, costs no results: they are in place.
-        with files_together(folder) as new:
+        with whole_files.files_together(folder) as new:
             if digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "

@@ -168,10 +168,9 @@ def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
     """Return a column of a table, without regard to blanks around its name."""
     by_name = {str(each).strip(): each for each in table.columns}
     if name.strip() not in by_name:
-        names = [each for each in by_name if each]
         raise ValueError(
             f"{option}: the table has no column {name!r}; its columns are "
-            f"{first_items(names, 8) or 'none'}"
+            f"{first_items(filter(None, by_name), 8) or 'none'}"
         )
     return table[by_name[name.strip()]]
 
