@@ -8,12 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._linalg.small_matrices import procrustes
 from isa_nrsfm._metric_upgrade.metric import (
-    CalibratedCamera,
     MetricFit,
     exponential,
-    fit_at,
     refine_metric,
-    strain_basis,
 )
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,
@@ -249,30 +246,31 @@ def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
 
     Starts without strains. Usable cameras are (I, 2, 3), coefficients (I, K).
     """
-    camera: CalibratedCamera = "weak_perspective"
-    size = len(strain_basis(camera))
+    size = len(rigid.curvature)
     n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, OF_DIFFERENCES**2)
     # Larger strains than these are taken for errors of the affine cameras.
     variance = most_variance = 0.3**2
-    none = np.zeros((alpha.shape[1], 3, 3))
-    fit = fit_at(cameras, alpha, rigid.Q, none, camera)
+    Q, strain = rigid.Q, np.zeros((alpha.shape[1], 3, 3))
     for _ in range(15):
         ridge = noise / variance
-        fit = refine_metric(cameras, alpha, fit, camera, ridge, 1e-4)
+        fit = refine_metric(
+            cameras, alpha, (Q, strain), "weak_perspective", ridge, 1e-4
+        )
+        Q, strain = fit.Q, fit.strain
         # Curvature in the strains, with the common metric eliminated (a Schur
         # complement), and the effective number of strain parameters from it.
         mixed = fit.curvature[:size, size:]
         inverse = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
         own = fit.curvature[size:, size:] - mixed.T @ inverse @ mixed
-        values = np.maximum(np.linalg.eigvalsh(own), 0.0)
-        n_effective = float(np.sum(values / (values + ridge)))
+        values = np.maximum(np.linalg.eigvalsh(own), ridge)
+        n_effective = float(np.sum(1.0 - ridge / values))
         # The two variances: sums of squares over effective numbers (MacKay).
         freedom = max(n_equations - size - n_effective, 0.1 * n_equations)
         previous = noise, variance
         noise = max(fit.cost / freedom, OF_DIFFERENCES**2)
-        variance = np.sum(fit.strain**2) / max(n_effective, 1e-3)
+        variance = np.sum(strain**2) / max(n_effective, 1e-3)
         variance = np.clip(variance, OF_DIFFERENCES, most_variance)
         if np.abs(np.log([noise, variance]) - np.log(previous)).max() < 0.05:
             break
-    return refine_metric(cameras, alpha, fit, camera, ridge)
+    return refine_metric(cameras, alpha, (Q, strain), "weak_perspective", ridge)

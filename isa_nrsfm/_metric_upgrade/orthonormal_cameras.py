@@ -7,7 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm._metric_upgrade.metric import levenberg_marquardt
+from isa_nrsfm._metric_upgrade.metric import (
+    levenberg_marquardt,
+    normal_equations,
+)
 
 # Number of columns that are added at a time: a basis shape has three.
 STEP = 3
@@ -27,10 +30,9 @@ def orthonormal_mixture(
     L = np.zeros((0, n)) if penalty is None else penalty
 
     def evaluated(Q: NDArray) -> tuple[float, NDArray, NDArray]:
-        residuals, J = _linearised(Q, basis, L)
-        return float(residuals @ residuals), J.T @ J, J.T @ residuals
+        return normal_equations(*_linearised(Q, basis, L))
 
-    def minimised(Q: NDArray, max_steps: int) -> tuple[NDArray, float]:
+    def minimised(Q: NDArray, max_steps: int) -> tuple[NDArray, float, NDArray]:
         return levenberg_marquardt(
             evaluated,
             Q,
@@ -45,8 +47,8 @@ def orthonormal_mixture(
         # close to it.
         triples = [np.column_stack(triple) for triple in combinations(np.eye(n), 3)]
         rough = [minimised(Q, 8) for Q in (start, *triples)]
-        start, _ = min(rough, key=itemgetter(1))
-    return minimised(start, max_iter)
+        start, *_ = min(rough, key=itemgetter(1))
+    return minimised(start, max_iter)[:2]
 
 
 def orthonormality_residuals(cameras: NDArray) -> NDArray:

@@ -10,7 +10,6 @@ from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._metric_upgrade.metric import (
     CalibratedCamera,
     MetricFit,
-    fit_at,
     mean_gram,
     metric_quadric,
     refine_metric,
@@ -55,8 +54,7 @@ def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> MetricFit:
     for G in (np.linalg.inv(gram), metric_quadric(cameras)):
         if G is not None:
             Q = safe_start(cameras, G, camera)
-            start = fit_at(cameras, no_alpha, Q, no_strain, camera)
-            fits.append(refine_metric(cameras, no_alpha, start, camera))
+            fits.append(refine_metric(cameras, no_alpha, (Q, no_strain), camera))
     return min(fits, key=lambda fit: fit.cost)
 
 
