@@ -16,14 +16,14 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class, check_frames_kept, frames_of
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.projection import compose
-from isa_nrsfm._metric_upgrade.deforming import (
+from isa_nrsfm.calibration import (
     DeformationMetric,
     EuclideanFrames,
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm._metric_upgrade.metric import unit_cameras
-from isa_nrsfm._metric_upgrade.rigid import usable_cameras
+from isa_nrsfm.calibration._metric import unit_cameras
+from isa_nrsfm.calibration._metric_upgrade import usable_cameras
 from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,

@@ -7,19 +7,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._linalg.small_matrices import procrustes
-from isa_nrsfm._metric_upgrade.metric import (
+from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm.calibration._metric import (
     MetricFit,
     exponential,
     refine_metric,
 )
-from isa_nrsfm._metric_upgrade.rigid import (
+from isa_nrsfm.calibration._metric_upgrade import (
     fit_metric,
     nearest_rotations,
     symmetric_upgrade,
     usable_cameras,
     warn_if_degenerate,
 )
-from isa_nrsfm._tables.tracks import of_all_rows
 
 
 class DeformationMetric(NamedTuple):

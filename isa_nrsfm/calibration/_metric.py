@@ -282,9 +282,9 @@ def refine_metric(
         cost, curvature, gradient = (sum(each) for each in zip(*terms, strict=True))
         values = np.linalg.eigvalsh(Q.T @ gram @ Q)
         deep = values[0] > OF_RANKS * values[-1]
-        cost = cost + ridge * np.sum(strain**2) if deep else np.inf
+        objective = cost + ridge * float(np.sum(strain**2)) if deep else np.inf
         numbers = np.einsum("kab,nab->kn", [np.zeros((3, 3)), *strain], basis).ravel()
-        return cost, curvature + np.diag(ridges), gradient + ridges * numbers
+        return objective, curvature + np.diag(ridges), gradient + ridges * numbers
 
     def moved(state: tuple[NDArray, NDArray], step: NDArray) -> tuple[NDArray, NDArray]:
         """Return the metric after a step that changes no log metric by more than 2."""
