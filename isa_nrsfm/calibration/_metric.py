@@ -21,7 +21,7 @@ with respect to these.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,6 @@ STRETCH_OF_START = 3.0
 ROW_PRODUCTS = np.array([[[1.0, 0, 1], [0, 1, 0]], [[0, 1, 0], [-1, 0, 1]]])
 
 CalibratedCamera = Literal["orthographic", "weak_perspective"]
-State = TypeVar("State")
 
 
 def unit_cameras(motion: NDArray) -> NDArray:
@@ -127,15 +126,15 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
 class MetricFit(NamedTuple):
     """A metric of least residuals.
 
-    Q (3, 3): ``G = Q Q^T`` is the metric of frames without deformation.
-    strain (K, 3, 3): E_k, symmetric with trace zero.
+    metric (K + 1, 3, 3): Q with ``G = Q Q^T``, the metric of frames without
+    deformation, and the strains E_k, symmetric with trace zero.
+    n_frames: number of cameras.
     cost: sum of the squared residuals.
     curvature: ``J^T J`` with the Jacobian of the residuals in the coordinates of E_0,
     E_1, ... in `strain_basis`, plus the ridge of the strains.
     """
 
-    Q: NDArray
-    strain: NDArray
+    metric: NDArray
     n_frames: int
     cost: float
     curvature: NDArray
@@ -148,7 +147,7 @@ class MetricFit(NamedTuple):
     @property
     def condition_number(self) -> float:
         """Condition number of the residuals as functions of the common metric."""
-        size = len(self.curvature) // (len(self.strain) + 1)
+        size = len(self.curvature) // len(self.metric)
         values = np.linalg.eigvalsh(self.curvature[:size, :size])
         if values[0] <= OF_PRODUCTS * values[-1]:
             return np.inf
@@ -201,14 +200,14 @@ def normal_equations(r: NDArray, J: NDArray) -> tuple[float, NDArray, NDArray]:
 
 
 def levenberg_marquardt(
-    evaluated: Callable[[State], tuple[float, NDArray, NDArray]],
-    state: State,
-    moved: Callable[[State, NDArray], State],
+    evaluated: Callable[[NDArray], tuple[float, NDArray, NDArray]],
+    moved: Callable[[NDArray, NDArray], NDArray],
+    state: NDArray,
     *,
     max_steps: int,
     shortest_step: float = 0.0,
     least_gain: float = -np.inf,
-) -> tuple[State, float, NDArray]:
+) -> tuple[NDArray, float, NDArray]:
     """Minimise a sum of squares; return the last state, its cost and ``J^T J``.
 
     `evaluated` returns the cost of a state, ``J^T J`` and ``J^T r``; `moved` the state
@@ -255,14 +254,14 @@ def safe_start(motion: NDArray, G: NDArray, camera: CalibratedCamera) -> NDArray
 def refine_metric(
     motion: NDArray,
     alpha: NDArray,
-    start: tuple[NDArray, NDArray],
+    start: NDArray,
     camera: CalibratedCamera,
     ridge: float = 0.0,
     shortest_step: float = 1e-9,
 ) -> MetricFit:
-    """Minimise ``sum_i |residuals_i|^2 + ridge * sum_k ||E_k||_F^2`` from Q and E_k.
+    """Minimise ``sum_i |residuals_i|^2 + ridge * sum_k ||E_k||_F^2`` from a metric.
 
-    Cameras (I, 2, 3) are finite and not zero, alpha is (I, K).
+    Cameras (I, 2, 3) are finite and not zero, alpha is (I, K), the start (K + 1, 3, 3).
     """
     # The unknowns of a step are coordinates in this basis: of E_0, which is zero at
     # each iterate, and of the strains E_k.
@@ -272,34 +271,30 @@ def refine_metric(
     # Bound of the change of the metric of a frame by one entry of a step
     reach = 1.0 + np.abs(alpha).sum(axis=1).max(initial=0.0)
 
-    def evaluated(state: tuple[NDArray, NDArray]) -> tuple[float, NDArray, NDArray]:
+    def evaluated(metric: NDArray) -> tuple[float, NDArray, NDArray]:
         """Return the objective; infinite where space hardly has depth."""
-        Q, strain = state
+        Q, strain = metric[0], metric[1:]
         terms = [
             normal_equations(*linearised(motion[part] @ Q, alpha[part], strain, camera))
             for part in gen_batches(len(motion), BLOCK_FRAMES)
         ]
         cost, curvature, gradient = (sum(each) for each in zip(*terms, strict=True))
+        numbers = np.einsum("kab,nab->kn", metric, basis).ravel()
         values = np.linalg.eigvalsh(Q.T @ gram @ Q)
         deep = values[0] > OF_RANKS * values[-1]
-        objective = cost + ridge * float(np.sum(strain**2)) if deep else np.inf
-        numbers = np.einsum("kab,nab->kn", [np.zeros((3, 3)), *strain], basis).ravel()
+        objective = float(cost + ridges @ numbers**2) if deep else np.inf
         return objective, curvature + np.diag(ridges), gradient + ridges * numbers
 
-    def moved(state: tuple[NDArray, NDArray], step: NDArray) -> tuple[NDArray, NDArray]:
+    def moved(metric: NDArray, step: NDArray) -> NDArray:
         """Return the metric after a step that changes no log metric by more than 2."""
         step = step * min(1.0, 2.0 / max(reach * np.abs(step).max(), 1e-300))
         changes = np.tensordot(step.reshape(-1, len(basis)), basis, 1)
-        return state[0] @ exponential(changes[0] / 2), state[1] + changes[1:]
+        values, axes = np.linalg.eigh(changes[0] / 2)
+        Q = metric[0] @ ((axes * np.exp(values)) @ axes.T)
+        return np.concatenate([Q[None], metric[1:] + changes[1:]])
 
-    (Q, strain), cost, curvature = levenberg_marquardt(
-        evaluated, start, moved, max_steps=200, shortest_step=shortest_step
+    metric, cost, curvature = levenberg_marquardt(
+        evaluated, moved, start, max_steps=200, shortest_step=shortest_step
     )
-    cost -= ridge * float(np.sum(strain**2))
-    return MetricFit(Q, strain, len(motion), cost, curvature)
-
-
-def exponential(matrices: NDArray) -> NDArray:
-    """Return the exponentials of symmetric matrices (..., 3, 3)."""
-    values, axes = np.linalg.eigh(matrices)
-    return (axes * np.exp(values)[..., None, :]) @ axes.mT
+    cost -= ridge * float(np.sum(metric[1:] ** 2))
+    return MetricFit(metric, len(motion), cost, curvature)

@@ -1,5 +1,6 @@
 """Metric upgrade of affine cameras of a rigid shape, and Euclidean shapes."""
 
+from operator import attrgetter
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -7,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
 from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS
 from isa_nrsfm._tables.tracks import of_all_rows
 from isa_nrsfm.calibration._metric import (
@@ -166,12 +167,12 @@ def metric_upgrade(
     if camera not in CALIBRATED_CAMERAS:
         raise ValueError(f"camera must be one of {CALIBRATED_CAMERAS}; got {camera!r}")
     fit = fit_metric(cameras[usable], camera)
-    _, Q = symmetric_upgrade(fit.Q, cameras[usable])
-    rotations, stretches = nearest_rotations(cameras[usable] @ Q)
-    scales = np.trace(stretches, axis1=1, axis2=2) / 2
+    _, Q = symmetric_upgrade(fit.metric[0], cameras[usable])
+    rows, scales = nearest_calibrated(cameras[usable] @ Q)
     if camera == "orthographic":
-        scales = np.ones(len(scales))
-    rotations, scales = (of_all_rows(each, usable) for each in (rotations, scales))
+        scales = np.ones_like(scales)
+    parts = full_rotations(rows)[0], scales
+    rotations, scales = (of_all_rows(values, usable) for values in parts)
     warn_if_degenerate(fit.condition_number)
     return MetricUpgrade(Q, rotations, scales, fit.residual, fit.condition_number)
 
@@ -231,23 +232,20 @@ def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]
 
 def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> MetricFit:
     """Return the best metric of usable cameras (n_frames, 2, 3), from two starts."""
-    eigenvalues = np.zeros(3)
-    if len(cameras):
-        gram = mean_gram(unit_cameras(cameras))
-        eigenvalues = np.linalg.eigvalsh(gram)
-    seen = eigenvalues > OF_RANKS * eigenvalues[-1]
-    if not seen.all():
+    gram = mean_gram(unit_cameras(cameras)) if len(cameras) else np.zeros((3, 3))
+    eigenvalues = np.linalg.eigvalsh(gram)
+    n_seen = np.count_nonzero(eigenvalues > OF_RANKS * eigenvalues[-1])
+    if n_seen < 3:
         raise ValueError(
             "a metric upgrade needs cameras that together see three directions of "
-            f"space; the {len(cameras)} usable cameras see {seen.sum()}"
+            f"space; the {len(cameras)} usable cameras see {n_seen}"
         )
-    no_alpha, no_strain = np.zeros((len(cameras), 0)), np.zeros((0, 3, 3))
-    fits = []
-    for G in (np.linalg.inv(gram), metric_quadric(cameras)):
-        if G is not None:
-            Q = safe_start(cameras, G, camera)
-            fits.append(refine_metric(cameras, no_alpha, (Q, no_strain), camera))
-    return min(fits, key=lambda fit: fit.cost)
+    alpha, metrics = np.zeros((len(cameras), 0)), [np.linalg.inv(gram)]
+    if (G := metric_quadric(cameras)) is not None:
+        metrics.append(G)
+    starts = [safe_start(cameras, G, camera)[None] for G in metrics]
+    fits = [refine_metric(cameras, alpha, start, camera) for start in starts]
+    return min(fits, key=attrgetter("cost"))
 
 
 def best_metric(motion: NDArray) -> NDArray:
@@ -260,7 +258,7 @@ def best_metric(motion: NDArray) -> NDArray:
         fit = fit_metric(cameras[usable], "weak_perspective")
     except ValueError:
         return np.eye(3)
-    return symmetric_upgrade(fit.Q, cameras[usable])[1]
+    return symmetric_upgrade(fit.metric[0], cameras[usable])[1]
 
 
 def symmetric_upgrade(Q: NDArray, cameras: NDArray) -> tuple[NDArray, NDArray]:
@@ -274,14 +272,6 @@ def symmetric_upgrade(Q: NDArray, cameras: NDArray) -> tuple[NDArray, NDArray]:
     rows = cameras @ Q
     area = np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=1)
     return turn, Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))
-
-
-def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
-    """Return rotations (I, 3, 3) and stretches P (I, 2, 2): cameras are ``P R[:2]``."""
-    rows, values, axes = polar(cameras)
-    depth = np.cross(rows[:, 0], rows[:, 1])
-    stretches = (axes * values[:, None]) @ axes.mT
-    return np.concatenate([rows, depth[:, None]], axis=1), stretches
 
 
 def warn_if_degenerate(condition_number: float) -> None:

@@ -1,5 +1,6 @@
 """Orthographic cameras: mixtures of columns of a motion factor, orthonormal in rows."""
 
+from functools import partial
 from itertools import combinations
 from operator import itemgetter
 from typing import NamedTuple
@@ -173,23 +174,18 @@ def orthonormal_mixture(
     def evaluated(Q: NDArray) -> tuple[float, NDArray, NDArray]:
         return normal_equations(*_linearised(Q, basis, L))
 
-    def minimised(Q: NDArray, max_steps: int) -> tuple[NDArray, float, NDArray]:
-        return levenberg_marquardt(
-            evaluated,
-            Q,
-            lambda Q, step: Q + step.reshape(Q.shape),
-            max_steps=max_steps,
-            least_gain=1e-9,
-        )
+    def moved(Q: NDArray, step: NDArray) -> NDArray:
+        return Q + step.reshape(Q.shape)
 
+    minimised = partial(levenberg_marquardt, evaluated, moved, least_gain=1e-9)
     start = np.vstack([mixing, np.zeros((n - len(mixing), 3))])
     if len(mixing) == 3 < n <= 3 + STEP:
         # The best of about twenty starts after some steps leads to the least cost, or
         # close to it.
         triples = [np.column_stack(triple) for triple in combinations(np.eye(n), 3)]
-        rough = [minimised(Q, 8) for Q in (start, *triples)]
+        rough = [minimised(Q, max_steps=8) for Q in (start, *triples)]
         start, *_ = min(rough, key=itemgetter(1))
-    return minimised(start, max_iter)[:2]
+    return minimised(start, max_steps=max_iter)[:2]
 
 
 def orthonormality_residuals(cameras: NDArray) -> NDArray:

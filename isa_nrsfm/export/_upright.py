@@ -23,7 +23,6 @@ from isa_nrsfm.calibration import (
     euclidean_frames,
 )
 from isa_nrsfm.calibration._metric import unit_cameras
-from isa_nrsfm.calibration._metric_upgrade import usable_cameras
 from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,
@@ -86,9 +85,8 @@ def upright_space(
     else:
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
-        cameras, usable = usable_cameras(model.motion_)
         transform = viewing_rotation(
-            unit_cameras(cameras[usable] @ metric.Q),
+            unit_cameras(model.motion_ @ metric.Q),
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )
