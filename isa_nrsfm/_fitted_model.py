@@ -14,7 +14,6 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._frames.search import FramePosterior
-from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.tracks import (
     Layout,
@@ -24,6 +23,7 @@ from isa_nrsfm._tables.tracks import (
     tracks_to_table,
     weighted_sizes,
 )
+from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 
 
 class UncertainShapes(NamedTuple):
