@@ -49,10 +49,14 @@ from isa_nrsfm._gauge.canonical import (
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
-from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.jackknife import depth_certainty
-from isa_nrsfm._joint.problem import FactorisedTable, JointOptions, JointSettings
-from isa_nrsfm._joint.quasi_newton import JointState
+from isa_nrsfm._joint.likelihood import JointFrames
+from isa_nrsfm._joint.problem import (
+    FactorisedTable,
+    JointOptions,
+    JointSettings,
+    JointState,
+)
 from isa_nrsfm._joint.sample_posterior import (
     LEAST_RELIABILITY,
     posterior_blocks,

@@ -13,7 +13,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
-from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.sample_posterior import (
     inlying_rows,
     posterior_blocks,

@@ -21,8 +21,7 @@ from sklearn.preprocessing import StandardScaler
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.depth import NOT_ESTIMATED
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import MarginalLikelihood
+from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import weighted_sizes
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -306,8 +305,10 @@ class TestFrames:
         scene = random_scene(noise=0.05, kind="missing")
         rows = FrameBlocks.of_array(scene.centred.transpose(0, 2, 1), 7)
         weights = 3.0 * scene.weights
-        likelihood = MarginalLikelihood(JointFrames.from_repeated(rows, weights), 0.1)
-        assert likelihood.n_seen == pytest.approx(2 * weights.sum())
+        likelihood = MarginalLikelihood(
+            JointFrames.from_points(rows, False, weights), 0.1
+        )
+        assert likelihood.frames.totals[0] == pytest.approx(2 * weights.sum())
         at = likelihood(scene.shapes, scene.motion, 0.01)
         turn, step = rng.normal(size=scene.shapes.shape), 1e-6
         moved = (scene.shapes + s * turn for s in (step, -step))
@@ -324,7 +325,7 @@ class TestFrames:
         counts = np.arange(20) % 3 + 1
         rows = FrameBlocks.of_array(scene.centred.transpose(0, 2, 1), 7)
         weights = np.broadcast_to(counts, scene.tracks.shape[:2]).astype(float)
-        found = MarginalLikelihood(JointFrames.from_repeated(rows, weights), 0.1)
+        found = MarginalLikelihood(JointFrames.from_points(rows, False, weights), 0.1)
         many = np.repeat(np.arange(20), counts)
         repeated = FrameBlocks.of_array(scene.centred[:, many].transpose(0, 2, 1), 7)
         repeated = repeated.derive(np.ascontiguousarray)
@@ -340,7 +341,7 @@ class TestFrames:
     def test_parts_keep_the_numbers(self):
         scene = random_scene(kind="weighted")
         rows = FrameBlocks.of_array(scene.centred.transpose(0, 2, 1), 7)
-        part = JointFrames.from_repeated(rows, scene.weights).take(np.arange(5))
+        part = JointFrames.from_points(rows, False, scene.weights).take(np.arange(5))
         assert part.totals[0] == pytest.approx(2 * scene.weights[:5].sum())
 
     def test_sizes(self, rng):

@@ -32,10 +32,8 @@ from isa_nrsfm._joint.common_depths import (
     aligning_rotations,
     common_coordinates,
 )
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.problem import JointSettings
-from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
+from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.problem import JointSettings, JointState, refine_joint
 from isa_nrsfm._joint.sample_posterior import inlying_rows
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
@@ -274,21 +272,18 @@ def group_fit(
     # Fixed cameras, without the prior, which would make basis shapes vanish
     blocks = FrameBlocks.of_array(tracks, len(tracks))
     part = JointFrames.from_points(blocks, bool(seen.all()))
-    free = MarginalLikelihood(part, 0.0)
-    refined = partial(
-        refine_joint,
-        least_noise=scene.floor * free.n_seen / free.square,
-        tol=0.1 * settings.tol,
-    )
+    free, (n_seen, square) = MarginalLikelihood(part), part.totals
+    least, tol = scene.floor * n_seen / square, 0.1 * settings.tol
+    refined = partial(refine_joint, least_noise=least, tol=tol)
     start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
     likelihood = MarginalLikelihood(part, scene.price / len(frames))
-    alpha = free.coefficients(*start)
+    alpha = free(*start).alpha
     shapes = likely_basis(start.shapes, motion, alpha, likelihood.penalty)
     start, orthographic = start._replace(shapes=shapes), CAMERAS["orthographic"]
     most = min(settings.max_iter, MOST_STEPS)
     state = refined(likelihood, start, orthographic, max_iter=most).state
-    alpha = likelihood.coefficients(*state)
+    alpha = likelihood(*state).alpha
     rotations, scales = full_rotations(state.motion)
     turned = scales[:, None, None] * rotations
     S = turned @ (state.shapes[0] + np.tensordot(alpha, state.shapes[1:], 1))

@@ -22,10 +22,8 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
 from isa_nrsfm._frames.models import PosteriorFrames
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, MarginalLikelihood
-from isa_nrsfm._joint.problem import JOINT_OPTIONS
-from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
+from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.problem import JOINT_OPTIONS, JointState, refine_joint
 from isa_nrsfm._joint.sample_posterior import inlying_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
@@ -120,10 +118,8 @@ class _Refit:
         rows, self.kept = rows[:, :, kept], kept
         shapes = shapes[:, :, kept] - shapes[:, :, kept].mean(axis=2, keepdims=True)
         blocks = FrameBlocks.of_array(rows, len(rows))
-        if weights is None:
-            part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()))
-        else:
-            part = JointFrames.from_repeated(blocks, weights[:, kept])
+        weights = None if weights is None else weights[:, kept]
+        part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), weights)
         n_numbers, energy = part.totals
         penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
         likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
@@ -138,7 +134,7 @@ class _Refit:
             tol=TOL,
         ).state
         self.rotations, scales = full_rotations(state.motion)
-        self.alpha = likelihood.coefficients(*state)
+        self.alpha = likelihood(*state).alpha
         z = np.einsum("ia,kaj->ikj", self.rotations[:, 2], state.shapes)
         z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", self.alpha, z[:, 1:]))
         self.depths = z - z.mean(axis=1, keepdims=True)

@@ -10,7 +10,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import distances, stacked_motion
 from isa_nrsfm._frames.search import FramePosterior
-from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._tables.blocks import FrameBlocks
 
 # With a robust loss, points with residuals above this threshold, in standard deviations

@@ -19,8 +19,12 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rigid_cameras,
 )
-from isa_nrsfm._joint.problem import JOINT_OPTIONS, FactorisedTable, JointProblem
-from isa_nrsfm._joint.quasi_newton import JointState
+from isa_nrsfm._joint.problem import (
+    JOINT_OPTIONS,
+    FactorisedTable,
+    JointProblem,
+    JointState,
+)
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
@@ -161,7 +165,7 @@ def best_starts(
             shapes = lifted_shapes(seen, motion[few], n_components)
         state = _first_state(part, seen, motion[few], shapes)
         fit = part.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
-        trials.append((fit.value, fit.state, motion))
+        trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
     motion, shapes = rigid_start(
@@ -188,7 +192,7 @@ def best_starts(
         fit = part.refined(state, cameras, max_iter=30)
         motion = motion.copy()
         motion[few] = fit.state.motion
-        freed.append((fit.value, fit.state._replace(motion=motion)))
+        freed.append((fit.history[-1], fit.state._replace(motion=motion)))
     freed.sort(key=itemgetter(0))
     return [with_prior(problem, state) for _, state in freed[: 3 if thorough else 1]]
 
@@ -205,7 +209,7 @@ def _first_state(
 def with_prior(problem: JointProblem, state: JointState) -> JointState:
     """Return a state with its basis shapes mixed and scaled to the likeliest basis."""
     shapes, motion, _ = state
-    alpha = problem.likelihood.coefficients(*state)
+    alpha = problem.likelihood(*state).alpha
     shapes = likely_basis(shapes, motion, alpha, problem.penalty)
     return state._replace(shapes=shapes)
 
