@@ -13,9 +13,9 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
-from isa_nrsfm._joint import jackknife
-from isa_nrsfm._joint.jackknife import N_GROUPS, depth_certainty, neighbours
+from isa_nrsfm._joint import uncertainty
 from isa_nrsfm._joint.likelihood import extent_penalty
+from isa_nrsfm._joint.uncertainty import N_GROUPS, depth_certainty, neighbours
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses, write_viewer
@@ -280,7 +280,7 @@ class TestJackknife:
                 n = self.number
                 return n, n * np.eye(3), n * self.kept
 
-        monkeypatch.setattr(jackknife, "_Refit", Refit)
+        monkeypatch.setattr(uncertainty, "_Refit", Refit)
         still = np.zeros((0, 2)), "linear", FrameMap.identity(2)
         frames = PosteriorFrames(shapes, 1e-4, *still)
         frames = replace(frames, camera="orthographic")
@@ -315,7 +315,7 @@ class TestJackknife:
         depths = mirror[2] * (part + off)
         fit = SimpleNamespace(kept=kept, depths=depths, rotations=turns)
         whole = SimpleNamespace(depths=z, rotations=rotations.as_matrix())
-        total, turns, points = jackknife._Refit.errors(fit, whole)
+        total, turns, points = uncertainty._Refit.errors(fit, whole)
         assert total == pytest.approx(np.sum(off**2) / np.sum(part**2))
         assert_allclose(points[kept], np.mean(off**2, axis=0))
         assert points[3] == 0.0

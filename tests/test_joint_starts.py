@@ -28,7 +28,7 @@ from isa_nrsfm._joint.starts import (
     mixed_cameras,
     rigid_start,
 )
-from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._paper.pipeline import Factorisation, factorise
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 

@@ -34,8 +34,8 @@ from isa_nrsfm._joint.common_depths import (
 )
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JointSettings, JointState, refine_joint
-from isa_nrsfm._joint.sample_posterior import inlying_rows
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
+from isa_nrsfm._joint.uncertainty import inlying_rows
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import representative_frames, spread
@@ -86,25 +86,24 @@ class Group(NamedTuple):
     """
 
     points: NDArray
+    weight: float
     frames: NDArray
     coordinates: NDArray
     noise: float
-    weight: float
 
 
 def consensus(
     model: PosteriorFrames,
     rows: FrameBlocks,
     settings: JointSettings,
-    n_components: int | None,
     most: int,
-    n_jobs: int | None = None,
+    free: bool,
 ) -> tuple[NDArray, float, NDArray, NDArray | None]:
     """Fit groups of neighbouring points, and merge them.
 
     The model is a joint fit with calibrated cameras, the rows are frames (I, 2, J) of
-    size one, NaN where a point is missing. Without a number of basis shapes, as many
-    are kept as exceed the noise, at most `most`.
+    size one, NaN where a point is missing. There are `most` basis shapes, or if their
+    number is free at most as many, those that exceed the noise.
 
     Returns centred shapes (K + 1, 3, J) for coefficients of variance one, the noise
     variance of a coordinate, the coefficients (n, K) of some frames, and the mean
@@ -135,7 +134,7 @@ def consensus(
     # Groups cannot improve a fit whose noise is below their floor.
     if noise >= scene.floor:
         n_fitted = len(model.shapes) - 1
-        groups = fitted_groups(scene, distances, n_fitted, settings, n_jobs)
+        groups = fitted_groups(scene, distances, n_fitted, settings)
     if groups:
         noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
         share = 1.0 - scene.floor / noise
@@ -153,11 +152,8 @@ def consensus(
     if groups:
         R = aligning_rotations(centred(S[:, :, chosen]), noise)
         S = R.mT @ S
-    if n_components is None:
-        merged_shapes, alpha, rest = principal_shapes(S, most, LEFT * noise)
-    else:
-        merged_shapes, alpha, rest = principal_shapes(S, n_components)
-    return merged_shapes, noise + rest, alpha, variances
+    shapes, alpha, rest = principal_shapes(S, most, LEFT * noise if free else 0.0)
+    return shapes, noise + rest, alpha, variances
 
 
 def together(
@@ -185,24 +181,17 @@ def together(
 
 
 def fitted_groups(
-    scene: Scene,
-    distances: NDArray,
-    n_components: int,
-    settings: JointSettings,
-    n_jobs: int | None,
+    scene: Scene, distances: NDArray, n_components: int, settings: JointSettings
 ) -> list[Group]:
     """Return the fits of all groups."""
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
     sizes = [size for size in SIZES if size <= largest]
     tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
-    quiet = settings._replace(on_step=None)
+    quiet, rows, first = settings._replace(on_step=None), scene.rows, scene.first
     # In the order of memory that pickled arrays have, else rounding errors differ.
-    fits = Parallel(n_jobs=n_jobs, return_as="generator")(
+    fits = Parallel(n_jobs=settings.n_jobs, return_as="generator")(
         delayed(group_fit)(
-            scene._replace(
-                rows=np.take(scene.rows, points, axis=2),
-                first=np.take(scene.first, points, axis=2),
-            ),
+            scene._replace(rows=rows.take(points, 2), first=first.take(points, 2)),
             n_components,
             quiet,
         )
@@ -213,8 +202,7 @@ def fitted_groups(
         if settings.on_step is not None:
             settings.on_step()
         if fit is not None:
-            frames, coordinates, noise = fit
-            groups.append(Group(points, frames, coordinates, noise, count))
+            groups.append(Group(points, count, *fit))
     return groups
 
 
@@ -310,17 +298,13 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
     weighted_groups = []
     for size in sorted({len(group.points) for group in groups}):
         same = [group for group in groups if len(group.points) == size]
-        merged = merge(scene, same)[:, 2]
-        off = [
-            group.weight
-            * np.mean(centred(group.coordinates[:, 2] - merged[place(group)]) ** 2)
-            for group in same
-        ]
-        total = sum(group.weight for group in same)
-        weight = 1.0 / (size * (sum(off) / total + rounding))
-        weighted_groups += [
-            group._replace(weight=weight * group.weight) for group in same
-        ]
+        merged, off, total = merge(scene, same)[:, 2], 0.0, 0.0
+        for group in same:
+            rest = group.coordinates[:, 2] - merged[np.ix_(group.frames, group.points)]
+            off += group.weight * np.mean(centred(rest) ** 2)
+            total += group.weight
+        factor = 1.0 / (size * (off / total + rounding))
+        weighted_groups += [g._replace(weight=factor * g.weight) for g in same]
     return weighted_groups
 
 
@@ -339,7 +323,7 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     weight, total = np.full(b.shape, small), small * scene.first[:, :2]
     for group in groups:
         frames, points = group.frames, group.points
-        n, at = len(points), place(group)
+        n, at = len(points), np.ix_(frames, points)
         A[np.ix_(frames, points, points)] += group.weight * (np.eye(n) - 1.0 / n)
         b[at] += group.weight * centred(group.coordinates[:, 2])
         weight[at] += group.weight
@@ -351,11 +335,6 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     depths = np.linalg.solve(A, b[:, :, None])
     images = images + share * (fitted - images)
     return np.concatenate([images, depths.mT], axis=1)
-
-
-def place(group: Group) -> tuple[NDArray, ...]:
-    """Return the index of the frames and points of a group in an array (I, n)."""
-    return np.ix_(group.frames, group.points)
 
 
 def centred(depths: NDArray) -> NDArray:

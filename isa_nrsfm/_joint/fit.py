@@ -68,7 +68,7 @@ def fit_jointly(
     corrected for degrees of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
-    first, sampled, n_components = problems[0], len(problems) > 1, len(paper_shapes) - 1
+    first, sampled = problems[0], len(problems) > 1
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is None:
         fit, start = _first_fit(first, table, paper_shapes)
@@ -77,7 +77,7 @@ def fit_jointly(
         start = first.aligned(start._replace(shapes=shapes))
         fit = first.unreversed(start, first.cameras)
     ratio = fit.camera_noise_ratio
-    fit, least_noise, sufficient = judged(first, fit, start, table, n_components)
+    fit, least_noise, sufficient = judged(first, table, fit, start)
     if sufficient:
         problems = [replace(problem, penalty=0.0) for problem in problems]
         if not sampled:  # for a sufficient model a smaller tolerance is safe
@@ -235,11 +235,7 @@ def _end(fit: JointFit) -> float:
 
 
 def judged(
-    problem: JointProblem,
-    fit: JointFit,
-    start: JointState,
-    table: FactorisedTable,
-    n_components: int,
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, start: JointState
 ) -> tuple[JointFit, float, bool]:
     """Decide whether K is sufficient and refit accordingly.
 
@@ -254,6 +250,7 @@ def judged(
     """
     options, mean_square = problem.settings.options, problem.mean_square
     cameras, least_noise = problem.cameras, options.least_noise
+    n_components = len(start.shapes) - 1
     noise_level = table.noise_level(n_components)
     # A spectrum of only 3K + 3 singular values has no noise.
     threshold = max(options.right * noise_level, 1e-10) * mean_square
@@ -331,7 +328,8 @@ def reweighted(
         model = motion, position, alpha, sizes
         M, t, a, few_sizes = (part[few] for part in model)
         distance = distances(few_rows, shapes, M, t, a)
-        distance /= residual_deviations(M, a, shapes, weights, variance, cameras)
+        state = JointState(shapes, M, variance)
+        distance /= residual_deviations(state, a, weights, cameras)
         deviation = max(median_noise(distance[np.isfinite(distance)]), OF_DISTANCES)
         # Weights from the residuals, and convergence test
         new = partial(_weighted, shapes=shapes, loss=loss, deviation=deviation)
@@ -347,12 +345,7 @@ def reweighted(
 
 
 def residual_deviations(
-    motion: NDArray,
-    alpha: NDArray,
-    shapes: NDArray,
-    weights: NDArray,
-    noise: float,
-    cameras: CameraModel,
+    state: JointState, alpha: NDArray, weights: NDArray, cameras: CameraModel
 ) -> NDArray:
     """Return the standard deviations (n, J) of residuals over that of the noise.
 
@@ -360,6 +353,7 @@ def residual_deviations(
     W, residuals are ``(I - A (A^T W A + P)^-1 A^T W)`` times the noise; the prior P is
     the noise variance for each coefficient.
     """
+    shapes, motion, noise = state
     (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
     n_pose = 2 + cameras.n_parameters
     deviations = np.empty(weights.shape)

@@ -23,7 +23,7 @@ from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
-from isa_nrsfm._paper.factors import Factorisation
+from isa_nrsfm._paper.pipeline import Factorisation
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 
@@ -131,6 +131,7 @@ class JointSettings(NamedTuple):
     max_iter: int
     tol: float
     on_step: Callable[[], None] | None = None
+    n_jobs: int | None = None
     options: JointOptions = JOINT_OPTIONS
 
 
@@ -215,16 +216,14 @@ class JointProblem:
     ) -> JointFit:
         """Refine a state jointly, within the limits of the settings or other ones."""
         cameras, settings = cameras or self.cameras, self.settings
-        by_affine = cameras.name == "affine"
+        extents = 0.0 if cameras.name == "affine" else EXTENT_WEIGHT
         given = {
             "least_noise": settings.options.least_noise,
             "max_iter": settings.max_iter,
             "tol": settings.tol * (0.1 if self.thorough else 1.0),
         }
         return refine_joint(
-            MarginalLikelihood(
-                self.frames, self.penalty, 0 if by_affine else EXTENT_WEIGHT
-            ),
+            MarginalLikelihood(self.frames, self.penalty, extents),
             state,
             cameras,
             on_step=settings.on_step,

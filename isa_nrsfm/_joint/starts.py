@@ -32,7 +32,7 @@ from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     principal_columns,
 )
 from isa_nrsfm._metric_upgrade.rigid import best_metric
-from isa_nrsfm._paper.factors import Factorisation, rigid_energy
+from isa_nrsfm._paper.pipeline import Factorisation, rigid_energy
 from isa_nrsfm._tables.ordering import spread
 
 # Largest number of steps of a start with fixed cameras.
@@ -119,11 +119,9 @@ def extended_shapes(
     return np.concatenate([shapes, more / np.sqrt(len(rows))])
 
 
-def affine_start(
-    problem: JointProblem, W: NDArray, paper_shapes: NDArray
-) -> JointState:
+def affine_start(problem: JointProblem, W: NDArray, paper: NDArray) -> JointState:
     """Return the paper's result, rigid cameras and scaled basis shapes, as a start."""
-    shapes = problem.frames.coordinates(paper_shapes)
+    shapes = problem.frames.coordinates(paper)
     W = problem.frames.coordinates(W)
     rows, motion = W.reshape(len(W) // 2, 2, -1), rigid_cameras(W, shapes[0].T)
     return _first_state(problem, rows, motion, _scaled(rows, motion, shapes))
@@ -142,10 +140,7 @@ def settled(
 
 
 def best_starts(
-    problem: JointProblem,
-    table: FactorisedTable,
-    paper_shapes: NDArray,
-    cameras: CameraModel,
+    problem: JointProblem, table: FactorisedTable, paper: NDArray, cameras: CameraModel
 ) -> list[JointState]:
     """Return the likeliest starts, best first: three of small tables, one of others."""
     frames, options = problem.frames, problem.settings.options
@@ -156,7 +151,7 @@ def best_starts(
     few = np.sort(spread(order, min(400 if thorough else 200, len(order))))
     # No prior: with the large noise of a start it would make basis shapes vanish.
     part = replace(problem.part(few, tol=options.compared_tol), penalty=0.0)
-    seen, n_components = rows[few], len(paper_shapes) - 1
+    seen, n_components = rows[few], len(paper) - 1
     trials: list[tuple[float, JointState, NDArray]] = []
 
     def compare(motion: NDArray, shapes: NDArray | None = None) -> None:
@@ -168,9 +163,7 @@ def best_starts(
         trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
-    motion, shapes = rigid_start(
-        factors, frames.coordinates(paper_shapes), cameras.scaled
-    )
+    motion, shapes = rigid_start(factors, frames.coordinates(paper), cameras.scaled)
     compare(motion, _scaled(seen, motion[few], shapes))
     compare(motion)
     # Mixtures of more and more columns, until the objective rises. Small tables use all
@@ -194,7 +187,7 @@ def best_starts(
         motion[few] = fit.state.motion
         freed.append((fit.history[-1], fit.state._replace(motion=motion)))
     freed.sort(key=itemgetter(0))
-    return [with_prior(problem, state) for _, state in freed[: 3 if thorough else 1]]
+    return [with_prior(problem, state) for _, state in freed[:3]]
 
 
 def _first_state(
