@@ -134,11 +134,6 @@ class FitSettings(NamedTuple):
         """Whether the refinement is the joint fit, or begins with it."""
         return self.refinement in JOINT_REFINEMENTS
 
-    @property
-    def joint_camera(self) -> str | None:
-        """The camera model of the joint refinement, None without it."""
-        return self.camera if self.joint else None
-
     def of_joint_fit(self, on_step: Callable[[], None] | None = None) -> JointSettings:
         """Return the settings of the joint refinement."""
         tol = JOINT_TOL if self.tol is None else self.tol
@@ -186,7 +181,7 @@ def ready_table(
         names=s.names,
         scale_frames=s.scale_frames,
         robust=s.loss != "linear",
-        camera=s.joint_camera,
+        camera=s.camera if s.joint else None,
         weights=weights,
     )
 

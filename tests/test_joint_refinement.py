@@ -1,5 +1,6 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
+from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -358,21 +359,27 @@ class TestWithoutNoise:
         assert state.noise == pytest.approx(NOISE_FLOOR * mean_square)
 
 
+AT_ZERO = SimpleNamespace(t=0.0, noise=1.0)
+
+
+@dataclass(frozen=True)
 class Parabola:
     """An iterate on the line ``a t^2 / 2 - t``, whose noise has the floor 1/2."""
 
-    gradient, n = np.array([-1.0, 0.0]), 0
+    a: float
+    state: SimpleNamespace = AT_ZERO
+    gradient = np.array([-1.0, 0.0])
     cameras = SimpleNamespace(largest_length=lambda step: np.inf)
 
-    def __init__(self, a, t=0.0, noise=1.0):
-        self.a, self.t, self.value = a, t, a * t**2 / 2 - t
-        self.state = SimpleNamespace(noise=noise)
+    @property
+    def value(self):
+        return self.a * self.state.t**2 / 2 - self.state.t
 
     def split(self, step):
         return None, step[:1], step[1]
 
     def moved(self, step):
-        return Parabola(self.a, step[0], max(np.exp(step[1]), 0.5))
+        return SimpleNamespace(t=step[0], noise=max(np.exp(step[1]), 0.5))
 
 
 class TestLineSearch:
@@ -382,12 +389,12 @@ class TestLineSearch:
     )
     def test_takes_the_whole_step_or_the_minimum_of_the_parabola(self, a, expected):
         reached, step = _line_search(Parabola(a), np.array([1.0, 0.0]))
-        assert reached.t == pytest.approx(expected)
+        assert reached.state.t == pytest.approx(expected)
         assert_allclose(step, [expected, 0.0])
 
     def test_noise_changes_by_a_limited_factor_and_not_below_its_floor(self):
         reached, step = _line_search(Parabola(0.5), np.array([1.0, -3.0]))
-        assert reached.t == pytest.approx(0.5)
+        assert reached.state.t == pytest.approx(0.5)
         assert_allclose(step, [0.5, np.log(0.5)])
 
     def test_no_step_where_the_objective_rises(self):

@@ -122,13 +122,9 @@ def consensus(
     n_points, options = part.shape[2], settings.options
     chosen = spread(np.arange(n_points), min(n_points, MOST_POINTS))
     mean_square = float(np.nanmean(part**2))
-    scene = Scene(
-        part[:, :, chosen],
-        first[:, :, chosen],
-        fit.motion,
-        1.0 / (options.basis_std**2 * mean_square),
-        FLOOR_SHARE * options.least_noise * mean_square,
-    )
+    price = 1.0 / (options.basis_std**2 * mean_square)
+    floor = FLOOR_SHARE * options.least_noise * mean_square
+    scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
     noise, change, groups = model.noise_variance, np.zeros_like(first), []
     distances, variances = neighbour_distances(shapes[:, :, chosen]), None
     # Groups cannot improve a fit whose noise is below their floor.

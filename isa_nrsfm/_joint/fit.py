@@ -22,9 +22,9 @@ g_k is the share of the 3J numbers of B_k that the table determines rather than 
 prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +42,10 @@ from isa_nrsfm._joint.problem import (
     regular,
 )
 from isa_nrsfm._joint.starts import (
+    FIXED_STEPS,
     affine_start,
     best_starts,
     camera_moments,
-    settled,
     with_prior,
 )
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
@@ -74,7 +74,7 @@ def fit_jointly(
         fit, start = _first_fit(first, table, paper_shapes)
     else:
         shapes = first.frames.coordinates(start.shapes)
-        start = first.aligned(start._replace(shapes=shapes))
+        start = first.aligned(start._replace(shapes=shapes), first.cameras)
         fit = first.unreversed(start, first.cameras)
     ratio = fit.camera_noise_ratio
     fit, least_noise, sufficient = judged(first, table, fit, start)
@@ -85,7 +85,8 @@ def fit_jointly(
             fit = problems[0].refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames
     for problem in problems[1:]:
-        fit = problem.refined(problem.aligned(fit.state), least_noise=least_noise)
+        state = problem.aligned(fit.state, problem.cameras)
+        fit = problem.refined(state, least_noise=least_noise)
     # After completed frames, the points that are seen, and robust weights
     problem = problems[-1]
     if seen is not None:
@@ -214,7 +215,11 @@ def _first_fit(
     fit = min(map(partial(problem.unreversed, cameras=calibrated), starts), key=_end)
     # Affine cameras, from the calibrated fit and from the paper's result
     rigid = affine_start(problem, table.W, paper_shapes)
-    states = [problem.aligned(fit.state, affine), settled(problem, rigid, affine)]
+    # Some steps without the prior: with the large noise of a start it would make basis
+    # shapes vanish.
+    free, tol = replace(problem, penalty=0.0), problem.settings.tol
+    state = free.refined(rigid, affine, max_iter=FIXED_STEPS, tol=tol).state
+    states = [problem.aligned(fit.state, affine), with_prior(problem, state)]
     refined = partial(problem.refined, cameras=affine)
     max_iter = problem.settings.max_iter
     if cameras.calibrated:  # only compared
@@ -402,9 +407,7 @@ def _weighted(
     return rows, frame_weights(loss, distance, deviation, sizes)
 
 
-def _change(
-    before: WeightedRows, *fit: NDArray, new: Callable[..., WeightedRows]
-) -> float:
+def _change(before: WeightedRows, *fit: NDArray, new: Any) -> float:
     """Return the largest change of the weights."""
     rows, weights = before
     return float(np.abs(new(rows, *fit)[1] - weights).max())

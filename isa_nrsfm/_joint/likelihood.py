@@ -160,20 +160,19 @@ def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
     """Return complete frames (I, 2, J) with directions in the place of points."""
     n_frames, _, n_points = rows.shape
     products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
-    return FrameTracks(
-        np.ascontiguousarray(products.transpose(2, 1, 0)),
-        None,
-        np.zeros((2, n_frames)),
-        np.full(n_frames, float(n_points)),
-        energies(rows),
-    )
+    W, weight = np.ascontiguousarray(products.T), np.full(n_frames, float(n_points))
+    return FrameTracks(W, None, np.zeros((2, n_frames)), weight, energies(rows))
+
+
+# Terms that are summed over frames, and those of each frame, in the order below
+Terms = tuple[tuple[Any, ...], tuple[NDArray, ...]]
 
 
 class LikelihoodTerms(NamedTuple):
     """Objective, derivatives and posterior moments, from one pass over the frames.
 
-    shape_gradient (n_shapes, 3, J): derivative of the value with respect to the shapes.
-    noise_gradient: derivative with respect to the logarithm of the noise variance.
+    noise_gradient: derivative of the value by the logarithm of the noise variance.
+    shape_gradient (n_shapes, 3, J): derivative with respect to the shapes.
     shape_curvature (J or 1, 3 n_shapes, 3 n_shapes): ``sum_i w_ij E_i (x) M_i^T M_i``
     with the posterior second moments E_i of (1, alpha). Times ``2 / s2`` it is the
     Hessian by point j of the shapes, posterior and positions held fixed. One matrix for
@@ -185,8 +184,8 @@ class LikelihoodTerms(NamedTuple):
     """
 
     value: float
-    shape_gradient: NDArray
     noise_gradient: float
+    shape_gradient: NDArray
     shape_curvature: NDArray
     residual: float
     motion_gradient: NDArray
@@ -214,7 +213,7 @@ class MarginalLikelihood(NamedTuple):
         # If the noise is tiny, refine the solution of the normal equations by one step.
         tiny_noise = noise * n_seen < 1e-7 * square
 
-        def over_block(block: FrameTracks, motion: NDArray) -> LikelihoodTerms:
+        def over_block(block: FrameTracks, motion: NDArray) -> Terms:
             """Return the sums over pieces whose matrices fit the cache."""
             M, parts = frames_last(motion), []
             for frames, piece in block.pieces(BLOCK_FRAMES):
@@ -222,15 +221,17 @@ class MarginalLikelihood(NamedTuple):
                 parts.append(_terms(piece, M_i, products, noise, penalty, tiny_noise))
             return _joined(parts)
 
-        terms = _joined(self.frames.blocks.map(over_block, motion))
+        sums, by_frame = _joined(self.frames.blocks.map(over_block, motion))
+        value, noise_gradient, shape_gradient, packed, residual = sums
+        motion_gradient, motion_curvature, alpha = by_frame
         # Matrices (n, size, size) from the sums, packed by shapes and by axes
-        size, packed = 3 * len(shapes), terms.shape_curvature
+        size = 3 * len(shapes)
         curvature = unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3)
         curvature = curvature.reshape(-1, size, size)
         columns = shapes.reshape(size, -1).T[:, :, None]
         pulled = (curvature @ columns)[:, :, 0].T.reshape(shapes.shape)
-        value = terms.value + n_seen * np.log(noise)
-        shape_gradient = terms.shape_gradient + (2 / noise) * pulled
+        value += n_seen * np.log(noise)
+        shape_gradient = shape_gradient + (2 / noise) * pulled
         if self.extent_weight:
             weight = self.extent_weight * n_seen
             # With one curvature for all points the shapes are centred already.
@@ -240,27 +241,29 @@ class MarginalLikelihood(NamedTuple):
             # zero.
             seen = curvature.any(axis=(1, 2))
             shape_gradient = shape_gradient + weight * np.where(seen, slope, 0.0)
-        return terms._replace(
-            value=float(value),
-            shape_gradient=shape_gradient,
-            noise_gradient=float(terms.noise_gradient + n_seen),
-            shape_curvature=curvature,
-            alpha=np.ascontiguousarray(terms.alpha.T),
+        return LikelihoodTerms(
+            float(value),
+            float(noise_gradient + n_seen),
+            shape_gradient,
+            curvature,
+            residual,
+            motion_gradient,
+            motion_curvature,
+            np.ascontiguousarray(alpha.T),
         )
 
 
-def _joined(parts: Iterable[LikelihoodTerms]) -> LikelihoodTerms:
+def _joined(parts: Iterable[Terms]) -> Terms:
     """Add the sums of consecutive frames, and concatenate the terms of each frame."""
-    n_sums = 5
     sums: Any = ()
     by_frame: list[Any] = []
-    for part in parts:
-        sums = tuple(map(add, sums, part)) if by_frame else part[:n_sums]
-        by_frame.append(part[n_sums:])
+    for added, own in parts:
+        sums = tuple(map(add, sums, added)) if by_frame else added
+        by_frame.append(own)
     if len(by_frame) == 1:
-        return part
-    joined: Any = map(partial(np.concatenate, axis=-1), zip(*by_frame, strict=True))
-    return LikelihoodTerms(*sums, *joined)
+        return sums, own
+    join = partial(np.concatenate, axis=-1)
+    return sums, tuple(map(join, zip(*by_frame, strict=True)))
 
 
 def _terms(
@@ -270,7 +273,7 @@ def _terms(
     noise: float,
     penalty: NDArray | float,
     tiny_noise: bool,
-) -> LikelihoodTerms:
+) -> Terms:
     """Return the sums over frames, M (2, 3, n_frames), for `MarginalLikelihood`.
 
     The curvature of the shapes is packed: (n_pairs, 6, n_points or 1).
@@ -305,16 +308,10 @@ def _terms(
         mixed = np.einsum("kli,lbi->kbi", unpacked(moments), products.shape_centroid)
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
         shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
-    return LikelihoodTerms(
-        value=float(value),
-        shape_gradient=(-2 / noise) * shape_gradient.reshape(shapes.shapes.shape),
-        noise_gradient=-(residual + spread) / noise,
-        shape_curvature=shape_curvature,
-        residual=residual,
-        motion_gradient=(2 / noise) * G,
-        motion_curvature=motion_curvature,
-        alpha=alpha,
-    )
+    noise_gradient = -(residual + spread) / noise
+    shape_gradient = (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape)
+    sums = float(value), noise_gradient, shape_gradient, shape_curvature, residual
+    return sums, ((2 / noise) * G, motion_curvature, alpha)
 
 
 def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArray]:

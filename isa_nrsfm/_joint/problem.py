@@ -198,14 +198,12 @@ class JointProblem:
         """The objective."""
         return MarginalLikelihood(self.frames, self.penalty)
 
-    def aligned(
-        self, state: JointState, cameras: CameraModel | None = None
-    ) -> JointState:
+    def aligned(self, state: JointState, cameras: CameraModel) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes."""
         shapes, _, noise = state
         if self.frames.directions is None:
             shapes = shapes - shapes.mean(axis=2, keepdims=True)
-        search = frame_search((cameras or self.cameras).name, shapes)
+        search = frame_search(cameras.name, shapes)
         motion = self.frames.blocks.joined(
             lambda block: search.fit(block, noise, covariances=False, rough=True).motion
         )
@@ -221,14 +219,10 @@ class JointProblem:
             "least_noise": settings.options.least_noise,
             "max_iter": settings.max_iter,
             "tol": settings.tol * (0.1 if self.thorough else 1.0),
+            "on_step": settings.on_step,
         }
-        return refine_joint(
-            MarginalLikelihood(self.frames, self.penalty, extents),
-            state,
-            cameras,
-            on_step=settings.on_step,
-            **given | limits,
-        )
+        likelihood = MarginalLikelihood(self.frames, self.penalty, extents)
+        return refine_joint(likelihood, state, cameras, **given | limits)
 
     def unreversed(
         self, state: JointState, cameras: CameraModel, **limits: Any
@@ -317,13 +311,9 @@ def refine_joint(
         history.append(iterate.value)
     memory.clear()
     slope = iterate.gradient @ iterate.precondition(iterate.gradient)
-    return JointFit(
-        iterate.state,
-        np.array(history),
-        float(np.sqrt(max(slope, 0.0) / n_seen)),
-        small_steps >= 2 and bool(np.isfinite(iterate.value)),
-        iterate.left,
-    )
+    norm = float(np.sqrt(max(slope, 0.0) / n_seen))
+    converged = small_steps >= 2 and bool(np.isfinite(iterate.value))
+    return JointFit(iterate.state, np.array(history), norm, converged, iterate.left)
 
 
 @dataclass(eq=False)
@@ -345,12 +335,10 @@ class _Iterate:
         self.value = passed.value
         self.left = max(noise, passed.residual / self.n_seen)
         at_floor = noise <= self.floor * (1 + 1e-6)
-        self.gradient = _stacked(
-            passed.shape_gradient,
-            self.cameras.gradient(self.M, passed.motion_gradient),
-            # At its lower bound the noise variance may only rise.
-            min(passed.noise_gradient, 0.0 if at_floor else np.inf),
-        )
+        # At its lower bound the noise variance may only rise.
+        by_noise = min(passed.noise_gradient, 0.0 if at_floor else np.inf)
+        by_cameras = self.cameras.gradient(self.M, passed.motion_gradient)
+        self.gradient = _stacked(passed.shape_gradient, by_cameras, by_noise)
         self.curvature = passed.shape_curvature, passed.motion_curvature
 
     @cached_property
@@ -379,22 +367,16 @@ class _Iterate:
 
     def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:
         """Return shapes (n, 3, J), parameters of cameras (p, I), and log noise."""
-        first = self.state.shapes.size
-        return (
-            vector[:first].reshape(self.state.shapes.shape),
-            vector[first:-1].reshape(self.cameras.n_parameters, len(self.state.motion)),
-            vector[-1],
-        )
+        shapes, motion, _ = self.state
+        steps = vector[shapes.size : -1].reshape(self.cameras.n_parameters, len(motion))
+        return vector[: shapes.size].reshape(shapes.shape), steps, vector[-1]
 
-    def moved(self, step: NDArray) -> "_Iterate":
-        """Return the iterate after a step; the noise variance is at least floor."""
+    def moved(self, step: NDArray) -> JointState:
+        """Return the state after a step; the noise variance is at least floor."""
         shapes, steps, noise = self.split(step)
-        state = JointState(
-            self.state.shapes + shapes,
-            frames_first(self.cameras.moved(self.M, steps)),
-            max(self.state.noise * np.exp(noise), self.floor),
-        )
-        return replace(self, state=state)
+        motion = frames_first(self.cameras.moved(self.M, steps))
+        noise = max(self.state.noise * np.exp(noise), self.floor)
+        return JointState(self.state.shapes + shapes, motion, noise)
 
 
 def regular(curvature: NDArray) -> NDArray:
@@ -431,14 +413,12 @@ def _line_search(
     """Return the first iterate that meets the Armijo condition, or None, and step."""
     slope = iterate.gradient @ direction
     # Largest step length that the parametrisation of noise and cameras allows
-    length = min(
-        1.0,
-        1.5 / max(abs(direction[-1]), 1e-300),
-        iterate.cameras.largest_length(iterate.split(direction)[1]),
-    )
+    of_noise = 1.5 / max(abs(direction[-1]), 1e-300)
+    of_cameras = iterate.cameras.largest_length(iterate.split(direction)[1])
+    length = min(1.0, of_noise, of_cameras)
     while length > 1e-8:
         step = length * direction
-        reached = iterate.moved(step)
+        reached = replace(iterate, state=iterate.moved(step))
         if reached.value <= iterate.value + 1e-4 * length * slope:
             # The lower bound may have shortened the change of the noise.
             step[-1] = np.log(reached.state.noise / iterate.state.noise)

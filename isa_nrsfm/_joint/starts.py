@@ -127,18 +127,6 @@ def affine_start(problem: JointProblem, W: NDArray, paper: NDArray) -> JointStat
     return _first_state(problem, rows, motion, _scaled(rows, motion, shapes))
 
 
-def settled(
-    problem: JointProblem, state: JointState, cameras: CameraModel
-) -> JointState:
-    """Return a start after some steps without the prior, in its likeliest basis.
-
-    With the large noise of a start the prior would make basis shapes vanish.
-    """
-    free, tol = replace(problem, penalty=0.0), problem.settings.tol
-    fit = free.refined(state, cameras, max_iter=FIXED_STEPS, tol=tol)
-    return with_prior(problem, fit.state)
-
-
 def best_starts(
     problem: JointProblem, table: FactorisedTable, paper: NDArray, cameras: CameraModel
 ) -> list[JointState]:

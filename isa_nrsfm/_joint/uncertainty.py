@@ -206,25 +206,19 @@ def depth_certainty(
     refit = partial(_Refit, frames, part[known], w, shapes, motion)
     whole = refit(np.ones(len(points), dtype=bool))
     errors = [refit(~group).errors(whole) for group in left_out]
-    total, turns, variances = (
-        (N_GROUPS - 1) / N_GROUPS * np.sum(terms, axis=0)
-        for terms in zip(*errors, strict=True)
-    )
+    sums = (np.sum(terms, axis=0) for terms in zip(*errors, strict=True))
+    total, turns, variances = ((N_GROUPS - 1) / N_GROUPS * each for each in sums)
     # Each point is left out of one of the fits
     variances *= N_GROUPS / (N_GROUPS - 1)
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
     # Rotations out of the image plane, and their residuals of a regression on alpha.
     mean_view = Rotation.from_matrix(whole.rotations).mean()
-    turning = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
-    predictors = np.column_stack([np.ones(len(turning)), whole.alpha])
-    rest = turning[:, :2] - predictors @ np.linalg.lstsq(predictors, turning[:, :2])[0]
+    vectors = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
+    predictors = np.column_stack([np.ones(len(vectors)), whole.alpha])
+    rest = vectors[:, :2] - predictors @ np.linalg.lstsq(predictors, vectors[:, :2])[0]
     freedom = max(len(rest) - predictors.shape[1], 1)
-    return DepthCertainty(
-        float(np.sqrt(total)),
-        float(np.sqrt(np.sum(rest**2) / freedom)),
-        turns,
-        variances[nearest],
-    )
+    turning = float(np.sqrt(np.sum(rest**2) / freedom))
+    return DepthCertainty(float(np.sqrt(total)), turning, turns, variances[nearest])
 
 
 def neighbours(points: NDArray) -> NDArray:
@@ -261,14 +255,10 @@ class _Refit:
         penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
         likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
-        least_noise = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
+        least = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
+        start, cameras = JointState(shapes, motion, noise), CAMERAS[frames.camera]
         state = refine_joint(
-            likelihood,
-            JointState(shapes, motion, noise),
-            CAMERAS[frames.camera],
-            least_noise=least_noise,
-            max_iter=MOST_STEPS,
-            tol=TOL,
+            likelihood, start, cameras, least_noise=least, max_iter=MOST_STEPS, tol=TOL
         ).state
         self.rotations, scales = full_rotations(state.motion)
         self.alpha = likelihood(*state).alpha
