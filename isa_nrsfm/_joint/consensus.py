@@ -125,12 +125,11 @@ def consensus(
     price = 1.0 / (options.basis_std**2 * mean_square)
     floor = FLOOR_SHARE * options.least_noise * mean_square
     scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
-    noise, change, groups = model.noise_variance, np.zeros_like(first), []
-    distances, variances = neighbour_distances(shapes[:, :, chosen]), None
+    noise, S, groups, variances = model.noise_variance, shapes, [], None
+    distances = neighbour_distances(shapes[:, :, chosen])
     # Groups cannot improve a fit whose noise is below their floor.
     if noise >= scene.floor:
-        n_fitted = len(model.shapes) - 1
-        groups = fitted_groups(scene, distances, n_fitted, settings)
+        groups = fitted_groups(scene, distances, len(model.shapes) - 1, settings)
     if groups:
         noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
         share = 1.0 - scene.floor / noise
@@ -142,12 +141,10 @@ def consensus(
         others = np.setdiff1d(np.arange(n_points), chosen)
         off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
         change[:, :2, others] = off[:, :, others]
-        change = centred(change)
-    # Shapes in the axes of the object, and their principal components
-    S = shapes + rotations.mT @ change / scales[:, None, None]
-    if groups:
-        R = aligning_rotations(centred(S[:, :, chosen]), noise)
-        S = R.mT @ S
+        # Shapes in the axes of the object
+        S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
+        S = aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S
+    # Their principal components
     shapes, alpha, rest = principal_shapes(S, most, LEFT * noise if free else 0.0)
     return shapes, noise + rest, alpha, variances
 
