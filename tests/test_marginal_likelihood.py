@@ -207,43 +207,6 @@ class TestCurvature:
             packed = A[np.triu_indices(3)]
             assert_allclose(got[:, i], packed, rtol=1e-10, atol=1e-12)
 
-    @PENALTIES
-    def test_newton_steps_are_those_of_expectation_maximisation(self, penalty):
-        # M_i = (sum_k c_ik W_i B_k^T) A_i^-1 for the shapes held, and
-        # B = N^-1 sum_i (c_i (x) M_i^T) W_i for the cameras held.
-        scene = random_scene("complete")
-        passed = scene.at(penalty)
-        n_shapes = len(scene.shapes)
-        N = np.zeros((3 * n_shapes, 3 * n_shapes))
-        R = np.zeros((3 * n_shapes, scene.tracks.shape[1]))
-        moments = second_moments(scene, NOISE, penalty)
-        for i, (E, c) in enumerate(moments):
-            W = scene.tracks[i].T - scene.tracks[i].mean(axis=0)[:, None]
-            A = np.einsum("kl,kaj,lbj->ab", E, scene.shapes, scene.shapes)
-            Y = np.einsum("k,rj,kaj->ra", c, W, scene.shapes)
-            step = NOISE / 2 * passed.motion_gradient[i] @ np.linalg.inv(A)
-            assert_allclose(scene.motion[i] - step, Y @ np.linalg.inv(A))
-            M = scene.motion[i]
-            N += np.kron(E, M.T @ M)
-            R += np.kron(c[:, None], M.T) @ W
-        slopes = NOISE / 2 * passed.shape_gradient.reshape(len(N), -1)
-        step = np.linalg.solve(passed.shape_curvature[0], slopes)
-        moved = scene.shapes.reshape(len(N), -1) - step
-        assert_allclose(moved, np.linalg.solve(N, R), atol=1e-10)
-
-    @PENALTIES
-    def test_noise_of_expectation_maximisation(self, penalty):
-        # The noise gradient vanishes where s2 is the mean of the expected residual.
-        scene = random_scene("missing")
-        passed = scene.at(penalty)
-        expected = passed.residual
-        for points, shapes, root, M, _ in frame_by_frame(scene):
-            images = np.array([(root * (M @ B)).ravel() for B in shapes[1:]])
-            covariance = coefficients(points, shapes, root, M, NOISE)[1]
-            expected += np.trace(images.T @ covariance @ images)
-        n_seen = np.isfinite(scene.tracks).sum()
-        assert passed.noise_gradient == pytest.approx(n_seen - expected / NOISE)
-
 
 def assert_same(got, expected, but=()):
     """Assert that two passes agree up to rounding, in all fields but those named."""
