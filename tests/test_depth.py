@@ -12,8 +12,8 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
-from isa_nrsfm._joint.jackknife import N_GROUPS, depth_certainty, neighbours
 from isa_nrsfm._joint.likelihood import extent_penalty
+from isa_nrsfm._joint.uncertainty import N_GROUPS, depth_certainty, neighbours
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses, write_viewer

@@ -12,7 +12,7 @@ from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._joint.sample_posterior import reliabilities
+from isa_nrsfm._joint.uncertainty import reliabilities
 from isa_nrsfm.analysis._diagnostics import (
     camera_advice,
     gross_residuals,

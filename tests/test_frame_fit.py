@@ -13,11 +13,10 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.sample_posterior import (
+from isa_nrsfm._joint.likelihood import JointFrames
+from isa_nrsfm._joint.uncertainty import (
+    fitted_frames,
     inlying_rows,
-    posterior_blocks,
-    posterior_moments,
     shape_uncertainty,
     shown_frames,
 )
@@ -292,9 +291,8 @@ class TestSamplePosterior:
         if compressed:
             directions = np.linalg.svd(model.shapes.reshape(9, -1))[2][:9]
             frames = JointFrames.from_directions(blocks, directions)
-        found = posterior_blocks(model, frames, blocks)
         expected = model.posterior(rows)
-        motion, alpha, covariance = posterior_moments(found)
+        _, motion, alpha, covariance = fitted_frames(model, frames, blocks)
         assert_allclose(motion, expected.motion, atol=1e-7)
         assert_allclose(alpha, expected.alpha, atol=1e-7)
         assert_allclose(covariance, expected.covariance.mean(axis=0), rtol=1e-6)
