@@ -9,22 +9,20 @@ from scipy.special import logit
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
-from isa_nrsfm._frames.models import LinearisedFrames
+from isa_nrsfm._frames.models import FrameMap, LinearisedFrames
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
-from isa_nrsfm.analysis._frame_columns import sequences_of
 from isa_nrsfm.analysis._smoothing import (
     Dynamics,
     Observations,
     estimated_dynamics,
     expected_gradient,
+    smooth,
     smoothed,
-    smoothed_frames,
 )
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 K = 3
-OPTIONS = {"max_gap": 10, "max_iter": 100, "tol": 0.1}
 
 
 def some_dynamics(n_walks=0, share=0.3, n_shares=K):
@@ -76,9 +74,13 @@ def alone(x, rng, noise=0.3):
     )
 
 
-def without_cameras():
-    """Return a camera model without parameters."""
-    return type(CAMERAS["affine"])(held=True)
+def smooth_people(frames, groups):
+    """Smooth frames of cameras without parameters."""
+    camera, time = type(CAMERAS["affine"])(held=True), None
+    limits = {"max_gap": 10, "max_iter": 100, "tol": 0.1}
+    return smooth(
+        frames, FrameMap.identity(K), camera, time, groups, **limits, dtype=float
+    )
 
 
 def dense_posterior(data, dynamics):
@@ -143,13 +145,13 @@ class TestSmoother:
             for each in data[:2]:
                 each[[0, 4, 5, 8]] = 0.0
         mean, covariance, likelihood = dense_posterior(data, dynamics)
-        got = smoothed(data, dynamics)
+        means, covariances, value, _ = smoothed(data, dynamics)
         # Cameras have prior variances of 1e6 to 1e8, with rounding errors to match.
         atol = 1e-6 if n_walks else 1e-10
-        assert_allclose(got.mean, mean, atol=atol)
+        assert_allclose(means, mean, atol=atol)
         expected = [covariance[t, :, t] for t in range(9)]
-        assert_allclose(got.covariance, expected, atol=atol)
-        assert_allclose(got.log_likelihood, likelihood)
+        assert_allclose(covariances, expected, atol=atol)
+        assert_allclose(value, likelihood)
 
     @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
     def test_gradient_is_that_of_the_likelihood(self, n_walks, n_shares):
@@ -161,12 +163,10 @@ class TestSmoother:
         splits = np.cumsum([len(each) for each in dynamics])[:-1]
 
         def likelihood(parameters):
-            return smoothed(
-                data, Dynamics(*np.split(parameters, splits))
-            ).log_likelihood
+            return smoothed(data, Dynamics(*np.split(parameters, splits)))[2]
 
         expected = approx_fprime(np.concatenate(dynamics), likelihood, 1e-5)
-        got = expected_gradient(dynamics, smoothed(data, dynamics).moments, 8, 1)
+        got = expected_gradient(dynamics, smoothed(data, dynamics)[3], 8, 1)
         assert_allclose(got, expected, rtol=1e-3, atol=2e-3)
 
 
@@ -193,18 +193,13 @@ class TestPeople:
         person = np.repeat(np.arange(n_people), n_frames)
         x = np.sqrt(0.8) * rng.normal(size=(n_people, K))[person]
         x += np.sqrt(0.2) * rng.normal(size=x.shape)
-        frames = alone(x, rng)
-        assert (
-            smoothed_frames(frames, without_cameras(), None, person, **OPTIONS) is None
-        )
+        assert not len(smooth_people(alone(x, rng), person).time_scales)
 
     @pytest.mark.parametrize("groups", [None, np.zeros(150)])
     def test_photos_of_one_unusual_person_have_none(self, groups):
         rng = np.random.default_rng(0)
         frames = alone(1.5 + 0.4 * rng.normal(size=(150, K)), rng)
-        assert (
-            smoothed_frames(frames, without_cameras(), None, groups, **OPTIONS) is None
-        )
+        assert not len(smooth_people(frames, groups).time_scales)
 
     def test_videos_of_people_are_smoothed(self):
         rng = np.random.default_rng(0)
@@ -213,13 +208,12 @@ class TestPeople:
         x = np.concatenate([simulated(40, rng, true) for _ in range(12)])
         x = np.sqrt(0.5) * (x + rng.normal(size=(12, K))[person])
         frames = alone(x, rng, 0.5)
-        found = smoothed_frames(frames, without_cameras(), None, person, **OPTIONS)
+        found = smooth_people(frames, person)
         assert_allclose(found.time_scales, 1 / 0.3, rtol=0.3)
         error = np.linalg.norm(found.alpha - x)
         assert error < 0.7 * np.linalg.norm(frames.alpha - x)
         # Deviations of the sum of process and intercept hold.
-        deviations = np.diagonal(found.covariance, axis1=1, axis2=2)
-        assert 0.8 < np.mean((found.alpha - x) ** 2 / deviations) < 1.25
+        assert 0.8 < np.mean(((found.alpha - x) / found.alpha_std) ** 2) < 1.25
 
 
 @pytest.mark.parametrize("name", CAMERAS)
@@ -268,13 +262,6 @@ def test_likelihood_of_frames_is_linearised(name, loss):
     whole = alone.precision[row] + np.diag(np.arange(len(start)) < 2)
     ratio = np.linalg.solve(alone.covariance[row], np.linalg.inv(whole)[:2, :2])
     assert_allclose(np.linalg.eigvals(ratio), 1.0, atol=0.2)
-
-
-class TestSequences:
-    def test_uneven_times_are_rounded_but_stay_apart(self):
-        time = np.array([0.0, 0.9, 2.0, 2.2, 4.3])
-        ((_, steps),), _ = sequences_of(time, np.zeros(5, int), 10)
-        assert steps.tolist() == [0, 1, 2, 3, 5]
 
 
 @pytest.fixture(scope="module")
@@ -348,6 +335,13 @@ class TestSmooth:
         # Rows that nobody saw are filled in, and less certain.
         assert np.isfinite(expected.alpha).all()
         assert (expected.alpha_std[63] > expected.alpha_std[30]).all()
+
+    def test_uneven_times_are_rounded_but_stay_apart(self, waving):
+        model, table = waving
+        time = np.r_[0.0, 0.9, 2.0, 2.2, 4.3 + np.arange(156)]
+        found = model.smooth(table, time=time)
+        expected = model.smooth(table, time=np.r_[0:4, 5:161])
+        assert_allclose(found.alpha, expected.alpha, atol=1e-12)
 
     def test_nothing_goes_from_group_to_group(self, waving):
         model, table = waving

@@ -23,9 +23,10 @@ from isa_nrsfm.analysis import (
 from isa_nrsfm.analysis._frame_columns import (
     checked_times,
     group_numbers,
+    kind_of,
+    refuse_infinite,
     sequences_of,
 )
-from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import read_times, video_times
