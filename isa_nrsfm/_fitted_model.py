@@ -230,7 +230,7 @@ class TableModel(NamedTuple):
             sizes = robust_sizes(centred)
         if weights is not None:
             weights = weights[usable]
-            sizes = weighted_sizes(centred, weights, sizes)
+            sizes = weighted_sizes(rows[usable], weights)
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes, weights

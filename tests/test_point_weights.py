@@ -233,7 +233,7 @@ class TestMethods:
         holed = np.where(weights[..., None] > 0, tracks, np.nan)
         holed = holed - np.nanmean(holed, axis=1, keepdims=True)
         rows = holed.transpose(0, 2, 1)
-        sizes = weighted_sizes(rows, weights, np.ones(6))
+        sizes = weighted_sizes(rows, weights)
         found = frames.linearised(rows, sizes, weights)
         expected = repeated.linearised(rows[:, :, many], sizes)
         for name in ("motion", "alpha", "covariance", "precision"):

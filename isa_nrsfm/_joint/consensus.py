@@ -39,8 +39,7 @@ from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 from isa_nrsfm._joint.sample_posterior import inlying_rows
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames, spread
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # docs/benchmarks/consensus.md has the errors with other values of these constants.

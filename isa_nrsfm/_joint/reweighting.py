@@ -15,8 +15,7 @@ from isa_nrsfm._joint.quasi_newton import JointFit, regular
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
 
 def reweighted(

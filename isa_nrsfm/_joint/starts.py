@@ -29,7 +29,7 @@ from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
 )
 from isa_nrsfm._metric_upgrade.rigid import best_metric
 from isa_nrsfm._paper.factors import Factorisation, rigid_energy
-from isa_nrsfm._tables.ordering import spread
+from isa_nrsfm._tables.blocks import spread
 
 # Largest number of steps of a start with fixed cameras.
 FIXED_STEPS = 6

@@ -20,8 +20,7 @@ from scipy.linalg import eigh
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
 from isa_nrsfm._linalg.small_matrices import unpacked
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
 
 class _Frames(NamedTuple):
