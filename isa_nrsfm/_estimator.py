@@ -67,9 +67,8 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose
+from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
-from isa_nrsfm.analysis._summary import summary_html
 from isa_nrsfm.isa import PooledFastICA
 
 _NEEDS_CALIBRATED = (

@@ -26,37 +26,29 @@ def random_mask(shape, missing, seed, least=4):
     return (order >= missing) | (rank >= shape[1] - least)
 
 
-def centred_tracks(tracks):
-    """Return centred tracks, their centroids and sizes."""
+def unit_rows(tracks):
+    """Return tracks as rows of size one, their centroids and sizes."""
     rows, report = centred_frames(tracks.transpose(0, 2, 1))
-    return rows.transpose(0, 2, 1), report.translation, report.size
+    return rows / report.size[:, None, None], report.translation, report.size
 
 
-def unit_rows(centred, sizes):
-    """Return tracks as frames (n_frames, 2, n_points) of size one."""
-    return (centred / sizes[:, None, None]).transpose(0, 2, 1)
-
-
-def completed(tracks, n_components, **params):
+def completed(tracks, n_components):
     """Return tracks in place of those with missing points."""
-    centred, translation, sizes = centred_tracks(tracks)
-    rows = unit_rows(centred, sizes)
-    filled = filled_in(rows, completion_model(rows, 3 * n_components + 3, **params))
+    rows, translation, sizes = unit_rows(tracks)
+    filled = filled_in(rows, completion_model(rows, 3 * n_components + 3))
     assert_allclose(filled.mean(axis=2), 0, atol=1e-12)
     # Seen points are the given ones minus a shift.
     filled += np.nanmean(rows - filled, axis=2, keepdims=True)
     return sizes[:, None, None] * filled.transpose(0, 2, 1) + translation[:, None]
 
 
-def held_out_error(tracks, seen, n_components, usable=None):
+def held_out_error(tracks, seen, n_components, usable=True):
     """Return the inverse SNR of the hidden points, frames of unit size."""
     filled = completed(hide(tracks, seen), n_components)
-    _, translation, sizes = centred_tracks(hide(tracks, seen))
-    weights = sizes**-2.0
-    hidden = ~seen if usable is None else ~seen & usable[:, None]
+    _, translation, sizes = unit_rows(hide(tracks, seen))
     error = np.sum((filled - tracks) ** 2, axis=2)
     energy = np.sum((tracks - translation[:, None]) ** 2, axis=2)
-    weights = np.where(hidden, weights[:, None], 0.0)
+    weights = np.where(~seen, (usable / sizes**2)[:, None], 0.0)
     return np.sum(weights * error) / np.sum(weights * energy)
 
 
@@ -74,57 +66,52 @@ def test_seen_points_are_kept():
 
 @pytest.fixture(scope="module")
 def small():
-    """Return frames of a small noisy table, with a complete and a repeated pattern."""
+    """Return rows of a small noisy table, with a complete and a repeated pattern."""
     scene = make_nonrigid_tracks(24, 9, 1, noise=0.1, random_state=0)
     seen = random_mask((24, 9), 0.3, 0)
     seen[5:8] = True
     seen[10:13] = seen[10]
-    centred, _, sizes = centred_tracks(hide(scene.tracks, seen))
-    return centred, seen, sizes
+    return unit_rows(hide(scene.tracks, seen))[0]
 
 
-def log_likelihood(B, noise, centred, seen, sizes):
+def log_likelihood(B, noise, rows):
     """Return that of all rows, as said by normal densities without translation."""
     total = 0.0
-    for frame, mask, size in zip(centred, seen, sizes, strict=True):
+    for frame in rows:
+        mask = ~np.isnan(frame[0])
         n = mask.sum()
         # Contrasts of the seen points: an orthonormal basis of what sums to zero.
         contrasts = np.linalg.svd(np.ones((1, n)))[2][1:]
         covariance = contrasts @ (B[:, mask].T @ B[:, mask]) @ contrasts.T
         covariance += noise * np.eye(n - 1)
-        for row in (contrasts @ frame[mask] / size).T:
+        for row in frame[:, mask] @ contrasts.T:
             total -= 0.5 * row @ np.linalg.solve(covariance, row)
             total -= 0.5 * np.linalg.slogdet(covariance)[1]
     return total
 
 
 def test_missing_points_are_conditional_expectations(small):
-    centred, seen, sizes = small
-    filled = completed(centred, 1)  # rank 6 of 9 points
-    model = completion_model(unit_rows(centred, sizes), 6)
+    model = completion_model(small, 6)
+    filled = filled_in(small, model)
+    filled += np.nanmean(small - filled, axis=2, keepdims=True)
     far = 1e7  # variance of the translation, which may be anything
     covariance = model.B.T @ model.B + model.noise * np.eye(9) + far
-    for frame, mask, result in zip(centred, seen, filled, strict=True):
+    for frame, result in zip(small, filled, strict=True):
+        mask = ~np.isnan(frame[0])
         inverse = np.linalg.inv(covariance[np.ix_(mask, mask)])
         gain = covariance[np.ix_(~mask, mask)] @ inverse
-        assert_allclose(result[~mask], gain @ frame[mask], atol=1e-5)
+        assert_allclose(result[:, ~mask], frame[:, mask] @ gain.T, atol=1e-5)
 
 
 def test_the_fit_is_a_stationary_point_of_the_likelihood(small, rng):
-    centred, _, sizes = small
-    rows = unit_rows(centred, sizes)
-    model = completion_model(rows, 3, tol=-1.0, max_iter=2000)  # never ends before
-    best = log_likelihood(*model, *small)
-    for _ in range(10):
-        step = 1e-4 * rng.normal(size=model.B.shape) * np.std(model.B)
-        near = model.B + step, model.B - step
-        up, down = (log_likelihood(B, model.noise, *small) for B in near)
+    B, noise = completion_model(small, 3, tol=-1.0, max_iter=2000)  # never ends before
+    best = log_likelihood(B, noise, small)
+    steps = [1e-4 * rng.normal(size=B.shape) * np.std(B) for _ in range(10)]
+    near = [[(B + step, noise), (B - step, noise)] for step in steps]
+    for pair in (*near, [(B, 1.001 * noise), (B, noise / 1.001)]):
+        up, down = (log_likelihood(*parameters, small) for parameters in pair)
         assert abs(up - down) < 1e-6
         assert max(up, down) < best
-    near = 1.001 * model.noise, model.noise / 1.001
-    up, down = (log_likelihood(model.B, noise, *small) for noise in near)
-    assert abs(up - down) < 1e-6
-    assert max(up, down) < best
 
 
 # --- exact tables -------------------------------------------------------------------
@@ -212,35 +199,31 @@ def test_faces_that_hide_a_side(load_data):
 # --- degenerate tables --------------------------------------------------------------
 
 
-def assert_completes(tracks, seen, n_components):
-    """Complete without warnings and with finite numbers; return the relative error."""
-    assert np.isfinite(completed(hide(tracks, seen), n_components)).all()
-    return np.sqrt(held_out_error(tracks, seen, n_components))
-
-
 def test_shark_has_a_lower_rank(load_data):
     tracks = load_data("shark_torresani")["W2d"].astype(float)
     seen = random_mask(tracks.shape[:2], 0.3, 0)
     for n_components in (1, 2, 6):
-        assert assert_completes(tracks, seen, n_components) < 1e-5
+        assert np.sqrt(held_out_error(tracks, seen, n_components)) < 1e-5
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_rigid_objects_and_more_basis_shapes(dtype):
-    tracks = make_nonrigid_tracks(200, 40, 0, random_state=0).tracks.astype(dtype)
+@pytest.mark.parametrize(
+    ("n_components", "dtype", "limit"),
+    [(1, np.float64, 1e-5), (5, np.float64, 3e-4), (5, np.float32, 3e-4)],
+)
+def test_rigid_and_flat_objects_and_more_basis_shapes(n_components, dtype, limit, rng):
     seen = random_mask((200, 40), 0.3, 0)
-    assert assert_completes(tracks, seen, 5) < 3e-4
-
-
-def test_flat_objects(rng):
-    tracks = rng.normal(size=(40, 2)) @ rng.normal(size=(200, 2, 2)) + 5
-    assert assert_completes(tracks, random_mask((200, 40), 0.3, 0), 1) < 1e-5
+    rigid = make_nonrigid_tracks(200, 40, 0, random_state=0).tracks
+    flat = rng.normal(size=(40, 2)) @ rng.normal(size=(200, 2, 2)) + 5
+    for tracks in (rigid, flat):
+        error = held_out_error(tracks.astype(dtype), seen, n_components)
+        assert np.sqrt(error) < limit
 
 
 @pytest.mark.parametrize(("n_frames", "n_points"), [(8, 13), (8, 68), (30, 100)])
 def test_the_smallest_tables(n_frames, n_points):
     tracks = make_nonrigid_tracks(n_frames, n_points, 3, random_state=0).tracks
-    assert_completes(tracks, random_mask((n_frames, n_points), 0.1, 3), 3)
+    seen = random_mask((n_frames, n_points), 0.1, 3)
+    assert np.isfinite(completed(hide(tracks, seen), 3)).all()
 
 
 def test_points_and_frames_that_are_rarely_seen():
@@ -248,9 +231,9 @@ def test_points_and_frames_that_are_rarely_seen():
     seen = np.ones((100, 30), dtype=bool)
     seen[6:, 3] = False
     seen[50:, 4:] = False
-    assert_completes(tracks, seen, 3)
+    assert np.isfinite(completed(hide(tracks, seen), 3)).all()
     seen[90:, 1:] = False
-    rows = unit_rows(hide(tracks - tracks[:, :1], seen), np.ones(100))
+    rows = hide(tracks - tracks[:, :1], seen).transpose(0, 2, 1)
     assert np.isfinite(filled_in(rows, completion_model(rows, 12))).all()
 
 
@@ -261,6 +244,6 @@ def test_points_and_frames_that_are_rarely_seen():
 def test_noise_of_a_rigid_object(missing):
     scene = make_nonrigid_tracks(500, 30, 0, noise=0.05, random_state=0)
     tracks = hide(scene.tracks, random_mask((500, 30), missing, 0))
-    centred, *_ = centred_tracks(tracks)
-    variance = completion_model(unit_rows(centred, np.ones(500)), 3).noise
+    rows, _ = centred_frames(tracks.transpose(0, 2, 1))
+    variance = completion_model(rows, 3).noise
     assert_allclose(variance, scene.noise_variance, rtol=0.05)

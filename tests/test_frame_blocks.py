@@ -11,6 +11,11 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 N_FRAMES = 23
 
 
+def stored(array, length, n_threads=1):
+    """Return blocks of an array that are read when they are needed."""
+    return FrameBlocks.read_later(array.__getitem__, len(array), length, n_threads)
+
+
 @pytest.fixture
 def array():
     return np.random.default_rng(0).normal(size=(N_FRAMES, 4))
@@ -23,28 +28,18 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
         calls.append(len(block))
         return block
 
-    stored = FrameBlocks.of_stored(array, 10).derive(recorded)
+    later = stored(array, 10).derive(recorded)
     assert calls == []
-    list(stored.map(len))
-    stored.whole()
+    list(later.map(len))
+    later.whole()
     assert calls == [10, 10, 3] * 2
+    frames = np.isin(np.arange(N_FRAMES), [0, 22])
+    assert_array_equal(later.subset(frames).whole(), array[frames])
+    assert max(calls) == 10
     calls.clear()
     kept = FrameBlocks.of_array(array, 10).derive(recorded)
     kept.whole()
     assert calls == [10, 10, 3]
-
-
-def test_kept_frames_far_apart_are_read_a_block_at_a_time(array):
-    calls = []
-
-    def recorded(block):
-        calls.append(len(block))
-        return block
-
-    stored = FrameBlocks.of_stored(array, 4).derive(recorded)
-    frames = np.isin(np.arange(N_FRAMES), [0, 22])
-    assert_array_equal(stored.subset(frames).whole(), array[frames])
-    assert max(calls) == 4
 
 
 @pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
@@ -58,7 +53,7 @@ def test_small_blocks_are_regrouped(array, n_frames, lengths):
 @pytest.mark.parametrize(
     ("n_threads", "length", "others"), [(3, 5, True), (1, 5, False), (3, 23, False)]
 )
-@pytest.mark.parametrize("make", [FrameBlocks.of_array, FrameBlocks.of_stored])
+@pytest.mark.parametrize("make", [FrameBlocks.of_array, stored])
 def test_threads_are_used_for_several_blocks(array, make, n_threads, length, others):
     blocks = make(array, length, n_threads=n_threads).derive(lambda block: block)
     for each in (blocks, blocks.subset(np.full(N_FRAMES, True))):

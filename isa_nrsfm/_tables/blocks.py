@@ -9,7 +9,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -61,13 +60,7 @@ class FrameBlocks:
         return cls.of_blocks(blocks, list(map(len, blocks)), n_threads)
 
     @classmethod
-    def of_stored(cls, table: Any, block_frames: int, n_threads: int = 1) -> Self:
-        """Return blocks that are read from a table that can be sliced."""
-        rows = partial(read_rows, table)
-        return cls._read_later(rows, table.shape[0], block_frames, n_threads)
-
-    @classmethod
-    def _read_later(
+    def read_later(
         cls,
         rows: Callable[[slice], Any],
         n_frames: int,
@@ -127,7 +120,7 @@ class FrameBlocks:
             start = part.start - before[first]
             return np.concatenate(blocks)[start : start + part.stop - part.start]
 
-        return self._read_later(rows, int(before[-1]), length, self.n_threads)
+        return self.read_later(rows, int(before[-1]), length, self.n_threads)
 
     @one_blas_thread
     def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:

@@ -78,13 +78,11 @@ def warn_of_half_points(
     )
 
 
-def clean_tracks(
-    tracks: NDArray, layout: Layout = "interleaved", names: NDArray | None = None
-) -> NDArray:
-    """Return tracks (I, J, 2) without points that have one coordinate; warn of them."""
-    rows, n_half, first = without_half_points(tracks.transpose(0, 2, 1))
+def clean_rows(rows: NDArray, layout: Layout, names: NDArray | None) -> NDArray:
+    """Return rows (I, 2, J) without points that have one coordinate; warn of them."""
+    rows, n_half, first = without_half_points(rows)
     warn_of_half_points(n_half, first, layout, names)
-    return rows.transpose(0, 2, 1)
+    return rows
 
 
 def describe_point(point: int, layout: Layout, names: NDArray | None) -> str:

@@ -18,7 +18,7 @@ from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
     centred_frames,
-    clean_tracks,
+    clean_rows,
     tracks_to_table,
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
@@ -247,7 +247,9 @@ def _frames(
     stripped = [name.strip() for name in names]
     tracks = _tracks(args, table, columns, kept)
     _refuse_lost_points(args, table[kept], columns, tracks)
-    tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
+    points = tracks.transpose(0, 2, 1)
+    points = clean_rows(points, "interleaved", np.array(stripped))[rows]
+    tracks = points.transpose(0, 2, 1)
     if confidence is not None:
         confidence = confidence[list(columns.x)].iloc[rows]
         tracks[confidence.to_numpy() == 0] = np.nan
