@@ -219,10 +219,10 @@ class TableModel(NamedTuple):
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None]:
         """Return a mask of usable rows; these centred, centres, sizes and weights."""
         centred, report = centred_frames(rows)
-        usable = report.usable
+        usable, translation, sizes = report.usable, report.translation, report.size
         if not usable.all():
-            centred, report = centred[usable], report.of_frames(usable)
-        translation, sizes = report.translation, report.size
+            fitted = centred, translation, sizes
+            centred, translation, sizes = (part[usable] for part in fitted)
         frames = self.frames
         robust = isinstance(frames, PosteriorFrames) and frames.loss != "linear"
         if robust and len(centred):

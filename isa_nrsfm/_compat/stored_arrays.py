@@ -70,13 +70,13 @@ def kept_arrays(path: str | os.PathLike[str] | None) -> Iterator[Keep]:
         """Return memory maps of arrays."""
         # Another fit that failed may have removed the empty folder.
         (folder / name).mkdir(parents=True)
+        maps = {}
         for part, array in arrays.items():
-            with whole_file(folder / name / f"{part}.npy") as file:
-                np.save(file, array)
-        return {
-            part: np.load(folder / name / f"{part}.npy", mmap_mode="r")
-            for part in arrays
-        }
+            file = folder / name / f"{part}.npy"
+            with whole_file(file) as stream:
+                np.save(stream, array)
+            maps[part] = np.load(file, mmap_mode="r")
+        return maps
 
     with folder_for_writing(folder):
         try:

@@ -102,14 +102,14 @@ def scaled_table(
             "results are NaN"
         )
         check_size(int(shown.sum()), n_points, n_components, camera)
-        blocks, report = blocks.subset(shown), report.of_frames(shown)
-        visible, largest = visible[shown], largest[shown]
+        blocks = blocks.subset(shown)
+        visible, largest, *rest = (part[shown] for part in (visible, largest, *rest))
         weights = None if weights is None else weights[shown]
     check_points(visible, n_points, n_components, layout, names)
     if weights is not None:
         check_weights(weights, n_components, camera)
     warn_if_other_layout(blocks, n_points, layout, scale_frames)
-    translation, size, n_seen = report[:3]
+    translation, size, n_seen, *_ = rest
     if weights is not None:
         size = blocks.joined(weighted_sizes, weights)
     if robust:

@@ -7,7 +7,7 @@ frame has NaN in both. *Tracks* ``(n_frames, n_points, 2)`` are the form of publ
 results.
 """
 
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,10 +120,6 @@ class FrameReport(NamedTuple):
         """
         enough = self.n_seen >= FEWEST_POINTS
         return enough & ~self.in_one_place & ~self.on_line
-
-    def of_frames(self, frames: NDArray) -> Self:
-        """Return the report of some frames."""
-        return type(self)(*(part[frames] for part in self))
 
 
 def seen_points(rows: NDArray) -> NDArray:
