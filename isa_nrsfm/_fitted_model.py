@@ -223,9 +223,7 @@ class TableModel(NamedTuple):
         if not usable.all():
             fitted = centred, translation, sizes
             centred, translation, sizes = (part[usable] for part in fitted)
-        frames = self.frames
-        robust = isinstance(frames, PosteriorFrames) and frames.loss != "linear"
-        if robust and len(centred):
+        if self.frames.loss != "linear" and len(centred):
             centred, translation = robustly_centred(rows[usable])
             sizes = robust_sizes(centred)
         if weights is not None:

@@ -235,7 +235,7 @@ def test_the_top_of_the_package_is_short():
 
 @pytest.mark.parametrize("file", source_files())
 def test_no_module_is_long(file):
-    assert len((ROOT / file).read_text(encoding="utf-8").splitlines()) <= 1000
+    assert len((ROOT / file).read_text(encoding="utf-8").splitlines()) <= 1200
 
 
 @pytest.mark.parametrize("file", sorted(TESTS.glob("*.py")), ids=lambda path: path.name)

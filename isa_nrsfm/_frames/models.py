@@ -8,7 +8,7 @@ coefficients together.
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +124,8 @@ class LinearisedFrames(NamedTuple):
     slope: NDArray
 
 
-class RigidFrames(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class RigidFrames:
     """The paper's model of a frame: rigid camera, coefficients by least squares.
 
     Shapes are centred, ``B_k B_l^T = 0`` (3x3) for different k and l, with the mean
@@ -136,15 +137,13 @@ class RigidFrames(NamedTuple):
     basis: NDArray
     camera: str = "affine"
 
-    @property
-    def certainty(self) -> DepthCertainty:
-        """Not measured: there is no noise variance."""
-        return NOT_ESTIMATED
+    loss: ClassVar[str] = "linear"
+    certainty: ClassVar[DepthCertainty] = NOT_ESTIMATED  # there is no noise variance
 
     def mirrored(self) -> "RigidFrames":
         """Return the model with shapes mirrored in depth."""
-        return self._replace(
-            mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
+        return replace(
+            self, mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
         )
 
     def fit(
@@ -314,7 +313,7 @@ class PosteriorFrames:
         T -= slope[..., None]
         T *= np.sqrt(weights / self.noise_variance)[:, None, None]
         T = T.reshape(*T.shape[:2], 2 * rows.shape[2]) / sizes[:, None, None]
-        precision = T @ T.transpose(0, 2, 1)
+        precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         return LinearisedFrames(
             motion,
