@@ -79,8 +79,7 @@ from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import spread
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import Layout, of_all_rows
 
 JOINT_STAGE = "joint refinement"

@@ -219,16 +219,16 @@ class TableModel(NamedTuple):
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None]:
         """Return a mask of usable rows; these centred, centres, sizes and weights."""
         centred, report = centred_frames(rows)
-        usable = report.usable
+        usable, translation, sizes = report.usable, report.translation, report.size
         if not usable.all():
-            centred, report = centred[usable], report.of_frames(usable)
-        translation, sizes = report.translation, report.size
+            fitted = centred, translation, sizes
+            centred, translation, sizes = (part[usable] for part in fitted)
         if self.frames.loss != "linear" and len(centred):
             centred, translation = robustly_centred(rows[usable])
             sizes = robust_sizes(centred)
         if weights is not None:
             weights = weights[usable]
-            sizes = weighted_sizes(centred, weights, sizes)
+            sizes = weighted_sizes(rows[usable], weights)
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes, weights

@@ -13,8 +13,7 @@ from isa_nrsfm._paper.pipeline import (
     rigid_energy,
     sample_frames,
 )
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames, spread
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide

@@ -37,8 +37,7 @@ from isa_nrsfm._joint.problem import JointSettings, JointState, refine_joint
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._joint.uncertainty import inlying_rows
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames, spread
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # docs/benchmarks/consensus.md has the errors with other values of these constants.

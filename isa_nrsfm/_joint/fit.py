@@ -51,7 +51,7 @@ from isa_nrsfm._joint.starts import (
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
-from isa_nrsfm._tables.ordering import representative_frames
+from isa_nrsfm._tables.blocks import representative_frames
 
 
 def fit_jointly(

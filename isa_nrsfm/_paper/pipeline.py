@@ -37,8 +37,7 @@ from sklearn.utils.validation import has_fit_parameter
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import energies, orientations
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import spread
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 
 # Larger matrices, with more rows and more columns, are not factorised as a whole.
 DENSE = 1500

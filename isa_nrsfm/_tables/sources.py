@@ -12,9 +12,10 @@ from sklearn.utils import check_array
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks
+from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks, read_rows
 from isa_nrsfm._tables.tracks import (
     Layout,
+    clean_rows,
     refuse_odd,
     table_to_rows,
     warn_of_half_points,
@@ -61,8 +62,7 @@ def open_table(
     dtype = np.float32 if X.dtype == np.float32 else np.float64
     empty = np.empty((0, 2, X.shape[1] // 2), dtype)
     if not is_read_later(X):
-        rows, n_half, first = without_half_points(table_to_rows(X, layout))
-        warn_of_half_points(n_half, first, layout, names)
+        rows = clean_rows(table_to_rows(X, layout), layout, names)
         blocks = FrameBlocks.of_array(rows, min(length, 2048), n_threads)
         blocks.empty = empty
         return blocks
@@ -75,9 +75,11 @@ def open_table(
         numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
         most = max(int(numbers // n_columns), 1)
         if isinstance(X, np.memmap):
-            blocks = FrameBlocks.of_stored(X, min(most, length), n_threads)
+            most = min(most, length)
         else:  # row groups of parquet files are read whole for each block
-            blocks = FrameBlocks.of_stored(X, most)
+            n_threads = 1
+        read = partial(read_rows, X)
+        blocks = FrameBlocks.read_later(read, X.shape[0], most, n_threads)
     if counted and blocks.n_frames:
         half = zip(*blocks.map(partial(_half_points, layout=layout)), strict=True)
         n_half, first = map(np.concatenate, half)

@@ -14,7 +14,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
-from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
+from isa_nrsfm.analysis._frame_columns import kind_of, refuse_infinite
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named

@@ -18,7 +18,7 @@ from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
     centred_frames,
-    clean_tracks,
+    clean_rows,
     tracks_to_table,
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
@@ -138,11 +138,12 @@ def read_frames(
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
     tracks[kept] = tracks_in(table[kept], names, args.missing_value)
     _refuse_lost_points(args, table[kept], columns, tracks)
-    tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
+    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
+    tracks = cleaned.mT
     if confidence is not None:
         confidence = confidence[list(columns.x)].iloc[rows]
         tracks[confidence.to_numpy() == 0] = np.nan
-    _, report = centred_frames(tracks.transpose(0, 2, 1))
+    _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     _warn_of_code(tracks[report.usable])
