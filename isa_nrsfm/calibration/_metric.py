@@ -172,7 +172,7 @@ def linearised(
     values, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
     seen = MQ @ axes
     grown = (seen * np.exp(values)[:, None]) @ axes.mT  # M_i Q exp(E)
-    rows = (MQ @ np.hstack(basis)).reshape(len(MQ), -1, 3)
+    rows = (MQ @ np.hstack([*basis])).reshape(len(MQ), -1, 3)
     products = (rows @ grown.mT).reshape(len(MQ), 2, -1, 2)
     common = np.tensordot(products, ROW_PRODUCTS, ((1, 3), (0, 1))).mT  # (I, c, n)
     # In the axes of E its exponential changes by dE times, entry by entry, the divided
