@@ -42,7 +42,6 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
-from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CALIBRATED_CAMERAS,
@@ -70,6 +69,7 @@ from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.analysis._summary import summary_html
+from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa import PooledFastICA
 
 _NEEDS_CALIBRATED = (
@@ -788,7 +788,7 @@ class AffineNRSfM(
         covariance = space @ found.turn_covariance @ space.T
         if certainty.turns is not None:
             R, _ = full_rotations(found.motion @ space.T)
-            covariance = covariance + R.transpose(0, 2, 1) @ certainty.turns @ R
+            covariance = covariance + R.mT @ certainty.turns @ R
         return np.asarray(covariance).astype(table.empty.dtype, copy=False)
 
     def reconstruct(

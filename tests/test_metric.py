@@ -8,13 +8,13 @@ from refusals import refused
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._metric_upgrade.metric import (
+from isa_nrsfm.calibration import deformation_metric, metric_upgrade
+from isa_nrsfm.calibration._metric import (
     LARGEST_STRETCH,
     metric_quadric,
     strain_basis,
     unit_cameras,
 )
-from isa_nrsfm.calibration import deformation_metric, metric_upgrade
 
 both_cameras = pytest.mark.parametrize("camera", ["orthographic", "weak_perspective"])
 few_cameras = pytest.mark.filterwarnings("ignore:the cameras hardly determine")

@@ -23,13 +23,13 @@ from isa_nrsfm._joint.problem import JOINT_OPTIONS, FactorisedTable, JointProble
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
+from isa_nrsfm._paper.factors import Factorisation, rigid_energy
+from isa_nrsfm._tables.ordering import spread
+from isa_nrsfm.calibration._metric_upgrade import best_metric
+from isa_nrsfm.calibration._orthonormal_cameras import (
     orthonormal_mixture,
     principal_columns,
 )
-from isa_nrsfm._metric_upgrade.rigid import best_metric
-from isa_nrsfm._paper.factors import Factorisation, rigid_energy
-from isa_nrsfm._tables.ordering import spread
 
 # Largest number of steps of a start with fixed cameras.
 FIXED_STEPS = 6
