@@ -788,7 +788,7 @@ class AffineNRSfM(
         covariance = space @ found.turn_covariance @ space.T
         if certainty.turns is not None:
             R, _ = full_rotations(found.motion @ space.T)
-            covariance = covariance + R.transpose(0, 2, 1) @ certainty.turns @ R
+            covariance = covariance + R.mT @ certainty.turns @ R
         return np.asarray(covariance).astype(table.empty.dtype, copy=False)
 
     def reconstruct(

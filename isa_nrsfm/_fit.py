@@ -376,7 +376,7 @@ def _paper_frames(
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
     gauge, frames = rigid_gauge(
         shapes[0].T,
-        shapes[1:].transpose(0, 2, 1),
+        shapes[1:].mT,
         table.sizes,
         lambda mean_shape, basis: table.source.joined(
             partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
@@ -441,7 +441,7 @@ def _joint_frames(
     if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     model = replace(model, gauge=frame_map, certainty=certainty)
-    weight = table.weight
+    weight = table.n_observations
     share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
@@ -488,7 +488,7 @@ def _measures(
         "energy_share_": energy / (energy.sum() or 1.0),
         "inverse_snr_": reprojection_error(
             table.rows,
-            np.concatenate([mean_shape[None], basis]).transpose(0, 2, 1),
+            np.concatenate([mean_shape[None], basis]).mT,
             cameras,
             (frames.translation - table.translation) / table.sizes[:, None],
             frames.alpha,

@@ -65,7 +65,7 @@ class TableModel(NamedTuple):
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
         dtype = rows.dtype if dtype is None else dtype
-        return Decomposition(*(of_all_rows(each, usable).astype(dtype) for each in fit))
+        return Decomposition(*(of_all_rows(part, usable).astype(dtype) for part in fit))
 
     def posterior(
         self, rows: NDArray, weights: NDArray | None = None
@@ -86,7 +86,7 @@ class TableModel(NamedTuple):
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.linearised(centred, sizes, weights)
         fit = fit._replace(translation=fit.translation + translation)
-        return LinearisedFrames(*(of_all_rows(each, usable) for each in fit))
+        return LinearisedFrames(*(of_all_rows(part, usable) for part in fit))
 
     def reconstruct(
         self,
@@ -110,11 +110,11 @@ class TableModel(NamedTuple):
         """Return the shapes (n, n_points, 3) of frames that are fitted."""
         if metric is None:
             return compose(self.mean_shape, self.basis, fit.alpha)
-        found = euclidean_frames(
+        frames = euclidean_frames(
             metric, fit.motion, fit.alpha, self.mean_shape, self.basis
         )
-        sizes = found.scales[:, None, None] if scaled else 1.0
-        return (sizes * found.shapes).astype(fit.alpha.dtype, copy=False)
+        sizes = frames.scales[:, None, None] if scaled else 1.0
+        return (sizes * frames.shapes).astype(fit.alpha.dtype, copy=False)
 
     def uncertain_shapes(
         self, rows: NDArray, weights: NDArray | None = None
@@ -123,8 +123,8 @@ class TableModel(NamedTuple):
         assert isinstance(self.frames, PosteriorFrames)
         fit = self.decompose(rows, weights, deviations=False)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
-        found = self.frames.depth_deviations(centred, sizes, weights)
-        deviations = of_all_rows(found, usable).astype(rows.dtype, copy=False)
+        deviations = self.frames.depth_deviations(centred, sizes, weights)
+        deviations = of_all_rows(deviations, usable).astype(rows.dtype, copy=False)
         _, scales = full_rotations(fit.motion)
         return UncertainShapes(
             self.shapes(fit, None, scaled=False), deviations / scales[:, None]
@@ -223,9 +223,7 @@ class TableModel(NamedTuple):
         if not usable.all():
             centred, report = centred[usable], report.of_frames(usable)
         translation, sizes = report.translation, report.size
-        frames = self.frames
-        robust = isinstance(frames, PosteriorFrames) and frames.loss != "linear"
-        if robust and len(centred):
+        if self.frames.loss != "linear" and len(centred):
             centred, translation = robustly_centred(rows[usable])
             sizes = robust_sizes(centred)
         if weights is not None:

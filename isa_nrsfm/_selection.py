@@ -19,14 +19,9 @@ from sklearn import get_config
 from sklearn.base import BaseEstimator, MetaEstimatorMixin, TransformerMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.metrics import check_scoring
-from sklearn.model_selection import check_cv, cross_validate
+from sklearn.model_selection import GridSearchCV, check_cv, cross_validate
 from sklearn.utils import get_tags, indexable
-from sklearn.utils.metadata_routing import (
-    UNUSED,
-    MetadataRouter,
-    MethodMapping,
-    process_routing,
-)
+from sklearn.utils.metadata_routing import UNUSED, MetadataRouter, process_routing
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.callbacks import NoProgress
@@ -286,9 +281,7 @@ class AffineNRSfMCV(
                 text = line(k, part["test_score"], self.scoring is None)
                 print(f"[{type(self).__name__}] {text}, {seconds:.1f} s", flush=True)
         if any(n_unconverged):
-            which = [
-                str(k) for k, n in zip(candidates, n_unconverged, strict=True) if n
-            ]
+            which = [str(candidates[i]) for i in np.flatnonzero(n_unconverged)]
             warn_caller(
                 "not all fits converged while n_components was chosen: "
                 f"{sum(n_unconverged)} with n_components of {', '.join(which)} did "
@@ -457,15 +450,9 @@ class AffineNRSfMCV(
         MetadataRouter
             From `fit` to the splitter and the scorer, from `score` to the scorer.
         """
-        fit, split, score = (
-            MethodMapping().add(caller="fit", callee=callee)
-            for callee in ("fit", "split", "score")
-        )
-        score.add(caller="score", callee="score")
-        router = MetadataRouter(owner=self)
-        router.add(estimator=self._estimator(), method_mapping=fit)
-        router.add(splitter=self._splitter(), method_mapping=split)
-        return router.add(scorer=self._scorer(), method_mapping=score)
+        cv, scorer = self._splitter(), self._scorer()
+        plain = GridSearchCV(self._estimator(), {}, scoring=scorer, cv=cv)
+        return plain.get_metadata_routing()
 
     def __sklearn_tags__(self) -> Any:
         """Return the tags of the estimator that is fitted."""

@@ -400,6 +400,14 @@ class TestCompressible:
         assert model.inverse_snr_ < 1e-3
         assert error_of_frames(shapes, cameras, model) < 0.1
 
+    def test_atoms_that_few_frames_use_are_replaced(self):
+        # Twice as many atoms as the shapes have: without it one has no frames.
+        X, *_ = sparse_scene(60, 20, 3, sparsity=1)
+        options = {"n_atoms": 6, "sparsity": 1, "penalty": 0.3, "random_state": 0}
+        model = CompressibleNRSfM(2, **options).fit(X)
+        assert model.n_users_.min() >= 3
+        assert model.dictionary_residual_ < 1e-12
+
     def test_seeds_and_atoms(self):
         X = table().data
         first, second, other, named, many = (

@@ -159,20 +159,6 @@ class TestDegenerateCameras:
         assert upgrade.residual > 0.1
         assert np.isfinite(upgrade.rotations).all()
 
-    @pytest.mark.parametrize(
-        ("motion", "camera", "message"),
-        [
-            (np.ones((4, 3, 3)), "orthographic", r"2, 3\); got \(4, 3, 3\)"),
-            (np.ones((0, 2, 3)), "orthographic", r"2, 3\); got \(0, 2, 3\)"),
-            (np.full((4, 2, 3), np.inf), "orthographic", "infinite; 24 entries"),
-            (np.zeros((4, 2, 3)), "orthographic", "the 0 usable cameras see 0"),
-            (np.ones((4, 2, 3)), "weak_perspective", "the 4 usable cameras see 1"),
-            (np.ones((4, 2, 3)), "perspective", "must be one of .*'perspective'"),
-        ],
-    )
-    def test_refuses(self, motion, camera, message):
-        refused(message, metric_upgrade, motion, camera)
-
 
 class TestEuclideanShapes:
     def test_images_stay_what_they_are(self, rng):
@@ -184,18 +170,6 @@ class TestEuclideanShapes:
             assert upgraded.shape == shapes.shape
             images = [shapes @ M.T for M in motion]
             assert_allclose([upgraded @ (M @ Q).T for M in motion], images, atol=1e-9)
-
-    @pytest.mark.parametrize(
-        ("shapes", "Q", "message"),
-        [
-            (np.ones((4, 2)), np.eye(3), r"n_points, 3\); got \(4, 2\)"),
-            (np.ones(3), np.eye(3), r"n_points, 3\); got \(3,\)"),
-            (np.ones((4, 3)), np.eye(2), r"not singular; got \(2, 2\)"),
-            (np.ones((4, 3)), np.ones((3, 3)), "not singular; got a singular one"),
-        ],
-    )
-    def test_refuses(self, shapes, Q, message):
-        refused(message, euclidean_shapes, shapes, Q)
 
 
 def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
@@ -462,25 +436,6 @@ class TestColumnsOfMotion:
         assert_array_equal(found.mixing[[2, 6]], 0)
         assert_allclose(found.cameras, expected.cameras, atol=1e-6)
 
-    @pytest.mark.parametrize(
-        ("columns", "message"),
-        [
-            (np.eye(10, 2)[:, [0, 1, 0, 1]], "three linearly independent columns; 2"),
-            (np.ones((5, 3)), "two rows per frame, an even number; got 5"),
-            (np.full((6, 3), np.nan), "motion contains NaN"),
-        ],
-    )
-    def test_are_refused(self, columns, message):
-        refused(message, orthonormal_cameras, columns)
-
-    def test_variance_is_not_negative(self):
-        refused(
-            "must not be negative; got -1",
-            orthonormal_cameras,
-            deforming_scene(0)[0],
-            -1.0,
-        )
-
 
 ROTATIONS = Rotation.random(5, random_state=0).as_matrix()
 # The directions of `face`, by points: nose, chin, brow, eyes and ears.
@@ -499,13 +454,16 @@ def angle_between(one, two):
     return np.rad2deg(Rotation.from_matrix(one @ two.T).magnitude())
 
 
-class TestPoseByPoints:
+class TestPoses:
     @pytest.mark.parametrize("turn", ROTATIONS)
     @pytest.mark.parametrize("mirror", [np.eye(3), MIRROR], ids=["same", "mirrored"])
-    def test_turned_shapes_and_mirror_images_have_one_pose(self, face, turn, mirror):
+    @pytest.mark.parametrize("options", [POINTS, {"scheme": "ibug-68"}])
+    def test_turned_and_mirrored_shapes_agree(self, face, turn, mirror, options):
         given = face @ mirror @ turn.T
-        pose = canonical_pose(given, **POINTS)
-        assert_allclose(pose.shape, canonical_pose(face, **POINTS).shape, atol=1e-10)
+        pose = canonical_pose(given, **options)
+        assert_allclose(pose.shape, canonical_pose(face, **options).shape, atol=1e-10)
+        # The face is symmetric.
+        assert_allclose(pose.rotation[0], turn[:, 0], atol=1e-10)
         assert_allclose(pose.shape, given @ pose.rotation.T, atol=1e-10)
         assert np.linalg.det(pose.rotation) == pytest.approx(np.linalg.det(mirror))
         assert pose.mirrored == (mirror is MIRROR)
@@ -561,18 +519,6 @@ class TestPoseByPoints:
         one = canonical_pose(face, left_right=LEFT_RIGHT, up=pairs)
         two = canonical_pose(face, left_right=LEFT_RIGHT, up=2.5 * mean)
         assert_allclose(one.rotation, two.rotation, atol=1e-12)
-
-
-class TestPoseByScheme:
-    @pytest.mark.parametrize("turn", ROTATIONS)
-    @pytest.mark.parametrize("mirrored", [False, True])
-    def test_ibug_faces(self, face, turn, mirrored):
-        given = face @ (MIRROR if mirrored else np.eye(3)) @ turn.T
-        pose = canonical_pose(given, scheme="ibug-68")
-        assert pose.mirrored == mirrored
-        assert np.abs(pose.shape - face).max() < 0.03 * np.ptp(face[:, 1])
-        # The face is symmetric.
-        assert_allclose(pose.rotation[0], turn[:, 0], atol=1e-10)
 
     def test_true_faces_stand_upright(self, load_data):
         truth = load_data("ict_bu3dfe_like_68")["S3d"].astype(float)
@@ -679,18 +625,6 @@ def test_frames_without_a_rotation_have_no_angles():
     assert np.isnan(found[1]).all()
 
 
-@pytest.mark.parametrize(
-    ("rotations", "message"),
-    [
-        (np.eye(3), r"\(n_frames, 3, 3\); got \(3, 3\)"),
-        (2 * np.eye(3)[None], "off by 3"),
-        (-np.eye(3)[None], "1 are mirror images"),
-    ],
-)
-def test_refused_rotations(rotations, message):
-    refused(message, view_angles, rotations)
-
-
 class TestAngleDeviations:
     def test_of_random_small_turns(self, rng):
         R = Rotation.from_euler("ZXY", [20, -35, 50], degrees=True)
@@ -700,6 +634,38 @@ class TestAngleDeviations:
         found = angle_deviations(view_angles([R.as_matrix()]), [root @ root.T])
         assert_allclose(np.ravel(found), expected, rtol=0.03)
 
-    def test_refuses_another_number_of_frames(self):
-        message, angles = r"\(1, 3, 3\); got \(2, 3, 3\)", view_angles([np.eye(3)])
-        refused(message, angle_deviations, angles, np.zeros((2, 3, 3)))
+
+@pytest.mark.parametrize(
+    ("call", "arguments", "message"),
+    [
+        *(
+            (metric_upgrade, (motion, camera), message)
+            for motion, camera, message in (
+                (np.ones((4, 3, 3)), "orthographic", r"2, 3\); got \(4, 3, 3\)"),
+                (np.ones((0, 2, 3)), "orthographic", r"2, 3\); got \(0, 2, 3\)"),
+                (np.full((4, 2, 3), np.inf), "orthographic", "infinite; 24 entries"),
+                (np.zeros((4, 2, 3)), "orthographic", "0 usable cameras see 0"),
+                (np.ones((4, 2, 3)), "weak_perspective", "4 usable cameras see 1"),
+                (np.ones((4, 2, 3)), "perspective", "must be one of .*'perspective'"),
+            )
+        ),
+        (euclidean_shapes, (np.ones((4, 2)), np.eye(3)), r"3\); got \(4, 2\)"),
+        (euclidean_shapes, (np.ones(3), np.eye(3)), r"n_points, 3\); got \(3,\)"),
+        (euclidean_shapes, (np.eye(3), np.eye(2)), r"not singular; got \(2, 2\)"),
+        (euclidean_shapes, (np.eye(3), np.ones((3, 3))), "got a singular one"),
+        (orthonormal_cameras, (np.eye(10, 2)[:, [0, 1, 0]],), "independent columns; 2"),
+        (orthonormal_cameras, (np.ones((5, 3)),), "an even number; got 5"),
+        (orthonormal_cameras, (np.full((6, 3), np.nan),), "motion contains NaN"),
+        (orthonormal_cameras, (np.eye(6, 3), -1.0), "must not be negative; got -1"),
+        (view_angles, (np.eye(3),), r"\(n_frames, 3, 3\); got \(3, 3\)"),
+        (view_angles, (2 * np.eye(3)[None],), "off by 3"),
+        (view_angles, (-np.eye(3)[None],), "1 are mirror images"),
+        (
+            angle_deviations,
+            (view_angles([np.eye(3)]), np.zeros((2, 3, 3))),
+            r"\(1, 3, 3\); got \(2, 3, 3\)",
+        ),
+    ],
+)
+def test_refused_arrays(call, arguments, message):
+    refused(message, call, *arguments)

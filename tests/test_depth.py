@@ -1,7 +1,6 @@
 import copy
 import warnings
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
-from isa_nrsfm._joint import uncertainty
 from isa_nrsfm._joint.likelihood import extent_penalty
 from isa_nrsfm._joint.uncertainty import N_GROUPS, depth_certainty, neighbours
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -261,67 +259,6 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
     # Others are not, and with the linear loss none is.
     assert abs(error(complete) / expected - 1) > 0.02
     assert error(spoilt, "linear") > 1.1 * expected
-
-
-class TestJackknife:
-    def test_by_its_definition(self, monkeypatch, rng):
-        shapes = rng.normal(size=(3, 3, 20)) * [[[1.0]], [[0.1]], [[0.1]]]
-        shapes -= shapes.mean(axis=2, keepdims=True)
-        rotations = Rotation.from_rotvec(0.4 * rng.normal(size=(30, 3)))
-        alpha, number = rng.normal(size=(30, 2)), iter(range(6))
-
-        class Refit:
-            def __init__(self, frames, rows, weights, shapes, motion, kept):
-                self.number, self.kept, self.alpha = next(number), kept, alpha
-                self.rotations = rotations.as_matrix()
-
-            def errors(self, whole):
-                assert whole.kept.all()
-                n = self.number
-                return n, n * np.eye(3), n * self.kept
-
-        monkeypatch.setattr(uncertainty, "_Refit", Refit)
-        still = np.zeros((0, 2)), "linear", FrameMap.identity(2)
-        frames = PosteriorFrames(shapes, 1e-4, *still)
-        frames = replace(frames, camera="orthographic")
-        deformed = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
-        rows = rotations.as_matrix()[:, :2] @ deformed
-        found = depth_certainty(frames, FrameBlocks.of_array(rows, 8))
-        assert found.total == pytest.approx(np.sqrt(4 / 5 * 15))
-        assert_allclose(found.turns, 4 / 5 * 15 * np.eye(3))
-        assert_allclose(found.points, 15 - (neighbours(shapes[0]) + 1))
-        turning = (rotations * rotations.mean().inv()).as_rotvec()
-        square = 0.0
-        predictors = np.column_stack([alpha, np.ones(30)])
-        for each in turning.T[:2]:
-            square += np.linalg.lstsq(predictors, each)[1][0] / (30 - 3)
-        assert found.turning == pytest.approx(np.sqrt(square))
-
-    @pytest.mark.parametrize("mirrored", [False, True])
-    def test_differences_of_two_fits(self, mirrored, rng):
-        kept = np.arange(7) != 3
-        z, off = rng.normal(size=(200, 7)), 0.1 * rng.normal(size=(200, 6))
-        off -= off.mean(axis=1, keepdims=True)
-        part = z[:, kept] - z[:, kept].mean(axis=1, keepdims=True)
-        w = 1e-3 * rng.normal(size=(200, 3)) * [1.0, 2.0, 3.0]
-        w[:, 1] += 0.5 * w[:, 0]
-        w[100:] = -w[:100]  # their mean is no common rotation
-        rotations = Rotation.random(100, rng)
-        rotations = Rotation.concatenate([rotations, rotations])
-        common = Rotation.random(None, rng)
-        turned = (Rotation.from_rotvec(w) * rotations * common).as_matrix()
-        mirror = np.array([1.0, 1.0, -1.0 if mirrored else 1.0])
-        turns = mirror[:, None] * turned * mirror
-        depths = mirror[2] * (part + off)
-        fit = SimpleNamespace(kept=kept, depths=depths, rotations=turns)
-        whole = SimpleNamespace(depths=z, rotations=rotations.as_matrix())
-        total, turns, points = uncertainty._Refit.errors(fit, whole)
-        assert total == pytest.approx(np.sum(off**2) / np.sum(part**2))
-        assert_allclose(points[kept], np.mean(off**2, axis=0))
-        assert points[3] == 0.0
-        expected = w.T @ w / 200
-        expected[2, :2] = expected[:2, 2] = 0.0
-        assert_allclose(turns, expected, atol=1e-4 * expected.max())
 
 
 def test_neighbours_are_groups_of_equal_size(rng):

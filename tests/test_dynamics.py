@@ -228,8 +228,8 @@ def test_steps_between_cameras_move_one_to_the_other(name):
     start, end = camera.nearest(
         rng.normal(size=(2, 20, 2, 3)).reshape(-1, 2, 3)
     ).reshape(2, 20, 2, 3)
-    M, N = frames_last(start), frames_last(end)
-    assert_allclose(camera.moved(M, camera.steps_between(M, N)), N, atol=1e-12)
+    moved = camera.moved(frames_last(start), camera.steps_between(start, end).T)
+    assert_allclose(moved, frames_last(end), atol=1e-12)
 
 
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])

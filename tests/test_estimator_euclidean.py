@@ -143,32 +143,6 @@ class TestContract:
             shapes = model.reconstruct(faces.data, camera=camera)
             assert frame_error(faces.shapes, shapes) < 0.08
 
-    def test_layout_and_type_of_the_table(self, faces):
-        table = faces.data[:100]
-        planar = np.hstack([table[:, ::2], table[:, 1::2]])
-        single = table.astype(np.float32)
-        reference = AffineNRSfM(n_components=2, random_state=0)
-        in_planar = clone(reference).set_params(layout="planar").fit(planar)
-        in_single = clone(reference).fit(single)
-        reference.fit(table)
-        for camera in CAMERAS:
-            expected = reference.reconstruct(table, camera=camera)
-            shapes = in_planar.reconstruct(planar, camera=camera)
-            tolerance = 1e-6 * np.abs(expected).max()
-            assert_allclose(shapes, expected, rtol=1e-6, atol=tolerance)
-            shapes = in_single.reconstruct(single, camera=camera)
-            assert shapes.dtype == np.float32
-            assert frame_error(expected, shapes) < 1e-3
-
-    def test_images_that_are_turned_or_larger(self, faces, model):
-        turned = faces.data.reshape(-1, 68, 2) @ [[0.0, 2.0], [-2.0, 0.0]]
-        table = turned.reshape(300, -1)
-        other = clone(model).fit(table)
-        for camera in CAMERAS:
-            one = model.reconstruct(faces.data, camera=camera)
-            two = other.reconstruct(table, camera=camera)
-            assert frame_error(2 * one, two, scale=False) < 1e-3
-
     def test_refuses_other_cameras(self, faces, model):
         message = r"camera must be None or one of .*'weak_perspective'.* got 'affine'"
         refused(message, model.reconstruct, faces.data, camera="affine")

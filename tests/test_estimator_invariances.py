@@ -54,38 +54,20 @@ def rotations(angle):
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
 
 
-def turn_one(tracks, rng):
-    turned = tracks.copy()
-    turned[17] = turned[17] @ rotations(2.0)
-    return turned
-
-
-def mirror_one(tracks, rng):
-    mirrored = tracks.copy()
-    mirrored[17] *= [1, -1]
-    return mirrored
-
-
 def angles(tracks, rng):
     return rng.uniform(0, 2 * np.pi, len(tracks))
 
 
-IMAGE_CHANGES = {
-    "image moved": lambda tracks, rng: tracks + np.array([300.0, -2000.0]),
+CHANGES = {
     "frames moved": lambda tracks, rng: (
         tracks + rng.normal(0, 500, (len(tracks), 1, 2))
     ),
     "image turned": lambda tracks, rng: tracks @ rotations(1.0),
     "image mirrored": lambda tracks, rng: tracks * [-1, 1],
     "axes exchanged": lambda tracks, rng: tracks[:, :, ::-1],
-    "one frame turned": turn_one,
-    "one frame mirrored": mirror_one,
     "frames turned": lambda tracks, rng: tracks @ rotations(angles(tracks, rng)),
-    "other unit": lambda tracks, rng: tracks / 25.4,
     "tiny unit": lambda tracks, rng: tracks * 1e-9,
     "huge unit": lambda tracks, rng: tracks * 1e9,
-}
-SIZE_CHANGES = {
     "one frame rescaled": lambda tracks, rng: (
         tracks * np.where(np.arange(len(tracks)) == 17, 0.01, 1.0)[:, None, None]
     ),
@@ -145,24 +127,17 @@ def with_changes(tracks, *names):
     """Return the tracks with changes, one after the other."""
     rng = np.random.default_rng(0)
     for name in names:
-        tracks = (IMAGE_CHANGES | SIZE_CHANGES)[name](tracks, rng)
+        tracks = CHANGES[name](tracks, rng)
     return tracks
 
 
 # Several at once where nothing can hide: none undoes what another does.
 @pytest.mark.parametrize(
     "changes",
-    slow_after(
-        4,
-        [
-            ("image moved", "image turned", "other unit"),
-            ("frames moved", "tiny unit"),
-            ("image mirrored", "huge unit"),
-            ("axes exchanged", "one frame rescaled"),
-            ("one frame turned", "one frame mirrored"),
-            ("frames turned", "frames rescaled"),
-        ],
-    ),
+    [
+        ("image mirrored", "frames moved", "huge unit"),
+        ("axes exchanged", "frames turned", "one frame rescaled", "tiny unit"),
+    ],
     ids=", ".join,
 )
 def test_coefficients_do_not_depend_on_placement(tracks, model, variant, changes):
@@ -172,27 +147,10 @@ def test_coefficients_do_not_depend_on_placement(tracks, model, variant, changes
     assert_allclose(model.transform(table_of(changed)), model.alpha_, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "changes", [("frames moved", "tiny unit"), ("one frame turned",)], ids=", ".join
-)
-def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, variant, changes):
-    changed = with_changes(tracks, *changes)
+def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, variant):
+    changed = with_changes(tracks, "frames moved", "frames turned", "tiny unit")
     fitted = estimator(variant, scale_frames=False).fit(table_of(changed))
     assert_models_agree(fitted, unscaled)
-
-
-def test_frames_may_change_places(tracks, model, variant):
-    order = np.random.default_rng(0).permutation(len(tracks))
-    permuted = estimator(variant).fit(table_of(tracks[order]))
-    assert_allclose(permuted.alpha_, model.alpha_[order], atol=ALPHA_TOLERANCE)
-    assert_shapes_agree(all_shapes(permuted), all_shapes(model))
-
-
-def test_points_may_change_places(tracks, model, variant):
-    order = np.random.default_rng(0).permutation(tracks.shape[1])
-    permuted = estimator(variant).fit(table_of(tracks[:, order]))
-    assert_allclose(permuted.alpha_, model.alpha_, atol=ALPHA_TOLERANCE)
-    assert_shapes_agree(all_shapes(permuted), all_shapes(model)[:, order])
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

@@ -14,7 +14,6 @@ from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
 K = 2
 REFINEMENTS = ["joint", "alternating", None]
 VARIANTS = [{"refinement": refinement} for refinement in REFINEMENTS]
-VARIANTS += [{"loss": loss} for loss in LOSSES[1:]]
+VARIANTS += [{"loss": loss} for loss in ["huber", "cauchy"]]
 
 
 def scene(seed=0, **params):
@@ -121,7 +120,7 @@ def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     assert_allclose(alone, together[:6], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("loss", LOSSES[1:])
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_frames_that_the_model_does_not_explain_have_finite_fits(loss):
     """Without noise, the weights of their points fall until no camera is left."""
     X = make_nonrigid_tracks(7, 7, 1, random_state=14).data.copy()
@@ -413,7 +412,7 @@ def with_outliers(made, seed, share=0.05, size=1.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "size"), [(0, 5.0), (0, 1.0), (1, 1.0)])
-@pytest.mark.parametrize("loss", LOSSES[1:])
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_robust_losses_withstand_outliers(loss, seed, size):
     # The influence of outliers is bounded by "huber", but not small.
     *_, expected = gross_scene(seed)
@@ -423,7 +422,7 @@ def test_robust_losses_withstand_outliers(loss, seed, size):
     assert linear > 2 * expected
 
 
-@pytest.mark.parametrize("loss", LOSSES[1:])
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_robust_losses_cost_little_without_outliers(loss):
     made, X, linear, expected = gross_scene(0)
     robust = estimator(loss=loss).fit(X)

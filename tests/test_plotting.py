@@ -247,7 +247,7 @@ def test_shapes_are_inside_limits_of_one_scale(rng):
 
 @pytest.mark.parametrize("n_shapes", [2, 3, 10])
 def test_shapes_fit_on_a_page(n_shapes, rng):
-    for aspect in (0.25, 0.8, 3.0):
+    for aspect in (0.25, 3.0):
         mean = rng.uniform(size=(20, 3)) * [aspect, 1, aspect]
         display = drawn_shapes(mean, np.zeros((n_shapes - 1, 20, 3))).plot()
         figure = display.figure_
@@ -384,7 +384,7 @@ def test_shapes_are_those_of_the_estimator_in_natural_proportions(faces, estimat
 
 @pytest.mark.parametrize("camera", slow_after(1, ["weak_perspective", "orthographic"]))
 def test_shapes_of_calibrated_cameras_are_only_turned(camera):
-    faces = make_face_tracks(n_frames=80, n_components=2, camera=camera, random_state=0)
+    faces = make_face_tracks(n_frames=40, n_components=2, camera=camera, random_state=0)
     model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
     display = BasisShapeDisplay.from_estimator(model)
     error = f"depth error {100 * model.depth_uncertainty_:.2g} %"
@@ -397,7 +397,7 @@ def test_shapes_of_calibrated_cameras_are_only_turned(camera):
         assert_allclose(drawn @ drawn.T, scale**2 * shape @ shape.T, atol=1e-6)
     # Points in no known order are seen as the mean camera does.
     order = np.random.RandomState(0).permutation(68)
-    model.fit(faces.tracks[:, order].reshape(80, -1))
+    model.fit(faces.tracks[:, order].reshape(40, -1))
     seen = model.reference_motion_ @ model.mean_shape_.T
     front = BasisShapeDisplay.from_estimator(model).mean_shape[:, :2].T
     unit = np.linalg.norm(model.reference_motion_[0]) / np.median(model.scales_)

@@ -22,6 +22,9 @@ NUMBERS = {
     "robust": [9.927971000e-3, 1.390439467e-2, -4.797831290e-2, 0.8675502040],
     "consensus": [1.435656244e-2, 1.113716499e-3, -1.970364542e-3, 0.7743476784],
 }
+# Uncertainty of depths, their mean deviation, and mean variances of rotations.
+STATED_ERRORS = [0.0958206819, 0.0720495716, 6.55198901e-4, 8.53082804e-4]
+STATED_ERRORS.append(4.42218653e-4)
 # Relative RMS errors of the shapes, a little above what is reached.
 ERRORS = {"calibrated": 0.045, "missing": 0.044, "consensus": 0.054}
 
@@ -52,6 +55,14 @@ def test_numbers_of_fits(fits, kind):
     energies = model.noise_variance_, model.inverse_snr_, model.score(X[::8])
     numbers = *energies, np.abs(model.alpha_).mean()
     assert_allclose(numbers, NUMBERS[kind], rtol=1e-6)
+
+
+def test_stated_errors_of_calibrated_cameras(fits):
+    X, _, model = fits["calibrated"]
+    _, depth_std = model.reconstruct(X, return_std=True)
+    covariance = model.rotation_covariance(X).mean(axis=0)
+    numbers = [model.depth_uncertainty_, depth_std.mean(), *np.diag(covariance)]
+    assert_allclose(numbers, STATED_ERRORS, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ERRORS)

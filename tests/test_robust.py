@@ -115,18 +115,6 @@ class TestSpatialMedian:
         tracks[3, :8] = np.nan
         return tracks
 
-    @pytest.mark.parametrize(("n_seen", "n_half"), [(1, 1), (4, 2), (5, 3), (31, 16)])
-    def test_starts_from_the_half_of_points_nearest_to_their_mean(self, n_seen, n_half):
-        points = np.random.default_rng(0).normal(size=(1, 31, 2))
-        seen = np.arange(31)[None] < n_seen
-        weights, distance, largest = robust._nearest_half(points, seen * 1.0, seen)
-        expected = np.linalg.norm(points - points[:, :n_seen].mean(axis=1), axis=2)
-        assert_allclose(distance[seen], expected[seen])
-        assert np.isinf(distance[~seen]).all()
-        nearest = np.argsort(expected[0, :n_seen])[:n_half]
-        assert_array_equal(np.flatnonzero(weights), np.sort(nearest))
-        assert_allclose(largest, expected[:, nearest[-1]][:, None])
-
     def test_has_nearly_the_least_sum_of_distances(self):
         tracks = self.random_tracks()
         for frame, middle in zip(

@@ -37,6 +37,8 @@ from isa_nrsfm._frames.point_sums import (
 )
 from isa_nrsfm._frames.search import FrameProblem, FrameSearch, Minimum, State
 from isa_nrsfm._linalg.small_matrices import (
+    COLUMNS,
+    ROWS,
     frames_first,
     frames_last,
     of_frames,
@@ -102,7 +104,7 @@ class CalibratedSearch(FrameSearch):
         """
         M = affine_cameras(problem.products, with_one(alpha))[2]
         starts = calibrated_starts(self.model, M)
-        values = [_value(problem, _posterior(problem, each)) for each in starts]
+        values = [_value(problem, _posterior(problem, start)) for start in starts]
         return np.where(values[1] < values[0], *starts[::-1])
 
     def moved(self, position: NDArray, step: NDArray) -> NDArray:
@@ -126,17 +128,16 @@ class CalibratedSearch(FrameSearch):
         G = np.einsum("rbi,bai->rai", M, unpack3(A))
         G -= np.einsum("ki,kari->rai", posterior.c, products.cross)
         gradient, definite = self.model.gradient(M, G), self.model.curvature(M, A)
-        # <G, D_cd>: D_cd = (e_c m_d + e_d m_c) / 2 - m d_cd for rotations, row by row
+        # Second derivatives <G, D_cd>. Of two rotations, row by row,
+        # D_cd = (e_c m_d + e_d m_c) / 2 - m d_cd. With the scale D_c4 = D_c, D_44 = M.
         mixed = np.einsum("rai,rbi->abi", G, M)
-        trace = np.einsum("aai->i", mixed)
-        bent = np.empty((len(gradient), *gradient.shape))
-        bent[3:], bent[:, 3:] = gradient, gradient[:, None]
-        bent[:3, :3] = 0.5 * (mixed + mixed.swapaxes(0, 1))
-        bent[:3, :3] -= trace * np.eye(3)[:, :, None]
-        # - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
+        second = np.empty((len(gradient), *gradient.shape))
+        second[:3, :3] = 0.5 * (mixed + mixed.swapaxes(0, 1))
+        second[:3, :3] -= np.einsum("aai->i", mixed) * np.eye(3)[:, :, None]
+        second[3:], second[:, 3:] = gradient, gradient[:, None]
+        # The coefficients follow: - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
         coupling, through = self._coupling(problem, M, posterior)
-        rows, columns = pair_indices(len(gradient))
-        hessian = definite + bent[rows, columns]
+        hessian = definite + second[pair_indices(len(gradient))]
         hessian -= packed_products(through.swapaxes(0, 1), coupling.swapaxes(0, 1))
         value = _value(problem, posterior)
         return State(M, value, -gradient, definite, hessian), through
@@ -148,18 +149,18 @@ class CalibratedSearch(FrameSearch):
 
         Cameras are replaced by minima from reversed ones if these are lower.
         """
-        found = _posterior(problem, position)
+        posterior = _posterior(problem, position)
         if n_steps:
-            value = _value(problem, found)
-            rise = _rise(problem, position, found)
+            value = _value(problem, posterior)
+            rise = _rise(problem, position, posterior)
             tried = np.flatnonzero(~(rise > LARGE_RISE * value))
             position, better, reached = self._better_reversed(
                 problem, position, value, tried, n_steps
             )
             converged[better] = reached[better]
             if better.any():
-                found = _posterior(problem, position)
-        return position, found.alpha, found.objective
+                posterior = _posterior(problem, position)
+        return position, posterior.alpha, posterior.objective
 
     def covariances(
         self, problem: FrameProblem, M: NDArray, alpha: NDArray
@@ -201,7 +202,7 @@ class CalibratedSearch(FrameSearch):
         converged.
         """
         limit = value - 1e-10 * problem.energy
-        found, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
+        cameras, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
         tried = padded(tried)
         if len(tried):
             problem, M, limit = (of_frames(p, tried) for p in (problem, M, limit))
@@ -211,8 +212,8 @@ class CalibratedSearch(FrameSearch):
             known = Minimum(M, limit, radius)
             other, converged[tried] = self.descend(problem, start, max_steps, known)
             better[tried] = lower = _value(problem, _posterior(problem, other)) < limit
-            found[..., tried] = np.where(lower, other, M)
-        return found, better, converged
+            cameras[..., tried] = np.where(lower, other, M)
+        return cameras, better, converged
 
 
 def calibrated_starts(model: CameraModel, M: NDArray) -> list[NDArray]:
@@ -260,8 +261,9 @@ def _rise(
     A = problem.products.gram.moments(posterior.second_moments(problem.noise))
     Y = -packed_products(posterior.covaried(F).swapaxes(0, 1), F.swapaxes(0, 1))
     # A for each row of the camera: the diagonal 3x3 blocks of the packed 6x6 matrix
-    Y[[0, 1, 2, 6, 7, 11]] += A
-    Y[15:] += A
+    places = unpacked(np.arange(len(Y)))
+    Y[places[:3, :3][ROWS, COLUMNS]] += A
+    Y[places[3:, 3:][ROWS, COLUMNS]] += A
     z = (M * (REVERSED < 0)).reshape(6, n)
     square = np.einsum("pi,pi->i", z, z)
     e = z / np.sqrt(np.where(square > 0, square, 1.0))

@@ -24,7 +24,6 @@ from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     DIAGONAL,
     ROWS,
-    frames_first,
     inverse3,
     packed_products,
     polar,
@@ -57,9 +56,9 @@ class AffineCameras:
         """Return cameras (2, 3, n) after steps (p, n)."""
         return M + step.reshape(M.shape) if self.n_parameters else M
 
-    def steps_between(self, M: NDArray, N: NDArray) -> NDArray:
-        """Return the steps (p, n) that move cameras M to N (2, 3, n)."""
-        return (N - M).reshape(6, -1)[: self.n_parameters]
+    def steps_between(self, first: NDArray, second: NDArray) -> NDArray:
+        """Return the steps (n, p) that move cameras (n, 2, 3) to others."""
+        return (second - first).reshape(-1, 6)[:, : self.n_parameters]
 
     def tangents(self, M: NDArray) -> NDArray:
         """Return the derivatives (p, 2, 3, n) of cameras."""
@@ -107,14 +106,12 @@ class CalibratedCameras:
         turned = rotated(M, step[:3])
         return np.exp(step[3]) * turned if self.scaled else turned
 
-    def steps_between(self, M: NDArray, N: NDArray) -> NDArray:
-        """Return the steps (p, n) that move cameras M to N (2, 3, n)."""
-        R, scales = full_rotations(frames_first(M))
-        turned, others = full_rotations(frames_first(N))
-        turns = Rotation.from_matrix(R.transpose(0, 2, 1) @ turned).as_rotvec().T
-        if not self.scaled:
-            return turns
-        return np.concatenate([turns, np.log(others / scales)[None]])
+    def steps_between(self, first: NDArray, second: NDArray) -> NDArray:
+        """Return the steps (n, p) that move cameras (n, 2, 3) to others."""
+        (R, scales), (turned, others) = map(full_rotations, (first, second))
+        turns = Rotation.from_matrix(R.swapaxes(1, 2) @ turned).as_rotvec()
+        steps = np.column_stack([turns, np.log(others / scales)])
+        return steps[:, : self.n_parameters]
 
     def tangents(self, M: NDArray) -> NDArray:
         """Return ``M hat(e_c)``, and M itself where there are scales."""

@@ -8,7 +8,7 @@ coefficients together.
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +124,8 @@ class LinearisedFrames(NamedTuple):
     slope: NDArray
 
 
-class RigidFrames(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class RigidFrames:
     """The paper's model of a frame: rigid camera, coefficients by least squares.
 
     Shapes are centred, ``B_k B_l^T = 0`` (3x3) for different k and l, with the mean
@@ -136,15 +137,13 @@ class RigidFrames(NamedTuple):
     basis: NDArray
     camera: str = "affine"
 
-    @property
-    def certainty(self) -> DepthCertainty:
-        """Not measured: there is no noise variance."""
-        return NOT_ESTIMATED
+    loss: ClassVar[str] = "linear"
+    certainty: ClassVar[DepthCertainty] = NOT_ESTIMATED  # there is no noise variance
 
     def mirrored(self) -> "RigidFrames":
         """Return the model with shapes mirrored in depth."""
-        return self._replace(
-            mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
+        return replace(
+            self, mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
         )
 
     def fit(
@@ -296,15 +295,15 @@ class PosteriorFrames:
     ) -> LinearisedFrames:
         """Return fits of rows (n, 2, J), NaN where missing, of sizes (n,)."""
         unit = rows / sizes[:, None, None]
-        found = self.posterior(unit, weights=weights)
+        fit = self.posterior(unit, weights=weights)
         if weights is None:
             weights = seen_points(rows).astype(float)
         if self.loss != "linear":
-            distance = distances(unit, self.shapes, *found[:3])
+            distance = distances(unit, self.shapes, *fit[:3])
             deviation = np.sqrt(self.noise_variance)
             weights = frame_weights(self.loss, distance, deviation, robust_sizes(unit))
-        motion = found.motion * sizes[:, None, None]
-        shapes = self.shapes[0] + np.tensordot(found.alpha, self.shapes[1:], 1)
+        motion = fit.motion * sizes[:, None, None]
+        shapes = self.shapes[0] + np.tensordot(fit.alpha, self.shapes[1:], 1)
         tangents = CAMERAS[self.camera].tangents(frames_last(motion))
         bent = np.einsum("ira,kaj->ikrj", motion, self.shapes[1:])
         turned = np.einsum("prai,iaj->iprj", tangents, shapes)
@@ -314,13 +313,13 @@ class PosteriorFrames:
         T -= slope[..., None]
         T *= np.sqrt(weights / self.noise_variance)[:, None, None]
         T = T.reshape(*T.shape[:2], 2 * rows.shape[2]) / sizes[:, None, None]
-        precision = T @ T.transpose(0, 2, 1)
+        precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         return LinearisedFrames(
             motion,
-            found.translation * sizes[:, None],
-            found.alpha,
-            found.covariance,
+            fit.translation * sizes[:, None],
+            fit.alpha,
+            fit.covariance,
             precision,
             slope,
         )
@@ -336,17 +335,17 @@ class PosteriorFrames:
         Weights (n, J) multiply the squares.
         """
         unit = rows / sizes[:, None, None]
-        found = self.posterior(unit, covariances=False, weights=weights)
+        fit = self.posterior(unit, covariances=False, weights=weights)
         seen, free = seen_points(rows), CAMERAS[self.camera].scaled
         weights = seen.astype(float) if weights is None else weights
         variances = np.full(seen.shape, np.nan)
-        rotations, scales = full_rotations(found.motion)
-        prior = np.diag([0.0] * (3 + free) + [1.0] * found.alpha.shape[1])
+        rotations, scales = full_rotations(fit.motion)
+        prior = np.diag([0.0] * (3 + free) + [1.0] * fit.alpha.shape[1])
         for i in np.flatnonzero(np.isfinite(scales)):
             w = weights[i, seen[i]]
             middle = (self.shapes[:, :, seen[i]] @ w / w.sum())[..., None]
             mean_shape, basis = np.split(self.shapes - middle, [1])
-            shape = mean_shape[0] + np.tensordot(found.alpha[i], basis, 1)
+            shape = mean_shape[0] + np.tensordot(fit.alpha[i], basis, 1)
             turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
             changes = np.stack([*turned, *([shape] if free else []), *basis])
             changes = scales[i] * rotations[i] @ changes
@@ -355,7 +354,7 @@ class PosteriorFrames:
             covariance = np.linalg.pinv(information, hermitian=True)
             Z = changes[:, 2]
             variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
-        variances += self.certainty.variances(found.alpha)
+        variances += self.certainty.variances(fit.alpha)
         return sizes[:, None] * np.sqrt(variances)
 
     def posterior(
@@ -420,8 +419,8 @@ class PosteriorFrames:
         if fit is None:
             return None
         motion, turns = fit.motion @ space, space.T @ fit.turns @ space
-        found = motion, centre, fit.alpha, fit.covariance, turns, fit.objective, True
-        return FramePosterior(*(np.array(each)[None] for each in found))
+        parts = motion, centre, fit.alpha, fit.covariance, turns, fit.objective, True
+        return FramePosterior(*(np.array(part)[None] for part in parts))
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:

@@ -84,13 +84,13 @@ class Gram:
 class FrameTracks(NamedTuple):
     """Tracks with the frame index last, ready for products with any shapes.
 
-    weighted (J, 2, I): ``w_ij (m_ij - mean_i)``; zero for points that are missing.
+    deviations (J, 2, I): ``w_ij (m_ij - mean_i)``; zero for points that are missing.
     weights (J, I): w_ij; None where all are 1.
     centroid (2, I): ``mean_i``, zero for frames without points.
     weight, energy (I,): ``sum_j w_ij`` and ``sum_j w_ij ||m_ij - mean_i||^2``.
     """
 
-    weighted: NDArray
+    deviations: NDArray
     weights: NDArray | None
     centroid: NDArray
     weight: NDArray
@@ -193,8 +193,8 @@ def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
     if len(parts) == 1:
         return parts[0]
     joined: list[Any] = []
-    for each in zip(*parts, strict=True):
-        joined.append(None if each[0] is None else np.concatenate(each, axis=-1))
+    for values in zip(*parts, strict=True):
+        joined.append(None if values[0] is None else np.concatenate(values, axis=-1))
     return FrameTracks(*joined)
 
 
@@ -226,10 +226,10 @@ class ShapeProducts:
 
 def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:
     """Return the sums over the points of frames; complete ones share a Gram matrix."""
-    weighted, W, centroid, weight, energy = tracks
+    deviations, W, centroid, weight, energy = tracks
     n_shapes, _, n_points = shapes.shapes.shape
     rows = shapes.rows
-    cross = (rows @ weighted.reshape(n_points, -1)).reshape(n_shapes, 3, 2, -1)
+    cross = (rows @ deviations.reshape(n_points, -1)).reshape(n_shapes, 3, 2, -1)
     if W is None:
         means = np.zeros((n_shapes, 3, len(weight)))
         return FrameSums(cross, shapes.gram, means, centroid, weight, energy)

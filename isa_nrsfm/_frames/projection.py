@@ -16,8 +16,8 @@ def reprojection_error(
     Frames of W, blocks (n, 2, J), are below centred. Motion (n, 2, 3), position (n, 2)
     and alpha (n, K) are those of all frames, shapes (K + 1, 3, J).
     """
-    found = W.map(partial(_energies, shapes=shapes), motion, position, alpha)
-    noise, signal = np.sum(list(found), axis=0)
+    energies = W.map(partial(_energies, shapes=shapes), motion, position, alpha)
+    noise, signal = np.sum(list(energies), axis=0)
     return float(noise / signal)
 
 

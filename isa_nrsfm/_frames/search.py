@@ -73,12 +73,12 @@ class FramePosterior(NamedTuple):
 
     def take(self, frames: NDArray) -> Self:
         """Return the fits of some of the frames."""
-        return type(self)(*(each[frames] for each in self))
+        return type(self)(*(part[frames] for part in self))
 
     def put(self, frames: NDArray, others: Self) -> None:
         """Set the fits of some of the frames."""
-        for each, other in zip(self, others, strict=True):
-            each[frames] = other
+        for part, other in zip(self, others, strict=True):
+            part[frames] = other
 
 
 def largest_objective(n_points: Any, noise: Any) -> Any:
@@ -281,7 +281,7 @@ class FrameSearch:
                 covariance, turns = self.covariances(problem, M, alpha)
                 turns = self.space.T @ frames_first(turns) @ self.space
                 spreads = frames_first(covariance), turns
-            found = FramePosterior(
+            minima = FramePosterior(
                 motion @ self.space,
                 products.positions(motion, alpha.T),
                 alpha.T,
@@ -289,7 +289,7 @@ class FrameSearch:
                 np.maximum(objective, 0.0),  # less is rounding errors
                 converged,
             )
-            fits.put(block, found)
+            fits.put(block, minima)
         return fits
 
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
@@ -341,7 +341,7 @@ class FrameSearch:
         Gives up a frame that is not expected to end below its known minimum.
         """
         n_frames = len(state.value)
-        found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)
+        ends, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)
         running, damping = np.arange(n_frames), np.zeros(n_frames)
         for n_left in range(max_steps, -1, -1):
             # Next step, and convergence test by its predicted decrease. Convergence is
@@ -355,10 +355,10 @@ class FrameSearch:
             # Remove frames that have ended; converged ones take a last step.
             if leaving.any():
                 last = self.moved(state.position, np.where(small, step, 0.0))
-                found[..., running[leaving]] = last[..., leaving]
+                ends[..., running[leaving]] = last[..., leaving]
                 converged[running[leaving]] = small[leaving]
                 if leaving.all():
-                    return found, converged
+                    return ends, converged
                 left = padded(np.flatnonzero(~leaving))
                 problem, state, step, running, damping, known = (
                     of_frames(part, left)
@@ -377,8 +377,8 @@ class FrameSearch:
                 for new, old in zip(trial, state, strict=True):
                     new[..., worse] = old[..., worse]
             state, damping = trial, eased
-        found[..., running] = state.position
-        return found, converged
+        ends[..., running] = state.position
+        return ends, converged
 
     def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
         """Return Newton steps (p, n) and the damping (n,) that makes them definite."""

@@ -112,22 +112,22 @@ class SingleSearch:
         starts = calibrated_starts(self.model, affine[..., None])
         cameras = [self._camera(M[..., 0], P, energy, noise) for M in starts]
         start = min(cameras, key=lambda camera: camera.value)
-        found = self._minimum(start, P, energy, noise)
-        if found is None:
+        minimum = self._minimum(start, P, energy, noise)
+        if minimum is None:
             return None
-        moments = self._moments(found, P, noise)
-        if not self._rise(found, moments) > LARGE_RISE * found.value:
+        moments = self._moments(minimum, P, noise)
+        if not self._rise(minimum, moments) > LARGE_RISE * minimum.value:
             # A lower minimum from the reversed camera is left to the other search.
-            other = self._camera(found.M * REVERSED.T, P, energy, noise)
-            limit = found.value - 1e-10 * (energy + noise)
-            if self._minimum(other, P, energy, noise, found, limit) is not None:
+            other = self._camera(minimum.M * REVERSED.T, P, energy, noise)
+            limit = minimum.value - 1e-10 * (energy + noise)
+            if self._minimum(other, P, energy, noise, minimum, limit) is not None:
                 return None
-        _, hessian, _, through = self._derivatives(found, P, moments)
+        _, hessian, _, through = self._derivatives(minimum, P, moments)
         turns = np.linalg.inv(hessian)
-        covariance = noise * (found.Q + through @ turns @ through.T)
-        objective = max(found.value - noise * found.log_determinant, 0.0)
+        covariance = noise * (minimum.Q + through @ turns @ through.T)
+        objective = max(minimum.value - noise * minimum.log_determinant, 0.0)
         turns = noise * turns[:3, :3]
-        return SingleFit(found.M, found.alpha, covariance, turns, objective)
+        return SingleFit(minimum.M, minimum.alpha, covariance, turns, objective)
 
     def _camera(self, M: NDArray, P: NDArray, energy: float, noise: float) -> _Camera:
         """Return a camera with the posterior of the coefficients."""

@@ -44,7 +44,7 @@ def independent_gauge(
     shift, motion, alpha = _centred(shapes, motion, alpha, camera)
     shapes = np.tensordot(shift, shapes, 1)
     space = canonical_space(shapes[0].T, motion)
-    white = shapes[1:].transpose(0, 2, 1) @ space.T
+    white = shapes[1:].mT @ space.T
     if camera != "affine":
         space = euclidean_space(shapes[0].T, motion, unit)
     # The mixing of the basis shapes, then their order, scale and signs.
@@ -55,7 +55,7 @@ def independent_gauge(
         mixing = np.linalg.inv(independent_coefficients(alpha)).T
     else:
         mixing = _principal_axes(white, alpha)
-    basis = np.tensordot(mixing, shapes[1:], 1).transpose(0, 2, 1)
+    basis = np.tensordot(mixing, shapes[1:], 1).mT
     unmixing = np.linalg.inv(mixing).T
     gauge = canonical_gauge(shapes[0].T, basis, motion, alpha @ unmixing.T, space)
     # Coefficients (1, alpha_i) change by the inverse transpose of the mixing of shapes.

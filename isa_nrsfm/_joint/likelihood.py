@@ -298,7 +298,7 @@ def _terms(
     G -= np.einsum("ki,kari->rai", c, products.cross)
     # With respect to the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
     X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
-    shape_gradient = X @ block.weighted.reshape(n_points, -1).T
+    shape_gradient = X @ block.deviations.reshape(n_points, -1).T
     if block.weights is None:
         shape_curvature = (moments @ cameras.T)[:, :, None]
     else:

@@ -36,7 +36,7 @@ Memory = deque[tuple[NDArray, NDArray, float]]
 
 
 class JointOptions(NamedTuple):
-    """Thresholds of the joint fit; docs/architecture.md has the effect of others."""
+    """Thresholds of the joint fit; docs/benchmarks/README.md has their effects."""
 
     # Prior standard deviation of the coordinates of the image of a basis shape with
     # coefficient one, as a share of the size of the frame

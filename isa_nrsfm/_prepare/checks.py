@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from sklearn.utils.validation import validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
@@ -213,29 +214,16 @@ def check_points(
             f"determine {equations} numbers of the shapes, which have {unknowns}. Take "
             "fewer basis shapes, or leave out points that are rarely visible"
         )
-    group = _groups(seen)
-    if group.any():
+    shown = seen.astype(np.float32)
+    n_groups, group = connected_components(shown.T @ shown)  # points seen together
+    if n_groups > 1:
         raise ValueError(
-            f"the points fall into {group.max() + 1} groups that no frame shows "
+            f"the points fall into {n_groups} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "
             f"{describe_point(int(group.argmax()), layout, names)} is never visible "
             f"with {describe_point(0, layout, names)} and its group). Add frames that "
             "show points of both, or fit each group by itself"
         )
-
-
-def _groups(seen: NDArray) -> NDArray:
-    """Return group numbers of points (J,) that frames (I, J) connect."""
-    group = np.full(seen.shape[1], -1)
-    for number in range(len(group)):
-        if (group >= 0).all():
-            break
-        reached, before = np.arange(len(group)) == group.argmin(), 0
-        while reached.sum() > before:
-            before = reached.sum()
-            reached = reached | seen[(seen & reached).any(axis=1)].any(axis=0)
-        group[reached] = number
-    return group
 
 
 def warn_if_other_layout(

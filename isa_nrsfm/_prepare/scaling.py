@@ -53,7 +53,7 @@ class ScaledTable(NamedTuple):
     weights: NDArray | None = None
 
     @property
-    def weight(self) -> NDArray:
+    def n_observations(self) -> NDArray:
         """Numbers of observations (I,) of the frames."""
         return self.n_seen if self.weights is None else self.weights.sum(axis=1)
 

@@ -122,9 +122,9 @@ class FrameBlocks:
         def rows(part: slice) -> NDArray:
             ends = [part.start, part.stop - 1]
             first, last = np.searchsorted(before, ends, side="right") - 1
-            found = [chosen.read(number) for number in range(first, last + 1)]
+            blocks = [chosen.read(number) for number in range(first, last + 1)]
             start = part.start - before[first]
-            return np.concatenate(found)[start : start + part.stop - part.start]
+            return np.concatenate(blocks)[start : start + part.stop - part.start]
 
         return self._read_later(rows, int(before[-1]), length, self.n_threads)
 
@@ -143,9 +143,9 @@ class FrameBlocks:
         """Return different frames (n_chosen,) in any order. Blocks are arrays."""
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        found: NDArray = self.joined(chosen_rows, chosen)
+        block: NDArray = self.joined(chosen_rows, chosen)
         in_order = (np.diff(frames) > 0).all()
-        return found if in_order else found[np.argsort(np.argsort(frames))]
+        return block if in_order else block[np.argsort(np.argsort(frames))]
 
     def whole(self) -> NDArray:
         """Return all frames. Blocks are arrays."""
@@ -276,9 +276,9 @@ def chosen_rows(block: NDArray, kept: NDArray) -> NDArray:
 
 def read_rows(table: Any, rows: slice) -> NDArray:
     """Return rows of a table; the pages of a memory map do not stay in memory."""
-    found = np.array(table[rows])
+    block = np.array(table[rows])
     mapped = getattr(table, "_mmap", None)
     # Mode "c" is copy on write: pages that were changed are in memory only.
     if mapped is not None and hasattr(mapped, "madvise") and table.mode != "c":
         mapped.madvise(mmap.MADV_DONTNEED)
-    return found
+    return block

@@ -199,10 +199,10 @@ class StoredTable:
         if not isinstance(rows, slice) or rows.step not in (None, 1):
             raise TypeError(f"rows must be a slice without steps; got {rows!r}")
         start, stop, _ = rows.indices(len(self))
-        found = [np.empty((0, self.shape[1]), dtype=self.dtype)]
+        parts = [np.empty((0, self.shape[1]), dtype=self.dtype)]
         begins = [0, *self._ends[:-1].tolist()]
         for begin, end, read in zip(begins, self._ends, self._read, strict=True):
             first, last = max(start, begin), min(stop, end)
             if first < last:
-                found.append(read(int(first - begin), int(last - begin)))
-        return np.concatenate(found[1:] or found).astype(self.dtype, copy=False)
+                parts.append(read(int(first - begin), int(last - begin)))
+        return np.concatenate(parts[1:] or parts).astype(self.dtype, copy=False)

@@ -223,24 +223,6 @@ def refuse_one_place(report: FrameReport, n_points: int) -> None:
         )
 
 
-def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
-    """Return tracks (I, J, 2) centred over their visible points, and centroids."""
-    centred, report = centred_frames(tracks.transpose(0, 2, 1))
-    refuse_one_place(report, tracks.shape[1])
-    return centred.transpose(0, 2, 1), report.translation
-
-
-def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
-    """Return the sizes (I,) by which centred rows or tracks are divided.
-
-    The RMS of the visible coordinates of each frame, or of all if not `scale_frames`.
-    """
-    known = ~np.isnan(centred)
-    seen = np.where(known, centred, 0.0)
-    square = np.einsum("ijc,ijc->i", seen, seen) / known.sum(axis=(1, 2))
-    return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
-
-
 def weighted_sizes(centred: NDArray, weights: NDArray, sizes: NDArray) -> NDArray:
     """Return the weighted RMS (I,) of centred rows (I, 2, J), weights (I, J).
 
@@ -253,10 +235,3 @@ def weighted_sizes(centred: NDArray, weights: NDArray, sizes: NDArray) -> NDArra
     square = np.vecdot(weights, (off**2).sum(axis=1)) / (2 * total)
     eps = 4 * np.finfo(float).eps
     return np.where(square > (eps * sizes) ** 2, np.sqrt(square), sizes)
-
-
-def measurement_matrix(centred: NDArray) -> NDArray:
-    """Return W (2 * n_frames, n_points): for each frame the row of x, then of y."""
-    return np.ascontiguousarray(centred.transpose(0, 2, 1)).reshape(
-        -1, centred.shape[1]
-    )

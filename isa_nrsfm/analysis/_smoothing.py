@@ -273,9 +273,8 @@ def _observations(
         return rows, data
     data.precision[at], data.fit[at, :K] = alone.precision[chosen], alone.alpha[chosen]
     if len(chosen) > 1:
-        motion = frames_last(alone.motion[chosen])
-        between = camera.steps_between(motion[..., :-1], motion[..., 1:])
-        data.change[at[1:], K:] = between.T
+        motion = alone.motion[chosen]
+        data.change[at[1:], K:] = camera.steps_between(motion[:-1], motion[1:])
     return chosen[np.maximum(np.cumsum(seen) - 1, 0)], data
 
 

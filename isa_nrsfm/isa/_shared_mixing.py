@@ -268,7 +268,7 @@ def _relative_derivatives(
     (n, n, n).
     """
     n_signals, n_samples, size = Y.shape
-    Y = np.ascontiguousarray(Y.transpose(0, 2, 1))  # samples last: long rows are fast
+    Y = np.ascontiguousarray(Y.mT)  # samples last: long rows are fast
     flat = Y.reshape(n_signals, -1)
     gradient = 2.0 / n_samples * (g[:, None] * Y).reshape(n_signals, -1) @ flat.T
     gradient += size * np.eye(n_signals)
