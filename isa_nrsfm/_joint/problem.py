@@ -247,12 +247,11 @@ class JointProblem:
         search = CalibratedSearch(state.shapes, cameras.scaled)
 
         def reversed_cameras(block: FrameTracks, motion: NDArray) -> Any:
-            parts = [
-                search.reversed_cameras(
-                    frame_sums(piece, search.shared), state.noise, motion[frames]
-                )
-                for frames, piece in block.pieces(BLOCK_FRAMES)
-            ]
+            parts = []
+            for frames, piece in block.pieces(BLOCK_FRAMES):
+                sums = frame_sums(piece, search.shared)
+                other = search.reversed_cameras(sums, state.noise, motion[frames])
+                parts.append(other)
             return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
         parts = self.frames.blocks.map(reversed_cameras, state.motion)

@@ -16,7 +16,7 @@ These fits do not have the prior of the extents, which would hide uncertain dept
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,7 +203,28 @@ def depth_certainty(
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], fit.motion[known]
-    refit = partial(_Refit, frames, part[known], w, shapes, motion)
+    tracks = part[known]
+
+    def refit(kept: NDArray) -> _Refit:
+        """Return a fit of some points, by a few steps from the fit of all points."""
+        rows, chosen = tracks[:, :, kept], shapes[:, :, kept]
+        blocks = FrameBlocks.of_array(rows, len(rows))
+        counts = None if w is None else w[:, kept]
+        part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
+        n_numbers, energy = part.totals
+        penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
+        likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
+        noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
+        least = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
+        start = JointState(chosen - chosen.mean(axis=2, keepdims=True), motion, noise)
+        limits: Any = {"least_noise": least, "max_iter": MOST_STEPS, "tol": TOL}
+        state = refine_joint(likelihood, start, CAMERAS[frames.camera], **limits).state
+        rotations, scales = full_rotations(state.motion)
+        alpha = likelihood(*state).alpha
+        z = np.einsum("ia,kaj->ikj", rotations[:, 2], state.shapes)
+        z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", alpha, z[:, 1:]))
+        return _Refit(kept, rotations, alpha, z - z.mean(axis=1, keepdims=True))
+
     whole = refit(np.ones(len(points), dtype=bool))
     errors = [refit(~group).errors(whole) for group in left_out]
     sums = (np.sum(terms, axis=0) for terms in zip(*errors, strict=True))
@@ -234,37 +255,13 @@ def neighbours(points: NDArray) -> NDArray:
     return places[linear_sum_assignment(squares)[1]]
 
 
-class _Refit:
-    """A fit of some of the points, by a few steps from the fit of all points."""
+class _Refit(NamedTuple):
+    """A fit of the kept points: rotations (I, 3, 3), alpha (I, K), centred depths."""
 
-    def __init__(
-        self,
-        frames: PosteriorFrames,
-        rows: NDArray,
-        weights: NDArray | None,
-        shapes: NDArray,
-        motion: NDArray,
-        kept: NDArray,
-    ):
-        rows, self.kept = rows[:, :, kept], kept
-        shapes = shapes[:, :, kept] - shapes[:, :, kept].mean(axis=2, keepdims=True)
-        blocks = FrameBlocks.of_array(rows, len(rows))
-        weights = None if weights is None else weights[:, kept]
-        part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), weights)
-        n_numbers, energy = part.totals
-        penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
-        likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
-        noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
-        least = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
-        start, cameras = JointState(shapes, motion, noise), CAMERAS[frames.camera]
-        state = refine_joint(
-            likelihood, start, cameras, least_noise=least, max_iter=MOST_STEPS, tol=TOL
-        ).state
-        self.rotations, scales = full_rotations(state.motion)
-        self.alpha = likelihood(*state).alpha
-        z = np.einsum("ia,kaj->ikj", self.rotations[:, 2], state.shapes)
-        z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", self.alpha, z[:, 1:]))
-        self.depths = z - z.mean(axis=1, keepdims=True)
+    kept: NDArray
+    rotations: NDArray
+    alpha: NDArray
+    depths: NDArray
 
     def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray]:
         """Compute squared differences from the fit of all points.
