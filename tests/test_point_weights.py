@@ -414,32 +414,24 @@ class TestCommandLine:
         succeeds("transform", saved, results, *options, "-o", new)
         assert_allclose(self.coefficients(new), model.alpha_, atol=1e-6)
 
-    def test_all_results_are_of_weighted_points(self, results, tmp_path, succeeds):
+    def test_all_results_of_some_points_are_weighted(self, results, tmp_path, succeeds):
         options = ["--weights", "confidence", "--camera", "weak_perspective"]
-        options += ["--fps", 25, "--std", "-o", tmp_path / "out"]
-        succeeds("fit", results, *options, *self.QUICK)
-        found = read_landmarks(results)
-        X, weights = found.points, {"point_weight": found.confidence}
+        options += ["--points", "without:3,7", "--fps", 25, "--std"]
+        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
+        left, found = np.delete(np.arange(N_POINTS), [3, 7]), read_landmarks(results)
+        X = found.points.to_numpy().reshape(N_FRAMES, -1, 2)[:, left]
+        X = X.reshape(N_FRAMES, -1)
+        weights = {"point_weight": found.confidence.to_numpy()[:, left]}
         model = estimator(camera="weak_perspective").fit(X, **weights)
         cameras = pd.read_csv(tmp_path / "out" / "cameras.csv")
         poses = frame_poses(model, X, **weights)
         for name in ("yaw", "roll", "pitch_std"):
             assert_allclose(cameras[name], getattr(poses, name), atol=1e-6)
         table = pd.read_csv(tmp_path / "out" / "alpha.csv")
+        assert_allclose(table[["alpha_1", "alpha_2"]], model.alpha_, atol=1e-6)
         smooth = model.smooth(X, time=np.arange(N_FRAMES) / 25, **weights)
         assert_allclose(table["alpha_1_smooth"], smooth.alpha[:, 0], atol=1e-6)
         assert_allclose(frame_poses(model).yaw, poses.yaw, atol=1e-6)
-
-    def test_some_points(self, results, tmp_path, succeeds):
-        options = ["--weights", "confidence", "--points", "without:3,7"]
-        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
-        left = np.delete(np.arange(N_POINTS), [3, 7])
-        found = read_landmarks(results)
-        X = found.points.to_numpy().reshape(N_FRAMES, -1, 2)[:, left]
-        weights = found.confidence.to_numpy()[:, left]
-        model = estimator().fit(X.reshape(N_FRAMES, -1), point_weight=weights)
-        alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
-        assert_allclose(alpha, model.alpha_, atol=1e-6)
 
     def test_refusals(self, results, tmp_path, fails):
         options = ["--weights", "confidence", "-o", tmp_path / "out", "--no-figures"]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -186,9 +187,9 @@ class StoredTable:
         dtype: Any,
         columns: NDArray | None = None,
     ):
-        self._ends = np.cumsum([n_rows for n_rows, _ in parts], dtype=int)
-        self._read = [read for _, read in parts]
-        self.shape = (int(self._ends[-1]), n_columns)
+        lengths, self._read = zip(*parts, strict=True)
+        self._ends = np.cumsum([0, *lengths]).tolist()
+        self.shape = (self._ends[-1], n_columns)
         self.dtype = np.dtype(dtype)
         self.columns = columns
 
@@ -202,9 +203,8 @@ class StoredTable:
             raise TypeError(f"rows must be a slice without steps; got {rows!r}")
         start, stop, _ = rows.indices(len(self))
         parts = [np.empty((0, self.shape[1]), dtype=self.dtype)]
-        begins = [0, *self._ends[:-1].tolist()]
-        for begin, end, read in zip(begins, self._ends, self._read, strict=True):
+        for (begin, end), read in zip(pairwise(self._ends), self._read, strict=True):
             first, last = max(start, begin), min(stop, end)
             if first < last:
-                parts.append(read(int(first - begin), int(last - begin)))
+                parts.append(read(first - begin, last - begin))
         return np.concatenate(parts[1:] or parts).astype(self.dtype, copy=False)

@@ -174,9 +174,8 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     kept = np.maximum(1 - 1 / len(alpha) - np.sum(axes**2, axis=1), OF_RANKS)
     left_out = (centred - axes @ (axes.T @ centred)) / kept[:, None]
     energy = np.sum(centred**2, axis=0)
-    ratio = np.full(len(energy), np.nan)
-    np.divide(np.sum(left_out**2, axis=0), energy, where=energy > 0, out=ratio)
-    return 1 - ratio
+    energy[energy == 0] = np.nan
+    return np.asarray(1 - np.sum(left_out**2, axis=0) / energy)
 
 
 def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
