@@ -5,14 +5,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.camera_models import compose, full_rotations, project
 from isa_nrsfm._frames.models import (
     Decomposition,
     LinearisedFrames,
     PosteriorFrames,
     RigidFrames,
 )
-from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred

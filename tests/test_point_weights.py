@@ -19,7 +19,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frames.depth import NOT_ESTIMATED
+from isa_nrsfm._frames.models import NOT_ESTIMATED
 from isa_nrsfm._tables.tracks import weighted_sizes
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses

@@ -1,6 +1,6 @@
 """The search for the most probable camera and coefficients of one complete frame.
 
-The algebra of `affine_newton` and `calibrated_newton` with LAPACK. The search for many
+The algebra of `newton` with LAPACK. The search for many
 frames takes as long for one frame as for sixteen: 4 to 7 times as long as this one.
 Frames that are not regular are left to it.
 """
@@ -10,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.calibrated_newton import (
+from isa_nrsfm._frames.camera_models import CameraModel
+from isa_nrsfm._frames.newton import (
     LARGE_RISE,
     REVERSED,
     SAME_WELL,
     calibrated_starts,
 )
-from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.search import LARGEST_DAMPING, MAX_STEPS
 
 # Rotations of affine cameras
@@ -160,7 +160,7 @@ class SingleSearch:
         return gradient, definite + bent - coupling.T @ through, definite, through
 
     def _moments(self, camera: _Camera, P: NDArray, noise: float) -> _Moments:
-        """Return ``c = (1, alpha)``, A (3, 3) and F (K, 6) of `calibrated_newton`."""
+        """Return ``c = (1, alpha)``, A (3, 3) and F (K, 6) of `newton`."""
         c = np.append(1.0, camera.alpha)
         E = np.outer(c, c)
         E[1:, 1:] += noise * camera.Q

@@ -20,8 +20,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
-from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
-from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.models import NOT_ESTIMATED, DepthCertainty, PosteriorFrames
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, MarginalLikelihood
 from isa_nrsfm._joint.problem import JOINT_OPTIONS

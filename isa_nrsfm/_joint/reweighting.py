@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CameraModel
-from isa_nrsfm._frames.projection import compose, distances
+from isa_nrsfm._frames.camera_models import CameraModel, compose, distances
 from isa_nrsfm._joint.frames import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointFit, regular

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.camera_models import CAMERAS, distances, stacked_motion
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
-from isa_nrsfm._frames.projection import distances, stacked_motion
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._tables.blocks import FrameBlocks

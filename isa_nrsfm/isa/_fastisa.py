@@ -13,9 +13,16 @@ from sklearn.utils.parallel import Parallel, delayed
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import HasMethods, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
-from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
-from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise
-from isa_nrsfm.isa._grouping import likelihood_gains, rows_by_subspace, swap_until_best
+from isa_nrsfm.isa._steps import (
+    SqrtDensity,
+    SubspaceDensity,
+    iterate,
+    likelihood_gains,
+    log_likelihood,
+    orthogonalise,
+    rows_by_subspace,
+    swap_until_best,
+)
 
 
 class FastISA(BaseSubspaceAnalysis):
