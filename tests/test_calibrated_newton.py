@@ -182,7 +182,7 @@ class TestDerivatives:
             step = np.zeros((n, M.shape[2]))
             step[c] = self.H
             yield tuple(
-                search.evaluate(problem, search.moved(M, sign * step))
+                search.evaluate(problem, search.model.moved(M, sign * step))
                 for sign in (1, -1)
             )
 

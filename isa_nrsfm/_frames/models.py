@@ -21,7 +21,7 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.search import FramePosterior, FrameSearch, largest_objective
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import frames_last, padded
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
@@ -117,9 +117,8 @@ NOT_ESTIMATED = DepthCertainty()
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
-# Least number of visible points for which the likelihood is normal near the fit. With
-# 4, 5 and 6 points the 3D errors of such frames, smoothed, are .35, .05 and .01, and
-# .02, .01 and .01 without their own points.
+# Least number of visible points for which the likelihood is normal near the fit:
+# docs/benchmarks/README.md, "Thresholds".
 LEAST_POINTS = 6
 
 
@@ -175,23 +174,16 @@ class FrameMap(NamedTuple):
         Standard deviations (n, K) are to first order. They are NaN without covariances
         (n, K, K).
         """
-        new, deviation, scale = self.coefficients(alpha, covariance)
-        cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
-        return cameras, new, deviation
-
-    def coefficients(
-        self, alpha: NDArray, covariance: NDArray | None
-    ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return coefficients, standard deviations and scales (n,) of cameras."""
         mixed = self.mixing[:, 0] + alpha @ self.mixing[:, 1:].T
         scale = mixed[:, 0]
         new = mixed[:, 1:] / scale[:, None]
+        cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
         if covariance is None:
-            return new, np.full_like(new, np.nan), scale
+            return cameras, new, np.full_like(new, np.nan)
         # d new / d alpha, times scale
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)
-        return new, np.sqrt(variance) / np.abs(scale)[:, None], scale
+        return cameras, new, np.sqrt(variance) / np.abs(scale)[:, None]
 
 
 class LinearisedFrames(NamedTuple):
@@ -331,7 +323,7 @@ class PosteriorFrames:
     @cached_property
     def single_search(self) -> SingleSearch:
         """The search for one complete frame."""
-        return SingleSearch(self._search.shared.shapes, CAMERAS[self.camera])
+        return SingleSearch(self._search)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""
@@ -457,11 +449,10 @@ class PosteriorFrames:
             self._search.fit_rows, noise=self.noise_variance, covariances=covariances
         )
         if self.loss == "linear":
-            alone = None
             if len(rows) == 1 and weights is None:
-                alone = self._alone(rows[0])
-            if alone is not None:
-                return alone
+                alone = self.single_search.fit(rows[0], self.noise_variance)
+                if alone is not None:
+                    return alone
             return fitted(rows, weights=weights, starts=self.starts)
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(rows), 0.0, 1.0)
@@ -494,21 +485,6 @@ class PosteriorFrames:
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
         return fit
-
-    def _alone(self, points: NDArray) -> FramePosterior | None:
-        """Return the fit of a frame (2, J), if it is complete and regular."""
-        points = points.astype(np.float64, copy=False)
-        centre, space = points.mean(axis=1), self._search.space
-        if not np.isfinite(centre).all():
-            return None
-        largest = largest_objective(points.shape[1], self.noise_variance)
-        W = points - centre[:, None]
-        fit = self.single_search.fit(W, self.noise_variance, largest)
-        if fit is None:
-            return None
-        motion, turns = fit.motion @ space, space.T @ fit.turns @ space
-        parts = motion, centre, fit.alpha, fit.covariance, turns, fit.objective, True
-        return FramePosterior(*(np.array(part)[None] for part in parts))
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:

@@ -20,7 +20,8 @@ The first step uses ``H + s2 I`` instead, half the Hessian for a fixed camera, s
 decreases. The others are Newton steps, damped by ``H + s2 I``.
 
 **Calibrated cameras.** Shapes and noise variance s2 are given. For each frame by
-itself, this minimises minus twice the log marginal likelihood of its camera, with the coefficients integrated out ::
+itself, this minimises minus twice the log marginal likelihood of its camera, with the
+coefficients integrated out ::
 
     F(M) = f(M) / s2 + log det(I + H / s2),  f(M) = min_a ||W - M S(a)||^2 + s2 |a|^2,
 
@@ -42,6 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
     CalibratedCameras,
     CameraModel,
     nearest_calibrated,
@@ -82,7 +84,7 @@ class AffineSearch(FrameSearch):
     rough_steps = 2
 
     def __init__(self, shapes: NDArray):
-        super().__init__(*whitened(np.ascontiguousarray(shapes)))
+        super().__init__(*whitened(np.ascontiguousarray(shapes)), CAMERAS["affine"])
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
         """Return coefficients (K, n) after a step with the cameras held."""
@@ -140,14 +142,10 @@ def _held(
 # object is, the less its images change (Necker reversal).
 REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
 # A search from a reversed camera that comes nearer than this share of its first
-# distance returns to where it came from. With 0.1 none of 80,000 frames of faces,
-# hands and bodies ended in a higher minimum, with 0.5 seven. Saves a fifth of the time.
+# distance returns to where it came from: docs/benchmarks/README.md, "Thresholds".
 SAME_WELL = 0.1
 # The reversed camera is not tried if the objective rises by more than this multiple of
-# itself on the way there. In 390,000 searches with a rise above 10 (motion capture,
-# bodies, hands, faces), it was lower in eight, the last at 15. In 210,000 above 20 it
-# never was. Saves 27 to 45 % of the time of faces in weak perspective. For bodies and
-# hands it saves nothing, because most of their reversed cameras are tried.
+# itself on the way there: docs/benchmarks/README.md, "Thresholds".
 LARGE_RISE = 20.0
 
 
@@ -158,12 +156,13 @@ class CalibratedSearch(FrameSearch):
     Cameras are `scaled` (weak perspective) or have the scale one (orthographic).
     """
 
+    model: CalibratedCameras
+
     def __init__(self, shapes: NDArray, scaled: bool):
-        self.model = CalibratedCameras(scaled)
         axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
         turned = axes.T @ shapes
         turned[0, size <= FLAT * size[0]] = 0.0
-        super().__init__(turned, axes.T)
+        super().__init__(turned, axes.T, CalibratedCameras(scaled))
 
     def reversed_cameras(
         self, products: FrameSums, noise: float, motion: NDArray
@@ -192,14 +191,6 @@ class CalibratedSearch(FrameSearch):
         values = [_value(problem, _posterior(problem, start)) for start in starts]
         return np.where(values[1] < values[0], *starts[::-1])
 
-    def moved(self, position: NDArray, step: NDArray) -> NDArray:
-        """Return cameras (2, 3, n) after steps (p, n)."""
-        return self.model.moved(position, step)
-
-    def limited(self, step: NDArray) -> NDArray:
-        """Return steps (p, n) that move no camera by more than the largest turn."""
-        return self.model.limited(step)
-
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
         return self._derivatives(problem, position, _posterior(problem, position))[0]
@@ -207,7 +198,7 @@ class CalibratedSearch(FrameSearch):
     def _derivatives(
         self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
     ) -> tuple[State, NDArray]:
-        """Return the state at M (2, 3, n), and ``Q C`` (K, p, n) of `_coupling`."""
+        """Return the state at M (2, 3, n), and ``Q C`` (K, p, n), C = <D_c, F_k>."""
         products, noise = problem
         A = products.gram.moments(posterior.second_moments(noise))
         G = np.einsum("rbi,bai->rai", M, unpack3(A))
@@ -221,7 +212,9 @@ class CalibratedSearch(FrameSearch):
         second[:3, :3] -= np.einsum("aai->i", mixed) * np.eye(3)[:, :, None]
         second[3:], second[:, 3:] = gradient, gradient[:, None]
         # The coefficients follow: - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
-        coupling, through = self._coupling(problem, M, posterior)
+        F = _changes(problem, M, posterior)
+        coupling = np.einsum("crai,krai->kci", self.model.tangents(M), F)
+        through = posterior.covaried(coupling)
         hessian = definite + second[pair_indices(len(gradient))]
         hessian -= packed_products(through.swapaxes(0, 1), coupling.swapaxes(0, 1))
         value = _value(problem, posterior)
@@ -263,14 +256,6 @@ class CalibratedSearch(FrameSearch):
         covariance -= unpacked(posterior.inverse[len(posterior.c) :])
         covariance = 0.5 * (covariance + covariance.swapaxes(0, 1))
         return noise * covariance, noise * inverse[:3, :3]
-
-    def _coupling(
-        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
-    ) -> tuple[NDArray, NDArray]:
-        """Return ``C = <D_c, F_k>`` (K, p, n), and ``Q C``."""
-        F = _changes(problem, M, posterior)
-        C = np.einsum("crai,krai->kci", self.model.tangents(M), F)
-        return C, posterior.covaried(C)
 
     def _better_reversed(
         self,

@@ -113,15 +113,6 @@ def orthogonalise(W: NDArray) -> NDArray:
     return nearest
 
 
-def subspace_energies(Y: NDArray, subspace_size: int) -> NDArray:
-    """Return energies (..., n_subspaces, n_samples) of Y (..., n_signals, n_samples).
-
-    Consecutive rows form a subspace.
-    """
-    *batch, _, n_samples = Y.shape
-    return (Y * Y).reshape(*batch, -1, subspace_size, n_samples).sum(axis=-2)
-
-
 def log_likelihood(
     W: NDArray, Z: NDArray, subspace_size: int, density: SubspaceDensity
 ) -> NDArray:
@@ -129,7 +120,8 @@ def log_likelihood(
 
     W is (..., n_signals, n_signals), orthogonal, Z (n_signals, n_samples), white.
     """
-    u = subspace_energies(W @ Z, subspace_size)
+    Y = W @ Z
+    u = (Y * Y).reshape(*W.shape[:-2], -1, subspace_size, Z.shape[1]).sum(axis=-2)
     return density.log_density(u).mean(axis=-1).sum(axis=-1)
 
 
