@@ -40,9 +40,8 @@ from isa_nrsfm._fit import (
     supported_components,
 )
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
+from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
-from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CALIBRATED_CAMERAS,

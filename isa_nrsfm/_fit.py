@@ -30,23 +30,26 @@ from sklearn.exceptions import ConvergenceWarning
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import nearest_calibrated, reference_camera
-from isa_nrsfm._frames.depth import leverages
+from isa_nrsfm._frames.camera_models import (
+    nearest_calibrated,
+    reference_camera,
+    reprojection_error,
+)
 from isa_nrsfm._frames.models import (
     Decomposition,
     FrameMap,
     PosteriorFrames,
     RigidFrames,
+    leverages,
     spread_starts,
 )
-from isa_nrsfm._frames.projection import reprojection_error
-from isa_nrsfm._gauge.canonical import (
+from isa_nrsfm._gauge import (
     image_energies,
+    independent_gauge,
     mode_covariance,
     reorder_blocks,
     rigid_gauge,
 )
-from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames

@@ -5,14 +5,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.camera_models import compose, full_rotations, project
 from isa_nrsfm._frames.models import (
     Decomposition,
     LinearisedFrames,
     PosteriorFrames,
     RigidFrames,
 )
-from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.tracks import (
@@ -146,14 +145,7 @@ class TableModel(NamedTuple):
         return of_all_rows(distance / sizes[:, None], usable)
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
-        """Return the energies (1, 2) of `held_out_energies`."""
-        usable, _, _, sizes, weights = self._ready(rows, weights)
-        return np.array([self.held_out_energies(rows[usable], sizes, weights)])
-
-    def held_out_energies(
-        self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
-    ) -> tuple[float, float]:
-        """Return the energies of the error and of the signal of held-out points.
+        """Return the energies (1, 2) of the error and the signal of held-out points.
 
         The points are divided into five parts, the same for all tables. Each part is
         predicted from the others: camera, position and coefficients of each frame are
@@ -167,6 +159,8 @@ class TableModel(NamedTuple):
         frames would dominate the score. This does not depend on the basis, so scores of
         different K use the same points.
         """
+        given, _, _, sizes, weights = self._ready(rows, weights)
+        rows = rows[given]
         folds = np.random.RandomState(0).permutation(rows.shape[2]) % 5
         seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
@@ -204,15 +198,12 @@ class TableModel(NamedTuple):
             weight = counts[np.ix_(usable, held)][..., None]
             counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)
-            # Effect of the threshold 2: in 12 scenes of 120 frames, two frames that
-            # show six of 23 points multiply the error by 1.0 to 1.8, and by 1.5 to 52
-            # without a threshold. With 20 % of all points missing it changes the error
-            # by at most 1.2 %; a threshold of 1 changes it by up to 21 %.
+            # Effect of the threshold 2: docs/benchmarks/README.md, "Thresholds"
             leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
             counted[some] &= leverage[:, held] <= 2.0
             noise += np.sum((weight * (part[:, held] - predicted) ** 2)[counted])
             signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
-        return float(noise), float(signal)
+        return np.array([[noise, signal]])
 
     def _ready(
         self, rows: NDArray, weights: NDArray | None = None

@@ -13,16 +13,15 @@ from scenes import with_gaps
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.calibrated_newton import (
+from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.newton import (
     LARGE_RISE,
     REVERSED,
     CalibratedSearch,
     _rise,
     calibrated_starts,
 )
-from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.coefficients import coefficient_posterior
-from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
+from isa_nrsfm._frames.point_sums import coefficient_posterior, frame_sums, frame_tracks
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpacked
 
 NOISE = 0.02
@@ -183,7 +182,7 @@ class TestDerivatives:
             step = np.zeros((n, M.shape[2]))
             step[c] = self.H
             yield tuple(
-                search.evaluate(problem, search.moved(M, sign * step))
+                search.evaluate(problem, search.model.moved(M, sign * step))
                 for sign in (1, -1)
             )
 

@@ -8,9 +8,9 @@ import scenes
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.coefficients import coefficient_posterior
 from isa_nrsfm._frames.point_sums import (
     ShapeProducts,
+    coefficient_posterior,
     determines_camera,
     frame_sums,
     frame_tracks,

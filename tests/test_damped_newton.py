@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.search import FrameSearch, Minimum, State
 from isa_nrsfm._linalg.small_matrices import LANES
 
@@ -22,6 +23,7 @@ class Wells(FrameSearch):
         a = np.array(a, dtype=float)
         self.problem = Frames(a, np.full_like(a, energy))
         self.tried = []  # numbers of frames
+        self.model = CAMERAS["affine"]  # steps are added
 
     def value(self, x, a):
         return x[0] ** 4 / 4 - a * x[0] ** 2 / 2

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._frames.depth import DepthCertainty
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm._frames.models import DepthCertainty, FrameMap, PosteriorFrames
 from isa_nrsfm._joint.likelihood import extent_penalty
 from isa_nrsfm._joint.uncertainty import N_GROUPS, depth_certainty, neighbours
 from isa_nrsfm._tables.blocks import FrameBlocks

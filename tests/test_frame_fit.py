@@ -9,10 +9,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, with_gaps
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.depth import DepthCertainty
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
-from isa_nrsfm._frames.projection import compose, distances, project
+from isa_nrsfm._frames.camera_models import CAMERAS, compose, distances, project
+from isa_nrsfm._frames.models import (
+    DepthCertainty,
+    FrameMap,
+    PosteriorFrames,
+    RigidFrames,
+)
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.uncertainty import (
     fitted_frames,

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import images, random_rotation, with_gaps
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frames.affine_newton import AffineSearch
 from isa_nrsfm._frames.models import spread_starts
+from isa_nrsfm._frames.newton import AffineSearch
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._frames.search import MAX_STEPS
 from isa_nrsfm._linalg.small_matrices import unpacked

@@ -292,13 +292,15 @@ def test_is_the_fit_of_the_frame_among_others(camera, extent, dtype, share):
     together = model.posterior(rows)
     for i in range(len(tracks)):
         assert_same(model.posterior(rows[[i]]), together.take([i]))
-    assert sum(model._alone(row) is not None for row in rows) >= share * len(rows)
+    assert sum(
+        model.single_search.fit(row, NOISE**2) is not None for row in rows
+    ) >= share * len(rows)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_is_a_minimum_of_the_documented_objective(camera):
     model, tracks = model_and_tracks(camera, 1)
-    fit = model._alone(tracks[0].T)
+    fit = model.single_search.fit(tracks[0].T, NOISE**2)
     image = scenes.images(model.shapes, fit.motion, fit.translation, fit.alpha)
     square = np.sum((tracks[:1] - image) ** 2) + NOISE**2 * np.sum(fit.alpha**2)
     assert_allclose(fit.objective, square, rtol=1e-9)
@@ -319,7 +321,8 @@ def test_unusual_frames_are_those_of_the_search_for_many(camera):
     together = model.posterior(rows)
     for i in range(5):
         assert_same(model.posterior(rows[[i]]), together.take([i]))
-    assert [model._alone(frame) is None for frame in rows[[0, 1, 3]]] == [True] * 3
+    for frame in rows[[0, 1, 3]]:
+        assert model.single_search.fit(frame, NOISE**2) is None
 
 
 @pytest.mark.parametrize("length", [1, 2, 5, 11, 12, 40])

@@ -10,14 +10,14 @@ from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import mean_view
-from isa_nrsfm._gauge.canonical import (
+from isa_nrsfm._gauge import (
     canonical_gauge,
     canonical_rotation,
     canonical_space,
     euclidean_space,
+    independent_gauge,
     reorder_blocks,
 )
-from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._parameters.choices import INDEPENDENCE
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 

@@ -9,15 +9,13 @@ from scipy.linalg import polar
 
 from isa_nrsfm.isa import SqrtDensity
 from isa_nrsfm.isa._base import whiten
-from isa_nrsfm.isa._fixed_point import (
+from isa_nrsfm.isa._steps import (
+    covariance_gains,
     fixed_point_step,
     iterate,
+    likelihood_gains,
     orthogonalise,
     subspace_change,
-)
-from isa_nrsfm.isa._grouping import (
-    covariance_gains,
-    likelihood_gains,
 )
 
 DENSITY = SqrtDensity()

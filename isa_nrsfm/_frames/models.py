@@ -13,25 +13,112 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.affine_newton import AffineSearch
-from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
-from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations, rigid_cameras
-from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    distances,
+    full_rotations,
+    rigid_cameras,
+)
+from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.projection import distances
-from isa_nrsfm._frames.search import FramePosterior, FrameSearch, largest_objective
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import frames_last, padded
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.tracks import seen_points
 
+# Rotations are not determined if their standard deviation is a larger share of their
+# spread. This share is 0.2 to 0.3 for faces of known shape that turn by 10 degrees, 0.9
+# to 1.3 by 4 degrees; 0.5 for bodies that turn by 20 degrees, 1 by 10 degrees. Depth
+# errors above this share are warned of as well: they are at most 0.47 where rotations
+# are determined (mean of ten tables, ``python -m benchmarks.depth``).
+LARGEST_SHARE = 0.55
+# RMS turning out of the image plane, if all sides of a half sphere are seen as often.
+HALF_SPHERE = np.sqrt(np.pi - 2)
+
+
+class DepthCertainty(NamedTuple):
+    """
+    Jackknife estimates of the errors of a fit with calibrated cameras.
+
+    Attributes
+    ----------
+    total : float
+        RMS error of the depths, relative to their RMS.
+    turning : float
+        RMS rotation of the cameras out of the image plane from their mean, in radians.
+        The part that the coefficients predict is left out, because it cannot be
+        distinguished from deformation.
+    turns : ndarray of shape (3, 3) or None
+        Covariance of the rotation vectors, in radians squared, in the camera's axes.
+    points : ndarray of shape (n_points,) or None
+        Mean variance of the depths of the points, for frames of size one.
+    leverage : float or None
+        Mean of 1 + |alpha|^2 of the frames, if variances are proportional to it, as for
+        equal errors of all shapes. None if all frames have the mean variance.
+    """
+
+    total: float = np.nan
+    turning: float = np.nan
+    turns: NDArray | None = None
+    points: NDArray | None = None
+    leverage: float | None = None
+
+    @property
+    def turning_deviation(self) -> float:
+        """Standard deviation of the rotations out of the image plane, in radians."""
+        turns = self.turns
+        return np.nan if turns is None else float(turns[:2, :2].trace() ** 0.5)
+
+    @property
+    def determined(self) -> bool:
+        """Whether the table determines depths and rotations; True if not estimated."""
+        return not self.turning_deviation > LARGEST_SHARE * self.turning
+
+    def variances(self, alpha: NDArray) -> NDArray:
+        """Return variances of depths (n, n_points) of frames of size one."""
+        points = np.zeros(1) if self.points is None else self.points
+        if self.leverage is None:
+            return np.tile(points, (len(alpha), 1))
+        return np.outer(leverages(alpha) / self.leverage, points)
+
+    @property
+    def advice(self) -> str:
+        """Reason and remedy for depths that are not determined."""
+        turning, deviation = np.degrees([self.turning, self.turning_deviation])
+        other = (
+            "fit a table in which the objects turn further, and transform this one "
+            "with that model"
+        )
+        if self.turning > HALF_SPHERE:
+            other = (
+                "make sure that x and y have the same unit, unlike shares of the width "
+                "and height of an image"
+            )
+        return (
+            "the depth of the shapes is not determined: apart from their deformation "
+            f"the objects turn by {turning:.2g} degrees (root mean square) out of the "
+            "image plane, and these rotations have a standard deviation of "
+            f"{deviation:.2g} degrees. Use affine cameras for this table "
+            f'(camera="affine"), or {other}. See "How reliable is the depth?" in the '
+            "documentation"
+        )
+
+
+def leverages(alpha: NDArray) -> NDArray:
+    """Return 1 + |alpha|^2 of frames (n, K)."""
+    return np.asarray(1.0 + np.vecdot(alpha, alpha))
+
+
+NOT_ESTIMATED = DepthCertainty()
+
+
 # Factors of the coordinates of a mirror image in depth.
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
-# Least number of visible points for which the likelihood is normal near the fit. With
-# 4, 5 and 6 points the 3D errors of such frames, smoothed, are .35, .05 and .01, and
-# .02, .01 and .01 without their own points.
+# Least number of visible points for which the likelihood is normal near the fit:
+# docs/benchmarks/README.md, "Thresholds".
 LEAST_POINTS = 6
 
 
@@ -87,23 +174,16 @@ class FrameMap(NamedTuple):
         Standard deviations (n, K) are to first order. They are NaN without covariances
         (n, K, K).
         """
-        new, deviation, scale = self.coefficients(alpha, covariance)
-        cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
-        return cameras, new, deviation
-
-    def coefficients(
-        self, alpha: NDArray, covariance: NDArray | None
-    ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return coefficients, standard deviations and scales (n,) of cameras."""
         mixed = self.mixing[:, 0] + alpha @ self.mixing[:, 1:].T
         scale = mixed[:, 0]
         new = mixed[:, 1:] / scale[:, None]
+        cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
         if covariance is None:
-            return new, np.full_like(new, np.nan), scale
+            return cameras, new, np.full_like(new, np.nan)
         # d new / d alpha, times scale
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)
-        return new, np.sqrt(variance) / np.abs(scale)[:, None], scale
+        return cameras, new, np.sqrt(variance) / np.abs(scale)[:, None]
 
 
 class LinearisedFrames(NamedTuple):
@@ -243,7 +323,7 @@ class PosteriorFrames:
     @cached_property
     def single_search(self) -> SingleSearch:
         """The search for one complete frame."""
-        return SingleSearch(self._search.shared.shapes, CAMERAS[self.camera])
+        return SingleSearch(self._search)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""
@@ -369,11 +449,10 @@ class PosteriorFrames:
             self._search.fit_rows, noise=self.noise_variance, covariances=covariances
         )
         if self.loss == "linear":
-            alone = None
             if len(rows) == 1 and weights is None:
-                alone = self._alone(rows[0])
-            if alone is not None:
-                return alone
+                alone = self.single_search.fit(rows[0], self.noise_variance)
+                if alone is not None:
+                    return alone
             return fitted(rows, weights=weights, starts=self.starts)
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(rows), 0.0, 1.0)
@@ -406,21 +485,6 @@ class PosteriorFrames:
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
         return fit
-
-    def _alone(self, points: NDArray) -> FramePosterior | None:
-        """Return the fit of a frame (2, J), if it is complete and regular."""
-        points = points.astype(np.float64, copy=False)
-        centre, space = points.mean(axis=1), self._search.space
-        if not np.isfinite(centre).all():
-            return None
-        largest = largest_objective(points.shape[1], self.noise_variance)
-        W = points - centre[:, None]
-        fit = self.single_search.fit(W, self.noise_variance, largest)
-        if fit is None:
-            return None
-        motion, turns = fit.motion @ space, space.T @ fit.turns @ space
-        parts = motion, centre, fit.alpha, fit.covariance, turns, fit.objective, True
-        return FramePosterior(*(np.array(part)[None] for part in parts))
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:

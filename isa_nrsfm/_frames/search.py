@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import (
     FrameSums,
     FrameTracks,
@@ -157,8 +158,8 @@ class FrameSearch:
     first_steps = MAX_STEPS
     rough_steps = 3
 
-    def __init__(self, shapes: NDArray, space: NDArray):
-        self.shared, self.space = ShapeProducts(shapes), space
+    def __init__(self, shapes: NDArray, space: NDArray, model: CameraModel):
+        self.shared, self.space, self.model = ShapeProducts(shapes), space, model
 
     def fit_rows(
         self,
@@ -321,14 +322,6 @@ class FrameSearch:
         """Return covariances of coefficients (K, K, n) and rotations (3, 3, n)."""
         raise NotImplementedError
 
-    def moved(self, position: NDArray, step: NDArray) -> NDArray:
-        """Return the positions after steps (n_parameters, n)."""
-        return position + step
-
-    def limited(self, step: NDArray) -> NDArray:
-        """Return steps (n_parameters, n), each shortened to the largest allowed one."""
-        return step
-
     def descend(
         self,
         problem: FrameProblem,
@@ -354,7 +347,7 @@ class FrameSearch:
                 leaving |= known.excludes(state, gain)
             # Remove frames that have ended; converged ones take a last step.
             if leaving.any():
-                last = self.moved(state.position, np.where(small, step, 0.0))
+                last = self.model.moved(state.position, np.where(small, step, 0.0))
                 ends[..., running[leaving]] = last[..., leaving]
                 converged[running[leaving]] = small[leaving]
                 if leaving.all():
@@ -368,7 +361,7 @@ class FrameSearch:
                 break
             # Trial step, refused where the objective rises. Less damping after a good
             # step, more after a refused one.
-            trial = self.evaluate(problem, self.moved(state.position, step))
+            trial = self.evaluate(problem, self.model.moved(state.position, step))
             highest = state.value + OF_STEPS * problem.energy
             worse = np.flatnonzero(~(trial.value <= highest))
             eased = np.where(damping > 0.01, 0.1 * damping, 0.0)
@@ -394,7 +387,7 @@ class FrameSearch:
             step[:, failing], positive = solve_positive(matrix, part.slope)
             still = ~positive & (damping[failing] < LARGEST_DAMPING)
             failing = padded(np.unique(failing[still]))
-        return self.limited(step), damping
+        return self.model.limited(step), damping
 
 
 def raised(damping: NDArray) -> NDArray:

@@ -1,6 +1,6 @@
 """The search for the most probable camera and coefficients of one complete frame.
 
-The algebra of `affine_newton` and `calibrated_newton` with LAPACK. The search for many
+The algebra of `newton` with LAPACK. The search for many
 frames takes as long for one frame as for sixteen: 4 to 7 times as long as this one.
 Frames that are not regular are left to it.
 """
@@ -10,27 +10,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.calibrated_newton import (
+from isa_nrsfm._frames.newton import (
     LARGE_RISE,
     REVERSED,
     SAME_WELL,
     calibrated_starts,
 )
-from isa_nrsfm._frames.camera_models import CameraModel
-from isa_nrsfm._frames.search import LARGEST_DAMPING, MAX_STEPS
+from isa_nrsfm._frames.search import (
+    LARGEST_DAMPING,
+    MAX_STEPS,
+    FramePosterior,
+    FrameSearch,
+    largest_objective,
+)
 
 # Rotations of affine cameras
 UNKNOWN = np.full((3, 3), np.nan)
-
-
-class SingleFit(NamedTuple):
-    """Fit of a frame: camera (2, 3), alpha (K,), covariances of alpha and rotation."""
-
-    motion: NDArray
-    alpha: NDArray
-    covariance: NDArray
-    turns: NDArray
-    objective: float
 
 
 class _Camera(NamedTuple):
@@ -44,14 +39,17 @@ class _Camera(NamedTuple):
 
 
 _Moments = tuple[NDArray, NDArray, NDArray]
+# Camera (2, 3), alpha (K,), covariances of alpha and rotation, objective
+_Fit = tuple[NDArray, NDArray, NDArray, NDArray, float]
 
 
 class SingleSearch:
-    """The search for shapes (K + 1, 3, J), rows centred, in the axes of a search."""
+    """The search for one frame, of the shapes of a search for many."""
 
-    def __init__(self, shapes: NDArray, model: CameraModel):
+    def __init__(self, search: FrameSearch):
+        shapes = search.shared.shapes
         n_shapes, _, n_points = shapes.shape
-        self.model, self.K = model, n_shapes - 1
+        self.model, self.space, self.K = search.model, search.space, n_shapes - 1
         self.rows = shapes.reshape(-1, n_points)
         gram = np.einsum("kaj,lbj->klab", shapes, shapes, optimize=True)
         gram = 0.5 * (gram + gram.swapaxes(2, 3))
@@ -59,11 +57,17 @@ class SingleSearch:
         # 2 G_kl (9 n_shapes, n_shapes): rows (k, a, b), columns l
         self.sums = 2.0 * gram.transpose(0, 2, 3, 1).reshape(-1, n_shapes)
 
-    def fit(self, W: NDArray, noise: float, largest: float) -> SingleFit | None:
-        """Fit a centred frame (2, J); None without a regular minimum below `largest`.
+    def fit(self, points: NDArray, noise: float) -> FramePosterior | None:
+        """Fit a frame (2, J); None if it is not complete and regular.
 
         Objectives are ``||W - M S(a)||^2 + noise |a|^2``.
         """
+        points = points.astype(np.float64, copy=False)
+        centre = points.mean(axis=1)
+        if not np.isfinite(centre).all():
+            return None
+        largest = largest_objective(points.shape[1], noise)
+        W = points - centre[:, None]
         energy = float(np.vdot(W, W))
         P = (self.rows @ W.T).reshape(-1, 3, 2).swapaxes(1, 2)
         noise = max(noise, 1e-13 * energy)
@@ -73,9 +77,14 @@ class SingleSearch:
                 fit = search(P, energy, noise)
         except np.linalg.LinAlgError:
             return None
-        return fit if fit is not None and fit.objective <= largest else None
+        if fit is None or not fit[-1] <= largest:
+            return None
+        M, alpha, covariance, turns, objective = fit
+        motion, turns = M @ self.space, self.space.T @ turns @ self.space
+        parts = motion, centre, alpha, covariance, turns, objective, True
+        return FramePosterior(*(np.array(part)[None] for part in parts))
 
-    def _affine(self, P: NDArray, energy: float, noise: float) -> SingleFit | None:
+    def _affine(self, P: NDArray, energy: float, noise: float) -> _Fit | None:
         """Minimise over the coefficients, with the best camera for them."""
         K, alpha, before, ended = self.K, np.zeros(self.K), np.inf, False
         tol = 1e-12 * (energy + noise)
@@ -99,14 +108,14 @@ class SingleSearch:
             value = energy - np.vdot(M, Y) + noise * (alpha @ alpha)
             if ended:
                 covariance = noise * np.linalg.inv(hessian)
-                return SingleFit(M, alpha, covariance, UNKNOWN, max(value, 0.0))
+                return M, alpha, covariance, UNKNOWN, max(value, 0.0)
             if not value <= before + tol:
                 return None
             step = np.linalg.solve(hessian, slope)
             before, alpha, ended = value, alpha + step, slope @ step <= tol
         return None
 
-    def _calibrated(self, P: NDArray, energy: float, noise: float) -> SingleFit | None:
+    def _calibrated(self, P: NDArray, energy: float, noise: float) -> _Fit | None:
         """Minimise over cameras, with the coefficients integrated out."""
         affine = P[0] @ np.linalg.inv(0.5 * self.sums[:9, 0].reshape(3, 3))
         starts = calibrated_starts(self.model, affine[..., None])
@@ -127,7 +136,7 @@ class SingleSearch:
         covariance = noise * (minimum.Q + through @ turns @ through.T)
         objective = max(minimum.value - noise * minimum.log_determinant, 0.0)
         turns = noise * turns[:3, :3]
-        return SingleFit(minimum.M, minimum.alpha, covariance, turns, objective)
+        return minimum.M, minimum.alpha, covariance, turns, objective
 
     def _camera(self, M: NDArray, P: NDArray, energy: float, noise: float) -> _Camera:
         """Return a camera with the posterior of the coefficients."""
@@ -160,7 +169,7 @@ class SingleSearch:
         return gradient, definite + bent - coupling.T @ through, definite, through
 
     def _moments(self, camera: _Camera, P: NDArray, noise: float) -> _Moments:
-        """Return ``c = (1, alpha)``, A (3, 3) and F (K, 6) of `calibrated_newton`."""
+        """Return ``c = (1, alpha)``, A (3, 3) and F (K, 6) of `newton`."""
         c = np.append(1.0, camera.alpha)
         E = np.outer(c, c)
         E[1:, 1:] += noise * camera.Q

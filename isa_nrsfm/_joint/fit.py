@@ -29,8 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
-from isa_nrsfm._frames.projection import compose, distances
+from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, compose, distances
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,

@@ -36,11 +36,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.coefficients import coefficient_posterior
 from isa_nrsfm._frames.point_sums import (
     FrameTracks,
     ShapeProducts,
     camera_gram,
+    coefficient_posterior,
     frame_sums,
     frame_tracks,
     joined_frames,

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._frames.models import frame_search
+from isa_nrsfm._frames.newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS

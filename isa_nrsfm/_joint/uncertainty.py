@@ -24,10 +24,18 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
-from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
-from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
-from isa_nrsfm._frames.projection import distances, stacked_motion
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    distances,
+    full_rotations,
+    stacked_motion,
+)
+from isa_nrsfm._frames.models import (
+    NOT_ESTIMATED,
+    Decomposition,
+    DepthCertainty,
+    PosteriorFrames,
+)
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JOINT_OPTIONS, JointState, refine_joint

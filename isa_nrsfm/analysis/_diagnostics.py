@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._frames.depth import LARGEST_SHARE, DepthCertainty
+from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import LEAST_RELIABILITY
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar

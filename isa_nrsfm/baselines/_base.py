@@ -22,9 +22,9 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
+from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, frame_search
-from isa_nrsfm._frames.projection import compose, project
-from isa_nrsfm._gauge.canonical import canonical_rotation
+from isa_nrsfm._gauge import canonical_rotation
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table

@@ -14,8 +14,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class, check_frames_kept, frames_of
-from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._frames.projection import compose
+from isa_nrsfm._frames.camera_models import compose, full_rotations
 from isa_nrsfm.calibration import (
     DeformationMetric,
     EuclideanFrames,

@@ -27,8 +27,12 @@ from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.depth import DepthCertainty
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.models import (
+    DepthCertainty,
+    FrameMap,
+    PosteriorFrames,
+    RigidFrames,
+)
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.tracks import LAYOUTS
 

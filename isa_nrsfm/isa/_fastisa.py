@@ -13,9 +13,16 @@ from sklearn.utils.parallel import Parallel, delayed
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import HasMethods, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
-from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
-from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise
-from isa_nrsfm.isa._grouping import likelihood_gains, rows_by_subspace, swap_until_best
+from isa_nrsfm.isa._steps import (
+    SqrtDensity,
+    SubspaceDensity,
+    iterate,
+    likelihood_gains,
+    log_likelihood,
+    orthogonalise,
+    rows_by_subspace,
+    swap_until_best,
+)
 
 
 class FastISA(BaseSubspaceAnalysis):
@@ -162,10 +169,7 @@ class FastISA(BaseSubspaceAnalysis):
         batches = [starts[first : first + 16] for first in range(0, self.n_init, 16)]
         n_jobs = min(effective_n_jobs(self.n_jobs), len(batches))
         runs = Parallel(n_jobs=n_jobs, return_as="generator")(
-            delayed(_run)(
-                batch, Z, self.subspace_size, density, self.max_iter, self.tol
-            )
-            for batch in batches
+            delayed(self._run)(batch, Z, density) for batch in batches
         )
         results = []
         for run in runs:
@@ -190,29 +194,21 @@ class FastISA(BaseSubspaceAnalysis):
         self.n_iter_ = int(n_iters[best])
         return W[best]
 
-
-def _run(
-    starts: NDArray,
-    Z: NDArray,
-    subspace_size: int,
-    density: SubspaceDensity,
-    max_iter: int,
-    tol: float,
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return unmixing, likelihood, steps and convergence of starts (n_batch, n, n)."""
-    # FastICA: subspaces of size one. Inside a subspace the components may be
-    # undetermined, so a moderate convergence is enough.
-    W, n_iter_ica, _ = iterate(
-        starts, Z, 1, density, max_iter=max_iter, tol=max(tol, 1e-4)
-    )
-    # Group the components into subspaces.
-    first = np.arange(len(Z)) // subspace_size
-    for r in range(len(W)):
-        assignment = swap_until_best(first, likelihood_gains(W[r] @ Z, density))
-        W[r] = W[r][rows_by_subspace(assignment)]
-    # FastISA.
-    W, n_iter, converged = iterate(
-        W, Z, subspace_size, density, max_iter=max_iter, tol=tol
-    )
-    likelihood = log_likelihood(W, Z, subspace_size, density)
-    return W, likelihood, n_iter_ica + n_iter, converged
+    def _run(
+        self, starts: NDArray, Z: NDArray, density: SubspaceDensity
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return unmixing, likelihood, steps, convergence of starts (n_batch, n, n)."""
+        size, max_iter, tol = self.subspace_size, self.max_iter, self.tol
+        # FastICA: subspaces of size one. Inside a subspace the components may be
+        # undetermined, so a moderate convergence is enough.
+        W, n_iter_ica, _ = iterate(
+            starts, Z, 1, density, max_iter=max_iter, tol=max(tol, 1e-4)
+        )
+        # Group the components into subspaces.
+        first = np.arange(len(Z)) // size
+        for r in range(len(W)):
+            assignment = swap_until_best(first, likelihood_gains(W[r] @ Z, density))
+            W[r] = W[r][rows_by_subspace(assignment)]
+        # FastISA.
+        W, n_iter, converged = iterate(W, Z, size, density, max_iter=max_iter, tol=tol)
+        return W, log_likelihood(W, Z, size, density), n_iter_ica + n_iter, converged

@@ -12,12 +12,13 @@ from sklearn.utils import check_array, check_random_state
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import StrOptions, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
-from isa_nrsfm.isa._density import SqrtDensity
-from isa_nrsfm.isa._fixed_point import log_likelihood, orthogonalise
-from isa_nrsfm.isa._grouping import (
+from isa_nrsfm.isa._steps import (
     Gains,
+    SqrtDensity,
     covariance_gains,
     likelihood_gains,
+    log_likelihood,
+    orthogonalise,
     rows_by_subspace,
     swap_until_best,
     value_gains,

@@ -1,7 +1,27 @@
-"""Most probable calibrated camera of frames and their coefficients, by Newton's method.
+"""Most probable camera and coefficients of frames, by Newton's method.
 
-Shapes and noise variance s2 are given. For each frame by itself, this minimises minus
-twice the log marginal likelihood of its camera, with the coefficients integrated out ::
+**Affine cameras.** For each frame by itself, with weights ``w_ij`` (zero for missing
+points), shapes ``S(a) = B_0 + sum_k a_k B_k`` and noise variance s2 this minimises
+
+    f(M, t, a) = sum_j w_ij || m_ij - M S_j(a) - t ||^2 + s2 |a|^2,
+
+the negative log posterior times ``2 s2``, where a has the prior N(0, I). Position and
+camera are eliminated. With ``A = S S^T`` and ``Y = W S^T``, points and shapes centred
+over the points that the frame sees, the camera is ``M = Y A^-1`` and
+
+    f(a) = ||W||^2 - <M, Y> + s2 |a|^2.
+
+Write ``P_k = B_k W^T``, ``H_kl = <M B_k, M B_l>`` and c = (1, a). Half the gradient is
+``s2 a_k + sum_l H_kl c_l - <P_k^T, M>``. Half the Hessian is the Schur complement
+
+    H_kl + s2 d_kl - <F_k A^-1, F_l>,  F_k = M (B_k S^T + S B_k^T) - P_k^T.
+
+The first step uses ``H + s2 I`` instead, half the Hessian for a fixed camera, so that f
+decreases. The others are Newton steps, damped by ``H + s2 I``.
+
+**Calibrated cameras.** Shapes and noise variance s2 are given. For each frame by
+itself, this minimises minus twice the log marginal likelihood of its camera, with the
+coefficients integrated out ::
 
     F(M) = f(M) / s2 + log det(I + H / s2),  f(M) = min_a ||W - M S(a)||^2 + s2 |a|^2,
 
@@ -23,22 +43,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
     CalibratedCameras,
     CameraModel,
     nearest_calibrated,
 )
-from isa_nrsfm._frames.coefficients import CoefficientPosterior, coefficient_posterior
 from isa_nrsfm._frames.point_sums import (
     FLAT,
+    TWICE,
+    CoefficientPosterior,
     FrameSums,
     affine_cameras,
+    camera_gram,
+    coefficient_posterior,
     seen_changes,
+    whitened,
     with_one,
 )
 from isa_nrsfm._frames.search import FrameProblem, FrameSearch, Minimum, State
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     ROWS,
+    diagonal_of,
     frames_first,
     frames_last,
     of_frames,
@@ -50,19 +76,76 @@ from isa_nrsfm._linalg.small_matrices import (
     unpacked,
 )
 
+
+class AffineSearch(FrameSearch):
+    """The search for affine cameras of shapes (K + 1, 3, J), which it whitens."""
+
+    first_steps = 5
+    rough_steps = 2
+
+    def __init__(self, shapes: NDArray):
+        super().__init__(*whitened(np.ascontiguousarray(shapes)), CAMERAS["affine"])
+
+    def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
+        """Return coefficients (K, n) after a step with the cameras held."""
+        T, _, M, _ = affine_cameras(problem.products, with_one(alpha))
+        return alpha + solve_positive(*_held(problem, alpha, T, M))[0]
+
+    def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
+        """Return ``f(a) - ||W||^2`` and its derivatives at alpha (K, n)."""
+        products, noise = problem
+        T, inverse, M, explained = affine_cameras(products, with_one(position))
+        value = noise * np.einsum("ki,ki->i", position, position) - explained
+        held, slope = _held(problem, position, T, M)
+        F = seen_changes(products.cross, T, M)
+        FA = np.einsum("krai,abi->krbi", F, inverse)
+        shape = len(F), 6, len(noise)
+        schur = held - packed_products(FA.reshape(shape), F.reshape(shape))
+        return State(position, value, slope, held, schur)
+
+    def solution(
+        self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,)."""
+        products, noise = problem
+        _, _, M, explained = affine_cameras(products, with_one(position))
+        square = noise * np.einsum("ki,ki->i", position, position)
+        return M, position, products.energy - explained + square
+
+    def covariances(
+        self, problem: FrameProblem, M: NDArray, alpha: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """Return the covariances of coefficients (K, K, n), and NaN for rotations."""
+        inverse = self.evaluate(problem, alpha).inverse()
+        return problem.noise * inverse, np.full((3, 3, len(problem.noise)), np.nan)
+
+
+def _held(
+    problem: FrameProblem, alpha: NDArray, T: NDArray, M: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return packed ``H + s2 I`` (n_pairs, n) and minus half the gradient (K, n).
+
+    T and the cameras M come from `affine_cameras` for alpha (K, n).
+    """
+    Q = camera_gram(M)
+    held = problem.products.gram.energies(Q)[len(T) :]
+    held[diagonal_of(held)] += problem.noise
+    # sum_l H_kl c_l = <B_k S^T + S B_k^T, M^T M> / 2
+    slope = np.einsum("kari,rai->ki", problem.products.cross[1:], M)
+    slope -= np.einsum("kpi,pi->ki", T[1:], 0.5 * TWICE[:, None] * Q)
+    slope -= problem.noise * alpha
+    return held, slope
+
+
 # Maps cameras, in the axes of the mean shape, to their depth reversals. Reflecting a
 # flat object at its plane does not change its images. The thinner an
 # object is, the less its images change (Necker reversal).
 REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
 # A search from a reversed camera that comes nearer than this share of its first
-# distance returns to where it came from. With 0.1 none of 80,000 frames of faces,
-# hands and bodies ended in a higher minimum, with 0.5 seven. Saves a fifth of the time.
+# distance returns to where it came from: docs/benchmarks/README.md, "Thresholds".
 SAME_WELL = 0.1
 # The reversed camera is not tried if the objective rises by more than this multiple of
-# itself on the way there. In 390,000 searches with a rise above 10 (motion capture,
-# bodies, hands, faces), it was lower in eight, the last at 15. In 210,000 above 20 it
-# never was. Saves 27 to 45 % of the time of faces in weak perspective. For bodies and
-# hands it saves nothing, because most of their reversed cameras are tried.
+# itself on the way there: docs/benchmarks/README.md, "Thresholds".
 LARGE_RISE = 20.0
 
 
@@ -73,12 +156,13 @@ class CalibratedSearch(FrameSearch):
     Cameras are `scaled` (weak perspective) or have the scale one (orthographic).
     """
 
+    model: CalibratedCameras
+
     def __init__(self, shapes: NDArray, scaled: bool):
-        self.model = CalibratedCameras(scaled)
         axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
         turned = axes.T @ shapes
         turned[0, size <= FLAT * size[0]] = 0.0
-        super().__init__(turned, axes.T)
+        super().__init__(turned, axes.T, CalibratedCameras(scaled))
 
     def reversed_cameras(
         self, products: FrameSums, noise: float, motion: NDArray
@@ -107,14 +191,6 @@ class CalibratedSearch(FrameSearch):
         values = [_value(problem, _posterior(problem, start)) for start in starts]
         return np.where(values[1] < values[0], *starts[::-1])
 
-    def moved(self, position: NDArray, step: NDArray) -> NDArray:
-        """Return cameras (2, 3, n) after steps (p, n)."""
-        return self.model.moved(position, step)
-
-    def limited(self, step: NDArray) -> NDArray:
-        """Return steps (p, n) that move no camera by more than the largest turn."""
-        return self.model.limited(step)
-
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
         return self._derivatives(problem, position, _posterior(problem, position))[0]
@@ -122,7 +198,7 @@ class CalibratedSearch(FrameSearch):
     def _derivatives(
         self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
     ) -> tuple[State, NDArray]:
-        """Return the state at M (2, 3, n), and ``Q C`` (K, p, n) of `_coupling`."""
+        """Return the state at M (2, 3, n), and ``Q C`` (K, p, n), C = <D_c, F_k>."""
         products, noise = problem
         A = products.gram.moments(posterior.second_moments(noise))
         G = np.einsum("rbi,bai->rai", M, unpack3(A))
@@ -136,7 +212,9 @@ class CalibratedSearch(FrameSearch):
         second[:3, :3] -= np.einsum("aai->i", mixed) * np.eye(3)[:, :, None]
         second[3:], second[:, 3:] = gradient, gradient[:, None]
         # The coefficients follow: - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
-        coupling, through = self._coupling(problem, M, posterior)
+        F = _changes(problem, M, posterior)
+        coupling = np.einsum("crai,krai->kci", self.model.tangents(M), F)
+        through = posterior.covaried(coupling)
         hessian = definite + second[pair_indices(len(gradient))]
         hessian -= packed_products(through.swapaxes(0, 1), coupling.swapaxes(0, 1))
         value = _value(problem, posterior)
@@ -178,14 +256,6 @@ class CalibratedSearch(FrameSearch):
         covariance -= unpacked(posterior.inverse[len(posterior.c) :])
         covariance = 0.5 * (covariance + covariance.swapaxes(0, 1))
         return noise * covariance, noise * inverse[:3, :3]
-
-    def _coupling(
-        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
-    ) -> tuple[NDArray, NDArray]:
-        """Return ``C = <D_c, F_k>`` (K, p, n), and ``Q C``."""
-        F = _changes(problem, M, posterior)
-        C = np.einsum("crai,krai->kci", self.model.tangents(M), F)
-        return C, posterior.covaried(C)
 
     def _better_reversed(
         self,

@@ -1,1 +1,0 @@
-"""The coordinates in which shapes and coefficients are given."""
