@@ -328,6 +328,7 @@ class _Iterate:
     floor: float
 
     def __post_init__(self) -> None:
+        """Evaluate the objective, its gradient and curvature."""
         passed = self.likelihood(*self.state)
         self.M, noise = frames_last(self.state.motion), self.state.noise
         self.n_seen = self.likelihood.frames.totals[0]

@@ -13,8 +13,13 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis import _frame_columns
-from isa_nrsfm.analysis._frame_columns import kind_of, refuse_infinite
+from isa_nrsfm.analysis._frame_columns import (
+    checked_times,
+    group_numbers,
+    kind_of,
+    refuse_infinite,
+    sequences_of,
+)
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
@@ -65,10 +70,8 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
         times = video_times(numbers, name, groups) / args.fps
     if times is not None:
         try:
-            times_in_seconds = _frame_columns.checked_times(times, len(table))
-            _frame_columns.sequences_of(
-                times_in_seconds, _frame_columns.group_numbers(groups, len(table)), 1
-            )
+            times_in_seconds = checked_times(times, len(table))
+            sequences_of(times_in_seconds, group_numbers(groups, len(table)), 1)
         except ValueError as error:
             hint = " (--group: the rows that belong together)" * (groups is None)
             option = "--fps" if args.time is None else f"--time {args.time}"
