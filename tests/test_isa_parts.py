@@ -11,20 +11,20 @@ from scipy.optimize import linear_sum_assignment
 
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.isa import SqrtDensity, _shared_mixing
-from isa_nrsfm.isa._base import whiten
-from isa_nrsfm.isa._shared_mixing import (
-    LIGHT,
-    TAILS,
-    independent_coefficients,
-    shared_mixing,
-)
-from isa_nrsfm.isa._steps import (
+from isa_nrsfm.isa._base import (
     covariance_gains,
     fixed_point_step,
     iterate,
     likelihood_gains,
     orthogonalise,
     subspace_change,
+    whiten,
+)
+from isa_nrsfm.isa._shared_mixing import (
+    LIGHT,
+    TAILS,
+    independent_coefficients,
+    shared_mixing,
 )
 
 DENSITY = SqrtDensity()
@@ -99,19 +99,6 @@ class TestChange:
                 difference = a.swapaxes(1, 2) @ a - b.swapaxes(1, 2) @ b
                 expected.append(np.max(np.sum(difference**2, axis=(1, 2))) / 2 / size)
             assert_allclose(subspace_change(W, V, size), expected)
-
-
-class TestIterate:
-    def test_steps_and_convergence_are_counted(self):
-        Z, first = white_signals(0), starts(0, 4, 6)
-        _, n_iter, converged = iterate(first, Z, 3, DENSITY, max_iter=3, tol=1e-12)
-        assert_array_equal(n_iter, 3)
-        assert not converged.any()
-        W, n_iter, converged = iterate(first, Z, 3, DENSITY, max_iter=2000, tol=1e-8)
-        assert converged.all()
-        assert np.all((n_iter > 1) & (n_iter < 2000))
-        new = fixed_point_step(W, Z, 3, DENSITY)
-        assert subspace_change(W, new, 3).max() < 2e-8  # steps were shorter
 
 
 def likelihood(signals, assignment):
