@@ -29,6 +29,7 @@ from isa_nrsfm._compat.scikit_learn import (
     StrOptions,
     fit_context,
 )
+from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import (
     STEPWISE,
     FitSettings,
@@ -41,7 +42,6 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
-from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CALIBRATED_CAMERAS,
@@ -52,9 +52,8 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
 )
 from isa_nrsfm._prepare.checks import check_table, validated_table
-from isa_nrsfm._prepare.point_weights import check_weightable, weighted_rows
+from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
 from isa_nrsfm._tables.sources import (
     CHECKS,
     StoredTable,
@@ -66,9 +65,9 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose
+from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
-from isa_nrsfm.analysis._summary import summary_html
+from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa import PooledFastICA
 
 _NEEDS_CALIBRATED = (

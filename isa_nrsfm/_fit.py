@@ -52,34 +52,37 @@ from isa_nrsfm._gauge import (
 )
 from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.jackknife import depth_certainty
-from isa_nrsfm._joint.problem import FactorisedTable, JointOptions, JointSettings
-from isa_nrsfm._joint.quasi_newton import JointState
-from isa_nrsfm._joint.sample_posterior import (
+from isa_nrsfm._joint.likelihood import JointFrames
+from isa_nrsfm._joint.problem import (
+    FactorisedTable,
+    JointOptions,
+    JointSettings,
+    JointState,
+)
+from isa_nrsfm._joint.starts import extended_shapes, rigid_start
+from isa_nrsfm._joint.uncertainty import (
     LEAST_RELIABILITY,
-    posterior_blocks,
-    posterior_moments,
+    depth_certainty,
+    fitted_frames,
     reliabilities,
     shape_uncertainty,
     shown_frames,
 )
-from isa_nrsfm._joint.starts import extended_shapes, rigid_start
-from isa_nrsfm._paper.factors import (
+from isa_nrsfm._paper.pipeline import (
     DENSE,
     Factorisation,
+    PaperResult,
     block_triplets,
     factorise,
+    run_paper_pipeline,
     sample_frames,
 )
-from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import spread
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import Layout, of_all_rows
 
 JOINT_STAGE = "joint refinement"
@@ -133,17 +136,11 @@ class FitSettings(NamedTuple):
         """Whether the refinement is the joint fit, or begins with it."""
         return self.refinement in JOINT_REFINEMENTS
 
-    @property
-    def joint_camera(self) -> str | None:
-        """The camera model of the joint refinement, None without it."""
-        return self.camera if self.joint else None
-
     def of_joint_fit(self, on_step: Callable[[], None] | None = None) -> JointSettings:
         """Return the settings of the joint refinement."""
         tol = JOINT_TOL if self.tol is None else self.tol
-        return JointSettings(
-            self.camera, self.loss, self.max_iter, tol, on_step, self.limits.joint
-        )
+        given = self.camera, self.loss, self.max_iter, tol, on_step, self.n_jobs
+        return JointSettings(*given, self.limits.joint)
 
 
 class TableFit(NamedTuple):
@@ -186,7 +183,7 @@ def ready_table(
         names=s.names,
         scale_frames=s.scale_frames,
         robust=s.loss != "linear",
-        camera=s.joint_camera,
+        camera=s.camera if s.joint else None,
         weights=weights,
     )
 
@@ -226,7 +223,7 @@ def fit_table(
     if settings.joint:
         joint = settings.of_joint_fit(progress.step)
         fit, tracks, alpha = fit_jointly(factorised, shapes, joint, given)
-        model = _frame_model(fit.state.shapes, fit.state.noise, alpha, settings)
+        model = _frame_model(fit.state.shapes, fit.state.noise, alpha, joint)
         progress(JOINT_STAGE)
         attributes = {
             "camera_noise_ratio_": fit.camera_noise_ratio,
@@ -243,8 +240,7 @@ def fit_table(
             n_numbers, square = tracks.totals
             noise = factorised.noise_level(n_components) * square / n_numbers
             if wanted > n_components or fit.left > noise:
-                wanted_or_free = None if free else wanted
-                model = _consensus_model(table, model, joint, wanted_or_free, settings)
+                model = _consensus_model(table, model, joint, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
         fitted, frames, measures = _joint_frames(table, model, tracks, settings)
@@ -396,7 +392,7 @@ def _paper_frames(
 
 
 def _frame_model(
-    shapes: NDArray, noise: float, alpha: NDArray, settings: FitSettings
+    shapes: NDArray, noise: float, alpha: NDArray, settings: JointSettings
 ) -> PosteriorFrames:
     """Return the model of a frame for shapes (K + 1, 3, J), before the gauge."""
     starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
@@ -406,16 +402,16 @@ def _frame_model(
 def _consensus_model(
     table: ScaledTable,
     model: PosteriorFrames,
-    joint: JointSettings,
-    wanted: int | None,
-    settings: FitSettings,
+    settings: JointSettings,
+    wanted: int,
+    free: bool,
 ) -> PosteriorFrames:
     """Return the consensus of groups of points, with the errors of the depths."""
-    most = most_components(len(table.sizes), table.n_points, settings.camera)
-    most = min(most, MOST_COMPONENTS)
-    shapes, noise, alpha, variances = consensus(
-        model, table.rows, joint, wanted, most, settings.n_jobs
-    )
+    if free:
+        most = most_components(len(table.sizes), table.n_points, settings.camera)
+        wanted = min(most, MOST_COMPONENTS)
+    merged = consensus(model, table.rows, settings, wanted, free)
+    shapes, noise, alpha, variances = merged
     # If the object hardly turns, groups share the errors of the depths.
     certainty = model.certainty
     if variances is not None and certainty.determined:
@@ -428,8 +424,8 @@ def _joint_frames(
     table: ScaledTable, model: PosteriorFrames, tracks: JointFrames, s: FitSettings
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of a joint fit in the independent gauge."""
-    posteriors = posterior_blocks(model, tracks, table.rows)
-    motion, alpha, covariance = posterior_moments(posteriors)
+    fits = fitted_frames(model, tracks, table.rows)
+    posteriors, motion, alpha, covariance = fits
     unknown = np.isnan(motion).any(axis=(1, 2))
     if unknown.any():
         row = np.flatnonzero(table.shown)[unknown.argmax()]

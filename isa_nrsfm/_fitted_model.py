@@ -13,7 +13,6 @@ from isa_nrsfm._frames.models import (
     RigidFrames,
 )
 from isa_nrsfm._frames.search import FramePosterior
-from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.tracks import (
     Layout,
@@ -23,6 +22,7 @@ from isa_nrsfm._tables.tracks import (
     tracks_to_table,
     weighted_sizes,
 )
+from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 
 
 class UncertainShapes(NamedTuple):
@@ -210,16 +210,16 @@ class TableModel(NamedTuple):
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None]:
         """Return a mask of usable rows; these centred, centres, sizes and weights."""
         centred, report = centred_frames(rows)
-        usable = report.usable
+        usable, translation, sizes = report.usable, report.translation, report.size
         if not usable.all():
-            centred, report = centred[usable], report.of_frames(usable)
-        translation, sizes = report.translation, report.size
+            fitted = centred, translation, sizes
+            centred, translation, sizes = (part[usable] for part in fitted)
         if self.frames.loss != "linear" and len(centred):
             centred, translation = robustly_centred(rows[usable])
             sizes = robust_sizes(centred)
         if weights is not None:
             weights = weights[usable]
-            sizes = weighted_sizes(centred, weights, sizes)
+            sizes = weighted_sizes(rows[usable], weights)
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes, weights

@@ -11,16 +11,8 @@ from isa_nrsfm.io import load_model
 
 MODEL = "model.npz"
 FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
-FILES = {
-    "alpha.csv",
-    "cameras.csv",
-    MODEL,
-    "report.html",
-    "report.json",
-    "shapes.csv",
-    "shapes.npz",
-    "viewer.html",
-}
+FILES = {"alpha.csv", "cameras.csv", "shapes.csv", "shapes.npz", MODEL}
+FILES |= {"report.html", "report.json", "viewer.html"}
 
 
 # Options of fits that take no time.

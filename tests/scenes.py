@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.point_sums import frame_tracks
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import MarginalLikelihood
+from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_face_tracks
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, random_rotation, structured_motion
 
-from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.pipeline import (
+    factorise,
     leading_blocks,
     lifted_blocks,
     lifted_moments,

@@ -11,37 +11,26 @@ from isa_nrsfm.cli._progress import show_stage, shown_progress
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 
-class Stream(io.StringIO):
-    """A stream that may be a terminal."""
-
-    def __init__(self, terminal):
-        super().__init__()
-        self.terminal = terminal
-
-    def isatty(self):
-        """Return whether it is a terminal."""
-        return self.terminal
-
-
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_latest_line_is_repeated(terminal, capsys, monkeypatch):
-    monkeypatch.setattr("sys.stderr", stream := Stream(terminal))
-    with shown_progress("program", time.perf_counter(), shortest=0.02):
+    monkeypatch.setattr("sys.stderr", stream := io.StringIO())
+    monkeypatch.setattr(stream, "isatty", lambda: terminal)
+    with shown_progress(time.perf_counter(), shortest=0.02):
         print("a stage: 1 s")
         assert stream.getvalue().count("a stage: 1 s\n") >= terminal
         show_stage("smoothing")
         time.sleep(0.5)
     lines = stream.getvalue().splitlines()
     assert ("a stage: 1 s" in lines) == terminal
-    assert 2 <= lines.count("program: 0 s: smoothing") <= 25
+    assert 2 <= lines.count("isa-nrsfm: 0 s: smoothing") <= 25
     time.sleep(0.1)
     assert stream.getvalue().splitlines() == lines
     assert capsys.readouterr().out == ""
 
 
 def test_lines_become_rarer(monkeypatch):
-    monkeypatch.setattr("sys.stderr", stream := Stream(terminal=False))
-    with shown_progress("program", time.perf_counter() - 3600, shortest=0.02):
+    monkeypatch.setattr("sys.stderr", stream := io.StringIO())
+    with shown_progress(time.perf_counter() - 3600, shortest=0.02):
         time.sleep(0.2)
     assert stream.getvalue() == ""
 

@@ -3,7 +3,7 @@
 import contextlib
 import io
 import re
-from html.parser import HTMLParser
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -80,23 +80,6 @@ def answers(tmp_path_factory):
     return results, table, dict(zip(names, figures, strict=True))
 
 
-class Page(HTMLParser):
-    """Tags, texts and images of a page."""
-
-    def __init__(self, source):
-        super().__init__()
-        self.tags, self.texts, self.images = [], [], []
-        self.feed(source)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append(tag)
-        if tag == "img":
-            self.images.append(dict(attributes))
-
-    def handle_data(self, data):
-        self.texts.append(data)
-
-
 def test_the_text_is_as_expected(answers):
     """Numbers and lines are left out: they differ between machines."""
     found, *_ = answers
@@ -122,10 +105,9 @@ def test_the_page_has_the_text_the_figures_and_nothing_else(answers):
     found, *_ = answers
     folder, report = found.folder, found.report
     source = (folder / "report.html").read_text(encoding="utf-8")
-    page = Page(source)
     # Texts of the table stay text.
-    assert "script" not in page.tags
-    text = "".join(page.texts)
+    assert "<script" not in source
+    text = unescape(re.sub("<[^<>]+>", "", source))
     assert HOSTILE in text
     for parts in fit_sections(report).values():
         for part in parts:
@@ -134,8 +116,8 @@ def test_the_page_has_the_text_the_figures_and_nothing_else(answers):
     assert all(warning[1:] in text for warning in report["warnings"])
     assert "isa-nrsfm fit" in text
     figures = [name for name in report["files"] if name.endswith(".png")]
-    assert len(page.images) == len(figures) == 9
-    assert all(image["alt"] for image in page.images)
+    assert len(re.findall('<img [^>]+ alt="[^"]+"', source)) == len(figures) == 9
+    assert source.count("<img") == 9
     assert not re.search(r"(src|href)=\"(?!data:)", source)
     assert "default-src 'none'" in source
     for name in figures:

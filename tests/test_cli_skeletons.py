@@ -8,13 +8,8 @@ import pytest
 from exported_files import Read, content_of
 from fit_runs import Results
 
+from isa_nrsfm import datasets
 from isa_nrsfm.cli import main
-from isa_nrsfm.datasets import (
-    make_body_tracks,
-    make_face_tracks,
-    make_hand_tracks,
-    make_nonrigid_tracks,
-)
 from isa_nrsfm.export import frame_poses
 from isa_nrsfm.skeletons import get_skeleton
 
@@ -41,7 +36,7 @@ def pairs_of(name):
 
 @pytest.fixture(scope="module")
 def bodies():
-    return make_body_tracks(60, noise=0.002, random_state=0)
+    return datasets.make_body_tracks(60, noise=0.002, random_state=0)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +53,7 @@ def bodies_fit(table, tmp_path_factory):
 
 
 def test_layouts_are_recognised_by_order_or_names(fits, bodies, bodies_fit, tmp_path):
-    path = write(make_hand_tracks(120, random_state=0), tmp_path / "hands.csv")
+    path = write(datasets.make_hand_tracks(120, random_state=0), tmp_path / "hands.csv")
     found = fits(path, "--no-figures", *QUICK)
     assert "points recognised as hand-21" in found.out
     assert found.report["model"]["skeleton"] == "hand-21"
@@ -128,7 +123,9 @@ def test_transform_writes_a_page(fails, transforms, table, bodies_fit, tmp_path)
 
 def test_where_y_is_zero_is_said(fits, transforms, succeeds, tmp_path):
     # Points without a known layout, which nothing else says to be upside down.
-    scene = make_nonrigid_tracks(40, 12, 1, camera="weak_perspective", random_state=0)
+    scene = datasets.make_nonrigid_tracks(
+        40, 12, 1, camera="weak_perspective", random_state=0
+    )
     path = write(scene, tmp_path / "points.csv")
     options = ["--camera", "weak_perspective", "-k", "1", "--no-figures", "--std"]
     lower = ["--origin", "lower", "--viewer", tmp_path / "new.html"]
@@ -181,7 +178,7 @@ def test_edges_are_numbers_of_named_points(run, fails, bodies, tmp_path):
 
 @pytest.fixture(scope="module")
 def faces(tmp_path_factory):
-    scene = make_face_tracks(60, n_components=1, noise=0.01, random_state=0)
+    scene = datasets.make_face_tracks(60, n_components=1, noise=0.01, random_state=0)
     return write(scene, tmp_path_factory.mktemp("faces") / "faces.csv")
 
 

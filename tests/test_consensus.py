@@ -43,7 +43,7 @@ def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):
         points = np.sort(rng.choice(n_points, size, replace=False))
         coordinates = rng.standard_normal((n_frames, 3, size))
         coordinates[:, 2] = z[:, points] + rng.standard_normal((n_frames, 1))
-        groups.append(Group(points, np.arange(n_frames), coordinates, 1.0, weight))
+        groups.append(Group(points, weight, np.arange(n_frames), coordinates, 1.0))
     return groups
 
 
@@ -104,7 +104,7 @@ class TestMerge:
         found = merge(scene_of(first), groups)[:, 2]
         # The same problem, each group as rows of one matrix; the joint fit last
         small = 1e-3 * min(group.weight for group in groups)
-        whole = Group(np.arange(7), np.arange(3), first, 1.0, small)
+        whole = Group(np.arange(7), small, np.arange(3), first, 1.0)
         rows, values = [], []
         for group in [*groups, whole]:
             n = len(group.points)

@@ -24,18 +24,9 @@ import pytest
 from layers import slow_after
 from sklearn.exceptions import NotFittedError
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, io
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import PointDistributionModel, read_pdm, write_pdm
-from isa_nrsfm.io import (
-    find_format,
-    load_model,
-    open_table,
-    read_landmarks,
-    read_table,
-    save_model,
-    write_table,
-)
 
 resource = pytest.importorskip("resource", reason="limits the memory of a process")
 for library in ("h5py", "tables", "pyarrow"):
@@ -132,8 +123,8 @@ def read_format(name):
 
     def read(path):
         with contextlib.suppress(ValueError):
-            find_format(path)
-        found = read_landmarks(path, format)
+            io.find_format(path)
+        found = io.read_landmarks(path, format)
         check_landmarks(found)
         separator = {".csv": ",", ".tsv": "\t"}.get(path.suffix)
         if format in ("openface", "pyfeat") and separator is not None:
@@ -143,32 +134,32 @@ def read_format(name):
 
 
 def read_text_table(path):
-    table = read_table(path)
+    table = io.read_table(path)
     separator = {".csv": ",", ".tsv": "\t"}[path.suffix]
     rows = rows_of(path, separator)
     assert table.shape == (len(rows) - 1, len(rows[0]))
     for name, cells in zip(table, zip(*rows[1:], strict=True), strict=True):
         if table[name].dtype != np.float64:
             assert list(table[name]) == list(cells)
-    found = read_landmarks(path, "table")
+    found = io.read_landmarks(path, "table")
     check_landmarks(found)
     check_cells(found.points, found.failed, path, separator)
 
 
 def read_parquet(path):
-    read_table(path)
-    check_landmarks(read_landmarks(path, "table"))
+    io.read_table(path)
+    check_landmarks(io.read_landmarks(path, "table"))
 
 
 def read_stored(path):
-    table = open_table(path)
+    table = io.open_table(path)
     rows = np.asarray(table[0 : len(table)])
     assert rows.shape == table.shape
     assert rows.dtype.kind in "fiu"
 
 
 def read_model(path):
-    model = load_model(path)
+    model = io.load_model(path)
     alpha = model.transform(FACES[:2, : model.n_features_in_])
     assert alpha.shape == (2, len(model.basis_))
     assert np.isfinite(alpha).all()
@@ -189,7 +180,7 @@ def write_points(path):
     points = files.TRACKS.reshape(len(files.TRACKS), -1)
     frame = pd.DataFrame(points, columns=columns)
     frame.insert(0, "id", [f"00{i}" for i in range(len(frame))])
-    write_table(frame, path)
+    io.write_table(frame, path)
     return path
 
 
@@ -211,7 +202,7 @@ def model():
 
 
 def write_model(path):
-    save_model(model(), path)
+    io.save_model(model(), path)
     return path
 
 

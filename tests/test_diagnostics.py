@@ -1,6 +1,7 @@
 """What a fit says of itself: reliabilities and information, by their definitions."""
 
 import re
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,11 +9,14 @@ import numpy as np
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose
+from refusals import warned
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
+from sklearn.base import clone
+from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._joint.sample_posterior import reliabilities
+from isa_nrsfm._joint.uncertainty import reliabilities
 from isa_nrsfm.analysis._diagnostics import (
     camera_advice,
     gross_residuals,
@@ -22,6 +26,8 @@ from isa_nrsfm.analysis._diagnostics import (
 )
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.skeletons import get_skeleton
+
+TABLE = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
 
 
 def random_coefficients(seed, n_frames=50, n_components=3):
@@ -120,36 +126,20 @@ class TestWeakInformation:
         motion = rng.normal(size=(n_frames, 2, 3))
         alpha = rng.normal(size=(n_frames, n_components))
 
-        def images(M, t, a, V):
-            basis = shapes[1:] + np.stack([shapes[0] @ each.T for each in V])
-            return ((shapes[0] + np.tensordot(a, basis, 1)) @ M.T + t).ravel()
+        def information(M, a):
+            def images(x):
+                M_x, t, a_x, V = np.split(x, [6, 8, 8 + n_components])
+                basis = shapes[1:] + shapes[0] @ V.reshape(-1, 3, 3).swapaxes(1, 2)
+                shape = shapes[0] + np.tensordot(a + a_x, basis, 1)
+                return (shape @ (M + M_x.reshape(2, 3)).T + t).ravel()
 
-        def changes(f, size):
-            return np.stack([f(e) - f(np.zeros(size)) for e in np.eye(size)], axis=1)
-
-        still = np.zeros((n_components, 3, 3))
-        expected = np.zeros((9 * n_components, 9 * n_components))
-        for M, a in zip(motion, alpha, strict=True):
-            free = np.hstack(
-                [
-                    changes(
-                        lambda x, M=M, a=a: images(
-                            M + x[:6].reshape(2, 3), x[6:8], a, still
-                        ),
-                        8,
-                    ),
-                    changes(
-                        lambda x, M=M, a=a: images(M, 0.0, a + x, still), n_components
-                    ),
-                ]
-            )
-
-            def strained(x, M=M, a=a):
-                return images(M, 0.0, a, x.reshape(-1, 3, 3))
-
-            strain = changes(strained, 9 * n_components)
+            unknowns = np.eye(8 + 10 * n_components)
+            changes = np.array([images(x) - images(0 * x) for x in unknowns]).T
+            free, strain = np.split(changes, [8 + n_components], axis=1)
             rest = strain - free @ np.linalg.lstsq(free, strain)[0]
-            expected += rest.T @ rest
+            return rest.T @ rest
+
+        expected = sum(map(information, motion, alpha))
         found = weak_information(shapes[0], shapes[1:], motion, alpha)
         assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
 
@@ -300,20 +290,18 @@ class TestOutliers:
         assert re.search(r"rows image9, .* points 7,", message)
 
 
-@pytest.mark.parametrize("share", [5e-4, 6e-4])
-def test_outliers_are_named_by_rows_and_most_frequent_points(share):
-    points = np.array([[3, 1], [0, 2], [3, 2], [7, 0]])
-    found = SimpleNamespace(outlier_share=share, outliers=points)
-    advice = outlier_advice(found, np.arange(10, 20), ["a", "b", "c"])
-    if share == 5e-4:
-        assert advice == ""
-    else:
-        told = "the table has outliers: 4 points (0.06 %) in 3 frames"
-        assert advice.startswith(told)
-        assert advice.endswith(
-            "more than 8 standard deviations from the model, in the rows 10, 13, 17, "
-            "most often the points c, a, b"
-        )
+def test_outliers_are_named_by_rows_and_most_frequent_points():
+    def advice(share):
+        points = np.array([[3, 1], [0, 2], [3, 2], [7, 0]])
+        found = SimpleNamespace(outlier_share=share, outliers=points)
+        return outlier_advice(found, np.arange(10, 20), "abc")
+
+    assert advice(5e-4) == ""
+    assert advice(6e-4) == (
+        "the table has outliers: 4 points (0.06 %) in 3 frames are more than 8 "
+        "standard deviations from the model, in the rows 10, 13, 17, most often the "
+        "points c, a, b"
+    )
 
 
 def test_a_few_frames_that_determine_a_coefficient_are_named():
@@ -329,8 +317,7 @@ def test_a_few_frames_that_determine_a_coefficient_are_named():
 
 
 def test_messages_on_the_basis_come_first():
-    table = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
-    model = AffineNRSfM(2, random_state=0, independence=None).fit(table)
+    model = estimator(independence=None).fit(TABLE)
     model.alpha_ = model.alpha_.copy()
     model.alpha_[7, 0] = 30.0
     model.reliability_ = np.ones(2)
@@ -347,3 +334,93 @@ def test_advice_on_cameras_does_not_lead_back(ratio):
     assert found.startswith("next: affine cameras for this table")
     found = camera_advice("affine", ratio, determined=True)
     assert re.search("^keep these cameras|with these cameras$", found)
+
+
+# --- what a notebook shows of a model ------------------------------------------------
+
+
+def estimator(**params):
+    return AffineNRSfM(2, random_state=0, **params)
+
+
+def summary(model):
+    """Return the rows of the summary, without tags."""
+    shown = model._repr_html_()
+    assert model._repr_mimebundle_()["text/html"].count("isa-nrsfm-summary") == 1
+    rows = re.findall(r"<tr><th[^>]*>(.*?)</th><td[^>]*>(.*?)</td></tr>", shown)
+    return dict(rows)
+
+
+@pytest.fixture(scope="module")
+def summarised():
+    return estimator().fit(TABLE)
+
+
+def test_unfitted_models_have_no_summary():
+    assert "isa-nrsfm-summary" not in estimator()._repr_html_()
+
+
+def test_summary_of_the_joint_refinement(summarised):
+    shown = summary(summarised)
+    assert shown["Shapes"] == "2 basis shapes of 16 points"
+    assert shown["Frames"] == "60"
+    percent = 100 * np.array([summarised.inverse_snr_, summarised.rank_floor_])
+    expected = "{:.3g} %, rank floor {:.3g} %".format(*percent)
+    assert shown["Inverse SNR"] == expected
+    assert shown["Noise"].endswith(" of a frame&#x27;s size")
+    assert shown["Energy of each"].count(" %") == 2
+    assert shown["Diagnostics"] == "no warning"
+    assert shown["Cameras"].startswith("affine; calibrated cameras explain the table")
+
+
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+def test_summary_of_calibrated_cameras(camera):
+    options = {"camera": camera, "noise": 0.02, "random_state": 0}
+    table = make_nonrigid_tracks(60, 16, 2, **options).data
+    shown = summary(estimator(camera=camera).fit(table))
+    assert shown["Cameras"].startswith(f"{camera.replace('_', ' ')}; ")
+    unit = "in the units of the table" if camera == "orthographic" else "s size"
+    assert shown["Noise"].endswith(unit)
+    shown = summary(estimator(camera=camera, refinement=None).fit(table))
+    assert shown["Cameras"] == camera.replace("_", " ")
+
+
+def test_rows_without_points_are_told():
+    table = TABLE.copy()
+    table[[3, 8]] = np.nan
+    shown = summary(warned("2 of 60", estimator(scale_frames=False).fit, table))
+    assert shown["Frames"] == "58, 2 rows without points"
+    assert shown["Noise"].endswith("in the units of the table")
+
+
+def test_warnings_of_the_diagnostics_are_shown(summarised):
+    model = copy(summarised)
+    model.reliability_ = np.array([0.3, 0.0])
+    assert "does not support" in model.diagnostics().messages[0]
+    assert "at most n_components=1" in summary(model)["Diagnostics"]
+
+
+@pytest.mark.parametrize(
+    "params", [{"refinement": "alternating"}, {"keep_frames": False}], ids=str
+)
+def test_what_is_not_known_is_left_out(params):
+    shown = summary(estimator(**params).fit(TABLE))
+    assert "Diagnostics" not in shown
+    assert "Inverse SNR" in shown
+
+
+def test_names_of_columns_are_escaped(summarised):
+    pandas = pytest.importorskip("pandas")
+    names = [f"<marked>{column}" for column in range(32)]
+    named = clone(summarised).set_params(refinement=None)
+    named.fit(pandas.DataFrame(TABLE, columns=names))
+    shown = make_pipeline(named)._repr_html_() + named._repr_html_()
+    assert "<marked>" not in shown
+    assert "isa-nrsfm-summary" in shown
+
+
+@pytest.mark.parametrize(("n_components", "more"), [(12, ""), (13, ", ...")])
+def test_energies_of_twelve_basis_shapes_are_shown(summarised, n_components, more):
+    model = copy(summarised)
+    model.energy_share_ = np.full(n_components, 0.05)
+    assert summary(model)["Energy of each"] == ", ".join(["5 %"] * 12) + more

@@ -15,15 +15,8 @@ from numpy.testing import assert_array_equal
 from refusals import refused
 from sklearn.exceptions import NotFittedError
 
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import AffineNRSfM, FastISA, export
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.export import (
-    point_distribution_model,
-    write_glb,
-    write_pdm,
-    write_shapes,
-    write_viewer,
-)
 from isa_nrsfm.io import read_table, save_model, write_table
 
 OLD = b"what was there before"
@@ -38,14 +31,17 @@ WRITERS = {
     "long.tsv": lambda path: write_table(LONG_TABLE, path),
     "a.parquet": lambda path: write_table(TABLE, path),
     "a.npz": lambda path: save_model(face_model(), path),
-    "a.html": lambda path: write_viewer(face_model(), path),
-    "a.glb": lambda path: write_glb(face_model(), path),
+    "a.html": lambda path: export.write_viewer(face_model(), path),
+    "a.glb": lambda path: export.write_glb(face_model(), path),
     **dict.fromkeys(
         ("pdm.txt", "pdm.npz", "pdm.mat"),
-        lambda path: write_pdm(point_distribution_model(face_model()), path),
+        lambda path: export.write_pdm(
+            export.point_distribution_model(face_model()), path
+        ),
     ),
     **dict.fromkeys(
-        ("shapes.npz", "shapes.mat"), lambda path: write_shapes(face_model(), path)
+        ("shapes.npz", "shapes.mat"),
+        lambda path: export.write_shapes(face_model(), path),
     ),
 }
 

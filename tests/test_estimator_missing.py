@@ -12,6 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused, warned
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -455,3 +457,16 @@ def test_frames_that_show_less_are_known_less_well():
     fitted = estimator().fit(tracks.reshape(90, -1))
     few, many = fitted.alpha_std_[:45], fitted.alpha_std_[45:]
     assert np.all(np.median(few, axis=0) > 1.2 * np.median(many, axis=0))
+
+
+@pytest.mark.parametrize(("n_jobs", "piped"), [(None, True), (2, False)])
+def test_warnings_point_to_the_line_of_the_user(n_jobs, piped):
+    model = AffineNRSfM(1, refinement=None, n_jobs=n_jobs, random_state=0)
+    if piped:
+        model = make_pipeline(FunctionTransformer(), model)
+    X = scene().data
+    X[3, 4] = np.nan  # a point has only one of its coordinates
+    for method in (model.fit, model.fit_transform, model.transform, model.score):
+        with pytest.warns(UserWarning, match="only one of") as caught:
+            method(X)
+        assert {each.filename for each in caught} == {__file__}

@@ -26,13 +26,13 @@ from isa_nrsfm._frames.models import (
     PosteriorFrames,
     RigidFrames,
 )
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.jackknife import N_GROUPS, depth_certainty, neighbours
-from isa_nrsfm._joint.likelihood import extent_penalty
-from isa_nrsfm._joint.sample_posterior import (
+from isa_nrsfm._joint.likelihood import JointFrames, extent_penalty
+from isa_nrsfm._joint.uncertainty import (
+    N_GROUPS,
+    depth_certainty,
+    fitted_frames,
     inlying_rows,
-    posterior_blocks,
-    posterior_moments,
+    neighbours,
     shape_uncertainty,
     shown_frames,
 )
@@ -312,9 +312,8 @@ class TestSamplePosterior:
         if compressed:
             directions = np.linalg.svd(model.shapes.reshape(9, -1))[2][:9]
             frames = JointFrames.from_directions(blocks, directions)
-        found = posterior_blocks(model, frames, blocks)
         expected = model.posterior(rows)
-        motion, alpha, covariance = posterior_moments(found)
+        _, motion, alpha, covariance = fitted_frames(model, frames, blocks)
         assert_allclose(motion, expected.motion, atol=1e-7)
         assert_allclose(alpha, expected.alpha, atol=1e-7)
         assert_allclose(covariance, expected.covariance.mean(axis=0), rtol=1e-6)

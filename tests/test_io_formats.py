@@ -218,6 +218,7 @@ def test_openpose_parts_are_chosen(tmp_path):
         ([[1, 2]], "b_keypoints.json: pose_keypoints_2d .* each point; got 2 numbers"),
         ([["1", 2, 3]], r"b_.*: pose_keypoints_2d should be .* got \['1', 2, 3\]"),
         ([[1, 2, np.inf]], "b_.*: pose_keypoints_2d should be a list of finite"),
+        ([[np.nan, 2, 1]], "b_.*: pose_keypoints_2d should be a list of finite"),
         ([[10**400, 2, 1]], "b_.*: pose_keypoints_2d should be a list of finite"),
     ],
 )

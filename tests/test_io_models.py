@@ -58,11 +58,8 @@ CASES = {
     "planar": {"layout": "planar", "independence": None, "scale_frames": False},
     "alternating": ALTERNATING | {"isa": STRATEGY},
     "alternating, calibrated": ALTERNATING | CALIBRATED,
-    "not refined": {
-        "refinement": None,
-        "isa": PooledFastICA(n_init=2),
-        "keep_frames": False,
-    },
+    "not refined": {"refinement": None, "keep_frames": False}
+    | {"isa": PooledFastICA(n_init=2)},
     "single precision": {},
     "single precision, alternating": ALTERNATING | {"block_recovery": "eigen"},
     "missing points": {},

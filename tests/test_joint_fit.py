@@ -16,8 +16,8 @@ from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._joint import problem as problem_module
-from isa_nrsfm._joint.problem import FactorisedTable
-from isa_nrsfm._joint.reweighting import residual_deviations
+from isa_nrsfm._joint.fit import residual_deviations
+from isa_nrsfm._joint.problem import FactorisedTable, JointState
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
@@ -234,7 +234,7 @@ class TestLargeTables:
         refine = problem_module.refine_joint
 
         def recorded(likelihood, *args, **options):
-            sizes.append(likelihood.n_frames)
+            sizes.append(likelihood.frames.n_frames)
             return refine(likelihood, *args, **options)
 
         monkeypatch.setattr(problem_module, "refine_joint", recorded)
@@ -273,8 +273,8 @@ class TestRobustLoss:
             left = np.eye(len(A)) - A @ np.linalg.solve(A.T @ W @ A + prior, A.T @ W)
             square = np.sum(left**2, axis=1).reshape(2, -1)
             expected[i] = np.sqrt(square.mean(axis=0))
-        fit = scene.motion, scene.alpha, scene.shapes, scene.weights
-        got = residual_deviations(*fit, variance, model)
+        state = JointState(scene.shapes, scene.motion, variance)
+        got = residual_deviations(state, scene.alpha, scene.weights, model)
         assert_allclose(got, expected, rtol=1e-6)
 
     @ROBUST

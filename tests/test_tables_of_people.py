@@ -210,9 +210,13 @@ def test_names_are_texts(asked, names):
         assert sorted(set(found.labels[0].values)) == sorted(names)
 
 
-def test_whole_numbers_are_classes_in_their_order(asked):
-    (label,) = asked({"age": np.resize([10, 9, 8], N)}, "--label", "age").labels
-    assert [str(name) for name in np.unique(label.values)] == ["8", "9", "10"]
+@pytest.mark.parametrize(
+    ("cells", "classes"),
+    [([10, 9, 8], ["8", "9", "10"]), (["round", "none"], ["none", "round"])],
+)
+def test_whole_numbers_and_none_are_classes_in_their_order(asked, cells, classes):
+    (label,) = asked({"age": np.resize(cells, N)}, "--label", "age").labels
+    assert [str(name) for name in np.unique(label.values)] == classes
     assert label.kind == "classes"
 
 
@@ -245,12 +249,6 @@ def test_words_for_missing_are_missing(asked, word, suffix):
     assert list(np.flatnonzero(~mood.known)) == list(np.flatnonzero(~age.known)) == [4]
     message = r"--group: 1 of 24 frames have no 'mood' .*w 4"
     refused(message, asked, columns, "--group", "mood", suffix=suffix)
-
-
-def test_none_is_a_class(asked):
-    cells = np.resize(["none", "round"], N)
-    (label,) = asked({"glasses": cells}, "--label", "glasses").labels
-    assert set(label.values) == {"none", "round"}
 
 
 def test_dollar_signs_are_shown_as_they_are(tmp_path, capsys):

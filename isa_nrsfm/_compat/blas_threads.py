@@ -1,15 +1,12 @@
 """One BLAS thread, in all functions of small matrices."""
 
-from collections.abc import Callable
 from functools import wraps
 from operator import attrgetter
 from threading import Lock
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, cast
 from weakref import WeakSet
 
-from isa_nrsfm._compat.scikit_learn import threadpool_controller
-
-Function = TypeVar("Function", bound=Callable[..., Any])
+from isa_nrsfm._compat.scikit_learn import Function, threadpool_controller
 
 
 class OneBlasThread:

@@ -1,13 +1,23 @@
-"""Arrays in NumPy's format: many in a file, and one of the size of its file."""
+"""Arrays in NumPy's format: in one file, in bytes, and each in a file of its own."""
 
+import contextlib
 import io
 import math
-from collections.abc import Mapping
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import IO
 from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
+
+from isa_nrsfm._compat.whole_files import folder_for_writing, whole_file
+
+Keep = Callable[[Mapping[str, NDArray]], dict[str, NDArray]]
 
 
 def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray]) -> None:
@@ -38,3 +48,39 @@ def array_in(content: bytes) -> NDArray:
         )
     stored.seek(0)
     return np.lib.format.read_array(stored, allow_pickle=False)
+
+
+@contextlib.contextmanager
+def kept_arrays(path: str | os.PathLike[str] | None) -> Iterator[Keep]:
+    """Keep arrays in files of a folder, and remove the files if the block fails.
+
+    Yields a function that maps arrays by name to memory maps, or to themselves if the
+    path is None. Each block writes to a new folder: no other process writes to mapped
+    files.
+    """
+    if path is None:
+        yield dict
+        return
+    if not os.fspath(path):
+        raise ValueError("frames_folder should be None or the path of a folder; got ''")
+    folder = Path(path)
+    name = f"fit-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid.uuid4().hex[:12]}"
+
+    def keep(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
+        """Return memory maps of arrays."""
+        # Another fit that failed may have removed the empty folder.
+        (folder / name).mkdir(parents=True)
+        maps = {}
+        for part, array in arrays.items():
+            file = folder / name / f"{part}.npy"
+            with whole_file(file) as stream:
+                np.save(stream, array)
+            maps[part] = np.load(file, mmap_mode="r")
+        return maps
+
+    with folder_for_writing(folder):
+        try:
+            yield keep
+        except BaseException:
+            shutil.rmtree(folder / name, ignore_errors=True)
+            raise

@@ -26,6 +26,8 @@ from isa_nrsfm._linalg.small_matrices import (
     procrustes,
 )
 
+# Frames and points of a group
+Indices = tuple[NDArray, NDArray]
 # Steps, and the share of the noise floor in the last one (docs/benchmarks/consensus.md)
 STEPS, LAST_SHARE = 30, 0.2
 # Weight of the first coordinates, or of the joint fit, among the groups. It matters
@@ -34,11 +36,7 @@ WEIGHT_OF_WHOLE = 1e-3
 
 
 def common_coordinates(
-    images: NDArray,
-    first: NDArray,
-    groups: list[tuple[NDArray, NDArray]],
-    noise: float,
-    floor: float,
+    images: NDArray, first: NDArray, groups: list[Indices], noise: float, floor: float
 ) -> NDArray:
     """Return coordinates (I, 3, n) of images (I, 2, n), NaN where points are missing.
 

@@ -32,15 +32,12 @@ from isa_nrsfm._joint.common_depths import (
     aligning_rotations,
     common_coordinates,
 )
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.problem import JointSettings
-from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
-from isa_nrsfm._joint.sample_posterior import inlying_rows
+from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.problem import JointSettings, JointState, refine_joint
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
+from isa_nrsfm._joint.uncertainty import inlying_rows
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames, spread
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # docs/benchmarks/consensus.md has the errors with other values of these constants.
@@ -88,25 +85,24 @@ class Group(NamedTuple):
     """
 
     points: NDArray
+    weight: float
     frames: NDArray
     coordinates: NDArray
     noise: float
-    weight: float
 
 
 def consensus(
     model: PosteriorFrames,
     rows: FrameBlocks,
     settings: JointSettings,
-    n_components: int | None,
     most: int,
-    n_jobs: int | None = None,
+    free: bool,
 ) -> tuple[NDArray, float, NDArray, NDArray | None]:
     """Fit groups of neighbouring points, and merge them.
 
     The model is a joint fit with calibrated cameras, the rows are frames (I, 2, J) of
-    size one, NaN where a point is missing. Without a number of basis shapes, as many
-    are kept as exceed the noise, at most `most`.
+    size one, NaN where a point is missing. There are `most` basis shapes, or if their
+    number is free at most as many, those that exceed the noise.
 
     Returns centred shapes (K + 1, 3, J) for coefficients of variance one, the noise
     variance of a coordinate, the coefficients (n, K) of some frames, and the mean
@@ -125,19 +121,14 @@ def consensus(
     n_points, options = part.shape[2], settings.options
     chosen = spread(np.arange(n_points), min(n_points, MOST_POINTS))
     mean_square = float(np.nanmean(part**2))
-    scene = Scene(
-        part[:, :, chosen],
-        first[:, :, chosen],
-        fit.motion,
-        1.0 / (options.basis_std**2 * mean_square),
-        FLOOR_SHARE * options.least_noise * mean_square,
-    )
-    noise, change, groups = model.noise_variance, np.zeros_like(first), []
-    distances, variances = neighbour_distances(shapes[:, :, chosen]), None
+    price = 1.0 / (options.basis_std**2 * mean_square)
+    floor = FLOOR_SHARE * options.least_noise * mean_square
+    scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
+    noise, S, groups, variances = model.noise_variance, shapes, [], None
+    distances = neighbour_distances(shapes[:, :, chosen])
     # Groups cannot improve a fit whose noise is below their floor.
     if noise >= scene.floor:
-        n_fitted = len(model.shapes) - 1
-        groups = fitted_groups(scene, distances, n_fitted, settings, n_jobs)
+        groups = fitted_groups(scene, distances, len(model.shapes) - 1, settings)
     if groups:
         noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
         share = 1.0 - scene.floor / noise
@@ -149,17 +140,12 @@ def consensus(
         others = np.setdiff1d(np.arange(n_points), chosen)
         off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
         change[:, :2, others] = off[:, :, others]
-        change = centred(change)
-    # Shapes in the axes of the object, and their principal components
-    S = shapes + rotations.mT @ change / scales[:, None, None]
-    if groups:
-        R = aligning_rotations(centred(S[:, :, chosen]), noise)
-        S = R.mT @ S
-    if n_components is None:
-        merged_shapes, alpha, rest = principal_shapes(S, most, LEFT * noise)
-    else:
-        merged_shapes, alpha, rest = principal_shapes(S, n_components)
-    return merged_shapes, noise + rest, alpha, variances
+        # Shapes in the axes of the object
+        S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
+        S = aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S
+    # Their principal components
+    shapes, alpha, rest = principal_shapes(S, most, LEFT * noise if free else 0.0)
+    return shapes, noise + rest, alpha, variances
 
 
 def together(
@@ -187,24 +173,17 @@ def together(
 
 
 def fitted_groups(
-    scene: Scene,
-    distances: NDArray,
-    n_components: int,
-    settings: JointSettings,
-    n_jobs: int | None,
+    scene: Scene, distances: NDArray, n_components: int, settings: JointSettings
 ) -> list[Group]:
     """Return the fits of all groups."""
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
     sizes = [size for size in SIZES if size <= largest]
     tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
-    quiet = settings._replace(on_step=None)
+    quiet, rows, first = settings._replace(on_step=None), scene.rows, scene.first
     # In the order of memory that pickled arrays have, else rounding errors differ.
-    fits = Parallel(n_jobs=n_jobs, return_as="generator")(
+    fits = Parallel(n_jobs=settings.n_jobs, return_as="generator")(
         delayed(group_fit)(
-            scene._replace(
-                rows=np.take(scene.rows, points, axis=2),
-                first=np.take(scene.first, points, axis=2),
-            ),
+            scene._replace(rows=rows.take(points, 2), first=first.take(points, 2)),
             n_components,
             quiet,
         )
@@ -215,8 +194,7 @@ def fitted_groups(
         if settings.on_step is not None:
             settings.on_step()
         if fit is not None:
-            frames, coordinates, noise = fit
-            groups.append(Group(points, frames, coordinates, noise, count))
+            groups.append(Group(points, count, *fit))
     return groups
 
 
@@ -274,21 +252,18 @@ def group_fit(
     # Fixed cameras, without the prior, which would make basis shapes vanish
     blocks = FrameBlocks.of_array(tracks, len(tracks))
     part = JointFrames.from_points(blocks, bool(seen.all()))
-    free = MarginalLikelihood(part, 0.0)
-    refined = partial(
-        refine_joint,
-        least_noise=scene.floor * free.n_seen / free.square,
-        tol=0.1 * settings.tol,
-    )
+    free, (n_seen, square) = MarginalLikelihood(part), part.totals
+    least, tol = scene.floor * n_seen / square, 0.1 * settings.tol
+    refined = partial(refine_joint, least_noise=least, tol=tol)
     start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
     likelihood = MarginalLikelihood(part, scene.price / len(frames))
-    alpha = free.coefficients(*start)
+    alpha = free(*start).alpha
     shapes = likely_basis(start.shapes, motion, alpha, likelihood.penalty)
     start, orthographic = start._replace(shapes=shapes), CAMERAS["orthographic"]
     most = min(settings.max_iter, MOST_STEPS)
     state = refined(likelihood, start, orthographic, max_iter=most).state
-    alpha = likelihood.coefficients(*state)
+    alpha = likelihood(*state).alpha
     rotations, scales = full_rotations(state.motion)
     turned = scales[:, None, None] * rotations
     S = turned @ (state.shapes[0] + np.tensordot(alpha, state.shapes[1:], 1))
@@ -315,17 +290,13 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
     weighted_groups = []
     for size in sorted({len(group.points) for group in groups}):
         same = [group for group in groups if len(group.points) == size]
-        merged = merge(scene, same)[:, 2]
-        off = [
-            group.weight
-            * np.mean(centred(group.coordinates[:, 2] - merged[place(group)]) ** 2)
-            for group in same
-        ]
-        total = sum(group.weight for group in same)
-        weight = 1.0 / (size * (sum(off) / total + rounding))
-        weighted_groups += [
-            group._replace(weight=weight * group.weight) for group in same
-        ]
+        merged, off, total = merge(scene, same)[:, 2], 0.0, 0.0
+        for group in same:
+            rest = group.coordinates[:, 2] - merged[np.ix_(group.frames, group.points)]
+            off += group.weight * np.mean(centred(rest) ** 2)
+            total += group.weight
+        factor = 1.0 / (size * (off / total + rounding))
+        weighted_groups += [g._replace(weight=factor * g.weight) for g in same]
     return weighted_groups
 
 
@@ -344,7 +315,7 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     weight, total = np.full(b.shape, small), small * scene.first[:, :2]
     for group in groups:
         frames, points = group.frames, group.points
-        n, at = len(points), place(group)
+        n, at = len(points), np.ix_(frames, points)
         A[np.ix_(frames, points, points)] += group.weight * (np.eye(n) - 1.0 / n)
         b[at] += group.weight * centred(group.coordinates[:, 2])
         weight[at] += group.weight
@@ -356,11 +327,6 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     depths = np.linalg.solve(A, b[:, :, None])
     images = images + share * (fitted - images)
     return np.concatenate([images, depths.mT], axis=1)
-
-
-def place(group: Group) -> tuple[NDArray, ...]:
-    """Return the index of the frames and points of a group in an array (I, n)."""
-    return np.ix_(group.frames, group.points)
 
 
 def centred(depths: NDArray) -> NDArray:

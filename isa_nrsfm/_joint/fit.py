@@ -22,25 +22,35 @@ g_k is the share of the 3J numbers of B_k that the table determines rather than 
 prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
-from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
-from isa_nrsfm._joint.frames import JointFrames, without
-from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointSettings
-from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointFit, JointState, regular
-from isa_nrsfm._joint.reweighting import reweighted
+from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, compose, distances
+from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
+from isa_nrsfm._joint.problem import (
+    NOISE_FLOOR,
+    FactorisedTable,
+    JointFit,
+    JointProblem,
+    JointSettings,
+    JointState,
+    regular,
+)
 from isa_nrsfm._joint.starts import (
+    FIXED_STEPS,
     affine_start,
     best_starts,
     camera_moments,
-    settled,
     with_prior,
 )
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._linalg.small_matrices import frames_last
+from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
+from isa_nrsfm._tables.blocks import representative_frames
 
 
 def fit_jointly(
@@ -57,18 +67,16 @@ def fit_jointly(
     corrected for degrees of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
-    first, sampled, n_components = problems[0], len(problems) > 1, len(paper_shapes) - 1
+    first, sampled = problems[0], len(problems) > 1
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is None:
         fit, start = _first_fit(first, table, paper_shapes)
     else:
         shapes = first.frames.coordinates(start.shapes)
-        start = first.aligned(start._replace(shapes=shapes))
-        fitted = _calibrated_fit if first.cameras.calibrated else JointProblem.refined
-        fit = fitted(first, start, first.cameras)
+        start = first.aligned(start._replace(shapes=shapes), first.cameras)
+        fit = first.unreversed(start, first.cameras)
     ratio = fit.camera_noise_ratio
-    levels = table.noise_level(n_components), table.missing_share(n_components)
-    fit, least_noise, sufficient = judged(first, fit, start, *levels)
+    fit, least_noise, sufficient = judged(first, table, fit, start)
     if sufficient:
         problems = [replace(problem, penalty=0.0) for problem in problems]
         if not sampled:  # for a sufficient model a smaller tolerance is safe
@@ -76,7 +84,8 @@ def fit_jointly(
             fit = problems[0].refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames
     for problem in problems[1:]:
-        fit = problem.refined(problem.aligned(fit.state), least_noise=least_noise)
+        state = problem.aligned(fit.state, problem.cameras)
+        fit = problem.refined(state, least_noise=least_noise)
     # After completed frames, the points that are seen, and robust weights
     problem = problems[-1]
     if seen is not None:
@@ -87,9 +96,7 @@ def fit_jointly(
     noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
     if table.outliers is not None:
         # This noise variance is corrected for the unknowns of the frames already.
-        fit, noise = reweighted(
-            problem, table.scaled.rows, table.outliers, fit, least_noise
-        )
+        fit, noise = reweighted(problem, table, fit, least_noise)
         n_pose = 0
     shapes = problem.frames.points(fit.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
@@ -100,7 +107,7 @@ def fit_jointly(
     centred = shapes - shapes.mean(axis=2, keepdims=True)
     end = JointState(centred, fit.state.motion, max(noise, OF_DISTANCES**2))
     fit = fit._replace(state=end, camera_noise_ratio=ratio)
-    return fit, problem.frames, first.likelihood.coefficients(*state)
+    return fit, problem.frames, first.likelihood(*state).alpha
 
 
 def count_components(
@@ -190,12 +197,10 @@ def _problems(
 
 def _visible_frames(table: FactorisedTable) -> JointFrames:
     """Return the frames by their visible points, without outliers, weighted."""
-    rows, weights = table.scaled.rows, table.scaled.weights
-    if weights is not None:
-        return JointFrames.from_repeated(rows, weights)
-    if table.outliers is not None and table.outliers.any():
-        return JointFrames.from_weighted(rows.derive(without, table.outliers))
-    return JointFrames.from_points(rows, table.scaled.complete)
+    rows, weights, outliers = table.scaled.rows, table.scaled.weights, table.outliers
+    if weights is None and outliers is not None and outliers.any():
+        return JointFrames.from_weighted(rows.derive(without, outliers))
+    return JointFrames.from_points(rows, table.scaled.complete, weights)
 
 
 def _first_fit(
@@ -206,51 +211,35 @@ def _first_fit(
     cameras, affine = problem.cameras, CAMERAS["affine"]
     calibrated = cameras if cameras.calibrated else CAMERAS["weak_perspective"]
     starts = best_starts(problem, table, paper_shapes, calibrated)
-    fit = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
+    fit = min(map(partial(problem.unreversed, cameras=calibrated), starts), key=_end)
     # Affine cameras, from the calibrated fit and from the paper's result
     rigid = affine_start(problem, table.W, paper_shapes)
-    states = [problem.aligned(fit.state, affine), settled(problem, rigid, affine)]
+    # Some steps without the prior: with the large noise of a start it would make basis
+    # shapes vanish.
+    free, tol = replace(problem, penalty=0.0), problem.settings.tol
+    state = free.refined(rigid, affine, max_iter=FIXED_STEPS, tol=tol).state
+    states = [problem.aligned(fit.state, affine), with_prior(problem, state)]
+    refined = partial(problem.refined, cameras=affine)
     max_iter = problem.settings.max_iter
     if cameras.calibrated:  # only compared
         max_iter = min(max_iter, 60)
     if not problem.thorough:  # only the better one continues
-        few = min(max_iter, 5)
-        raced = [problem.refined(state, affine, max_iter=few) for state in states]
-        states = [_least(raced).state]
-    other = _least(problem.refined(s, affine, max_iter=max_iter) for s in states)
+        raced = map(partial(refined, max_iter=min(max_iter, 5)), states)
+        states = [min(raced, key=_end).state]
+    other = min(map(partial(refined, max_iter=max_iter), states), key=_end)
     ratio = fit.left / min(other.left, fit.left)
     if cameras.calibrated:
         return fit._replace(camera_noise_ratio=ratio), starts[0]
     return other._replace(camera_noise_ratio=ratio), rigid
 
 
-def _least(fits: Iterable[JointFit]) -> JointFit:
-    """Return the fit with the lowest objective at its end."""
-    return min(fits, key=lambda fit: fit.value)
-
-
-def _calibrated_fit(
-    problem: JointProblem,
-    state: JointState,
-    cameras: CameraModel,
-    least_noise: float | None = None,
-) -> JointFit:
-    """Return the fit of calibrated cameras in which no frame is reversed in depth."""
-    fit = problem.refined(state, cameras, least_noise)
-    for _ in range(5 if problem.thorough else 0):
-        state, n_reversed = problem.reversed_back(fit.state, cameras)
-        if not n_reversed:
-            break
-        fit = problem.refined(state, cameras, least_noise)
-    return fit
+def _end(fit: JointFit) -> float:
+    """Return the objective at the end of a fit."""
+    return float(fit.history[-1])
 
 
 def judged(
-    problem: JointProblem,
-    fit: JointFit,
-    start: JointState,
-    noise_level: float,
-    missing_share: float,
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, start: JointState
 ) -> tuple[JointFit, float, bool]:
     """Decide whether K is sufficient and refit accordingly.
 
@@ -265,6 +254,8 @@ def judged(
     """
     options, mean_square = problem.settings.options, problem.mean_square
     cameras, least_noise = problem.cameras, options.least_noise
+    n_components = len(start.shapes) - 1
+    noise_level = table.noise_level(n_components)
     # A spectrum of only 3K + 3 singular values has no noise.
     threshold = max(options.right * noise_level, 1e-10) * mean_square
     at_floor = fit.state.noise < (1 + 1e-3) * least_noise * mean_square
@@ -277,9 +268,9 @@ def judged(
     # Not sufficient: with a floor as high as the missing deformation
     follows = cameras.scaled or at_floor
     if cameras.calibrated and follows and noise_level > 0:
-        missing = options.cut_off * missing_share
+        missing = options.cut_off * table.missing_share(n_components)
         least_noise = np.clip(missing, least_noise, options.most_noise)
-        fit = _calibrated_fit(problem, fit.state, cameras, least_noise)
+        fit = problem.unreversed(fit.state, cameras, least_noise=least_noise)
     return fit, least_noise, False
 
 
@@ -314,3 +305,108 @@ def _freedom_correction(
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
     unknowns = n_pose * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
     return float(n_numbers / max(n_numbers - unknowns, 0.1 * n_numbers))
+
+
+def reweighted(
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, least_noise: float
+) -> tuple[JointFit, float]:
+    """Iterate refinement and weights until the weights agree with the residuals.
+
+    In `fit`, outliers of the table had weight zero, other points weight one. Returns
+    the refinement and the noise variance of a coordinate, from the median of the
+    residuals, corrected for the degrees of freedom.
+    """
+    cameras, loss = problem.cameras, problem.settings.loss
+    rows, left_out = table.scaled.rows, table.outliers
+    assert left_out is not None
+    sizes = rows.joined(robust_sizes)
+    weighted = rows.derive(without, left_out)
+    # Estimate the noise from the residuals of at most about 2,000 frames.
+    few = representative_frames(rows, 2000)
+    few_rows = rows.take(few)
+    weights = without(few_rows, left_out[few])[1]
+    for _ in range(20):
+        shapes, motion, variance = fit.state
+        alpha = problem.likelihood(*fit.state).alpha
+        position = weighted.joined(partial(_positions, shapes=shapes), motion, alpha)
+        model = motion, position, alpha, sizes
+        M, t, a, few_sizes = (part[few] for part in model)
+        distance = distances(few_rows, shapes, M, t, a)
+        state = JointState(shapes, M, variance)
+        distance /= residual_deviations(state, a, weights, cameras)
+        deviation = max(median_noise(distance[np.isfinite(distance)]), OF_DISTANCES)
+        # Weights from the residuals, and convergence test
+        new = partial(_weighted, shapes=shapes, loss=loss, deviation=deviation)
+        change = max(weighted.map(partial(_change, new=new), *model))
+        if change < 1e-2:
+            break
+        # Refinement with the new weights
+        weighted = rows.derive(new, *model)
+        weights = new(few_rows, M, t, a, few_sizes)[1]
+        problem = replace(problem, frames=JointFrames.from_weighted(weighted))
+        fit = problem.refined(fit.state, least_noise=least_noise)
+    return fit, deviation**2
+
+
+def residual_deviations(
+    state: JointState, alpha: NDArray, weights: NDArray, cameras: CameraModel
+) -> NDArray:
+    """Return the standard deviations (n, J) of residuals over that of the noise.
+
+    With the derivatives A of the image by camera, position and coefficients and weights
+    W, residuals are ``(I - A (A^T W A + P)^-1 A^T W)`` times the noise; the prior P is
+    the noise variance for each coefficient.
+    """
+    shapes, motion, noise = state
+    (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
+    n_pose = 2 + cameras.n_parameters
+    deviations = np.empty(weights.shape)
+    # Process frames in slices whose derivatives fit into 32 MB
+    length = max(2**22 // (2 * n_points * (n_pose + n_components)), 1)
+    for first in range(0, n_frames, length):
+        part = slice(first, first + length)
+        M, w = motion[part], weights[part, None, None]
+        frames = shapes[0] + np.tensordot(alpha[part], shapes[1:], 1)
+        moved = np.moveaxis(cameras.tangents(frames_last(M)), 3, 0) @ frames[:, None]
+        positions = np.zeros((len(M), 2, 2, n_points))
+        positions[:, [0, 1], [0, 1]] = 1.0
+        A = np.concatenate([moved, positions, M[:, None] @ shapes[1:]], axis=1)
+        flat = A.reshape(*A.shape[:2], -1)
+        weighed = (A * w).reshape(flat.shape)
+        gram = weighed @ flat.swapaxes(1, 2)
+        coefficients = np.arange(n_pose, A.shape[1])
+        gram[:, coefficients, coefficients] += noise
+        Z = np.linalg.solve(regular(gram), flat)
+        spread = np.einsum("ipx,ipx->ix", Z, weighed @ weighed.swapaxes(1, 2) @ Z)
+        leverage = np.einsum("ipx,ipx->ix", weighed, Z)
+        square = (1.0 - 2.0 * leverage + spread).reshape(-1, 2, n_points).mean(axis=1)
+        deviations[part] = np.sqrt(np.maximum(square, OF_DISTANCES))
+    return deviations
+
+
+def _positions(
+    block: WeightedRows, motion: NDArray, alpha: NDArray, shapes: NDArray
+) -> NDArray:
+    """Return the positions (n, 2) of frames, the weighted means of residuals."""
+    rows, weights = block
+    stacked = shapes.mT
+    model = compose(stacked[0], stacked[1:], alpha) @ motion.mT
+    rest = np.nan_to_num(rows.mT - model)
+    total = weights.sum(axis=1, keepdims=True)  # zero where no point counts
+    position = np.einsum("ij,ijc->ic", weights, rest)
+    return position / np.where(total > 0, total, 1.0)
+
+
+def _weighted(
+    rows: NDArray, *fit: NDArray, shapes: NDArray, loss: str, deviation: float
+) -> WeightedRows:
+    """Return frames (n, 2, J) with the weights of their residuals from a fit."""
+    *model, sizes = fit
+    distance = distances(rows, shapes, *model)
+    return rows, frame_weights(loss, distance, deviation, sizes)
+
+
+def _change(before: WeightedRows, *fit: NDArray, new: Any) -> float:
+    """Return the largest change of the weights."""
+    rows, weights = before
+    return float(np.abs(new(rows, *fit)[1] - weights).max())

@@ -1,4 +1,6 @@
-"""Marginal likelihood of cameras and shapes, with the coefficients integrated out.
+"""Frames of a joint fit, and the marginal likelihood of their cameras and shapes.
+
+The coefficients are integrated out.
 
 Coefficients have the prior ``N(0, I)``. Coordinates have noise of variance s2. Write
 ``c = (1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1). Then minus twice the log
@@ -18,13 +20,18 @@ The gradient follows from the first two posterior moments of the coefficients, a
 expectation maximisation (Tipping, Bishop, "Probabilistic principal component analysis",
 1999; Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
 
+If no point is missing, the objective depends on a frame only through its energy and its
+products with directions that span the shapes: cheap for any number of points.
+
 All terms are sums over blocks of frames. Inside a block the frame is the last index.
 Cameras M and their gradient G are (2, 3, n_frames).
 """
 
 from collections.abc import Iterable
-from functools import partial
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from operator import add
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +42,19 @@ from isa_nrsfm._frames.point_sums import (
     camera_gram,
     coefficient_posterior,
     frame_sums,
+    frame_tracks,
+    joined_frames,
 )
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._linalg.small_matrices import diagonal_of, frames_last, unpack3, unpacked
-from isa_nrsfm._tables.blocks import BLOCK_FRAMES
+from isa_nrsfm._linalg.small_matrices import (
+    diagonal_of,
+    energies,
+    frames_last,
+    of_frames,
+    unpack3,
+    unpacked,
+)
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
+from isa_nrsfm._tables.tracks import seen_points
 
 # If one extent is r times both others, the fit must lower the noise variance by 4 % for
 # r = 5 and by 12 % for r = 10. Without the penalty, frontal photos of faces give
@@ -48,12 +64,115 @@ EXTENT_WEIGHT = 0.02
 # Floor of the squared extents, as a share of their mean. Flat objects stay flat.
 FLAT = 1e-3
 
+# Rows (n, 2, J), NaN where a point is missing, and weights (n, J), zero there.
+WeightedRows = tuple[NDArray, NDArray]
+
+
+def without(rows: NDArray, left_out: NDArray | bool = False) -> WeightedRows:
+    """Return rows (n, 2, J), with weight zero for missing points and those left out."""
+    return rows, (seen_points(rows) & np.logical_not(left_out)) * 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class JointFrames:
+    """Frames of a table, ready for passes over them.
+
+    All blocks of FrameTracks have weights, or none has. Directions (n_directions, J)
+    are orthonormal rows, None if frames are given by their points. `repeated`: a weight
+    is the number of observations of its point, otherwise each point is one.
+    """
+
+    blocks: FrameBlocks
+    directions: NDArray | None = None
+    repeated: bool = False
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return self.blocks.n_frames
+
+    @cached_property
+    def totals(self) -> tuple[float, float]:
+        """Number of observed coordinates of positive weight, and weighted energy."""
+        repeated = self.repeated
+
+        def of_block(block: FrameTracks) -> tuple[float, float]:
+            n_seen = block.weight.sum()
+            if block.weights is not None and not repeated:
+                n_seen = np.count_nonzero(block.weights)
+            return 2.0 * n_seen, block.energy.sum()
+
+        n_seen, square = np.sum(list(self.blocks.map(of_block)), axis=0)
+        return float(n_seen), float(square)
+
+    def basis_penalty(self, basis_std: float) -> float:
+        """Compute the factor of ``sum_i ||M_i B_k||^2`` in the prior of basis shapes.
+
+        `basis_std` is relative to the root mean square of the coordinates. The prior
+        counts once, not for each frame.
+        """
+        n_numbers, energy = self.totals
+        return n_numbers / (basis_std**2 * energy * self.n_frames)
+
+    @classmethod
+    def from_points(
+        cls, rows: FrameBlocks, complete: bool, observations: NDArray | None = None
+    ) -> Self:
+        """Return frames by points, from rows (n, 2, J) and observations (I, J)."""
+        if observations is not None:
+            return cls(rows.derive(frame_tracks, observations), repeated=True)
+        if complete:
+            return cls(rows.derive(frame_tracks))
+        return cls(rows.derive(lambda rows: frame_tracks(*without(rows))))
+
+    @classmethod
+    def from_weighted(cls, weighted: FrameBlocks) -> Self:
+        """Return frames by points, from blocks of `WeightedRows`."""
+        return cls(weighted.derive(lambda block: frame_tracks(*block)))
+
+    @classmethod
+    def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
+        """Return complete rows (I, 2, J) by products with directions of sum zero."""
+        blocks = rows.derive(partial(_compressed_frames, directions=directions))
+        return cls(blocks.regrouped(joined_frames, BLOCK_FRAMES), directions)
+
+    def coordinates(self, shapes: NDArray) -> NDArray:
+        """Return shapes (..., n_points) by directions, if the frames are given so."""
+        return shapes if self.directions is None else shapes @ self.directions.T
+
+    def points(self, shapes: NDArray) -> NDArray:
+        """Return shapes (..., n_points) from the result of `coordinates`."""
+        return shapes if self.directions is None else shapes @ self.directions
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames, in the order of the table."""
+        chosen = np.zeros(self.n_frames, dtype=bool)
+        chosen[frames] = True
+        parts = self.blocks.map(
+            lambda block, kept: of_frames(block, np.flatnonzero(kept)), chosen
+        )
+        taken = [part for part in parts if len(part.weight)]
+        blocks = FrameBlocks.of_blocks(taken, [len(part.weight) for part in taken])
+        return replace(self, blocks=blocks.regrouped(joined_frames, BLOCK_FRAMES))
+
+
+def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
+    """Return complete frames (I, 2, J) with directions in the place of points."""
+    n_frames, _, n_points = rows.shape
+    products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
+    W, weight = np.ascontiguousarray(products.T), np.full(n_frames, float(n_points))
+    return FrameTracks(W, None, np.zeros((2, n_frames)), weight, energies(rows))
+
+
+# Terms that are summed over frames, and those of each frame, in the order below
+Terms = tuple[tuple[Any, ...], tuple[NDArray, ...]]
+
 
 class LikelihoodTerms(NamedTuple):
     """Objective, derivatives and posterior moments, from one pass over the frames.
 
-    shape_gradient (n_shapes, 3, J): derivative of the value with respect to the shapes.
-    noise_gradient: derivative with respect to the logarithm of the noise variance.
+    noise_gradient: derivative of the value by the logarithm of the noise variance.
+    shape_gradient (n_shapes, 3, J): derivative with respect to the shapes.
     shape_curvature (J or 1, 3 n_shapes, 3 n_shapes): ``sum_i w_ij E_i (x) M_i^T M_i``
     with the posterior second moments E_i of (1, alpha). Times ``2 / s2`` it is the
     Hessian by point j of the shapes, posterior and positions held fixed. One matrix for
@@ -61,12 +180,12 @@ class LikelihoodTerms(NamedTuple):
     residual: sum of squared residuals of the tracks at the posterior means.
     motion_gradient (2, 3, I): derivative with respect to the cameras.
     motion_curvature (6, I): ``sum_kl E_kl B_k B_l^T``, packed: the same for each row.
-    alpha (K, I): posterior means of the coefficients.
+    alpha (I, K): posterior means of the coefficients.
     """
 
     value: float
-    shape_gradient: NDArray
     noise_gradient: float
+    shape_gradient: NDArray
     shape_curvature: NDArray
     residual: float
     motion_gradient: NDArray
@@ -74,36 +193,47 @@ class LikelihoodTerms(NamedTuple):
     alpha: NDArray
 
 
-class MarginalLikelihood:
+class MarginalLikelihood(NamedTuple):
     """The objective and its derivatives, as a sum over blocks of frames.
 
     penalty: factor of ``sum_i tr H_i``, or one (K,) for each diagonal entry.
     extent_weight: weight of the prior of the extents, for each coordinate.
-    n_seen: number N of coordinates that were seen.
-    square: weighted energy of the centred tracks.
     """
 
-    def __init__(
-        self, frames: JointFrames, penalty: NDArray | float, extent_weight: float = 0.0
-    ):
-        self.frames, self.penalty, self.extent_weight = frames, penalty, extent_weight
-        self.n_frames, (self.n_seen, self.square) = frames.n_frames, frames.totals
+    frames: JointFrames
+    penalty: NDArray | float = 0.0
+    extent_weight: float = 0.0
 
     def __call__(
         self, shapes: NDArray, motion: NDArray, noise: float
     ) -> LikelihoodTerms:
         """Return the terms at shapes (n, 3, J), motion (I, 2, 3), noise variance s2."""
-        terms = self._sums(shapes, motion, noise)
+        n_seen, square = self.frames.totals
+        products, penalty = ShapeProducts(shapes), self.penalty
+        # If the noise is tiny, refine the solution of the normal equations by one step.
+        tiny_noise = noise * n_seen < 1e-7 * square
+
+        def over_block(block: FrameTracks, motion: NDArray) -> Terms:
+            """Return the sums over pieces whose matrices fit the cache."""
+            M, parts = frames_last(motion), []
+            for frames, piece in block.pieces(BLOCK_FRAMES):
+                M_i = M[:, :, frames]
+                parts.append(_terms(piece, M_i, products, noise, penalty, tiny_noise))
+            return _joined(parts)
+
+        sums, by_frame = _joined(self.frames.blocks.map(over_block, motion))
+        value, noise_gradient, shape_gradient, packed, residual = sums
+        motion_gradient, motion_curvature, alpha = by_frame
         # Matrices (n, size, size) from the sums, packed by shapes and by axes
-        size, packed = 3 * len(shapes), terms.shape_curvature
+        size = 3 * len(shapes)
         curvature = unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3)
         curvature = curvature.reshape(-1, size, size)
         columns = shapes.reshape(size, -1).T[:, :, None]
         pulled = (curvature @ columns)[:, :, 0].T.reshape(shapes.shape)
-        value = terms.value + self.n_seen * np.log(noise)
-        shape_gradient = terms.shape_gradient + (2 / noise) * pulled
+        value += n_seen * np.log(noise)
+        shape_gradient = shape_gradient + (2 / noise) * pulled
         if self.extent_weight:
-            weight = self.extent_weight * self.n_seen
+            weight = self.extent_weight * n_seen
             # With one curvature for all points the shapes are centred already.
             penalty, slope = extent_penalty(shapes, centred=len(curvature) == 1)
             value += weight * penalty
@@ -111,66 +241,40 @@ class MarginalLikelihood:
             # zero.
             seen = curvature.any(axis=(1, 2))
             shape_gradient = shape_gradient + weight * np.where(seen, slope, 0.0)
-        return terms._replace(
-            value=float(value),
-            shape_gradient=shape_gradient,
-            noise_gradient=float(terms.noise_gradient + self.n_seen),
-            shape_curvature=curvature,
+        return LikelihoodTerms(
+            float(value),
+            float(noise_gradient + n_seen),
+            shape_gradient,
+            curvature,
+            residual,
+            motion_gradient,
+            motion_curvature,
+            np.ascontiguousarray(alpha.T),
         )
 
-    def coefficients(self, shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
-        """Return the posterior means of the coefficients (n_frames, n_components)."""
-        return np.ascontiguousarray(self._sums(shapes, motion, noise).alpha.T)
 
-    def _sums(self, shapes: NDArray, motion: NDArray, noise: float) -> LikelihoodTerms:
-        """Return the sums over all frames, with the curvature of the shapes packed."""
-        # If the noise is tiny, refine the solution of the normal equations by one step.
-        tiny_noise = noise * self.n_seen < 1e-7 * self.square
-        over_block = partial(
-            _block_terms,
-            shapes=ShapeProducts(shapes),
-            noise=noise,
-            penalty=self.penalty,
-            tiny_noise=tiny_noise,
-        )
-        return _joined(self.frames.blocks.map(over_block, motion))
-
-
-def _joined(parts: Iterable[LikelihoodTerms]) -> LikelihoodTerms:
+def _joined(parts: Iterable[Terms]) -> Terms:
     """Add the sums of consecutive frames, and concatenate the terms of each frame."""
-    remaining, n_sums = iter(parts), 5
-    first = next(remaining)
-    sums: list[Any] = list(first[:n_sums])
-    by_frame = [first[n_sums:]]
-    for part in remaining:
-        sums = [a + b for a, b in zip(sums, part[:n_sums], strict=True)]
-        by_frame.append(part[n_sums:])
+    sums: Any = ()
+    by_frame: list[Any] = []
+    for added, own in parts:
+        sums = tuple(map(add, sums, added)) if by_frame else added
+        by_frame.append(own)
     if len(by_frame) == 1:
-        return first
-    joined = (np.concatenate(each, axis=-1) for each in zip(*by_frame, strict=True))
-    return LikelihoodTerms(*sums, *joined)
+        return sums, own
+    join = partial(np.concatenate, axis=-1)
+    return sums, tuple(map(join, zip(*by_frame, strict=True)))
 
 
-def _block_terms(
-    block: FrameTracks, motion: NDArray, **constants: Any
-) -> LikelihoodTerms:
-    """Return the terms of a block, summed over pieces whose matrices fit the cache."""
-    M = frames_last(motion)
-    return _joined(
-        _frame_terms(piece, M[:, :, frames], **constants)
-        for frames, piece in block.pieces(BLOCK_FRAMES)
-    )
-
-
-def _frame_terms(
+def _terms(
     block: FrameTracks,
     M: NDArray,
     shapes: ShapeProducts,
     noise: float,
     penalty: NDArray | float,
     tiny_noise: bool,
-) -> LikelihoodTerms:
-    """Return the sums over frames, M (2, 3, n_frames), as `MarginalLikelihood._sums`.
+) -> Terms:
+    """Return the sums over frames, M (2, 3, n_frames), for `MarginalLikelihood`.
 
     The curvature of the shapes is packed: (n_pairs, 6, n_points or 1).
     """
@@ -204,16 +308,10 @@ def _frame_terms(
         mixed = np.einsum("kli,lbi->kbi", unpacked(moments), products.shape_centroid)
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
         shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
-    return LikelihoodTerms(
-        value=float(value),
-        shape_gradient=(-2 / noise) * shape_gradient.reshape(shapes.shapes.shape),
-        noise_gradient=-(residual + spread) / noise,
-        shape_curvature=shape_curvature,
-        residual=residual,
-        motion_gradient=(2 / noise) * G,
-        motion_curvature=motion_curvature,
-        alpha=alpha,
-    )
+    noise_gradient = -(residual + spread) / noise
+    shape_gradient = (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape)
+    sums = float(value), noise_gradient, shape_gradient, shape_curvature, residual
+    return sums, ((2 / noise) * G, motion_curvature, alpha)
 
 
 def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArray]:

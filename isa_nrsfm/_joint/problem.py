@@ -1,8 +1,16 @@
-"""The joint fit as an optimisation problem: frames, penalty and stopping rule."""
+"""The joint fit as an optimisation problem, and the method that solves it.
 
+Cameras, shapes and noise are moved together by a limited memory quasi-Newton method
+(Nocedal, Wright, "Numerical optimization", 2006, section 7.2). Its initial inverse
+Hessian is the inverse of the curvature of expectation maximisation at the current
+iterate. A step without remembered pairs is thus a generalised step of expectation
+maximisation.
+"""
+
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +20,19 @@ from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, MarginalLikelihood
-from isa_nrsfm._joint.quasi_newton import JointFit, JointState, refine_joint
-from isa_nrsfm._paper.factors import Factorisation
+from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
+from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
+from isa_nrsfm._paper.pipeline import Factorisation
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
+
+# Lower bound of the noise variance, as a share of the mean square of the tracks. It
+# keeps the objective finite for tables without noise.
+NOISE_FLOOR = 1e-11
+
+# Steps, changes of the gradient, and their inner products.
+Memory = deque[tuple[NDArray, NDArray, float]]
 
 
 class JointOptions(NamedTuple):
@@ -116,7 +131,37 @@ class JointSettings(NamedTuple):
     max_iter: int
     tol: float
     on_step: Callable[[], None] | None = None
+    n_jobs: int | None = None
     options: JointOptions = JOINT_OPTIONS
+
+
+class JointState(NamedTuple):
+    """Shapes (n_shapes, 3, J), cameras (I, 2, 3) and noise variance of a coordinate."""
+
+    shapes: NDArray
+    motion: NDArray
+    noise: float
+
+
+class JointFit(NamedTuple):
+    """Result of the joint refinement.
+
+    history (n_iter + 1,): objective at the start and after each step; it never rises.
+    gradient_norm: ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D
+    of the approximate Hessian and the number N of coordinates. Its square is about half
+    to twice the possible further decrease of the objective per coordinate.
+    left: the maximum of the noise variance and the mean square residual at the
+    posterior means of the coefficients. camera_noise_ratio: noise variance with
+    calibrated cameras divided by that with affine ones, for the sample of
+    `fit_jointly`. NaN with given starts.
+    """
+
+    state: JointState
+    history: NDArray
+    gradient_norm: float
+    converged: bool
+    left: float
+    camera_noise_ratio: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,17 +198,43 @@ class JointProblem:
         """The objective."""
         return MarginalLikelihood(self.frames, self.penalty)
 
-    def aligned(
-        self, state: JointState, cameras: CameraModel | None = None
-    ) -> JointState:
+    def aligned(self, state: JointState, cameras: CameraModel) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes."""
-        shapes = state.shapes
+        shapes, _, noise = state
         if self.frames.directions is None:
             shapes = shapes - shapes.mean(axis=2, keepdims=True)
-        search = frame_search((cameras or self.cameras).name, shapes)
-        fitted = partial(search.fit, noise=state.noise, covariances=False, rough=True)
-        motion = self.frames.blocks.joined(lambda block: fitted(block).motion)
-        return JointState(shapes, motion, state.noise)
+        search = frame_search(cameras.name, shapes)
+        motion = self.frames.blocks.joined(
+            lambda block: search.fit(block, noise, covariances=False, rough=True).motion
+        )
+        return JointState(shapes, motion, noise)
+
+    def refined(
+        self, state: JointState, cameras: CameraModel | None = None, **limits: Any
+    ) -> JointFit:
+        """Refine a state jointly, within the limits of the settings or other ones."""
+        cameras, settings = cameras or self.cameras, self.settings
+        extents = 0.0 if cameras.name == "affine" else EXTENT_WEIGHT
+        given = {
+            "least_noise": settings.options.least_noise,
+            "max_iter": settings.max_iter,
+            "tol": settings.tol * (0.1 if self.thorough else 1.0),
+            "on_step": settings.on_step,
+        }
+        likelihood = MarginalLikelihood(self.frames, self.penalty, extents)
+        return refine_joint(likelihood, state, cameras, **given | limits)
+
+    def unreversed(
+        self, state: JointState, cameras: CameraModel, **limits: Any
+    ) -> JointFit:
+        """Refine a state; with calibrated cameras no frame stays reversed in depth."""
+        fit = self.refined(state, cameras, **limits)
+        for _ in range(5 if self.thorough and cameras.calibrated else 0):
+            state, n_reversed = self.reversed_back(fit.state, cameras)
+            if not n_reversed:
+                break
+            fit = self.refined(state, cameras, **limits)
+        return fit
 
     def reversed_back(
         self, state: JointState, cameras: CameraModel
@@ -176,41 +247,182 @@ class JointProblem:
         search = CalibratedSearch(state.shapes, cameras.scaled)
 
         def reversed_cameras(block: FrameTracks, motion: NDArray) -> Any:
-            parts = [
-                search.reversed_cameras(
-                    frame_sums(piece, search.shared), state.noise, motion[frames]
-                )
-                for frames, piece in block.pieces(BLOCK_FRAMES)
-            ]
+            parts = []
+            for frames, piece in block.pieces(BLOCK_FRAMES):
+                sums = frame_sums(piece, search.shared)
+                other = search.reversed_cameras(sums, state.noise, motion[frames])
+                parts.append(other)
             return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
         parts = self.frames.blocks.map(reversed_cameras, state.motion)
         motion, better = map(np.concatenate, zip(*parts, strict=True))
         return state._replace(motion=motion), int(better.sum())
 
-    def refined(
-        self,
-        state: JointState,
-        cameras: CameraModel | None = None,
-        least_noise: float | None = None,
-        max_iter: int | None = None,
-        tol: float | None = None,
-    ) -> JointFit:
-        """Refine a state jointly, by default with the settings of the problem."""
-        settings, likelihood = self.settings, self.likelihood
-        cameras = cameras or self.cameras
-        if tol is None:
-            tol = settings.tol * (0.1 if self.thorough else 1.0)
-        if cameras.name != "affine":
-            likelihood = MarginalLikelihood(self.frames, self.penalty, EXTENT_WEIGHT)
-        if least_noise is None:
-            least_noise = settings.options.least_noise
-        return refine_joint(
-            likelihood,
-            state,
-            cameras,
-            least_noise=least_noise,
-            max_iter=settings.max_iter if max_iter is None else max_iter,
-            tol=tol,
-            on_step=settings.on_step,
-        )
+
+def refine_joint(
+    likelihood: MarginalLikelihood,
+    start: JointState,
+    cameras: CameraModel,
+    *,
+    least_noise: float = NOISE_FLOOR,
+    max_iter: int,
+    tol: float,
+    on_step: Callable[[], None] | None = None,
+) -> JointFit:
+    """Minimise the objective of `MarginalLikelihood` from a start.
+
+    `least_noise` is a share of the mean square of the tracks. The iteration ends when
+    two consecutive steps each gain less than `tol` times the number of frames.
+    """
+    n_frames, (n_seen, square) = likelihood.frames.n_frames, likelihood.frames.totals
+    floor = least_noise * square / n_seen
+    start = start._replace(noise=max(start.noise, floor))
+    iterate = _Iterate(likelihood, cameras, start, floor)
+    # At most 20 pairs, fewer if they would exceed 2^25 numbers, but never less than 3
+    most = 2**25 // (2 * iterate.gradient.size)
+    memory: Memory = deque(maxlen=max(min(most, 20), 3))
+    history, small_steps = [iterate.value], 0
+    while len(history) <= max_iter and small_steps < 2:
+        if on_step is not None:
+            on_step()
+        # L-BFGS direction, or the preconditioned gradient if L-BFGS does not descend
+        direction = -_inverse_hessian_product(iterate, memory)
+        if not iterate.gradient @ direction < 0:
+            memory.clear()
+            direction = -iterate.precondition(iterate.gradient)
+        reached, step = _line_search(iterate, direction)
+        if reached is None:
+            if not memory:  # even the gradient fails: only rounding errors remain
+                small_steps = 2
+            memory.clear()
+            continue
+        # Update of the memory, if the curvature along the step is positive
+        change = reached.gradient - iterate.gradient
+        curvature = float(step @ change)
+        if curvature > 1e-10 * np.linalg.norm(step) * np.linalg.norm(change):
+            memory.append((step, change, curvature))
+        # Convergence test
+        gain = iterate.value - reached.value
+        rounding = OF_SUMS * square / reached.state.noise
+        small = gain < max(tol * n_frames, rounding)
+        small_steps = small_steps + 1 if small else 0
+        iterate = reached
+        history.append(iterate.value)
+    memory.clear()
+    slope = iterate.gradient @ iterate.precondition(iterate.gradient)
+    norm = float(np.sqrt(max(slope, 0.0) / n_seen))
+    converged = small_steps >= 2 and bool(np.isfinite(iterate.value))
+    return JointFit(iterate.state, np.array(history), norm, converged, iterate.left)
+
+
+@dataclass(eq=False)
+class _Iterate:
+    """A state with the objective, its gradient and its approximate curvature.
+
+    The unknowns as one vector: shapes, parameters of the cameras, log noise variance.
+    """
+
+    likelihood: MarginalLikelihood
+    cameras: CameraModel
+    state: JointState
+    floor: float
+
+    def __post_init__(self) -> None:
+        passed = self.likelihood(*self.state)
+        self.M, noise = frames_last(self.state.motion), self.state.noise
+        self.n_seen = self.likelihood.frames.totals[0]
+        self.value = passed.value
+        self.left = max(noise, passed.residual / self.n_seen)
+        at_floor = noise <= self.floor * (1 + 1e-6)
+        # At its lower bound the noise variance may only rise.
+        by_noise = min(passed.noise_gradient, 0.0 if at_floor else np.inf)
+        by_cameras = self.cameras.gradient(self.M, passed.motion_gradient)
+        self.gradient = _stacked(passed.shape_gradient, by_cameras, by_noise)
+        self.curvature = passed.shape_curvature, passed.motion_curvature
+
+    @cached_property
+    def metric(self) -> tuple[NDArray, NDArray]:
+        """Inverses of the curvatures of the shapes and of the cameras."""
+        by_shapes, by_cameras = self.curvature
+        inverse = self.cameras.inverse_curvature(self.M, by_cameras)
+        return np.linalg.inv(regular(by_shapes)), inverse
+
+    def precondition(self, vector: NDArray) -> NDArray:
+        """Return a vector times the inverse of the approximate Hessian.
+
+        The Hessian is block diagonal: ``2 / s2`` times the curvatures of shapes and
+        cameras, and N for ``log s2``.
+        """
+        half = self.state.noise / 2
+        shapes, steps, noise = self.split(vector)
+        by_shapes, by_cameras = self.metric
+        stacked = shapes.reshape(-1, shapes.shape[-1])
+        if len(by_shapes) == 1:
+            stacked = by_shapes[0] @ stacked
+        else:
+            stacked = (by_shapes @ stacked.T[:, :, None])[:, :, 0].T
+        steps = self.cameras.product(by_cameras, steps)
+        return _stacked(half * stacked, half * steps, noise / self.n_seen)
+
+    def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:
+        """Return shapes (n, 3, J), parameters of cameras (p, I), and log noise."""
+        shapes, motion, _ = self.state
+        steps = vector[shapes.size : -1].reshape(self.cameras.n_parameters, len(motion))
+        return vector[: shapes.size].reshape(shapes.shape), steps, vector[-1]
+
+    def moved(self, step: NDArray) -> JointState:
+        """Return the state after a step; the noise variance is at least floor."""
+        shapes, steps, noise = self.split(step)
+        motion = frames_first(self.cameras.moved(self.M, steps))
+        noise = max(self.state.noise * np.exp(noise), self.floor)
+        return JointState(self.state.shapes + shapes, motion, noise)
+
+
+def regular(curvature: NDArray) -> NDArray:
+    """Return curvatures (n, m, m) with a small ridge, as they can be singular."""
+    size = curvature.shape[-1]
+    # Points that are visible in no frame have zero curvature and zero gradient.
+    ridge = OF_DIFFERENCES * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
+    return curvature + ridge * np.eye(size)
+
+
+def _stacked(shapes: NDArray, steps: NDArray, noise: float) -> NDArray:
+    """Return the three parts of the unknowns as one vector, with steps (p, I)."""
+    return np.concatenate([shapes.ravel(), steps.ravel(), [noise]])
+
+
+def _inverse_hessian_product(iterate: _Iterate, memory: Memory) -> NDArray:
+    """Return the L-BFGS inverse Hessian times the gradient (two-loop recursion)."""
+    vector = iterate.gradient.copy()
+    weights = []
+    for step, change, curvature in reversed(memory):
+        weights.append(step @ vector / curvature)
+        vector -= weights[-1] * change
+    vector = iterate.precondition(vector)
+    for (step, change, curvature), weight in zip(
+        memory, reversed(weights), strict=True
+    ):
+        vector += (weight - change @ vector / curvature) * step
+    return vector
+
+
+def _line_search(
+    iterate: _Iterate, direction: NDArray
+) -> tuple[_Iterate | None, NDArray]:
+    """Return the first iterate that meets the Armijo condition, or None, and step."""
+    slope = iterate.gradient @ direction
+    # Largest step length that the parametrisation of noise and cameras allows
+    of_noise = 1.5 / max(abs(direction[-1]), 1e-300)
+    of_cameras = iterate.cameras.largest_length(iterate.split(direction)[1])
+    length = min(1.0, of_noise, of_cameras)
+    while length > 1e-8:
+        step = length * direction
+        reached = replace(iterate, state=iterate.moved(step))
+        if reached.value <= iterate.value + 1e-4 * length * slope:
+            # The lower bound may have shortened the change of the noise.
+            step[-1] = np.log(reached.state.noise / iterate.state.noise)
+            return reached, step
+        # Backtracking by quadratic interpolation of both values and the slope
+        excess = reached.value - iterate.value - length * slope
+        length *= min(max(-length * slope / (2 * excess), 0.1), 0.5)
+    return None, direction

@@ -19,17 +19,21 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rigid_cameras,
 )
-from isa_nrsfm._joint.problem import JOINT_OPTIONS, FactorisedTable, JointProblem
-from isa_nrsfm._joint.quasi_newton import JointState
+from isa_nrsfm._joint.problem import (
+    JOINT_OPTIONS,
+    FactorisedTable,
+    JointProblem,
+    JointState,
+)
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
+from isa_nrsfm._paper.pipeline import Factorisation, rigid_energy
+from isa_nrsfm._tables.blocks import spread
+from isa_nrsfm.calibration._metric_upgrade import best_metric
+from isa_nrsfm.calibration._orthonormal_cameras import (
     orthonormal_mixture,
     principal_columns,
 )
-from isa_nrsfm._metric_upgrade.rigid import best_metric
-from isa_nrsfm._paper.factors import Factorisation, rigid_energy
-from isa_nrsfm._tables.ordering import spread
 
 # Largest number of steps of a start with fixed cameras.
 FIXED_STEPS = 6
@@ -115,33 +119,16 @@ def extended_shapes(
     return np.concatenate([shapes, more / np.sqrt(len(rows))])
 
 
-def affine_start(
-    problem: JointProblem, W: NDArray, paper_shapes: NDArray
-) -> JointState:
+def affine_start(problem: JointProblem, W: NDArray, paper: NDArray) -> JointState:
     """Return the paper's result, rigid cameras and scaled basis shapes, as a start."""
-    shapes = problem.frames.coordinates(paper_shapes)
+    shapes = problem.frames.coordinates(paper)
     W = problem.frames.coordinates(W)
     rows, motion = W.reshape(len(W) // 2, 2, -1), rigid_cameras(W, shapes[0].T)
     return _first_state(problem, rows, motion, _scaled(rows, motion, shapes))
 
 
-def settled(
-    problem: JointProblem, state: JointState, cameras: CameraModel
-) -> JointState:
-    """Return a start after some steps without the prior, in its likeliest basis.
-
-    With the large noise of a start the prior would make basis shapes vanish.
-    """
-    free, tol = replace(problem, penalty=0.0), problem.settings.tol
-    fit = free.refined(state, cameras, max_iter=FIXED_STEPS, tol=tol)
-    return with_prior(problem, fit.state)
-
-
 def best_starts(
-    problem: JointProblem,
-    table: FactorisedTable,
-    paper_shapes: NDArray,
-    cameras: CameraModel,
+    problem: JointProblem, table: FactorisedTable, paper: NDArray, cameras: CameraModel
 ) -> list[JointState]:
     """Return the likeliest starts, best first: three of small tables, one of others."""
     frames, options = problem.frames, problem.settings.options
@@ -152,7 +139,7 @@ def best_starts(
     few = np.sort(spread(order, min(400 if thorough else 200, len(order))))
     # No prior: with the large noise of a start it would make basis shapes vanish.
     part = replace(problem.part(few, tol=options.compared_tol), penalty=0.0)
-    seen, n_components = rows[few], len(paper_shapes) - 1
+    seen, n_components = rows[few], len(paper) - 1
     trials: list[tuple[float, JointState, NDArray]] = []
 
     def compare(motion: NDArray, shapes: NDArray | None = None) -> None:
@@ -161,12 +148,10 @@ def best_starts(
             shapes = lifted_shapes(seen, motion[few], n_components)
         state = _first_state(part, seen, motion[few], shapes)
         fit = part.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
-        trials.append((fit.value, fit.state, motion))
+        trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
-    motion, shapes = rigid_start(
-        factors, frames.coordinates(paper_shapes), cameras.scaled
-    )
+    motion, shapes = rigid_start(factors, frames.coordinates(paper), cameras.scaled)
     compare(motion, _scaled(seen, motion[few], shapes))
     compare(motion)
     # Mixtures of more and more columns, until the objective rises. Small tables use all
@@ -188,9 +173,9 @@ def best_starts(
         fit = part.refined(state, cameras, max_iter=30)
         motion = motion.copy()
         motion[few] = fit.state.motion
-        freed.append((fit.value, fit.state._replace(motion=motion)))
+        freed.append((fit.history[-1], fit.state._replace(motion=motion)))
     freed.sort(key=itemgetter(0))
-    return [with_prior(problem, state) for _, state in freed[: 3 if thorough else 1]]
+    return [with_prior(problem, state) for _, state in freed[:3]]
 
 
 def _first_state(
@@ -205,7 +190,7 @@ def _first_state(
 def with_prior(problem: JointProblem, state: JointState) -> JointState:
     """Return a state with its basis shapes mixed and scaled to the likeliest basis."""
     shapes, motion, _ = state
-    alpha = problem.likelihood.coefficients(*state)
+    alpha = problem.likelihood(*state).alpha
     shapes = likely_basis(shapes, motion, alpha, problem.penalty)
     return state._replace(shapes=shapes)
 

@@ -11,6 +11,7 @@ results are finite for any matrix.
 
 import math
 from functools import cache
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -213,7 +214,7 @@ def of_frames(values: Any, frames: NDArray | slice) -> Any:
     The frames stay the last axis in memory. None stays None.
     """
     if isinstance(values, tuple):
-        return type(values)(*(of_frames(part, frames) for part in values))
+        return type(values)(*map(of_frames, values, repeat(frames)))
     if not isinstance(values, np.ndarray):
         return values if values is None else values.of_frames(frames)
     return values[..., frames] if isinstance(frames, slice) else values.take(frames, -1)

@@ -12,7 +12,7 @@ its seen points. It is computed once for each pattern.
 """
 
 from functools import partial
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +20,7 @@ from scipy.linalg import eigh
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
 from isa_nrsfm._linalg.small_matrices import unpacked
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames
-
-
-class _Frames(NamedTuple):
-    """Frames of size one, and which points they show."""
-
-    rows: NDArray  # (n_frames, 2, n_points), centred over seen points, zero elsewhere
-    patterns: NDArray  # (n_patterns, n_points), 1.0 where a point is seen, else 0.0
-    pattern: NDArray  # (n_frames,), index of each frame's pattern
-
-    @classmethod
-    def of_rows(cls, rows: NDArray) -> Self:
-        """Return the frames of rows (n_frames, 2, n_points), NaN where not seen."""
-        seen = ~np.isnan(rows).any(axis=1)
-        _, first, pattern = np.unique(
-            np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
-        )
-        patterns = seen[first].astype(float)
-        return cls(np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1))
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
 
 class CompletionModel(NamedTuple):
@@ -77,12 +58,12 @@ def completion_model(
 
     Later steps mostly fit the noise.
     """
-    frames = _Frames.of_rows(rows)
+    frames = _frames(rows)
     # Centred points have n_points - 1 directions, of which the noise needs one.
-    model = _principal_axes(frames.rows, max(1, min(rank, rows.shape[2] - 2)))
+    model = _principal_axes(frames[0], max(1, min(rank, rows.shape[2] - 2)))
     for step in range(max_iter):
         before = model.noise
-        model, mean_square = _em_step(model, frames)
+        model, mean_square = _em_step(model, *frames)
         stands_still = step > 0 and model.noise > (1.0 - tol) * before
         if stands_still or mean_square < 1e-20:
             break
@@ -91,9 +72,23 @@ def completion_model(
 
 def filled_in(rows: NDArray, model: CompletionModel) -> NDArray:
     """Return frames (n_frames, 2, n_points), NaN filled in by the model, centred."""
-    z, t, *_ = _posterior(_Frames.of_rows(rows), model)
+    z, t, *_ = _posterior(*_frames(rows), model)
     filled = np.where(np.isnan(rows), z @ model.B + t, rows)
     return filled - filled.mean(axis=2, keepdims=True)
+
+
+def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return rows (n_frames, 2, n_points), zero where not seen, and their patterns.
+
+    A pattern (n_patterns, n_points) is 1.0 where a point is seen, otherwise 0.0. The
+    last array is the index (n_frames,) of the pattern of each frame.
+    """
+    seen = ~np.isnan(rows).any(axis=1)
+    _, first, pattern = np.unique(
+        np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    patterns = seen[first].astype(float)
+    return np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1)
 
 
 def _principal_axes(rows: NDArray, rank: int) -> CompletionModel:
@@ -115,7 +110,7 @@ def _principal_axes(rows: NDArray, rank: int) -> CompletionModel:
 
 
 def _posterior(
-    frames: _Frames, model: CompletionModel
+    rows: NDArray, patterns: NDArray, pattern: NDArray, model: CompletionModel
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return the posterior of coefficients z and translations t.
 
@@ -127,7 +122,6 @@ def _posterior(
     + ridge I)^-1`` is the posterior covariance over the noise variance, and ``z = w B^T
     C``, ``t = -z . mean(B)`` are the posterior means.
     """
-    rows, patterns, pattern = frames
     B, rank = model.B, len(model.B)
     upper = np.triu_indices(rank)
     sums = patterns @ B.T
@@ -142,12 +136,13 @@ def _posterior(
     return z, -(z @ means[pattern][:, :, None]), covariance, cross
 
 
-def _em_step(model: CompletionModel, frames: _Frames) -> tuple[CompletionModel, float]:
+def _em_step(
+    model: CompletionModel, rows: NDArray, patterns: NDArray, pattern: NDArray
+) -> tuple[CompletionModel, float]:
     """Return the model after one step of EM, and the mean square residual before it."""
-    rows, patterns, pattern = frames
     (n_frames, _, n_points), rank = rows.shape, len(model.B)
     upper = np.triu_indices(rank)
-    z, t, covariance, cross = _posterior(frames, model)
+    z, t, covariance, cross = _posterior(rows, patterns, pattern, model)
     # E step: residuals, E[z z^T] of each frame, packed, and E[(w - t) z] of each point
     seen = patterns[pattern]
     moved = (rows - t) * seen[:, None]

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import seen_points
 
 # Tuning constants c of the losses, in standard deviations of a coordinate. With these,
@@ -52,8 +51,8 @@ def median_noise(distance: NDArray) -> float:
 
 def distant_points(rows: NDArray) -> NDArray:
     """Return a mask (I, J) of points of rows (I, 2, J) far from their frame."""
-    square = _squares(rows)
-    return np.sqrt(square) > DISTANT * _sizes(square)[:, None]
+    distance, sizes = _spread(rows)
+    return distance > DISTANT * sizes[:, None]
 
 
 def robust_sizes(centred: NDArray) -> NDArray:
@@ -62,7 +61,7 @@ def robust_sizes(centred: NDArray) -> NDArray:
     The root of half the median squared distance of the visible points from their
     `spatial_median`. If half of them coincide, the RMS.
     """
-    return _sizes(_squares(centred))
+    return _spread(centred)[1]
 
 
 def robustly_centred(rows: NDArray) -> tuple[NDArray, NDArray]:
@@ -72,17 +71,14 @@ def robustly_centred(rows: NDArray) -> tuple[NDArray, NDArray]:
     return rows - middle[..., None], middle
 
 
-def _squares(rows: NDArray) -> NDArray:
-    """Return squared distances (I, J) of points from the spatial median of rows."""
-    return np.sum((rows - spatial_median(rows)[..., None]) ** 2, axis=1)
-
-
-def _sizes(square: NDArray) -> NDArray:
-    """Return the sizes (I,) of frames from the squared distances (I, J) of points."""
+def _spread(rows: NDArray) -> tuple[NDArray, NDArray]:
+    """Return distances (I, J) of points from their spatial median, and sizes (I,)."""
+    square = np.sum((rows - spatial_median(rows)[..., None]) ** 2, axis=1)
     median, upper = (np.nanquantile(square, q, axis=1) for q in (0.5, 0.75))
     # If half of the points coincide the median is rounding error: take the mean.
     mean = np.nanmean(square, axis=1)
-    return np.sqrt(np.where(median > OF_DISTANCES * upper, median, mean) / 2)
+    size = np.sqrt(np.where(median > OF_DISTANCES * upper, median, mean) / 2)
+    return np.sqrt(square), size
 
 
 def spatial_median(rows: NDArray) -> NDArray:

@@ -9,7 +9,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._linalg.small_matrices import energies
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048
@@ -60,13 +60,7 @@ class FrameBlocks:
         return cls.of_blocks(blocks, list(map(len, blocks)), n_threads)
 
     @classmethod
-    def of_stored(cls, table: Any, block_frames: int, n_threads: int = 1) -> Self:
-        """Return blocks that are read from a table that can be sliced."""
-        rows = partial(read_rows, table)
-        return cls._read_later(rows, table.shape[0], block_frames, n_threads)
-
-    @classmethod
-    def _read_later(
+    def read_later(
         cls,
         rows: Callable[[slice], Any],
         n_frames: int,
@@ -126,7 +120,7 @@ class FrameBlocks:
             start = part.start - before[first]
             return np.concatenate(blocks)[start : start + part.stop - part.start]
 
-        return self._read_later(rows, int(before[-1]), length, self.n_threads)
+        return self.read_later(rows, int(before[-1]), length, self.n_threads)
 
     @one_blas_thread
     def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
@@ -282,3 +276,48 @@ def read_rows(table: Any, rows: slice) -> NDArray:
     if mapped is not None and hasattr(mapped, "madvise") and table.mode != "c":
         mapped.madvise(mmap.MADV_DONTNEED)
     return block
+
+
+def order_by_halves(rows: FrameBlocks) -> NDArray:
+    """Return an order of frames (n_frames,) that stays the same when they are permuted.
+
+    Frames (n_frames, ...) are sorted by the share of their energy in the first half of
+    their entries: for rows (2, n_points) the share of x. NaN counts as zero.
+    """
+    return np.argsort(rows.joined(_first_half), kind="stable")
+
+
+def _first_half(rows: NDArray) -> NDArray:
+    """Return the share (n_frames,) of the energy in the first half of each row."""
+    flat = rows.reshape(len(rows), -1)
+    if np.isnan(flat.sum()):
+        flat = np.where(np.isnan(flat), 0.0, flat)
+    half, rest = (energies(part) for part in np.array_split(flat, 2, axis=1))
+    energy = half + rest
+    return np.divide(half, energy, where=energy > 0, out=np.zeros_like(energy))
+
+
+def spread(order: NDArray, n: int) -> NDArray:
+    """Return n entries of an order (n_frames,) at equal distances, ends included."""
+    return order[np.linspace(0, len(order) - 1, n).round().astype(int)]
+
+
+def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
+    """
+    Return indices of about `most` frames of rows (I, 2, J), for the model of a table.
+
+    They are spread evenly over `order_by_halves`, independent of the order of the
+    table. For each point that few of them show, frames that show it are added.
+    """
+    if rows.n_frames <= most:
+        return np.arange(rows.n_frames)
+    order = order_by_halves(rows)
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[spread(order, most)] = True
+    fewest = min(200, most // 5)
+    shown = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))
+    for point in np.flatnonzero(shown < fewest).tolist():
+        shows = rows.joined(lambda block, j=point: ~np.isnan(block[:, 0, j]))
+        showing = order[shows[order]]
+        chosen[spread(showing, min(fewest, len(showing)))] = True
+    return np.flatnonzero(chosen)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from sklearn.utils import check_array
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks
+from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks, read_rows
 from isa_nrsfm._tables.tracks import (
     Layout,
+    clean_rows,
     refuse_odd,
     table_to_rows,
     warn_of_half_points,
@@ -61,8 +63,7 @@ def open_table(
     dtype = np.float32 if X.dtype == np.float32 else np.float64
     empty = np.empty((0, 2, X.shape[1] // 2), dtype)
     if not is_read_later(X):
-        rows, n_half, first = without_half_points(table_to_rows(X, layout))
-        warn_of_half_points(n_half, first, layout, names)
+        rows = clean_rows(table_to_rows(X, layout), layout, names)
         blocks = FrameBlocks.of_array(rows, min(length, 2048), n_threads)
         blocks.empty = empty
         return blocks
@@ -75,9 +76,11 @@ def open_table(
         numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
         most = max(int(numbers // n_columns), 1)
         if isinstance(X, np.memmap):
-            blocks = FrameBlocks.of_stored(X, min(most, length), n_threads)
+            most = min(most, length)
         else:  # row groups of parquet files are read whole for each block
-            blocks = FrameBlocks.of_stored(X, most)
+            n_threads = 1
+        read = partial(read_rows, X)
+        blocks = FrameBlocks.read_later(read, X.shape[0], most, n_threads)
     if counted and blocks.n_frames:
         half = zip(*blocks.map(partial(_half_points, layout=layout)), strict=True)
         n_half, first = map(np.concatenate, half)
@@ -184,9 +187,9 @@ class StoredTable:
         dtype: Any,
         columns: NDArray | None = None,
     ):
-        self._ends = np.cumsum([n_rows for n_rows, _ in parts], dtype=int)
-        self._read = [read for _, read in parts]
-        self.shape = (int(self._ends[-1]), n_columns)
+        lengths, self._read = zip(*parts, strict=True)
+        self._ends = np.cumsum([0, *lengths]).tolist()
+        self.shape = (self._ends[-1], n_columns)
         self.dtype = np.dtype(dtype)
         self.columns = columns
 
@@ -200,9 +203,8 @@ class StoredTable:
             raise TypeError(f"rows must be a slice without steps; got {rows!r}")
         start, stop, _ = rows.indices(len(self))
         parts = [np.empty((0, self.shape[1]), dtype=self.dtype)]
-        begins = [0, *self._ends[:-1].tolist()]
-        for begin, end, read in zip(begins, self._ends, self._read, strict=True):
+        for (begin, end), read in zip(pairwise(self._ends), self._read, strict=True):
             first, last = max(start, begin), min(stop, end)
             if first < last:
-                parts.append(read(int(first - begin), int(last - begin)))
+                parts.append(read(first - begin, last - begin))
         return np.concatenate(parts[1:] or parts).astype(self.dtype, copy=False)

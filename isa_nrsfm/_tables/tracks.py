@@ -7,7 +7,7 @@ frame has NaN in both. *Tracks* ``(n_frames, n_points, 2)`` are the form of publ
 results.
 """
 
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,14 +56,10 @@ def table_to_rows(X: NDArray, layout: Layout) -> NDArray:
 
 def without_half_points(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Hide points with one coordinate; return rows (I, 2, J), counts, first ones."""
-    none = np.zeros(len(rows), dtype=int)
-    if not np.isnan(rows.sum()):  # one NaN makes the sum NaN: a fast test
-        return rows, none, none
-    missing = np.isnan(rows)
-    half = missing[:, 0] != missing[:, 1]
-    if not half.any():
-        return rows, none, none
-    rows = np.where(half[:, None], rows.dtype.type(np.nan), rows)
+    x, y = np.isnan(rows).swapaxes(0, 1)
+    half = x != y
+    if half.any():
+        rows = np.where(half[:, None], rows.dtype.type(np.nan), rows)
     return rows, half.sum(axis=1), half.argmax(axis=1)
 
 
@@ -82,13 +78,11 @@ def warn_of_half_points(
     )
 
 
-def clean_tracks(
-    tracks: NDArray, layout: Layout = "interleaved", names: NDArray | None = None
-) -> NDArray:
-    """Return tracks (I, J, 2) without points that have one coordinate; warn of them."""
-    rows, n_half, first = without_half_points(tracks.transpose(0, 2, 1))
+def clean_rows(rows: NDArray, layout: Layout, names: NDArray | None) -> NDArray:
+    """Return rows (I, 2, J) without points that have one coordinate; warn of them."""
+    rows, n_half, first = without_half_points(rows)
     warn_of_half_points(n_half, first, layout, names)
-    return rows.transpose(0, 2, 1)
+    return rows
 
 
 def describe_point(point: int, layout: Layout, names: NDArray | None) -> str:
@@ -126,10 +120,6 @@ class FrameReport(NamedTuple):
         """
         enough = self.n_seen >= FEWEST_POINTS
         return enough & ~self.in_one_place & ~self.on_line
-
-    def of_frames(self, frames: NDArray) -> Self:
-        """Return the report of some frames."""
-        return type(self)(*(part[frames] for part in self))
 
 
 def seen_points(rows: NDArray) -> NDArray:
@@ -223,15 +213,17 @@ def refuse_one_place(report: FrameReport, n_points: int) -> None:
         )
 
 
-def weighted_sizes(centred: NDArray, weights: NDArray, sizes: NDArray) -> NDArray:
-    """Return the weighted RMS (I,) of centred rows (I, 2, J), weights (I, J).
+def weighted_sizes(rows: NDArray, weights: NDArray) -> NDArray:
+    """Return the weighted sizes (I,) of rows (I, 2, J) with weights (I, J).
 
-    Weights of missing points are zero. If all of the weight is in one place, these are
-    the sizes (I,), which are not weighted.
+    Weights of missing points are zero. If all of the weight is in one place, sizes are
+    not weighted.
     """
+    centred, report = centred_frames(rows)
     rows, total = np.nan_to_num(centred), weights.sum(axis=1)
     place = np.vecdot(rows, (weights / total[:, None])[:, None])
     off = np.where(weights[:, None] > 0, rows - place[..., None], 0.0)
     square = np.vecdot(weights, (off**2).sum(axis=1)) / (2 * total)
     eps = 4 * np.finfo(float).eps
-    return np.where(square > (eps * sizes) ** 2, np.sqrt(square), sizes)
+    enough = square > (eps * report.size) ** 2
+    return np.where(enough, np.sqrt(square), report.size)

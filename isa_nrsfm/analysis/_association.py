@@ -24,8 +24,9 @@ from isa_nrsfm.analysis._frame_columns import (
     checked_column,
     checked_times,
     group_numbers,
+    kind_of,
+    refuse_infinite,
 )
-from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.analysis._permutations import (
     FrameOrder,
     dependent_blocks,
@@ -212,7 +213,7 @@ def predictability(
     check_scalar(n_folds, "n_folds", Integral, min_val=2)
     features, labels, numbers, order = _known_frames(features, y, groups, time)
     found = kind_of(labels, kind)
-    if numbers is None:
+    if groups is None:
         numbers = _dependent_frames(features, labels, found, order, n_folds)
     most = len(labels)
     if found == "classes":
@@ -252,8 +253,7 @@ def _known_frames(
         raise ValueError("no frame has coefficients: all rows of alpha have NaN")
     labels = checked_column("y", y, len(known))
     refuse_infinite("y", labels, np.arange(len(known)))
-    numbers = group_numbers(groups, len(known))
-    numbers = None if numbers is None else numbers[known]
+    numbers = group_numbers(groups, len(known))[known]
     order = FrameOrder.of(numbers, checked_times(time, len(known))[known])
     return features[known], labels[known], numbers, order
 

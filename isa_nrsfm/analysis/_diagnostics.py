@@ -1,14 +1,16 @@
-"""Diagnostics of a fit: figures, and messages that interpret them."""
+"""Diagnostics of a fit: figures, messages that interpret them, and a summary."""
 
-from collections.abc import Sequence
+import html
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._frames.models import LARGEST_SHARE
-from isa_nrsfm._joint.sample_posterior import LEAST_RELIABILITY
+from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
+from isa_nrsfm._joint.uncertainty import LEAST_RELIABILITY
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
@@ -145,19 +147,12 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
         return found._replace(messages=(f"{outliers}: {advice}",))
     image = estimator.mean_shape_ @ estimator.reference_motion_.T
     layout = find_skeleton(len(names), names, shape=image)
-    messages = _of_coefficients(found, coefficients, rows, layout)
-    if support := _of_support(found, frames.loss):
-        messages.insert(0, support)
-    certainty = frames.certainty
-    if certainty.determined and certainty.total > LARGEST_SHARE:  # else fit has warned
-        messages.insert(
-            0,
-            f"the depth is uncertain: its expected error is {100 * certainty.total:.2g}"
-            " % of the depth, so proportions and side views may be wrong. Try more "
-            "basis shapes, fit a table in which the objects turn further, or use "
-            'affine cameras (camera="affine")',
-        )
-    return found._replace(messages=tuple(messages))
+    messages = (
+        *_of_depth(frames.certainty),
+        *_of_support(found, frames.loss),
+        *_of_coefficients(found, coefficients, rows, layout),
+    )
+    return found._replace(messages=messages)
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
@@ -179,9 +174,8 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     kept = np.maximum(1 - 1 / len(alpha) - np.sum(axes**2, axis=1), OF_RANKS)
     left_out = (centred - axes @ (axes.T @ centred)) / kept[:, None]
     energy = np.sum(centred**2, axis=0)
-    ratio = np.full(len(energy), np.nan)
-    np.divide(np.sum(left_out**2, axis=0), energy, where=energy > 0, out=ratio)
-    return 1 - ratio
+    energy[energy == 0] = np.nan
+    return np.asarray(1 - np.sum(left_out**2, axis=0) / energy)
 
 
 def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
@@ -222,19 +216,31 @@ def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     )
 
 
-def _of_support(found: Diagnostics, loss: str) -> str:
-    """Return the message on basis shapes that the table does not determine, or ""."""
+def _of_depth(certainty: DepthCertainty) -> Iterator[str]:
+    """Yield the message on uncertain depths, unless `fit` has warned of them."""
+    if certainty.determined and certainty.total > LARGEST_SHARE:
+        yield (
+            f"the depth is uncertain: its expected error is {100 * certainty.total:.2g}"
+            " % of the depth, so proportions and side views may be wrong. Try more "
+            "basis shapes, fit a table in which the objects turn further, or use "
+            'affine cameras (camera="affine")'
+        )
+
+
+def _of_support(found: Diagnostics, loss: str) -> Iterator[str]:
+    """Yield the message on basis shapes that the table does not determine."""
     n_components = len(found.reliability)
     unsupported = int(np.sum(found.reliability < LEAST_RELIABILITY))
     if not unsupported:
         deviation = found.weak_deviations[-1]
-        if not deviation > LARGEST_DEVIATION:
-            return ""
-        return (
-            "the basis shapes are uncertain: deformation and camera motion cannot be "
-            f"separated well in this table (uncertainty up to {100 * deviation:.2g} % "
-            "of the mean shape). Use more frames or fewer basis shapes"
-        )
+        if deviation > LARGEST_DEVIATION:
+            yield (
+                "the basis shapes are uncertain: deformation and camera motion cannot "
+                "be separated well in this table (uncertainty up to "
+                f"{100 * deviation:.2g} % of the mean shape). Use more frames or fewer "
+                "basis shapes"
+            )
+        return
     if unsupported == n_components:
         text = (
             "no deformation was found beyond the noise: the object may be rigid, and "
@@ -248,14 +254,13 @@ def _of_support(found: Diagnostics, loss: str) -> str:
         )
     if loss == "linear":
         text += '. If some points are wrong (outliers), use loss="cauchy"'
-    return text
+    yield text
 
 
 def _of_coefficients(
     found: Diagnostics, alpha: NDArray, rows: Any, layout: Skeleton | None
-) -> list[str]:
-    """Return messages on coefficients that a handful of frames or the pose decide."""
-    messages = []
+) -> Iterator[str]:
+    """Yield messages on coefficients that a handful of frames or the pose decide."""
     n_frames = np.count_nonzero(~np.isnan(alpha[:, 0]))
     effective = found.effective_frames
     # Smallest numbers without outliers, on the tables named at GROSS: 20 of 307 to 320
@@ -269,7 +274,7 @@ def _of_coefficients(
             f"{rows[np.nanargmax(np.abs(alpha[:, k]))]})"
             for k in np.flatnonzero(few)
         ]
-        messages.append(
+        yield (
             f"a few of the {n_frames} frames determine {first_items(shown, 5)}. Look "
             "for wrong landmarks in the frames with the largest coefficients, or use "
             "fewer basis shapes"
@@ -277,13 +282,12 @@ def _of_coefficients(
     large = np.flatnonzero(~few & (found.pose_share > MOST_POSE))
     if layout is not None and layout.contour and len(large):
         shown = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
-        messages.append(
+        yield (
             f"the pose predicts {first_items(shown, 5)}: {len(layout.contour)} points "
             f"of {layout.name} follow the visible outline, which slides over the "
             "surface as the head turns. Fit the other points alone (--points inner; in "
             f"Python the columns get_skeleton({layout.name!r}).inner_columns)"
         )
-    return messages
 
 
 def camera_meaning(ratio: float) -> str:
@@ -348,3 +352,48 @@ def weak_information(
         strain = strain - tangent @ (tangent.T @ strain)
         total += np.kron(np.outer(alpha[i], alpha[i]), strain.T @ strain)
     return total * (n_frames / len(chosen))
+
+
+def summary_html(model: Any) -> str:
+    """Return the key figures of a fitted model as an HTML table."""
+    rows = "".join(
+        f'<tr><th scope="row" style="text-align: left">{html.escape(name)}</th>'
+        f'<td style="text-align: left">{html.escape(value)}</td></tr>'
+        for name, value in _lines(model).items()
+    )
+    return f'<table class="isa-nrsfm-summary"><tbody>{rows}</tbody></table>'
+
+
+def _lines(model: Any) -> dict[str, str]:
+    """Return the names and values of the key figures."""
+    n_components, n_points, _ = model.basis_.shape
+    lines = {"Shapes": f"{n_components} basis shapes of {n_points} points"}
+    if hasattr(model, "motion_"):
+        fitted = np.isfinite(model._frame_sizes)
+        without = f", {(~fitted).sum()} rows without points" * (not fitted.all())
+        lines["Frames"] = f"{fitted.sum()}{without}"
+    camera = model.camera_.replace("_", " ")
+    ratio = getattr(model, "camera_noise_ratio_", None)
+    meaning = "" if ratio is None else f"; {camera_meaning(ratio)}"
+    lines["Cameras"] = f"{camera}{meaning}"
+    floor = _percent(model.rank_floor_)
+    lines["Inverse SNR"] = f"{_percent(model.inverse_snr_)}, rank floor {floor}"
+    if hasattr(model, "noise_variance_"):
+        noise = math.sqrt(model.noise_variance_)
+        lines["Noise"] = (
+            f"{_percent(noise)} of a frame's size"
+            if model.frames_scaled_
+            else f"{noise:.3g} in the units of the table"
+        )
+    shares = [_percent(share) for share in model.energy_share_]
+    more = ["..."] * (len(shares) > 12)
+    lines["Energy of each"] = ", ".join(shares[:12] + more)
+    if "Noise" in lines and "Frames" in lines:
+        messages = model.diagnostics().messages
+        lines["Diagnostics"] = "; ".join(messages) or "no warning"
+    return lines
+
+
+def _percent(share: float) -> str:
+    """Return a share in percent."""
+    return f"{100 * share:.3g} %"

@@ -1,10 +1,13 @@
 """Columns with one entry for each frame, such as labels, groups and times."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import check_array, column_or_1d
+from sklearn.utils.multiclass import type_of_target
+
+Kind = Literal["classes", "number"]
 
 
 def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
@@ -36,10 +39,45 @@ def is_missing(value: Any) -> bool:
         return True
 
 
-def group_numbers(groups: Any, n_frames: int) -> NDArray | None:
-    """Return numbers of groups from zero (n_frames,), None for None."""
+def kind_of(y: NDArray, kind: str) -> Kind:
+    """Return whether labels (n_frames,) are classes or numbers; refuse unusable ones.
+
+    "auto" takes names, truth values and whole numbers for classes, as scikit-learn
+    does.
+    """
+    if kind not in ("auto", "classes", "number"):
+        raise ValueError(f"kind must be 'auto', 'classes' or 'number'; got {kind!r}")
+    n_values = len(np.unique(y))
+    if n_values == 1:
+        raise ValueError(f"all {len(y)} labels are {y[0]}: there is nothing to compare")
+    if kind == "number" and y.dtype.kind not in "biuf":
+        raise ValueError(f"labels must be numbers; got {str(y[0])!r}")
+    found: Kind = "classes"
+    if kind == "number" or (kind == "auto" and type_of_target(y) == "continuous"):
+        found = "number"
+    if found == "classes" and n_values == len(y):
+        raise ValueError(
+            f"the {len(y)} labels are all different, so that no class has two frames; "
+            "for a measured quantity use kind='number'"
+        )
+    return found
+
+
+def refuse_infinite(name: str, labels: NDArray, rows: NDArray) -> None:
+    """Refuse infinite numbers; `rows` are the numbers of their rows in the message."""
+    infinite = rows[np.isinf(labels)] if labels.dtype.kind == "f" else rows[:0]
+    if len(infinite):
+        raise ValueError(
+            f"{name} must be finite; {len(infinite)} of {len(labels)} labels are "
+            f"infinite, the first is in row {infinite[0]}: correct these labels, or "
+            "leave their frames out"
+        )
+
+
+def group_numbers(groups: Any, n_frames: int) -> NDArray:
+    """Return numbers of groups from zero (n_frames,), one group for None."""
     if groups is None:
-        return None
+        return np.zeros(n_frames, dtype=int)
     names = checked_column("groups", groups, n_frames)
     return np.asarray(np.unique(names, return_inverse=True)[1])
 
@@ -55,15 +93,13 @@ def checked_times(time: Any, n_rows: int) -> NDArray:
 
 
 def sequences_of(
-    time: NDArray, groups: NDArray | None, max_gap: int
+    time: NDArray, groups: NDArray, max_gap: int
 ) -> tuple[list[tuple[NDArray, NDArray]], float]:
     """Return the rows and steps of each sequence, and the time of a step (the median).
 
     A gap of more than max_gap steps begins a new sequence. Refuses times that do not
     rise within groups, and groups that have only one row each.
     """
-    if groups is None:
-        groups = np.zeros(len(time), dtype=int)
     rows_of = [np.flatnonzero(groups == group) for group in range(groups.max() + 1)]
     for rows in rows_of:
         falling = np.flatnonzero(np.diff(time[rows]) <= 0)

@@ -28,10 +28,8 @@ class FrameOrder(NamedTuple):
     sizes: NDArray  # number of frames of each group
 
     @classmethod
-    def of(cls, groups: NDArray | None, time: NDArray) -> "FrameOrder":
-        """Sort frames by groups (n_frames,), None for one, and time (n_frames,)."""
-        if groups is None:
-            groups = np.zeros(len(time), dtype=int)
+    def of(cls, groups: NDArray, time: NDArray) -> "FrameOrder":
+        """Sort frames by groups (n_frames,) and time (n_frames,)."""
         numbers = np.unique(groups, return_inverse=True)[1]
         rows = np.lexsort((time, numbers))
         return cls(rows, numbers[rows], np.bincount(numbers))

@@ -30,7 +30,8 @@ Gaussian process regression models", 2010; Rauch, Tung, Striebel, "Maximum likel
 estimates of linear dynamic systems", 1965.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,35 +119,6 @@ class Dynamics(NamedTuple):
         return F, Q, first, shown
 
 
-class Smoothed(NamedTuple):
-    """Posterior of the parameters of a sequence, given all of its frames.
-
-    Means (n_steps, p), covariances (n_steps, p, p), the log-likelihood of the frames,
-    up to a constant of each frame, and moments (4, D, D) of the states z: sums over t
-    of ``E z_t+1 z_t+1^T``, ``E z_t+1 z_t^T``, ``E z_t z_t^T``, and ``E z_1 z_1^T``.
-    """
-
-    mean: NDArray
-    covariance: NDArray
-    log_likelihood: float
-    moments: NDArray
-
-
-class SmoothedFrames(NamedTuple):
-    """Frames, given all frames of their sequences, before the gauge.
-
-    alpha (I, K) and its covariance (I, K, K), cameras (I, 2, 3) and positions (I, 2) in
-    the units of the table, and time scales (K,), the longest first. Sequences without a
-    known frame stay as they are.
-    """
-
-    alpha: NDArray
-    covariance: NDArray
-    motion: NDArray
-    translation: NDArray
-    time_scales: NDArray
-
-
 class SmoothedCoefficients(NamedTuple):
     """
     Coefficients and cameras of frames, given all frames of their sequence.
@@ -188,35 +160,40 @@ def smooth(
     """Return coefficients and cameras of fits given all frames of their sequences.
 
     Without dynamics these are the fits. Parameters as of `AffineNRSfM.smooth`, and the
-    type of the numbers of the result.
+    type of the numbers of the result. Time scales are ``1 / l``, infinite for the least
+    rates.
     """
-    frames = smoothed_frames(alone, camera, time, groups, max_gap, max_iter, tol)
-    fits, scales = (alone, np.empty(0)) if frames is None else (frames, frames[-1])
-    motion, alpha, deviation = gauge.apply(fits.motion, fits.alpha, fits.covariance)
-    parts = motion, fits.translation, alpha, deviation
+    n_frames = len(alone.alpha)
+    numbers = group_numbers(groups, n_frames)
+    sequences, unit = sequences_of(checked_times(time, n_frames), numbers, max_gap)
+    estimate = partial(
+        estimated_dynamics, intercepts=bool(numbers.any()), max_iter=max_iter, tol=tol
+    )
+    frames, rates = _smoothed_frames(alone, camera, sequences, estimate)
+    scales = np.where(rates > LEAST_RATE * (1 + 1e-6), unit / rates, np.inf)
+    motion, alpha, deviation = gauge.apply(
+        frames.motion, frames.alpha, frames.covariance
+    )
+    parts = motion, frames.translation, alpha, deviation
     fit = Decomposition(*(part.astype(dtype) for part in parts))
     return SmoothedCoefficients(fit.alpha, fit.alpha_std, scales, fit)
 
 
-def smoothed_frames(
+def _smoothed_frames(
     alone: LinearisedFrames,
     camera: CameraModel,
-    time: Any,
-    groups: Any,
-    max_gap: int,
-    max_iter: int,
-    tol: float,
-) -> SmoothedFrames | None:
-    """Return frames given all frames of their sequences; None without dynamics.
+    sequences: Sequence[tuple[NDArray, NDArray]],
+    estimate: Callable[..., Dynamics | None],
+) -> tuple[LinearisedFrames, NDArray]:
+    """Return frames given all frames of their sequences, and the rates, increasing.
 
-    Time scales are ``1 / l``, infinite for the least rates.
+    Sequences without a known frame stay as they are. Without dynamics all frames do,
+    and there are no rates.
     """
-    n_frames, K = alone.alpha.shape
-    times, numbers = checked_times(time, n_frames), group_numbers(groups, n_frames)
-    sequences, unit = sequences_of(times, numbers, max_gap)
+    K, none = alone.alpha.shape[1], np.empty(0)
     known = np.isfinite(alone.precision[:, 0, 0])
     if not known.any():
-        return None
+        return alone, none
     origins, observed = zip(
         *(_observations(alone, camera, known, *each) for each in sequences), strict=True
     )
@@ -230,26 +207,23 @@ def smoothed_frames(
         Observations(scale[:, None] * L * scale, fit / scale, change / scale)
         for L, fit, change in observed
     )
-    intercepts = numbers is not None and bool(numbers.any())
-    dynamics = estimated_dynamics(observed, K, intercepts, max_iter, tol)
+    dynamics = estimate(observed, K)
     if dynamics is None:
-        return None
-    alpha, covariance = alone.alpha.copy(), alone.covariance.copy()
-    motion, translation = alone.motion.copy(), alone.translation.copy()
+        return alone, none
+    motion, translation, alpha, covariance = map(np.copy, alone[:4])
     for (rows, steps), origin, each in zip(sequences, origins, observed, strict=True):
         if not known[rows].any():
             continue
-        found = smoothed(each, dynamics)
-        mean = scale * found.mean[steps]
-        alpha[rows], covariance[rows] = mean[:, :K], found.covariance[steps, :K, :K]
+        states, covariances, *_ = smoothed(each, dynamics)
+        mean = scale * states[steps]
+        alpha[rows], covariance[rows] = mean[:, :K], covariances[steps, :K, :K]
         moved = camera.moved(frames_last(alone.motion[origin]), mean[:, K:].T)
         motion[rows] = frames_first(moved)
         mean[:, :K] -= alone.alpha[rows]
         translation[rows] -= np.einsum("ip,ipr->ir", mean, alone.slope[rows])
         translation[rows[~known[rows]]] = np.nan
-    rates = np.exp(np.sort(dynamics.rates))
-    scales = np.where(rates > LEAST_RATE * (1 + 1e-6), unit / rates, np.inf)
-    return SmoothedFrames(alpha, covariance, motion, translation, scales)
+    frames = LinearisedFrames(motion, translation, alpha, covariance, *alone[4:])
+    return frames, np.exp(np.sort(dynamics.rates))
 
 
 def _observations(
@@ -278,8 +252,15 @@ def _observations(
     return chosen[np.maximum(np.cumsum(seen) - 1, 0)], data
 
 
-def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
-    """Return the posterior of a sequence: Kalman filter and smoother."""
+def smoothed(
+    observed: Observations, dynamics: Dynamics
+) -> tuple[NDArray, NDArray, float, NDArray]:
+    """Return the posterior of a sequence: Kalman filter and smoother.
+
+    Means (n_steps, p), covariances (n_steps, p, p), the log-likelihood of the frames,
+    up to a constant of each frame, and moments (4, D, D) of the states z: sums over t
+    of ``E z_t+1 z_t+1^T``, ``E z_t+1 z_t^T``, ``E z_t z_t^T``, and ``E z_1 z_1^T``.
+    """
     F, Q, first, shown = dynamics.matrices()
     n_steps, n = observed.fit.shape
     mean, covariance = np.empty((n_steps, len(F))), np.empty((n_steps, *F.shape))
@@ -311,13 +292,9 @@ def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
         covariance[t] += _symmetric(J @ (covariance[t + 1] - predicted) @ J.T)
         lagged += np.outer(following, mean[t])
         early += covariance[t] + np.outer(mean[t], mean[t])
-    moments = [late, lagged, early, covariance[0] + np.outer(mean[0], mean[0])]
-    return Smoothed(
-        mean @ shown.T,
-        shown @ covariance @ shown.T,
-        log_likelihood,
-        np.stack(moments),
-    )
+    first = covariance[0] + np.outer(mean[0], mean[0])
+    moments = np.stack([late, lagged, early, first])
+    return mean @ shown.T, shown @ covariance @ shown.T, log_likelihood, moments
 
 
 def estimated_dynamics(
@@ -333,11 +310,12 @@ def estimated_dynamics(
 
     def minus_log_likelihood(parameters: NDArray) -> tuple[float, NDArray]:
         dynamics = Dynamics(*np.split(parameters, splits))
-        ends = [smoothed(each, dynamics) for each in sequences]
-        moments = np.sum([each.moments for each in ends], axis=0)
-        n_pairs = sum(len(each.mean) - 1 for each in ends)
-        slope = expected_gradient(dynamics, moments, n_pairs, len(ends))
-        return -sum(each.log_likelihood for each in ends), -slope
+        ends = (smoothed(each, dynamics) for each in sequences)
+        _, _, values, moments = zip(*ends, strict=True)
+        n_pairs = sum(len(each.fit) - 1 for each in sequences)
+        total = np.sum(moments, axis=0)
+        slope = expected_gradient(dynamics, total, n_pairs, len(sequences))
+        return -sum(values), -slope
 
     # With dynamics, and independent frames with an intercept
     for rate, shares in (LEAST_RATE, intercepts), (LARGEST_RATE, True):

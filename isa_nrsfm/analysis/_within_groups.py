@@ -264,9 +264,8 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
     """
     X = check_array(alpha, input_name="alpha", **CHECKS | {"dtype": np.float64})
     known = np.isfinite(X).all(axis=1)
-    numbers = group_numbers(groups, len(X))
-    assert numbers is not None
-    X, numbers = X[known], np.unique(numbers[known], return_inverse=True)[1]
+    numbers = np.unique(group_numbers(groups, len(X))[known], return_inverse=True)[1]
+    X = X[known]
     sizes = np.bincount(numbers)
     n_frames, n_groups = len(X), len(sizes)
     if n_groups < 2 or n_frames == n_groups:

@@ -15,14 +15,14 @@ from sklearn.utils import check_random_state
 from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._metric_upgrade.metric import (
+from isa_nrsfm._tables.tracks import Layout
+from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
+from isa_nrsfm.baselines._block_dictionary import block_ksvd, group_sparse_factors
+from isa_nrsfm.calibration._metric import (
     LARGEST_STRETCH,
     conformal_equations,
     strain_basis,
 )
-from isa_nrsfm._tables.tracks import Layout
-from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
-from isa_nrsfm.baselines._block_dictionary import block_ksvd, group_sparse_factors
 
 # Fewest frames by whose cameras an atom is aligned. If few frames are shared, their
 # second blocks are small, and the result is often mirrored or wrong.

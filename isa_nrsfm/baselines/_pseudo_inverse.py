@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._paper.factors import leading_triplets
+from isa_nrsfm._paper.pipeline import leading_triplets
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.calibration import orthonormal_cameras
 

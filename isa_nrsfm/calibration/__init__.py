@@ -22,13 +22,13 @@ axes and the sign of the depth remain unknown: the mirror image, ``z -> -z``, ha
 same images.
 """
 
-from isa_nrsfm._metric_upgrade.deforming import (
+from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+from isa_nrsfm.calibration._deformation_metric import (
     DeformationMetric,
     EuclideanFrames,
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
 from isa_nrsfm.calibration._metric_upgrade import (
     MetricUpgrade,
     euclidean_shapes,

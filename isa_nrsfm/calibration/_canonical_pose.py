@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
@@ -142,21 +143,17 @@ def canonical_pose(
 def _frame(axes: list[Any]) -> NDArray:
     """Return the rotation whose rows are the first two axes that are known."""
     first, second, *_ = (i for i, axis in enumerate(axes) if axis is not None)
-    rotation = np.zeros((3, 3))
-    rotation[first] = axes[first]
-    rest = axes[second] - (axes[second] @ rotation[first]) * rotation[first]
-    size = np.linalg.norm(rest)
-    if size < 1e-6:
+    pair = [axes[first], axes[second]]
+    sine = np.linalg.norm(np.cross(*pair))
+    if sine < 1e-6:
         names = ("left_right", "up", "front")
         raise ValueError(
             f"{names[first]} and {names[second]} must not be parallel; the sine of "
-            f"their angle is {size:.1e}"
+            f"their angle is {sine:.1e}"
         )
-    rotation[second] = rest / size
-    third = 3 - first - second
-    sign = 1 if (second - first) % 3 == 1 else -1
-    rotation[third] = sign * np.cross(rotation[first], rotation[second])
-    return rotation
+    # An infinite weight: the first axis becomes the coordinate axis, exactly.
+    rows = np.eye(3)[[first, second]]
+    return Rotation.align_vectors(rows, pair, weights=[np.inf, 1])[0].as_matrix()
 
 
 def _principal_axes(points: NDArray) -> NDArray:

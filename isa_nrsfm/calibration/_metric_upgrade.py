@@ -1,20 +1,30 @@
 """Metric upgrade of affine cameras of a rigid shape, and Euclidean shapes."""
 
+from operator import attrgetter
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
 
-from isa_nrsfm._metric_upgrade.metric import CalibratedCamera
-from isa_nrsfm._metric_upgrade.rigid import (
-    fit_metric,
-    nearest_rotations,
-    symmetric_upgrade,
-    usable_cameras,
-    warn_if_degenerate,
-)
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
+from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS
 from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm.calibration._metric import (
+    CalibratedCamera,
+    MetricFit,
+    mean_gram,
+    metric_quadric,
+    refine_metric,
+    safe_start,
+    unit_cameras,
+)
+
+# Above this condition number the cameras hardly determine the metric. It is that of
+# rotations by about five degrees.
+LARGEST_CONDITION = 50.0
 
 
 class MetricUpgrade(NamedTuple):
@@ -157,12 +167,12 @@ def metric_upgrade(
     if camera not in CALIBRATED_CAMERAS:
         raise ValueError(f"camera must be one of {CALIBRATED_CAMERAS}; got {camera!r}")
     fit = fit_metric(cameras[usable], camera)
-    _, Q = symmetric_upgrade(fit.Q, cameras[usable])
-    rotations, stretches = nearest_rotations(cameras[usable] @ Q)
-    scales = np.trace(stretches, axis1=1, axis2=2) / 2
+    _, Q = symmetric_upgrade(fit.metric[0], cameras[usable])
+    rows, scales = nearest_calibrated(cameras[usable] @ Q)
     if camera == "orthographic":
-        scales = np.ones(len(scales))
-    rotations, scales = (of_all_rows(each, usable) for each in (rotations, scales))
+        scales = np.ones_like(scales)
+    parts = full_rotations(rows)[0], scales
+    rotations, scales = (of_all_rows(values, usable) for values in parts)
     warn_if_degenerate(fit.condition_number)
     return MetricUpgrade(Q, rotations, scales, fit.residual, fit.condition_number)
 
@@ -203,3 +213,73 @@ def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
             f"{'a singular one' if matrix.shape == (3, 3) else matrix.shape}"
         )
     return points @ np.linalg.inv(matrix).T
+
+
+def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]:
+    """Return cameras (I, 2, 3) and the mask of usable ones, at least `least`."""
+    cameras = np.asarray(motion, dtype=np.float64)
+    if cameras.ndim != 3 or cameras.shape[1:] != (2, 3) or len(cameras) < least:
+        raise ValueError(
+            f"motion must be of the shape (n_frames, 2, 3); got {cameras.shape}"
+        )
+    if np.isinf(cameras).any():
+        raise ValueError(
+            f"motion must not be infinite; {np.isinf(cameras).sum()} entries are"
+        )
+    usable = np.isfinite(cameras).all(axis=(1, 2)) & cameras.any(axis=(1, 2))
+    return cameras, np.asarray(usable)
+
+
+def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> MetricFit:
+    """Return the best metric of usable cameras (n_frames, 2, 3), from two starts."""
+    gram = mean_gram(unit_cameras(cameras)) if len(cameras) else np.zeros((3, 3))
+    eigenvalues = np.linalg.eigvalsh(gram)
+    n_seen = np.count_nonzero(eigenvalues > OF_RANKS * eigenvalues[-1])
+    if n_seen < 3:
+        raise ValueError(
+            "a metric upgrade needs cameras that together see three directions of "
+            f"space; the {len(cameras)} usable cameras see {n_seen}"
+        )
+    alpha, metrics = np.zeros((len(cameras), 0)), [np.linalg.inv(gram)]
+    if (G := metric_quadric(cameras)) is not None:
+        metrics.append(G)
+    starts = [safe_start(cameras, G, camera)[None] for G in metrics]
+    fits = [refine_metric(cameras, alpha, start, camera) for start in starts]
+    return min(fits, key=attrgetter("cost"))
+
+
+def best_metric(motion: NDArray) -> NDArray:
+    """Return Q (3, 3) with which cameras (n, 2, 3) are most nearly scaled rotations.
+
+    The identity if they do not see three directions of space.
+    """
+    cameras, usable = usable_cameras(motion)
+    try:
+        fit = fit_metric(cameras[usable], "weak_perspective")
+    except ValueError:
+        return np.eye(3)
+    return symmetric_upgrade(fit.metric[0], cameras[usable])[1]
+
+
+def symmetric_upgrade(Q: NDArray, cameras: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the orthogonal O and the symmetric S of ``Q = S O``, S (3, 3) scaled.
+
+    The scales of the upgraded cameras (I, 2, 3) have mean square one.
+    """
+    turn, Q = linalg.polar(Q, side="left")
+    # A scale is s = (s1 + s2) / 2 with the singular values of a camera. Then
+    # s^2 = (s1^2 + s2^2) / 4 + s1 s2 / 2, and s1 s2 is the area that the rows span.
+    rows = cameras @ Q
+    area = np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=1)
+    return turn, Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))
+
+
+def warn_if_degenerate(condition_number: float) -> None:
+    """Warn if the cameras hardly determine the metric."""
+    if condition_number > LARGEST_CONDITION:
+        warn_caller(
+            f"the cameras hardly determine the metric of space: its condition number "
+            f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
+            "may have wrong depth and angles. Take frames that are seen from more "
+            "sides, or more frames, or affine shapes"
+        )

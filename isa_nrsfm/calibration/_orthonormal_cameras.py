@@ -1,5 +1,8 @@
-"""Orthographic cameras in the motion factor of a table."""
+"""Orthographic cameras: mixtures of columns of a motion factor, orthonormal in rows."""
 
+from functools import partial
+from itertools import combinations
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -7,12 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from sklearn.utils import check_array
 
-from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
-    STEP,
-    orthonormal_mixture,
-    orthonormality_residuals,
-)
+from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
+from isa_nrsfm.calibration._metric import levenberg_marquardt, normal_equations
+
+# Number of columns that are added at a time: a basis shape has three.
+STEP = 3
 
 # Errors of covariance C of the rows r1 and r2 raise the expected cost, to first order,
 # by 4 r1 C r1 + 4 r2 C r2 + 2 (r1 C r1 + r2 C r2). On average over all cameras that is
@@ -154,3 +156,64 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     root = np.sqrt(len(motion) / 3)
     inverse = solve_triangular(triangle, root * np.eye(len(kept)))
     return kept, root * basis, inverse
+
+
+def orthonormal_mixture(
+    basis: NDArray, mixing: NDArray, penalty: NDArray | None = None, max_iter: int = 200
+) -> tuple[NDArray, float]:
+    """Mix columns such that rows are most nearly orthonormal; return Q (n, 3) and cost.
+
+    The columns (2 I, n) are about as long as columns of cameras. `mixing` (n_before, 3)
+    is the start, the best mixture of the first columns. If there are three of these,
+    each triple of columns is another start. The cost is the mean over the frames of the
+    squared norm of `orthonormality_residuals`, plus a penalty ``||L Q||_F^2``.
+    """
+    n = basis.shape[1]
+    L = np.zeros((0, n)) if penalty is None else penalty
+
+    def evaluated(Q: NDArray) -> tuple[float, NDArray, NDArray]:
+        return normal_equations(*_linearised(Q, basis, L))
+
+    def moved(Q: NDArray, step: NDArray) -> NDArray:
+        return Q + step.reshape(Q.shape)
+
+    minimised = partial(levenberg_marquardt, evaluated, moved, least_gain=1e-9)
+    start = np.vstack([mixing, np.zeros((n - len(mixing), 3))])
+    if len(mixing) == 3 < n <= 3 + STEP:
+        # The best of about twenty starts after some steps leads to the least cost, or
+        # close to it.
+        triples = [np.column_stack(triple) for triple in combinations(np.eye(n), 3)]
+        rough = [minimised(Q, max_steps=8) for Q in (start, *triples)]
+        start, *_ = min(rough, key=itemgetter(1))
+    return minimised(start, max_steps=max_iter)[:2]
+
+
+def orthonormality_residuals(cameras: NDArray) -> NDArray:
+    """Return ``|r1|^2 - 1``, ``|r2|^2 - 1``, ``sqrt(2) r1 . r2`` of cameras (n, 2, 3).
+
+    The sum of their squares is ``||R_i R_i^T - I||_F^2``. The result is (3, n).
+    """
+    r1, r2 = cameras[:, 0], cameras[:, 1]
+    across = np.sqrt(2.0) * np.vecdot(r1, r2)
+    return np.stack([np.vecdot(r1, r1) - 1.0, np.vecdot(r2, r2) - 1.0, across])
+
+
+def _linearised(Q: NDArray, basis: NDArray, L: NDArray) -> tuple[NDArray, NDArray]:
+    """Return residuals (n,) of Q and their Jacobian (n, 3 * n_columns)."""
+    n_frames = len(basis) // 2
+    P, R = basis.reshape(n_frames, 2, -1, 1), (basis @ Q).reshape(n_frames, 2, 1, 3)
+    p1, p2, r1, r2 = P[:, 0], P[:, 1], R[:, 0], R[:, 1]
+    residuals = orthonormality_residuals(R[:, :, 0]).ravel() / np.sqrt(n_frames)
+    rows = np.stack([2.0 * p1 * r1, 2.0 * p2 * r2, np.sqrt(2.0) * (p1 * r2 + p2 * r1)])
+    rows = rows.reshape(3 * n_frames, -1) / np.sqrt(n_frames)
+    return (
+        np.concatenate([residuals, (L @ Q).ravel()]),
+        np.concatenate([rows, np.kron(L, np.eye(3))]),
+    )
+
+
+def principal_columns(W: NDArray) -> NDArray:
+    """Return left singular vectors (2 I, rank) of W, as long as columns of cameras."""
+    square, V = np.linalg.eigh(W.T @ W)
+    kept = np.flatnonzero(square > OF_STEPS * square[-1])[::-1]
+    return W @ (V[:, kept] * np.sqrt(len(W) / 3 / square[kept]))

@@ -8,24 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.decomposition import PCA
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, analysis
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis import (
-    AlignedFrames,
-    WithinGroups,
-    association,
-    between_share,
-    predictability,
-)
-from isa_nrsfm.analysis._frame_columns import (
-    checked_times,
-    group_numbers,
-    sequences_of,
-)
-from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
+from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.analysis._frame_columns import kind_of, refuse_infinite
+from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import read_times, video_times
@@ -75,8 +65,10 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
         times = video_times(numbers, name, groups) / args.fps
     if times is not None:
         try:
-            times_in_seconds = checked_times(times, len(table))
-            sequences_of(times_in_seconds, group_numbers(groups, len(table)), 1)
+            times_in_seconds = _frame_columns.checked_times(times, len(table))
+            _frame_columns.sequences_of(
+                times_in_seconds, _frame_columns.group_numbers(groups, len(table)), 1
+            )
         except ValueError as error:
             hint = " (--group: the rows that belong together)" * (groups is None)
             option = "--fps" if args.time is None else f"--time {args.time}"
@@ -110,10 +102,10 @@ def column_results(
     if asked.groups is not None:
         report["groups"] = {"column": args.group}
         try:
-            report["groups"] |= between_share(alpha, asked.groups)._asdict()
+            report["groups"] |= analysis.between_share(alpha, asked.groups)._asdict()
         except ValueError as error:  # one group, or groups of one frame
             report["groups"]["not_divided"] = str(error)
-        within = WithinGroups().fit_transform(alpha, groups=asked.groups)
+        within = analysis.WithinGroups().fit_transform(alpha, groups=asked.groups)
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
     if asked.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
@@ -206,11 +198,8 @@ def _names(known: "pd.Series") -> "pd.Series":
 
 def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:
     """Return principal components of the aligned table, missing points filled in."""
-    table = X.to_numpy(dtype=float)
-    missing = np.isnan(table)
-    if missing.any():
-        table = np.where(missing, estimator.reproject(X), table)
-    aligned = AlignedFrames().fit_transform(table)
+    table = np.where(X.isna(), fitted_table(estimator), X)
+    aligned = analysis.AlignedFrames().fit_transform(table)
     most = min(len(estimator.basis_), *aligned.shape)
     return np.asarray(PCA(most, random_state=0).fit_transform(aligned))
 
@@ -227,7 +216,7 @@ def _label_report(
         "kind": label.kind,
         "random_state": random_state,
     }
-    found = association(alpha[known], **options)
+    found = analysis.association(alpha[known], **options)
     report: dict[str, Any] = {
         "column": label.name,
         "kind": label.kind,
@@ -245,8 +234,12 @@ def _label_report(
         report["largest_class"] = counts.max() / len(label.values)
         report["class_means"] = class_means(label, alpha)
     try:
-        report["cross_validated"] = predictability(alpha[known], **options).mean()
-        report["cross_validated_pca"] = predictability(aligned[known], **options).mean()
+        report["cross_validated"] = analysis.predictability(
+            alpha[known], **options
+        ).mean()
+        report["cross_validated_pca"] = analysis.predictability(
+            aligned[known], **options
+        ).mean()
     except ValueError as error:  # too few frames of a class, or groups, for two folds
         report["not_cross_validated"] = str(error)
     return report

@@ -4,24 +4,12 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+from isa_nrsfm import export
+from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
 from isa_nrsfm.cli._outputs import read_model, refuse_overwriting
-from isa_nrsfm.cli._reading import (
-    as_fitted,
-    cells_of,
-    drawing,
-    drawing_files,
-    read_frames,
-)
 from isa_nrsfm.cli._report import table_report
 from isa_nrsfm.cli._sections import table_section, text_of
-from isa_nrsfm.export import (
-    point_distribution_model,
-    write_glb,
-    write_pdm,
-    write_shapes,
-    write_viewer,
-)
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # The options of each content, besides those of the table.
@@ -32,7 +20,6 @@ _OPTIONS = {
     "pdm": ("n_modes", *_POSE),
     "shapes": (),
 }
-_WRITERS = {"viewer": write_viewer, "glb": write_glb, "shapes": write_shapes}
 
 
 def run(args: Namespace, warned: list[str]) -> str:
@@ -40,34 +27,33 @@ def run(args: Namespace, warned: list[str]) -> str:
     output = Path(args.output)
     content = _content(output, args.content)
     options = _given(args, content)
-    estimator, missing = read_model(args.model)
-    sources = filter(None, (args.model, args.table, *drawing_files(args)))
+    estimator = read_model(args)
+    sources = filter(None, (args.model, args.table, *_reading.drawing_files(args)))
     refuse_overwriting(sources, [output])
     sections: dict[str, Any] = {"Model": [args.model]}
     stored = None
     if args.table is not None:
-        args.missing_value = [*args.missing_value, *missing]
-        frames = read_frames(args, estimator)
+        frames = _reading.read_frames(args, estimator)
         stored = frames.skeleton
-        table = table_report(args.table, args.format, frames)
+        table = table_report(args, frames)
         sections["Table"] = table_section(table, unusable="not shown")
-        options["X"] = as_fitted(estimator, frames.X)
+        options["X"] = _reading.as_fitted(estimator, frames.X)
         if args.label is not None:
-            labels = cells_of(frames.other, args.label, "--label")
+            labels = _reading.cells_of(frames.other, args.label, "--label")
             options["labels"] = labels[frames.usable]
     if "edges" in _OPTIONS[content]:
         names = names_of_points(estimator)
-        options |= drawing(args, names, stored, surfaces=content == "glb")
+        options |= _reading.drawing(args, names, stored, surfaces=content == "glb")
     if options.get("camera") == NONE:
         options["camera"] = None
 
     lines = [str(output)]
     if content == "pdm":
-        pdm = point_distribution_model(estimator, **options)
-        write_pdm(pdm, output)
+        pdm = export.point_distribution_model(estimator, **options)
+        export.write_pdm(pdm, output)
         lines.append(f"{len(pdm.eigenvalues)} modes of {len(pdm.mean)} points")
     else:
-        _WRITERS[content](estimator, output, **options)
+        getattr(export, f"write_{content}")(estimator, output, **options)
     lines.append(f"{output.stat().st_size} bytes")
     return text_of("", sections | {"Output": lines})
 

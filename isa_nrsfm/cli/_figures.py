@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
@@ -20,13 +20,6 @@ from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._report import MOST_CLASSES
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics._reprojection import frame_energies
-from isa_nrsfm.plotting import (
-    BasisShapeDisplay,
-    CoefficientsDisplay,
-    ComponentChoiceDisplay,
-    ModeCovarianceDisplay,
-    ReprojectionDisplay,
-)
 from isa_nrsfm.plotting._axes import (
     MEAN_COLOUR,
     VIEWS,
@@ -58,7 +51,7 @@ Figures = dict[str, tuple[str, Callable[[Fit], Any]]]
 ALWAYS: Figures = {
     "basis_shapes.png": (
         f"mean shape and basis shapes; of more than {MOST_DRAWN} those of most energy",
-        lambda fit: BasisShapeDisplay.from_estimator(
+        lambda fit: plotting.BasisShapeDisplay.from_estimator(
             fit.estimator,
             components=np.arange(len(fit.estimator.basis_))[:MOST_DRAWN],
             **fit.drawn,
@@ -68,7 +61,7 @@ ALWAYS: Figures = {
         "whether basis shapes occur together; covariance of the deformations in the "
         "images, 3x3 blocks: only the diagonal blocks differ from zero if the "
         "coefficients are uncorrelated",
-        lambda fit: ModeCovarianceDisplay.from_estimator(fit.estimator),
+        lambda fit: plotting.ModeCovarianceDisplay.from_estimator(fit.estimator),
     ),
     "reprojection.png": (
         "frames of median and of largest residual: observed points and points of the "
@@ -84,7 +77,7 @@ def figures_of(args: Namespace, asked: Columns) -> Figures:
     if len(args.n_components) > 1:
         figures["choice.png"] = (
             "held-out error by the number of basis shapes",
-            lambda fit: ComponentChoiceDisplay.from_estimator(fit.search),
+            lambda fit: plotting.ComponentChoiceDisplay.from_estimator(fit.search),
         )
     for number, label in enumerate(asked.labels, 1):
         figures[f"label_{number}.png"] = (
@@ -124,7 +117,7 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     return drawn
 
 
-def _reprojections(fit: Fit) -> ReprojectionDisplay:
+def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
     """Draw up to three frames about the median residual, and as many of the largest."""
     model = fit.estimator
     energy, error, _ = frame_energies(fit.X, fitted_table(model), model.layout)
@@ -132,7 +125,9 @@ def _reprojections(fit: Fit) -> ReprojectionDisplay:
     n_drawn = max(min(3, len(order) // 3), 1)
     start = (len(order) - n_drawn) // 2
     rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
-    display = ReprojectionDisplay.from_estimator(model, fit.X, frames=rows, **fit.drawn)
+    display = plotting.ReprojectionDisplay.from_estimator(
+        model, fit.X, frames=rows, **fit.drawn
+    )
     for number, axes in enumerate(display.axes_):
         which = "median" if number < n_drawn else "largest"
         title = f"{which} residual: {axes.get_title()}"
@@ -140,10 +135,10 @@ def _reprojections(fit: Fit) -> ReprojectionDisplay:
     return display
 
 
-def _by_label(label: Label, fit: Fit) -> CoefficientsDisplay:
+def _by_label(label: Label, fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients by a label."""
     alpha = fit.estimator.alpha_[:, :MOST_DRAWN]
-    return CoefficientsDisplay(
+    return plotting.CoefficientsDisplay(
         alpha=alpha[label.known],
         y=label.values,
         label=label.name.replace("$", r"\$"),  # no mathematics
@@ -151,14 +146,14 @@ def _by_label(label: Label, fit: Fit) -> CoefficientsDisplay:
     ).plot(kind=label.kind)
 
 
-def _in_time(asked: Columns, fit: Fit) -> CoefficientsDisplay:
+def _in_time(asked: Columns, fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients in time, smoothed ones if there are any."""
     alpha = fit.estimator.alpha_
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
     alpha = alpha[:, :MOST_DRAWN]
-    shown = CoefficientsDisplay(
+    shown = plotting.CoefficientsDisplay(
         alpha=alpha,
         alpha_std=None if deviation is None else deviation[:, :MOST_DRAWN],
         time=asked.times,
@@ -170,9 +165,9 @@ def _in_time(asked: Columns, fit: Fit) -> CoefficientsDisplay:
     return shown
 
 
-def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:
+def _shapes_by_label(label: Label, fit: Fit) -> plotting.BasisShapeDisplay:
     """Draw the mean shape of each class over that of all frames."""
-    whole = BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn)
+    whole = plotting.BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn)
     import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
     mean = whole.mean_shape
     means = [*class_means(label, fit.estimator.alpha_).values()]
@@ -182,7 +177,7 @@ def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:
     classes, counts = np.unique(label.values, return_counts=True)
     for shape, pair, name, count in zip(shapes, axes, classes, counts, strict=True):
         for points, colour in ((mean, "0.8"), (shape, MEAN_COLOUR)):
-            display = BasisShapeDisplay(
+            display = plotting.BasisShapeDisplay(
                 mean_shape=points,
                 basis=np.empty((0, *points.shape)),
                 edges=whole.skeleton,

@@ -14,14 +14,9 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
-from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.whole_files import (
-    check_replaceable,
-    files_together,
-    folder_for_writing,
-)
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._selection import standard_errors
@@ -89,11 +84,11 @@ def fit_table(
         inputs.append(args.table)
     else:
         results = results | {Path(args.table).name: "the table"}
-    with folder_for_writing(folder):
+    with whole_files.folder_for_writing(folder):
         files = [*results, *figures, REPORT]
         refuse_overwriting(inputs, [folder / name for name in files])
         for name in files:
-            check_replaceable(folder / name)
+            whole_files.check_replaceable(folder / name)
         if not args.force:
             refuse_replacing(folder, files)
         removed = {*_old_figures(folder, files), *figures}
@@ -102,7 +97,7 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, asked, estimator, frames)
         show_stage("tables")
-        with files_together(folder, removed=removed) as new:
+        with whole_files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             std = estimator.alpha_std_ if args.std else None
@@ -117,7 +112,7 @@ def fit_table(
                 "command": "fit",
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-                "table": table_report(args.table, args.format, frames),
+                "table": table_report(args, frames),
                 **({} if search is None else {"choice": choice_report(search, X)}),
                 "model": model_report(estimator, X, frames.weighting, drawn["edges"]),
                 **answers,
@@ -131,7 +126,7 @@ def fit_table(
         if not figures:
             return report
         # A figure that fails, or takes long, costs no results: they are in place.
-        with files_together(folder) as new:
+        with whole_files.files_together(folder) as new:
             if digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "
@@ -210,7 +205,7 @@ def _fitted(
 def _old_figures(folder: Path, new: list[str]) -> list[str]:
     """Return the figures that the report of an earlier run lists; warn of others."""
     old = [name for name in entry_of_report(folder, "files") if name.endswith(".png")]
-    others = [name for name in sorted(ALWAYS) if name not in (*old, *new)]
+    others = sorted({*ALWAYS}.difference(old, new))
     others = [name for name in others if (folder / name).exists()]
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
@@ -228,10 +223,7 @@ def _first_classes(asked: Columns, X: "pd.DataFrame") -> "pd.Series | None":
 
 
 def choose_n_components(
-    estimator: AffineNRSfM,
-    X: "pd.DataFrame",
-    candidates: Sequence[int],
-    groups: NDArray | None = None,
+    estimator: AffineNRSfM, X: Any, candidates: Sequence[int], groups: NDArray | None
 ) -> AffineNRSfMCV:
     """Return the fitted search for the number that best predicts held-out frames.
 
@@ -292,6 +284,5 @@ def extrapolated(tried: NDArray, seconds: NDArray, following: NDArray) -> NDArra
     """
     if len(tried) > 2:
         tried, seconds = tried[1:], seconds[1:]
-    degree = min(len(tried) - 1, 1)
-    line = np.polyfit(tried, seconds, degree)
+    line = np.polyfit(tried, seconds, min(len(tried) - 1, 1))
     return np.maximum(np.polyval(line, following), seconds[-1])

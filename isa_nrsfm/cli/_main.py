@@ -24,7 +24,7 @@ def run(argv: Sequence[str] | None = None) -> int:
     started = Namespace(arguments=arguments, since=time.perf_counter())
     args = build_parser().parse_args(arguments, started)
     try:
-        with _warnings_as_lines(args) as warned, shown_progress(PROGRAM, args.since):
+        with _warnings_as_lines(args) as warned, shown_progress(args.since):
             show_stage(args.command)
             # Each command is a module, which is only loaded now: help does not wait.
             command = importlib.import_module(f"isa_nrsfm.cli._{args.command}")

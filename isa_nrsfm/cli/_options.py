@@ -8,19 +8,10 @@ import argparse
 import math
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from isa_nrsfm import __version__
-from isa_nrsfm._parameters.choices import (
-    BLOCK_RECOVERIES,
-    CAMERA_NAMES,
-    INDEPENDENCE,
-    LOSSES,
-    OPENPOSE_PARTS,
-    REFINEMENTS,
-    SKELETON_NAMES,
-)
+from isa_nrsfm._parameters import choices
 from isa_nrsfm.io._formats import FORMATS, TABLE
 
 PROGRAM = "isa-nrsfm"
@@ -118,11 +109,6 @@ def _row_rule(text: str) -> tuple[str, re.Pattern[str]]:
         ) from error
 
 
-def _is_skeleton(text: str) -> bool:
-    """Return whether a text names a layout, or a configuration of DeepLabCut."""
-    return text in SKELETON_NAMES or Path(text).suffix.lower() in CONFIGURATIONS
-
-
 def _names(text: str) -> list[str]:
     """Read names with commas between them."""
     return [name.strip() for name in text.split(",")]
@@ -135,7 +121,11 @@ TYPES: dict[str, Callable[[str], Any]] = {
     "CONFIDENCE": float,
     "K": _numbers_of_shapes,
     "LAYOUT": _reader(
-        f"one of {', '.join(SKELETON_NAMES)}, or a .yaml file", str, _is_skeleton
+        f"one of {', '.join(choices.SKELETON_NAMES)}, or a .yaml file",
+        str,
+        lambda text: (
+            text in choices.SKELETON_NAMES or text.lower().endswith(CONFIGURATIONS)
+        ),
     ),
     "MODES": _reader(
         "a whole number or a share between 0 and 1",
@@ -173,10 +163,9 @@ def _list(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
     return _arg(metavar, f"{help}; may be repeated", **settings)
 
 
-def _choice(choices: tuple[str, ...], help: str) -> dict[str, Any]:
+def _choice(of: tuple[str, ...], help: str) -> dict[str, Any]:
     """Return the arguments of `add_argument` for a choice, whose first one is taken."""
-    help = f"{help} (default: {choices[0]})"
-    return {"help": help, "choices": choices, "default": choices[0]}
+    return {"help": f"{help} (default: {of[0]})", "choices": of, "default": of[0]}
 
 
 # Arguments without a leading -- in the command line.
@@ -225,8 +214,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "part": _arg(
         "PART",
         "the points of OpenPose to read, if the files have several: "
-        f"{', '.join(OPENPOSE_PARTS)}",
-        choices=OPENPOSE_PARTS,
+        f"{', '.join(choices.OPENPOSE_PARTS)}",
+        choices=choices.OPENPOSE_PARTS,
     ),
     "points": _arg(
         "POINTS",
@@ -251,7 +240,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "skeleton": _arg(
         "LAYOUT",
         "the layout of the points, if names, number and order of the points do not "
-        f"determine it: {', '.join(SKELETON_NAMES)}, or the config.yaml of DeepLabCut",
+        f"determine it: {', '.join(choices.SKELETON_NAMES)}, or the config.yaml of "
+        "DeepLabCut",
     ),
     "origin": {
         "help": "where y is zero: upper in images, whose y points down, lower if y "
@@ -306,7 +296,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         default="3",
     ),
     "camera": _choice(
-        CAMERA_NAMES,
+        choices.CAMERA_NAMES,
         "camera model: affine (no assumption), weak_perspective (a rotation and a "
         "scale per frame), or orthographic (one scale). The last two estimate "
         "depth and proportions",
@@ -319,21 +309,22 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "STARTS", "number of random starts (default: 16 of pooled, 30 of fast)"
     ),
     "block_recovery": _choice(
-        BLOCK_RECOVERIES, "algorithm that finds the block structure"
+        choices.BLOCK_RECOVERIES, "algorithm that finds the block structure"
     ),
     "refinement": _choice(
-        (*REFINEMENTS, NONE),
+        (*choices.REFINEMENTS, NONE),
         "joint: cameras, coefficients and basis shapes together; consensus: "
         "afterwards groups of neighbouring points, for the truest shapes of "
         "calibrated cameras; alternating: the refinement of the paper, with cameras "
         "of the rigid part",
     ),
     "independence": _choice(
-        (*INDEPENDENCE, NONE),
+        (*choices.INDEPENDENCE, NONE),
         "joint refinement: independent basis shapes, or independent coefficients",
     ),
     "loss": _choice(
-        LOSSES, "joint refinement: all but linear limit the influence of outliers"
+        choices.LOSSES,
+        "joint refinement: all but linear limit the influence of outliers",
     ),
     "no_scale_frames": _flag(
         "weight frames by their size in the image, as orthographic cameras always do"
@@ -512,19 +503,15 @@ def build_parser() -> argparse.ArgumentParser:
                 is_one = isinstance(entry, str)
                 place = group if is_one else group.add_mutually_exclusive_group()
                 for name in [entry] if is_one else entry:
-                    _add(place, command, name)
+                    settings = OPTIONS[name] | DIFFERENT.get((command, name), {})
+                    flag = name if name in POSITIONAL else flag_of(name)
+                    place.add_argument(*SHORT.get(name, []), flag, **settings)
     return top
 
 
 def flag_of(name: str) -> str:
     """Return how an argument is written in the command line."""
     return name.upper() if name in POSITIONAL else f"--{name.replace('_', '-')}"
-
-
-def _add(group: argparse._ActionsContainer, command: str, name: str) -> None:
-    """Add an option of a command."""
-    flags = [name] if name in POSITIONAL else [*SHORT.get(name, []), flag_of(name)]
-    group.add_argument(*flags, **OPTIONS[name] | DIFFERENT.get((command, name), {}))
 
 
 def _manners(description: str, epilog: str) -> dict[str, Any]:

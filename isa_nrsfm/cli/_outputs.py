@@ -6,6 +6,7 @@ The report has the SHA-256 digests of the model and the other files of its run.
 import hashlib
 import json
 import warnings
+from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -72,11 +73,7 @@ def refuse_replacing(folder: Path, names: Iterable[str]) -> None:
 
 
 def write_alpha(
-    path: Path,
-    frames: Frames,
-    alpha: NDArray,
-    std: NDArray | None,
-    further: "pd.DataFrame | None" = None,
+    path: Path, frames: Frames, alpha: NDArray, std: NDArray | None, further: Any = None
 ) -> None:
     """Write coefficients after the row number and the other columns of the table.
 
@@ -167,16 +164,16 @@ def fitted_table(model: AffineNRSfM) -> NDArray:
     return model.inverse_transform(model.alpha_, model.motion_, model.translation_)
 
 
-def read_model(path: str) -> tuple[AffineNRSfM, list[float]]:
-    """Load a model, and the coordinates of missing points in the table of its fit.
+def read_model(args: Namespace) -> AffineNRSfM:
+    """Load a model; its missing points have the coordinates of those of its fit.
 
     These are in the report beside the model. Without a report of that model there are
     none. Warn if files beside it are not of the run of the report.
     """
-    estimator, folder, name = load_model(path), Path(path).parent, Path(path).name
-    recorded = entry_of_report(folder, "sha256")
-    if name not in recorded:  # a report of something else
-        return estimator, []
+    estimator, path = load_model(args.model), Path(args.model)
+    folder, recorded = path.parent, entry_of_report(path.parent, "sha256")
+    if path.name not in recorded:  # without a report, or with one of something else
+        return estimator
     beside = digests_of(folder, [each for each in recorded if Path(each).name == each])
     differing = [each for each in beside if beside[each] != recorded[each]]
     if differing:
@@ -184,8 +181,10 @@ def read_model(path: str) -> tuple[AffineNRSfM, list[float]]:
             f"{folder / REPORT} is of another run than {', '.join(differing)} beside "
             "it, or these were changed since"
         )
-    table = {} if name in differing else entry_of_report(folder, "table")
-    return estimator, list(table.get("missing_values", []))
+    if path.name not in differing:
+        missing = entry_of_report(folder, "table").get("missing_values", [])
+        args.missing_value = [*args.missing_value, *missing]
+    return estimator
 
 
 def entry_of_report(folder: Path, name: str) -> dict[str, Any]:

@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterator
 from typing import TextIO
 
+from isa_nrsfm.cli._options import PROGRAM
+
 # Seconds between two lines: a twentieth of the time so far, within these limits. An
 # hour has about 90 lines.
 SHORTEST, LONGEST = 5.0, 60.0
@@ -19,9 +21,7 @@ def show_stage(text: str) -> None:
 
 
 @contextlib.contextmanager
-def shown_progress(
-    program: str, since: float, shortest: float = SHORTEST
-) -> Iterator[None]:
+def shown_progress(since: float, shortest: float = SHORTEST) -> Iterator[None]:
     """Repeat the last printed line every few seconds on the standard error.
 
     Nothing of the block reaches the standard output. On a terminal whole lines are
@@ -35,7 +35,7 @@ def shown_progress(
     def repeat() -> None:
         while not ended.wait(min(max(_seconds(since) / 20, shortest), LONGEST)):
             with contextlib.suppress(OSError, ValueError):
-                line = f"{program}: {_seconds(since):.0f} s: {latest.line}"
+                line = f"{PROGRAM}: {_seconds(since):.0f} s: {latest.line}"
                 print(line, file=shown, flush=True)
 
     thread = threading.Thread(target=repeat, daemon=True)

@@ -18,7 +18,7 @@ from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
     centred_frames,
-    clean_tracks,
+    clean_rows,
     tracks_to_table,
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
@@ -60,7 +60,6 @@ class Frames(NamedTuple):
     that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
     request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
     numbers of the images that rows show, and the column that has them, if any.
-    ``missing_values`` are the coordinates of missing points, zero for (0, 0).
     ``confidence`` has the confidences of the points if they are asked for as weights.
     """
 
@@ -73,7 +72,6 @@ class Frames(NamedTuple):
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
     images: tuple[NDArray, str | None]
-    missing_values: list[float]
     confidence: "pd.DataFrame | None" = None
 
     @property
@@ -96,11 +94,13 @@ def read_frames(
 ) -> Frames:
     """Read the table if none is given, and take its frames; those of a model's points.
 
-    The format in the options becomes the one found.
+    The format in the options becomes the one found, and the coordinates of missing
+    points become those of all options.
     """
-    chosen = failed = layout = confidence = None
+    found = chosen = layout = confidence = None
     not_used: dict[str, int] = {}
     args.format = _format(args) if table is None else TABLE
+    args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
         given = {name: getattr(args, name) for name in _OF_FORMATS}
         options = {name: given[name] for name in given if given[name] is not None}
@@ -110,8 +110,7 @@ def read_frames(
         table = pd.concat([found.frames, found.points], axis=1)
         x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
         chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
-        failed, layout = found.failed, found.skeleton
-        confidence = _confidence(args, found)
+        layout, confidence = found.skeleton, _confidence(args, found)
     elif table is None:
         table = read_table(args.table)
         if args.columns is not None:
@@ -120,14 +119,13 @@ def read_frames(
         columns = _columns_of_model(estimator, table, chosen)
     else:
         columns = chosen or find_landmark_columns(table.columns)
-    if args.format == TABLE:
+    if found is None:
         table, confidence, not_used = _with_confidences(args, table, columns)
-    if estimator is not None:
-        if chosen is not None:
-            kept = [chosen.x.index(name) for name in columns.x]
-            layout = _part_of_layout(layout, kept)
+    kept, left_out = _rows_to_keep(args, table)
+    if estimator is not None and chosen is not None:
+        layout = _part_of_layout(layout, [chosen.x.index(name) for name in columns.x])
     elif args.points is not None:
-        layout = _layout(args, table, columns, layout)
+        layout = _layout(args, table[kept], columns, layout)
         left = _kept_points(args.points, columns.points, layout)
         points, x, y = (tuple(each[j] for j in left) for each in columns[1:4])
         dropped = [name for name in columns.interleaved if name not in {*x, *y}]
@@ -135,19 +133,45 @@ def read_frames(
         layout = _part_of_layout(layout, left)
         table = table.drop(columns=dropped)
         not_used[f"--points {args.points}"] = len(dropped) // 2
-    frames = _frames(args, table, columns, failed, layout, confidence)
-    frames.not_used.update(not_used)
-    return frames
+    rows, names = np.flatnonzero(kept), columns.interleaved
+    stripped = [name.strip() for name in names]
+    tracks = np.full((len(table), len(columns.points), 2), np.nan)
+    tracks[kept] = tracks_in(table[kept], names, args.missing_value)
+    _refuse_lost_points(args, table[kept], columns, tracks)
+    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
+    tracks = cleaned.mT
+    if confidence is not None:
+        confidence = confidence[list(columns.x)].iloc[rows]
+        tracks[confidence.to_numpy() == 0] = np.nan
+    _, report = centred_frames(cleaned)
+    reasons = _reasons(report, None if found is None else found.failed[rows])
+    left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
+    _warn_of_code(tracks[report.usable])
+    if found is None:
+        _warn_of_shares(tracks[report.usable])
+        not_used = _sets_not_used(table, columns) | not_used
+    images, numbered_by = image_numbers(table)
+    return Frames(
+        points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
+        other=table.loc[kept].drop(columns=names),
+        usable=report.usable,
+        columns=columns,
+        not_used=not_used,
+        n_rows=len(table),
+        left_out=[out for out in left_out if len(out[1])],
+        skeleton=layout,
+        images=(images[rows], numbered_by),
+        confidence=confidence,
+    )
 
 
 def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
     """Return a column of a table, without regard to blanks around its name."""
     by_name = {str(each).strip(): each for each in table.columns}
     if name.strip() not in by_name:
-        names = [each for each in by_name if each]
         raise ValueError(
             f"{option}: the table has no column {name!r}; its columns are "
-            f"{first_items(names, 8) or 'none'}"
+            f"{first_items(filter(None, by_name), 8) or 'none'}"
         )
     return table[by_name[name.strip()]]
 
@@ -233,47 +257,6 @@ def _confidence(args: Namespace, found: Landmarks) -> "pd.DataFrame | None":
     return found.confidence.set_axis(x, axis=1).fillna(1.0)
 
 
-def _frames(
-    args: Namespace,
-    table: "pd.DataFrame",
-    columns: LandmarkColumns,
-    failed: NDArray | None,
-    skeleton: Skeleton | None,
-    confidence: "pd.DataFrame | None",
-) -> Frames:
-    """Take the frames of a table; failed marks rows in which tracking failed."""
-    kept, left_out = _rows_to_keep(args, table)
-    rows, names = np.flatnonzero(kept), columns.interleaved
-    stripped = [name.strip() for name in names]
-    tracks = _tracks(args, table, columns, kept)
-    _refuse_lost_points(args, table[kept], columns, tracks)
-    tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
-    if confidence is not None:
-        confidence = confidence[list(columns.x)].iloc[rows]
-        tracks[confidence.to_numpy() == 0] = np.nan
-    _, report = centred_frames(tracks.transpose(0, 2, 1))
-    reasons = _reasons(report, None if failed is None else failed[rows])
-    left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
-    _warn_of_code(tracks[report.usable])
-    if args.format == TABLE:
-        _warn_of_shares(tracks[report.usable])
-    images, numbered_by = image_numbers(table)
-    not_used = {} if failed is not None else _sets_not_used(table, columns)
-    return Frames(
-        points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
-        other=table.loc[kept].drop(columns=names),
-        usable=report.usable,
-        columns=columns,
-        not_used=not_used,
-        n_rows=len(table),
-        left_out=[out for out in left_out if len(out[1])],
-        skeleton=skeleton,
-        images=(images[rows], numbered_by),
-        missing_values=_missing_values(args),
-        confidence=confidence,
-    )
-
-
 def _rows_to_keep(
     args: Namespace, table: "pd.DataFrame"
 ) -> tuple[NDArray, list[tuple[str, NDArray, bool]]]:
@@ -291,21 +274,6 @@ def _rows_to_keep(
     return kept, skipped
 
 
-def _missing_values(args: Namespace) -> list[float]:
-    """Return the numbers that are x and y of missing points."""
-    return sorted({*args.missing_value, *[0.0] * args.zeros_missing})
-
-
-def _tracks(
-    args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns, kept: NDArray
-) -> NDArray:
-    """Return the points of all rows of the table, NaN where missing or not kept."""
-    tracks = np.full((len(table), len(columns.points), 2), np.nan)
-    missing = _missing_values(args)
-    tracks[kept] = tracks_in(table[kept], columns.interleaved, missing)
-    return tracks
-
-
 def _refuse_lost_points(
     args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns, tracks: NDArray
 ) -> None:
@@ -313,7 +281,7 @@ def _refuse_lost_points(
 
     tracks (n_frames, n_points, 2) are those of all rows, without missing points.
     """
-    if args.command != "fit" or not _missing_values(args):
+    if args.command != "fit" or not args.missing_value:
         return
     absent = np.isnan(tracks).all(axis=(0, 2))
     found = zip(columns.points, columns.x, absent, strict=True)
@@ -466,7 +434,7 @@ def _layout(
         return stored if stored.n_points == len(names) else None
     if stored is not None:
         return stored
-    tracks = _tracks(args, table, columns, _rows_to_keep(args, table)[0])
+    tracks = tracks_in(table, columns.interleaved, args.missing_value)
     complete = tracks[np.isfinite(tracks).all(axis=(1, 2))]
     centred, report = centred_frames(complete.transpose(0, 2, 1))
     extended = report.size > 0

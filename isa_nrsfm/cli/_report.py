@@ -2,6 +2,7 @@
 
 import contextlib
 import platform
+from argparse import Namespace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -30,17 +31,17 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 MOST_LISTED, MOST_CLASSES = 10, 12
 
 
-def table_report(path: str, format: str, frames: Frames) -> dict[str, Any]:
+def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
     """Describe the table, its rows and columns that are used, and the others."""
     X, names = frames.X, list(frames.points.columns)
     missing = X.iloc[:, ::2].isna().to_numpy()
     return {
-        "path": str(Path(path).resolve()),
-        "format": format,
+        "path": str(Path(args.table).resolve()),
+        "format": args.format,
         "n_rows": frames.n_rows,
         "n_frames": len(X),
         "n_points": len(frames.columns.points),
-        "missing_values": frames.missing_values,
+        "missing_values": args.missing_value,
         "n_missing_points": missing.sum(),
         "n_frames_with_missing_points": missing.any(axis=1).sum(),
         "columns": frames.columns.pattern,

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.calibration import angle_deviations, view_angles
+from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.export._names import frames_of_table
 from isa_nrsfm.export._upright import (
     Camera,

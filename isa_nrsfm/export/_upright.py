@@ -15,14 +15,13 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class, check_frames_kept, frames_of
 from isa_nrsfm._frames.camera_models import compose, full_rotations
-from isa_nrsfm._metric_upgrade.deforming import (
+from isa_nrsfm.calibration import (
     DeformationMetric,
     EuclideanFrames,
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm._metric_upgrade.metric import unit_cameras
-from isa_nrsfm._metric_upgrade.rigid import usable_cameras
+from isa_nrsfm.calibration._metric import unit_cameras
 from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,
@@ -85,9 +84,8 @@ def upright_space(
     else:
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
-        cameras, usable = usable_cameras(model.motion_)
         transform = viewing_rotation(
-            unit_cameras(cameras[usable] @ metric.Q),
+            unit_cameras(model.motion_ @ metric.Q),
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )

@@ -16,6 +16,7 @@ _LEVELS = ["scorer", "bodyparts", "coords"]
 _LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
 # Lightning Pose adds columns of other names, such as set.
 _COORDS = ("x", "y", "z", "likelihood")
+_VALUES = ("x", "y", "likelihood")
 _KEY = "df_with_missing"
 # The individual to which points belong that are not of an animal.
 _UNIQUE = "single"
@@ -43,7 +44,9 @@ def read_deeplabcut(path: Path) -> Landmarks:
         raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
     places = _places(columns)
     first = next(iter(places.values()))
-    where = np.array([[parts[name] for name in first] for parts in places.values()])
+    points = [parts[name] for parts in places.values() for name in first]
+    where = np.array([[each.get(coord, -1) for coord in _VALUES] for each in points])
+    where = where.reshape(len(places), len(first), len(_VALUES))
     # A column of NaN stands for likelihoods that are not there.
     found = np.column_stack([table, np.full(len(table), np.nan)])[:, where]
     try:
@@ -112,33 +115,28 @@ def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
     return None
 
 
-def _places(
-    columns: Sequence[tuple[str, ...]],
-) -> dict[str, dict[str, tuple[int, int, int]]]:
-    """Return the places of x, y, likelihood (or -1) by individual and bodypart.
+def _places(columns: Sequence[tuple[str, ...]]) -> dict[str, dict[str, dict[str, int]]]:
+    """Return the places of coordinates by individual, bodypart and name.
 
     All individuals have the same bodyparts; one of others, for points of no animal, is
     left out.
     """
-    points: dict[tuple[str, str], dict[str, int]] = {}
-    for number, column in enumerate(columns):
-        *individual, bodypart, coord = column[1:]
-        of_point = points.setdefault(("".join(individual), bodypart), {})
+    places: dict[str, dict[str, dict[str, int]]] = {}
+    for number, (_, *individual, bodypart, coord) in enumerate(columns):
+        parts = places.setdefault("".join(individual), {})
         if coord == "z":
             raise ValueError(
                 f"{bodypart!r} has a z: these are points in space, not in an image"
             )
-        if coord in of_point:
+        if coord in parts.setdefault(bodypart, {}):
             raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
-        of_point[coord] = number
-    if not points:
+        parts[bodypart][coord] = number
+    if not places:
         raise ValueError("it has no columns x and y")
-    places: dict[str, dict[str, tuple[int, int, int]]] = {}
-    for (name, bodypart), of_point in points.items():
-        if not {"x", "y"}.issubset(of_point):
-            raise ValueError(f"{bodypart!r} has no x or no y")
-        place = of_point["x"], of_point["y"], of_point.get("likelihood", -1)
-        places.setdefault(name, {})[bodypart] = place
+    for parts in places.values():
+        for bodypart, of_point in parts.items():
+            if not {"x", "y"}.issubset(of_point):
+                raise ValueError(f"{bodypart!r} has no x or no y")
     others = [name for name in places if name != _UNIQUE]
     if others and _UNIQUE in places and {*places[_UNIQUE]} != {*places[others[0]]}:
         warn_caller(

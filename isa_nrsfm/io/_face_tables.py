@@ -15,7 +15,7 @@ from isa_nrsfm.io._landmark_columns import (
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
-from isa_nrsfm.io._tables import header_names, read_columns
+from isa_nrsfm.io._tables import header_names, read_columns, tracks_in
 
 # OpenFace names points in space, in millimetres, by capital letters.
 _NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
@@ -103,7 +103,7 @@ def read_mediapipe(
     numbers = [*found.interleaved, *sizes]
     text = {*names}.difference(numbers, found.z)
     table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
-    tracks = points_of(table, found.interleaved)
+    tracks = tracks_in(table, found.interleaved)
     known = np.abs(tracks[~np.isnan(tracks)])
     # Pixels of a face reach beyond this, and shares of the image's size do not.
     if known.size and np.median(known) <= 2.0:
@@ -153,11 +153,6 @@ def _check_inside(shares: NDArray[np.float64]) -> None:
     warn_caller(found)
 
 
-def points_of(table: "pd.DataFrame", columns: list[str]) -> NDArray[np.float64]:
-    """Return the points (n_frames, n_points, 2) of columns x0, y0, x1, y1, ...."""
-    return table[columns].to_numpy(dtype=np.float64).reshape(len(table), -1, 2)
-
-
 def _assembled(
     table: "pd.DataFrame",
     found: LandmarkColumns,
@@ -171,7 +166,7 @@ def _assembled(
     if score is not None:
         confidence = table[[score] * len(found.points)].to_numpy(dtype=np.float64)
     return assemble(
-        points_of(table, found.interleaved) if tracks is None else tracks,
+        tracks_in(table, found.interleaved) if tracks is None else tracks,
         found.points,
         table.drop(columns=found.interleaved),
         format=format,

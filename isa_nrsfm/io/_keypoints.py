@@ -96,11 +96,7 @@ def _annotations(content: Any, category: str | None) -> Landmarks:
     for part in lists:
         _refuse_non_objects(content[part], part)
     chosen, point_names = _chosen_categories(content["categories"], category)
-    images = {}
-    for image in content["images"]:
-        if not isinstance(image.get("id"), int | str):
-            raise ValueError("each of the images needs an id")
-        images[image["id"]] = image
+    images = _by_id(content["images"], "images")
     entries = []
     for entry in content["annotations"]:
         where, of = entry.get("image_id"), entry.get("category_id")
@@ -110,7 +106,7 @@ def _annotations(content: Any, category: str | None) -> Landmarks:
                 "among the images"
             )
         if isinstance(of, int | str) and of in chosen and "keypoints" in entry:
-            entries.append({**entry, "category": chosen[of]})
+            entries.append({**entry, "category": str(chosen[of].get("name"))})
     order = {image: i for i, image in enumerate(images)}
     entries.sort(key=lambda entry: order[entry["image_id"]])
     values = _keypoints(entries, "annotation", len(point_names))
@@ -128,8 +124,8 @@ def _annotations(content: Any, category: str | None) -> Landmarks:
 
 def _chosen_categories(
     categories: list[dict[str, Any]], name: str | None
-) -> tuple[dict[int | str, str], tuple[str, ...]]:
-    """Return names of the categories to read by id, and their common keypoints."""
+) -> tuple[dict[Any, dict[str, Any]], tuple[str, ...]]:
+    """Return the categories to read by their ids, and their common keypoints."""
     with_points = [entry for entry in categories if entry.get("keypoints")]
     names = [str(entry.get("name")) for entry in with_points]
     if name is not None:
@@ -149,10 +145,14 @@ def _chosen_categories(
                 f"the categories {', '.join(names)} have different keypoints: choose "
                 "one with category"
             )
-        if not isinstance(entry.get("id"), int | str):
-            raise ValueError("each of the categories needs an id")
-    chosen = {entry["id"]: str(entry.get("name")) for entry in with_points}
-    return chosen, tuple(with_points[0]["keypoints"])
+    return _by_id(with_points, "categories"), tuple(with_points[0]["keypoints"])
+
+
+def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]]:
+    """Return entries by their identifiers, or raise."""
+    if not all(isinstance(entry.get("id"), int | str) for entry in entries):
+        raise ValueError(f"each of the {what} needs an id")
+    return {entry["id"]: entry for entry in entries}
 
 
 def _keypoints(
@@ -162,7 +162,7 @@ def _keypoints(
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
         name = f"{what} {number} (counted from 0)"
-        found.append(_triples(entry.get("keypoints"), f"keypoints of {name}"))
+        found.append(_triples(entry.get("keypoints"), f"keypoints of {name}", True))
         n_points = n_points or len(found[0])
         if len(found[-1]) != max(n_points, 1):
             raise ValueError(
@@ -171,10 +171,12 @@ def _keypoints(
     return np.reshape(found, (len(entries), n_points or 0, 3))
 
 
-def _triples(numbers: Any, what: str) -> NDArray[np.float64]:
-    """Return x, y and a third number of points, (n_points, 3), or raise."""
+def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
+    """Return x, y and a third number of points, (n_points, 3), with NaN if allowed."""
     if not isinstance(numbers, list) or not all(
-        type(value) in (int, float) and not abs(value) >= 1e300 for value in numbers
+        type(number) in (int, float)
+        and (abs(number) < 1e300 or (gaps and number != number))
+        for number in numbers
     ):
         raise ValueError(
             f"{what} should be a list of finite numbers; got {numbers!r:.40}"
@@ -263,7 +265,10 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             "the coordinates are shares of the image's size, which stretch the shapes. "
             "Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    of_files = _numbers(files)
+    matches = [_NAME.fullmatch(file.name) for file in files]
+    of_files = [int(match[1]) for match in matches if match and match[1]]
+    if len(set(of_files)) < len(files):
+        of_files = list(range(len(files)))
     frames = {
         "file": [as_utf8(files[i].name) for i in image],
         "frame": [of_files[i] for i in image],
@@ -279,14 +284,7 @@ def _people_in(content: Any) -> list[dict[str, NDArray[np.float64]]]:
         raise ValueError("expected an object with a list of objects called people")
     keys = {part: f"{part}_keypoints_2d" for part in OPENPOSE_PARTS}
     found = [
-        {part: _triples(person.get(key, []), key) for part, key in keys.items()}
+        {part: _triples(person.get(key, []), key, False) for part, key in keys.items()}
         for person in people
     ]
     return [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
-
-
-def _numbers(files: list[Path]) -> list[int]:
-    """Return the numbers at the end of the names of files, or else of their order."""
-    found = [_NAME.fullmatch(file.name) for file in files]
-    numbers = [int(match[1]) for match in found if match and match[1]]
-    return numbers if len(set(numbers)) == len(files) else list(range(len(files)))

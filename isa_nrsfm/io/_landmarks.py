@@ -191,12 +191,7 @@ def stacked(
     `persons` are those of each image by their numbers, `names` those of the images. An
     image without persons has a row of NaN.
     """
-    rows = [
-        (i, number, values)
-        for i, each in enumerate(persons)
-        for number, values in each.items() or [(None, None)]
-    ]
-    shown = [(i, values) for i, _, values in rows if values is not None]
+    shown = [(i, values) for i, each in enumerate(persons) for values in each.values()]
     first, points = shown[0]
     for i, values in shown:
         if len(values) != len(points):
@@ -204,10 +199,14 @@ def stacked(
                 f"{names[first]} has {len(points)} points, {names[i]} has "
                 f"{len(values)}: all must have the same number"
             )
-    gap = np.full(points.shape, np.nan)
-    images, numbers, found = zip(*rows, strict=True)
-    stack = np.stack([gap if values is None else values for values in found])
-    return list(images), pd.array(numbers, dtype="Int64"), stack
+    nobody = {None: np.full(points.shape, np.nan)}
+    rows = [
+        (i, number, values)
+        for i, each in enumerate(persons)
+        for number, values in (each or nobody).items()
+    ]
+    images, numbers, stack = zip(*rows, strict=True)
+    return list(images), pd.array(numbers, dtype="Int64"), np.stack(stack)
 
 
 def checked_sizes(name: str, sizes: Any, n_images: int) -> NDArray[np.float64]:

@@ -251,40 +251,30 @@ def _check_shapes(values: dict[str, Any]) -> None:
         raise ValueError(f"it lacks attributes: {', '.join(missing)}")
     K, P = (*np.shape(values["basis_"]), 0, 0)[:2]
     N = (*np.shape(values.get("sizes", ())), 0)[0]
-    shapes: dict[str, tuple[int | None, ...]] = {
-        "basis_": (K, P, 3),
-        "mean_shape_": (P, 3),
-        "energy_share_": (K,),
-        "mode_covariance_": (3 * K, 3 * K),
-        "singular_values_": (min(3 * K + 3, P - 1),),
-        "reference_motion_": (2, 3),
-        "reference_translation_": (2,),
-        "reliability_": (K,),
-        "objective_history_": (None,),
-        "feature_names_in_": (2 * P,),
-        # of frames
-        "motion_": (N, 2, 3),
-        "translation_": (N, 2),
-        "alpha_": (N, K),
-        "alpha_std_": (N, K),
-        "rotations_": (N, 3, 3),
-        "scales_": (N,),
-        "sizes": (N,),
-        # of the model of a frame
-        "mean_shape": (P, 3),
-        "basis": (K, P, 3),
-        "shapes": (K + 1, 3, P),
-        "coefficient_starts": (None, K),
-        "mixing": (K + 1, K + 1),
-        "space": (3, 3),
-        "certainty": (2,),
-        "turns": (3, 3),
-        "depth_variances": (P,),
-        "leverage": (),
-    }
-    single = ("noise_variance", "unit", "n_features_in_", "n_iter_", "inverse_snr_")
-    shapes |= dict.fromkeys(single, ())
-    for name, shape in shapes.items():
+    single = "noise_variance unit n_features_in_ n_iter_ inverse_snr_ leverage".split()
+    shapes: tuple[tuple[tuple[int | None, ...], list[str]], ...] = (
+        ((K, P, 3), ["basis_", "basis"]),
+        ((P, 3), ["mean_shape_", "mean_shape"]),
+        ((K + 1, 3, P), ["shapes"]),
+        ((K,), ["energy_share_", "reliability_"]),
+        ((None, K), ["coefficient_starts"]),
+        ((K + 1, K + 1), ["mixing"]),
+        ((3 * K, 3 * K), ["mode_covariance_"]),
+        ((min(3 * K + 3, P - 1),), ["singular_values_"]),
+        ((P,), ["depth_variances"]),
+        ((2 * P,), ["feature_names_in_"]),
+        ((2, 3), ["reference_motion_"]),
+        ((2,), ["reference_translation_", "certainty"]),
+        ((3, 3), ["space", "turns"]),
+        ((None,), ["objective_history_"]),
+        ((N, 2, 3), ["motion_"]),
+        ((N, 2), ["translation_"]),
+        ((N, K), ["alpha_", "alpha_std_"]),
+        ((N, 3, 3), ["rotations_"]),
+        ((N,), ["scales_", "sizes"]),
+        ((), single),
+    )
+    for shape, name in ((shape, name) for shape, names in shapes for name in names):
         if (value := values.get(name)) is None:
             continue
         found, kinds = np.shape(value), "O" if name == "feature_names_in_" else "iuf"

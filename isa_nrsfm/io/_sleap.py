@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.io._face_tables import points_of
 from isa_nrsfm.io._hdf5 import content_of, is_hdf5, numbers_of, root_groups
 from isa_nrsfm.io._landmark_columns import find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
-from isa_nrsfm.io._tables import header_names, read_columns
+from isa_nrsfm.io._tables import header_names, read_columns, tracks_in
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
 _DIMS = ("frame", "track", "node", "xy")
@@ -61,7 +60,7 @@ def _read_table(path: Path) -> Landmarks:
         text=("track",),
     )
     return assemble(
-        points_of(table, found.interleaved),
+        tracks_in(table, found.interleaved),
         nodes,
         table[_CSV_COLUMNS].set_axis(["individual", "frame", "instance_score"], axis=1),
         format="sleap",

@@ -215,7 +215,7 @@ def landmark_table(
 
 
 def tracks_in(
-    frame: "pd.DataFrame", names: Sequence[str], missing: Sequence[float]
+    frame: "pd.DataFrame", names: Sequence[str], missing: Sequence[float] = ()
 ) -> NDArray[np.float64]:
     """Return the points (n_frames, n_points, 2) in columns x0, y0, x1, y1, ....
 

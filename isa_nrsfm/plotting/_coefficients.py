@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.analysis._frame_columns import checked_column
-from isa_nrsfm.analysis._labels import kind_of
+from isa_nrsfm.analysis._frame_columns import checked_column, kind_of
 from isa_nrsfm.plotting._axes import (
     MINUS_COLOUR,
     OBSERVED_COLOUR,

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._estimator import frames_of
-from isa_nrsfm._metric_upgrade.metric import (
+from isa_nrsfm.calibration import canonical_pose
+from isa_nrsfm.calibration._metric import (
     mean_gram,
     metric_quadric,
     symmetric_power,
     unit_cameras,
 )
-from isa_nrsfm.calibration import canonical_pose
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton

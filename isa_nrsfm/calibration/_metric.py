@@ -9,7 +9,7 @@ the first two rows of scaled rotations. Q is known up to a rotation. The metric 
 change with the deformation of the object, as ``G_i = Q exp(sum_k alpha_ik E_k) Q^T``
 with symmetric strains E_k.
 
-The sum of squares of the residuals (`orthonormality`) is minimised by damped
+The sum of squares of the residuals (`linearised`) is minimised by damped
 Gauss-Newton steps along geodesics, ``Q <- Q exp(E_0 / 2)``, and in the strains. So ``Q
 Q^T`` stays positive definite, even if the linear equations (`metric_quadric`) have an
 indefinite solution. The derivative of the exponential is that of Daleckii and Krein
@@ -21,10 +21,11 @@ with respect to these.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.utils import gen_batches
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES
@@ -37,8 +38,10 @@ LARGEST_STRETCH = 20.0
 # cameras see all directions alike. Nearly singular metrics are near saddle points.
 STRETCH_OF_START = 3.0
 
+# Matrices whose products with ``[[xx, xy], [xy, yy]]`` are xx - yy, 2 xy and xx + yy.
+ROW_PRODUCTS = np.array([[[1.0, 0, 1], [0, 1, 0]], [[0, 1, 0], [-1, 0, 1]]])
+
 CalibratedCamera = Literal["orthographic", "weak_perspective"]
-State = TypeVar("State")
 
 
 def unit_cameras(motion: NDArray) -> NDArray:
@@ -121,22 +124,20 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
 
 
 class MetricFit(NamedTuple):
-    """A metric, with its cost and derivatives.
+    """A metric of least residuals.
 
-    Q (3, 3): ``G = Q Q^T`` is the metric of frames without deformation.
-    strain (K, 3, 3): E_k, symmetric with trace zero.
-    cost: sum of the squared residuals of `orthonormality`.
+    metric (K + 1, 3, 3): Q with ``G = Q Q^T``, the metric of frames without
+    deformation, and the strains E_k, symmetric with trace zero.
+    n_frames: number of cameras.
+    cost: sum of the squared residuals.
     curvature: ``J^T J`` with the Jacobian of the residuals in the coordinates of E_0,
-    E_1, ... in `strain_basis`.
-    gradient: ``J^T r`` with r the residuals.
+    E_1, ... in `strain_basis`, plus the ridge of the strains.
     """
 
-    Q: NDArray
-    strain: NDArray
+    metric: NDArray
     n_frames: int
     cost: float
     curvature: NDArray
-    gradient: NDArray
 
     @property
     def residual(self) -> float:
@@ -146,50 +147,11 @@ class MetricFit(NamedTuple):
     @property
     def condition_number(self) -> float:
         """Condition number of the residuals as functions of the common metric."""
-        size = len(self.gradient) // (len(self.strain) + 1)
+        size = len(self.curvature) // len(self.metric)
         values = np.linalg.eigvalsh(self.curvature[:size, :size])
         if values[0] <= OF_PRODUCTS * values[-1]:
             return np.inf
         return float(np.sqrt(values[-1] / values[0]))
-
-
-def orthonormality(gram: NDArray, camera: CalibratedCamera) -> NDArray:
-    """Return residuals (n_frames, n) of the products ``M_i G M_i^T`` (n_frames, 2, 2).
-
-    For orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i G
-    M_i^T - I||_F``. For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``, with
-    the norm ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular values of
-    ``M_i Q``: it does not depend on roll and scale.
-    """
-    entries = _entries(gram, camera)
-    if camera == "orthographic":
-        return entries - [1.0, 0.0, 1.0]
-    return entries / np.trace(gram, axis1=1, axis2=2)[:, None]
-
-
-def _entries(products: NDArray, camera: CalibratedCamera) -> NDArray:
-    """Return the entries (..., n) of matrices (..., 2, 2) that are to be constant."""
-    xx, xy, yx, yy = np.moveaxis(products.reshape(*products.shape[:-2], 4), -1, 0)
-    if camera == "orthographic":
-        return np.stack([xx, np.sqrt(0.5) * (xy + yx), yy], axis=-1)
-    return np.stack([xx - yy, xy + yx], axis=-1)
-
-
-def fit_at(
-    motion: NDArray,
-    alpha: NDArray,
-    Q: NDArray,
-    strain: NDArray,
-    camera: CalibratedCamera,
-) -> MetricFit:
-    """Evaluate a metric for cameras (I, 2, 3) and strain coefficients (I, K)."""
-    sums = []
-    for start in range(0, len(motion), BLOCK_FRAMES):
-        part = slice(start, start + BLOCK_FRAMES)
-        r, J = linearised(motion[part] @ Q, alpha[part], strain, camera)
-        sums.append((float(r @ r), J.T @ J, J.T @ r))
-    cost, curvature, gradient = (sum(terms) for terms in zip(*sums, strict=True))
-    return MetricFit(Q, strain, len(motion), cost, curvature, gradient)
 
 
 def linearised(
@@ -197,62 +159,58 @@ def linearised(
 ) -> tuple[NDArray, NDArray]:
     """Return the residuals (m,) of cameras ``M_i Q`` (I, 2, 3), and their Jacobian.
 
-    The Jacobian (m, n_numbers * (K + 1)) is that by the coordinates of E_0, E_1, ... in
-    `strain_basis`.
+    The residuals are those of the products ``xx, xy, yy`` of the rows in the metric.
+    For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``, with the norm ``(s1^2
+    - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular values of ``M_i Q``: it does
+    not depend on roll and scale. For orthographic cameras ``(xx - yy, 2 xy, xx + yy -
+    2) / sqrt(2)``, with the norm ``||M_i G M_i^T - I||_F``. The Jacobian (m, n (K + 1))
+    is that by the coordinates of E_0, E_1, ... in `strain_basis`.
     """
-    # In the axes of ``E = sum_k alpha_ik E_k`` its exponential changes by dE times,
-    # entry by entry, the divided differences of exp at two eigenvalues, which are
-    # exp((a + b) / 2) sinh((a - b) / 2) / ((a - b) / 2).
-    values, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
-    half_gap = (values[:, :, None] - values[:, None]) / 2
-    equal = half_gap == 0
-    divided = np.where(equal, 1.0, np.sinh(half_gap) / np.where(equal, 1.0, half_gap))
-    divided *= np.exp((values[:, :, None] + values[:, None]) / 2)
-    seen, back = MQ @ axes, axes.mT
-    grown = (seen * np.exp(values)[:, None]) @ back  # M_i Q exp(E)
-    gram = grown @ MQ.mT
-    residuals = orthonormality(gram, camera)
-
-    def slopes(changes: NDArray) -> NDArray:
-        """Return the derivatives (I, c, n) for changes (I, 2, n, 2) of `gram`."""
-        changes = changes.swapaxes(1, 2)
-        entries = _entries(changes, camera)
-        if camera == "weak_perspective":  # a quotient
-            entries -= (
-                np.trace(changes, axis1=2, axis2=3)[..., None] * residuals[:, None]
-            )
-            entries /= np.trace(gram, axis1=1, axis2=2)[:, None, None]
-        return entries.swapaxes(1, 2)
-
-    basis = strain_basis(camera).swapaxes(0, 1).reshape(3, -1)
+    basis = strain_basis(camera)
     # exp(E_0 / 2) exp(E) exp(E_0 / 2) changes to first order by the symmetric part of
-    # E_0 exp(E).
-    columns = [slopes(_between(MQ, basis, grown))]
-    if len(strain):
-        turned = _between(back, basis, back) * divided[:, :, None]
-        own = slopes(_between(seen, turned.reshape(len(MQ), 3, -1), seen))
-        weighted = alpha[:, None, :, None] * own[:, :, None]
-        columns.append(weighted.reshape(*residuals.shape, -1))
-    J = np.concatenate(columns, axis=2)
+    # E_0 exp(E), where E = sum_k alpha_ik E_k.
+    values, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
+    seen = MQ @ axes
+    grown = (seen * np.exp(values)[:, None]) @ axes.mT  # M_i Q exp(E)
+    rows = (MQ @ np.hstack([*basis])).reshape(len(MQ), -1, 3)
+    products = (rows @ grown.mT).reshape(len(MQ), 2, -1, 2)
+    common = np.tensordot(products, ROW_PRODUCTS, ((1, 3), (0, 1))).mT  # (I, c, n)
+    # In the axes of E its exponential changes by dE times, entry by entry, the divided
+    # differences of exp at two eigenvalues, which are exp((a + b) / 2) sinh((a - b) /
+    # 2) / ((a - b) / 2).
+    a, b = values[:, :, None] / 2, values[:, None] / 2
+    divided = np.exp(a + b) * np.sinc(1j * (a - b) / np.pi).real
+    weights = np.einsum("ipa,pqc,iqb->icab", seen, ROW_PRODUCTS, seen)
+    weights = axes[:, None] @ (divided[:, None] * weights) @ axes[:, None].mT
+    own = np.tensordot(weights, basis, ((2, 3), (1, 2)))
+    entries = np.tensordot(grown @ MQ.mT, ROW_PRODUCTS)
+    changes = np.concatenate([common, own], axis=2)
+    if camera == "orthographic":
+        residuals, slopes = (entries - [0, 0, 2]) / np.sqrt(2), changes / np.sqrt(2)
+    else:  # a quotient
+        residuals = entries[:, :2] / entries[:, 2:]
+        slopes = changes[:, :2] - changes[:, 2:] * residuals[:, :, None]
+        slopes /= entries[:, 2:, None]
+    common, own = np.split(slopes[:, :, None], 2, axis=3)
+    J = np.concatenate([common, alpha[:, None, :, None] * own], axis=2)
     return residuals.ravel(), J.reshape(residuals.size, -1)
 
 
-def _between(A: NDArray, matrices: NDArray, B: NDArray) -> NDArray:
-    """Return ``A_i D_n B_i^T`` (I, p, n, q), for matrices D_n side by side (3, 3 n)."""
-    products = (A @ matrices).reshape(len(A), -1, 3) @ B.mT
-    return products.reshape(len(A), A.shape[1], -1, B.shape[1])
+def normal_equations(r: NDArray, J: NDArray) -> tuple[float, NDArray, NDArray]:
+    """Return the cost of residuals r, ``J^T J`` and ``J^T r``."""
+    return float(r @ r), J.T @ J, J.T @ r
 
 
 def levenberg_marquardt(
-    evaluated: Callable[[State], tuple[float, NDArray, NDArray]],
-    state: State,
-    moved: Callable[[State, NDArray], State],
+    evaluated: Callable[[NDArray], tuple[float, NDArray, NDArray]],
+    moved: Callable[[NDArray, NDArray], NDArray],
+    state: NDArray,
     *,
     max_steps: int,
     shortest_step: float = 0.0,
     least_gain: float = -np.inf,
-) -> tuple[State, float]:
-    """Minimise a sum of squares; return the last state and its cost.
+) -> tuple[NDArray, float, NDArray]:
+    """Minimise a sum of squares; return the last state, its cost and ``J^T J``.
 
     `evaluated` returns the cost of a state, ``J^T J`` and ``J^T r``; `moved` the state
     after a step (n_unknowns,). The iteration ends when no entry of a step is larger
@@ -276,7 +234,7 @@ def levenberg_marquardt(
             damping *= 4.0
         if ended:
             break
-    return state, cost
+    return state, cost, curvature
 
 
 def safe_start(motion: NDArray, G: NDArray, camera: CalibratedCamera) -> NDArray:
@@ -298,46 +256,47 @@ def safe_start(motion: NDArray, G: NDArray, camera: CalibratedCamera) -> NDArray
 def refine_metric(
     motion: NDArray,
     alpha: NDArray,
-    start: MetricFit,
+    start: NDArray,
     camera: CalibratedCamera,
     ridge: float = 0.0,
     shortest_step: float = 1e-9,
 ) -> MetricFit:
-    """Minimise ``sum_i |residuals_i|^2 + ridge * sum_k ||E_k||_F^2`` from a start.
+    """Minimise ``sum_i |residuals_i|^2 + ridge * sum_k ||E_k||_F^2`` from a metric.
 
-    Cameras (I, 2, 3) are finite and not zero, alpha is (I, K).
+    Cameras (I, 2, 3) are finite and not zero, alpha is (I, K), the start (K + 1, 3, 3).
     """
     # The unknowns of a step are coordinates in this basis: of E_0, which is zero at
     # each iterate, and of the strains E_k.
     basis = strain_basis(camera)
-    size = len(basis)
-    ridges = np.repeat([0.0, ridge], [size, size * alpha.shape[1]])
+    ridges = np.repeat([0.0, ridge], len(basis) * np.array([1, alpha.shape[1]]))
     gram = np.einsum("ira,irb->ab", motion, motion)
     # Bound of the change of the metric of a frame by one entry of a step
     reach = 1.0 + np.abs(alpha).sum(axis=1).max(initial=0.0)
 
-    def evaluated(fit: MetricFit) -> tuple[float, NDArray, NDArray]:
+    def evaluated(metric: NDArray) -> tuple[float, NDArray, NDArray]:
         """Return the objective; infinite where space hardly has depth."""
-        values = np.linalg.eigvalsh(fit.Q.T @ gram @ fit.Q)
+        Q, strain = metric[0], metric[1:]
+        terms = [
+            normal_equations(*linearised(motion[part] @ Q, alpha[part], strain, camera))
+            for part in gen_batches(len(motion), BLOCK_FRAMES)
+        ]
+        cost, curvature, gradient = (sum(each) for each in zip(*terms, strict=True))
+        numbers = np.einsum("kab,nab->kn", metric, basis).ravel()
+        values = np.linalg.eigvalsh(Q.T @ gram @ Q)
         deep = values[0] > OF_RANKS * values[-1]
-        cost = fit.cost + ridge * float(np.sum(fit.strain**2)) if deep else np.inf
-        numbers = np.einsum("kab,nab->kn", fit.strain, basis)
-        pull = ridges * np.append(np.zeros(size), numbers)
-        return cost, fit.curvature + np.diag(ridges), fit.gradient + pull
+        objective = float(cost + ridges @ numbers**2) if deep else np.inf
+        return objective, curvature + np.diag(ridges), gradient + ridges * numbers
 
-    def moved(fit: MetricFit, step: NDArray) -> MetricFit:
-        """Return the fit after a step that changes no log metric by more than 2."""
+    def moved(metric: NDArray, step: NDArray) -> NDArray:
+        """Return the metric after a step that changes no log metric by more than 2."""
         step = step * min(1.0, 2.0 / max(reach * np.abs(step).max(), 1e-300))
-        change, *strains = np.tensordot(step.reshape(-1, size), basis, 1)
-        strain = fit.strain + np.reshape(strains, fit.strain.shape)
-        return fit_at(motion, alpha, fit.Q @ exponential(change / 2), strain, camera)
+        changes = np.tensordot(step.reshape(-1, len(basis)), basis, 1)
+        values, axes = np.linalg.eigh(changes[0] / 2)
+        Q = metric[0] @ ((axes * np.exp(values)) @ axes.T)
+        return np.concatenate([Q[None], metric[1:] + changes[1:]])
 
-    return levenberg_marquardt(
-        evaluated, start, moved, max_steps=200, shortest_step=shortest_step
-    )[0]
-
-
-def exponential(matrices: NDArray) -> NDArray:
-    """Return the exponentials of symmetric matrices (..., 3, 3)."""
-    values, axes = np.linalg.eigh(matrices)
-    return (axes * np.exp(values)[..., None, :]) @ axes.mT
+    metric, cost, curvature = levenberg_marquardt(
+        evaluated, moved, start, max_steps=200, shortest_step=shortest_step
+    )
+    cost -= ridge * float(np.sum(metric[1:] ** 2))
+    return MetricFit(metric, len(motion), cost, curvature)

@@ -5,24 +5,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._linalg.small_matrices import procrustes
-from isa_nrsfm._metric_upgrade.metric import (
-    CalibratedCamera,
+from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm.calibration._metric import (
     MetricFit,
-    exponential,
-    fit_at,
     refine_metric,
-    strain_basis,
 )
-from isa_nrsfm._metric_upgrade.rigid import (
+from isa_nrsfm.calibration._metric_upgrade import (
     fit_metric,
-    nearest_rotations,
     symmetric_upgrade,
     usable_cameras,
     warn_if_degenerate,
 )
-from isa_nrsfm._tables.tracks import of_all_rows
 
 
 class DeformationMetric(NamedTuple):
@@ -130,9 +126,9 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
     fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
-    # The symmetric Q is fit.Q times a rotation, which turns the strains as well.
-    turn, Q = symmetric_upgrade(fit.Q, cameras)
-    strain = turn @ fit.strain @ turn.T
+    # The symmetric Q is the fitted one times a rotation, which turns the strains.
+    turn, Q = symmetric_upgrade(fit.metric[0], cameras)
+    strain = turn @ fit.metric[1:] @ turn.T
     warn_if_degenerate(fit.condition_number)
     return DeformationMetric(Q, strain, fit.residual, fit.condition_number)
 
@@ -225,22 +221,19 @@ def euclidean_frames(
     # The metric of each frame. Unusual coefficients stretch no direction by more than
     # exp(1 / 2).
     stretch, axes = np.linalg.eigh(np.tensordot(weights, metric.strain, 1))
-    stretch = np.clip(stretch, -1.0, 1.0)
-    strain = (axes * stretch[:, None]) @ axes.mT
-    Q = metric.Q @ exponential(strain / 2)
+    growth = np.exp(np.clip(stretch, -1.0, 1.0) / 2)
+    Q = metric.Q @ (axes * growth[:, None]) @ axes.mT
+    cameras = cameras @ Q
     shapes = mean + np.tensordot(weights, directions, 1)
     shapes = shapes @ np.linalg.inv(Q).mT
-    rotations, stretches = nearest_rotations(cameras @ Q)
-    scales = np.trace(stretches, axis1=1, axis2=2) / 2
-    # A camera is a stretch times a rotation. In the axes of the image, the stretch is
-    # moved to the shape, and the scaled rotation remains.
-    seen = shapes @ rotations.mT
-    seen[:, :, :2] = seen[:, :, :2] @ (stretches / scales[:, None, None])
-    shapes = seen @ rotations
+    # A camera is a stretch times rows of a rotation. In the axes of the image, the
+    # stretch is moved to the shape, and the scaled rotation remains.
+    rows, scales = nearest_calibrated(cameras)
+    shapes = shapes + shapes @ rows.mT @ (cameras / scales[:, None, None] - rows)
     # The rotation nearest to the mean shape.
     mean = (mean - mean.mean(axis=0)) @ np.linalg.inv(metric.Q).T
     turns = procrustes(shapes.mT @ mean)
-    parts = shapes @ turns, rotations @ turns, scales
+    parts = shapes @ turns, full_rotations(rows)[0] @ turns, scales
     return EuclideanFrames(*(of_all_rows(values, usable) for values in parts))
 
 
@@ -249,30 +242,29 @@ def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
 
     Starts without strains. Usable cameras are (I, 2, 3), coefficients (I, K).
     """
-    camera: CalibratedCamera = "weak_perspective"
-    size = len(strain_basis(camera))
+    size = len(rigid.curvature)
     n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, OF_DIFFERENCES**2)
     # Larger strains than these are taken for errors of the affine cameras.
     variance = most_variance = 0.3**2
-    none = np.zeros((alpha.shape[1], 3, 3))
-    fit = fit_at(cameras, alpha, rigid.Q, none, camera)
+    metric = np.concatenate([rigid.metric, np.zeros((alpha.shape[1], 3, 3))])
     for _ in range(15):
         ridge = noise / variance
-        fit = refine_metric(cameras, alpha, fit, camera, ridge, 1e-4)
+        fit = refine_metric(cameras, alpha, metric, "weak_perspective", ridge, 1e-4)
+        metric = fit.metric
         # Curvature in the strains, with the common metric eliminated (a Schur
         # complement), and the effective number of strain parameters from it.
         mixed = fit.curvature[:size, size:]
         inverse = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
         own = fit.curvature[size:, size:] - mixed.T @ inverse @ mixed
-        values = np.maximum(np.linalg.eigvalsh(own), 0.0)
-        n_effective = float(np.sum(values / (values + ridge)))
+        values = np.maximum(np.linalg.eigvalsh(own), ridge)
+        n_effective = float(np.sum(1.0 - ridge / values))
         # The two variances: sums of squares over effective numbers (MacKay).
         freedom = max(n_equations - size - n_effective, 0.1 * n_equations)
         previous = noise, variance
         noise = max(fit.cost / freedom, OF_DIFFERENCES**2)
-        variance = np.sum(fit.strain**2) / max(n_effective, 1e-3)
+        variance = np.sum(metric[1:] ** 2) / max(n_effective, 1e-3)
         variance = np.clip(variance, OF_DIFFERENCES, most_variance)
         if np.abs(np.log([noise, variance]) - np.log(previous)).max() < 0.05:
             break
-    return refine_metric(cameras, alpha, fit, camera, ridge)
+    return refine_metric(cameras, alpha, metric, "weak_perspective", ridge)

@@ -1,0 +1,292 @@
+"""The fit of each frame after the joint fit, and the errors of both.
+
+Reliability of the coefficients: the share of their variance that is signal.
+
+Errors of a fit with calibrated cameras, by leaving out groups of its points: unmodelled
+deformation is correlated between neighbouring points and between frames, and part of it
+resembles a rotation. A posterior covariance with independent noise is
+therefore too small. The delete-a-group jackknife (Efron and Stein, The Annals of
+Statistics, 1981) needs no model of the noise: from fits without each of g groups of
+neighbouring points the variance of an estimate t is ::
+
+    (g - 1) / g sum_g (t_g - t)^2.
+
+These fits do not have the prior of the extents, which would hide uncertain depths.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    distances,
+    full_rotations,
+    stacked_motion,
+)
+from isa_nrsfm._frames.models import (
+    NOT_ESTIMATED,
+    Decomposition,
+    DepthCertainty,
+    PosteriorFrames,
+)
+from isa_nrsfm._frames.search import FramePosterior
+from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.problem import JOINT_OPTIONS, JointState, refine_joint
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.tracks import FEWEST_POINTS
+
+# With a robust loss, points with residuals above this threshold, in standard deviations
+# of a coordinate, are left out. Without outliers this is one point in 3,000.
+OUTLYING = 4.0
+# Directions of the coefficients with a lower reliability are not supported by the
+# table. Pure noise has reliability zero.
+LEAST_RELIABILITY = 0.1
+# Groups have equal size. With k-means groups the errors are half too large.
+N_GROUPS = 5
+# Largest number of steps of a fit, and its convergence tolerance. 30 steps understate
+# the errors of undetermined depths. A tolerance of 1e-6 changes determined ones by less
+# than 2 %; 1e-2 understates undetermined ones.
+MOST_STEPS, TOL = 100, 1e-3
+# Largest numbers of frames and points of the fits. With 100 frames one deviation
+# changed from 12 to 19 %. Points are assigned to groups in cubic time.
+MOST_FRAMES, MOST_POINTS = 200, 200
+# Floor of the noise variance of the fits, as a share of the mean square. Without noise,
+# surplus basis shapes leave the depth undetermined, and fits stay near their start.
+# Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
+# %, the floor changes no deviation by more than a third.
+LEAST_NOISE = 1e-6
+
+
+def inlying_rows(
+    model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
+) -> tuple[NDArray, FramePosterior]:
+    """Return frames (n, 2, J) of size one with outliers as NaN, and their fit."""
+    fit = model.posterior(rows, covariances=False, weights=weights)
+    if model.loss != "linear":
+        off = distances(rows, model.shapes, *fit[:3])
+        outlying = off > OUTLYING * np.sqrt(model.noise_variance)
+        rows = np.where(outlying[:, None], np.nan, rows)
+    return rows, fit
+
+
+def fitted_frames(
+    model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
+) -> tuple[FrameBlocks, NDArray, NDArray, NDArray]:
+    """Return the fits of all frames in blocks of FramePosterior, before the gauge.
+
+    Also returns cameras, coefficients, and the mean of their covariances (K, K).
+    """
+    if model.loss == "linear":
+        model = replace(model, shapes=frames.coordinates(model.shapes))
+        posteriors = frames.blocks.derive(model.prepared_posterior)
+    else:
+        posteriors = rows.derive(model.posterior)
+    parts = posteriors.map(lambda fit: (fit.motion, fit.alpha, fit.covariance.sum(0)))
+    motion, alpha, covariance = zip(*parts, strict=True)
+    total = np.sum(covariance, axis=0) / posteriors.n_frames
+    return posteriors, np.concatenate(motion), np.concatenate(alpha), total
+
+
+def shape_uncertainty(
+    motion: NDArray,
+    alpha: NDArray,
+    covariance: NDArray,
+    share: NDArray,
+    slices: Sequence[slice],
+) -> NDArray:
+    """Return the covariance of a point of the shapes for noise of variance one.
+
+    The inverse of ``sum_i share_i E_i (x) M_i^T M_i``, with the second moments E_i of
+    (1, alpha) and the mean weight of the points of frame i, zero for missing ones. The
+    sum is over slices of frames.
+    """
+    seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
+    information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
+    for frames in slices:
+        X = stacked_motion(motion[frames], alpha[frames])
+        information += X.T @ (np.repeat(share[frames], 2)[:, None] * X)
+    return np.linalg.pinv(information, hermitian=True)
+
+
+def shown_frames(
+    posterior: FramePosterior,
+    sizes: NDArray,
+    n_seen: NDArray,
+    weight: NDArray,
+    frames: PosteriorFrames,
+    uncertainty: NDArray,
+) -> tuple[Decomposition, NDArray, float]:
+    """Return fits in the gauge, and the effect of their noise on their coefficients.
+
+    The noise of frame i changes the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
+    M_i``. This shifts the coefficients of the frame by ``w_i s2_i Sigma_i / s2 tr(M_i
+    (N^-1 X_i^T)_k)`` on average, with the sum w_i of the weights of its points. The
+    second result (K, K) is the sum over the frames of ``alpha_i`` times that shift
+    times s2, the third the sum of s2_i.
+    """
+    motion, alpha = posterior.motion, posterior.alpha
+    X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
+    Z = X @ uncertainty
+    # Degrees of freedom of the residual, without the parameters of the shapes
+    leverage = np.einsum("irp,irp->i", X, Z)
+    n_pose = 2 + CAMERAS[frames.camera].n_parameters
+    mean = weight / n_seen
+    freedom = np.maximum(n_seen * (2.0 - mean * leverage) - n_pose, 1.0)
+    noise = posterior.objective / mean / freedom
+    own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
+    shift = np.einsum("i,ikl,il->ik", weight * noise, posterior.covariance, own)
+    return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
+
+
+def reliabilities(
+    alpha: NDArray, covariance: NDArray, moments: NDArray, noise: float
+) -> NDArray:
+    """
+    Return the shares of the variance of coefficients that are signal.
+
+    These are squared correlations (K,) of the coefficients alpha (I, K) with the true
+    ones, along uncorrelated directions, decreasing. The covariance is the mean
+    posterior one; moments and noise are sums over the blocks of `shown_frames`.
+
+    With known shapes they are the eigenvalues of ``(S + C)^-1 S``, with S the second
+    moment of the coefficients and C the mean covariance: ``S + C`` is the whole
+    variance. Estimated shapes follow the noise. A shape of ``gamma`` numbers a frame
+    raises the variance along it from ``1 + l`` to ``y = (1 + l) (1 + gamma / l)`` noise
+    variances, and noise alone to ``(1 + sqrt(gamma))^2``. The squared correlation is
+    ``(l^2 - gamma) / (l (l + 1))`` (Benaych-Georges, Nadakuditi, "The singular values
+    and vectors of low rank perturbations of large rectangular random matrices", 2012).
+    Here ``y = 1 / (1 - share)``; gamma is y times the share of S that is chance.
+    """
+    known = alpha / np.sqrt(len(alpha))  # known.T @ known is S
+    variance, axes = np.linalg.eigh(known.T @ known + covariance)
+    kept = variance > 1e-14 * variance[-1]  # others are rounding errors
+    white = axes[:, kept] / np.sqrt(variance[kept])
+    # Squared singular values are the eigenvalues, with less rounding error.
+    _, deviations, turn = np.linalg.svd(known @ white, full_matrices=False)
+    own = white @ turn.T
+    share = deviations**2
+    left = np.einsum("kd,kl,ld->d", own, covariance, own)  # 1 / y
+    caused = np.einsum("kd,kl,ld->d", own, moments, own) / (noise or 1.0)
+    # The factor is a margin for chance. With it all reliabilities are zero on tables of
+    # rigid objects (60 to 1,000 frames, 68 to 478 points, one to four basis shapes).
+    # Without it some are 0.9 (``python -m benchmarks.recovery rigid``).
+    gamma = 1.5 * np.maximum(caused, 0.0)  # gamma share / y
+    gamma = np.divide(gamma, share, where=share > 0, out=np.ones_like(share))
+    rest = share - gamma
+    real = (rest > 0) & (rest**2 > 4 * gamma * left)
+    rest, gamma, left = rest[real], gamma[real], left[real]
+    signal = (rest + np.sqrt(rest**2 - 4 * gamma * left)) / 2  # l / y
+    correlation = (signal**2 - gamma * left) / (signal * (signal + left))
+    shares = np.zeros(len(kept))
+    shares[: len(signal)] = np.sort(correlation)[::-1]
+    return shares
+
+
+def depth_certainty(
+    frames: PosteriorFrames, rows: FrameBlocks, weights: NDArray | None = None
+) -> DepthCertainty:
+    """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
+
+    Weights (I, J) are numbers of observations, by default one.
+    """
+    n_frames, n_points = rows.n_frames, frames.shapes.shape[2]
+    chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
+    part = np.asarray(rows.take(chosen), dtype=np.float64)
+    w = None if weights is None else weights[chosen]
+    part, fit = inlying_rows(frames, part, w)
+    points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
+    part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
+    left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
+    seen = np.asarray(np.isfinite(part).all(axis=1))
+    least = np.min([seen[:, ~group].sum(axis=1) for group in left_out], axis=0)
+    known = np.isfinite(fit.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
+    if known.sum() < 2:
+        return NOT_ESTIMATED
+    w = None if w is None else w[np.ix_(known, points)]
+    shapes, motion = frames.shapes[:, :, points], fit.motion[known]
+    tracks = part[known]
+
+    def refit(kept: NDArray) -> _Refit:
+        """Return a fit of some points, by a few steps from the fit of all points."""
+        rows, chosen = tracks[:, :, kept], shapes[:, :, kept]
+        blocks = FrameBlocks.of_array(rows, len(rows))
+        counts = None if w is None else w[:, kept]
+        part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
+        n_numbers, energy = part.totals
+        penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
+        likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
+        noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
+        least = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
+        start = JointState(chosen - chosen.mean(axis=2, keepdims=True), motion, noise)
+        limits: Any = {"least_noise": least, "max_iter": MOST_STEPS, "tol": TOL}
+        state = refine_joint(likelihood, start, CAMERAS[frames.camera], **limits).state
+        rotations, scales = full_rotations(state.motion)
+        alpha = likelihood(*state).alpha
+        z = np.einsum("ia,kaj->ikj", rotations[:, 2], state.shapes)
+        z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", alpha, z[:, 1:]))
+        return _Refit(kept, rotations, alpha, z - z.mean(axis=1, keepdims=True))
+
+    whole = refit(np.ones(len(points), dtype=bool))
+    errors = [refit(~group).errors(whole) for group in left_out]
+    sums = (np.sum(terms, axis=0) for terms in zip(*errors, strict=True))
+    total, turns, variances = ((N_GROUPS - 1) / N_GROUPS * each for each in sums)
+    # Each point is left out of one of the fits
+    variances *= N_GROUPS / (N_GROUPS - 1)
+    nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
+    # Rotations out of the image plane, and their residuals of a regression on alpha.
+    mean_view = Rotation.from_matrix(whole.rotations).mean()
+    vectors = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
+    predictors = np.column_stack([np.ones(len(vectors)), whole.alpha])
+    rest = vectors[:, :2] - predictors @ np.linalg.lstsq(predictors, vectors[:, :2])[0]
+    freedom = max(len(rest) - predictors.shape[1], 1)
+    turning = float(np.sqrt(np.sum(rest**2) / freedom))
+    return DepthCertainty(float(np.sqrt(total)), turning, turns, variances[nearest])
+
+
+def neighbours(points: NDArray) -> NDArray:
+    """Assign points (3, n_points) to groups of equal size around distant points."""
+    centred = points.T - points.mean(axis=1)
+    centres = [np.argmax(np.sum(centred**2, axis=1))]
+    while len(centres) < N_GROUPS:
+        centres.append(np.argmax(cdist(centred, centred[centres]).min(axis=1)))
+    sizes = np.full(N_GROUPS, len(centred) // N_GROUPS)
+    sizes[: len(centred) % N_GROUPS] += 1
+    places = np.repeat(np.arange(N_GROUPS), sizes)
+    squares = cdist(centred, centred[centres][places], "sqeuclidean")
+    return places[linear_sum_assignment(squares)[1]]
+
+
+class _Refit(NamedTuple):
+    """A fit of the kept points: rotations (I, 3, 3), alpha (I, K), centred depths."""
+
+    kept: NDArray
+    rotations: NDArray
+    alpha: NDArray
+    depths: NDArray
+
+    def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray]:
+        """Compute squared differences from the fit of all points.
+
+        Relative square of the depths; mean products of the rotation vectors (3, 3);
+        mean squares of the depths (n_points,).
+        """
+        z = whole.depths[:, self.kept]
+        z = z - z.mean(axis=1, keepdims=True)
+        mirror = np.array([1.0, 1.0, np.sign(np.sum(self.depths * z))])
+        off = mirror[2] * self.depths - z
+        points = np.zeros(len(self.kept))
+        points[self.kept] = np.mean(off**2, axis=0)
+        # Rotations up to a common rotation of the object
+        turned = Rotation.from_matrix(mirror[:, None] * self.rotations * mirror)
+        rotations = Rotation.from_matrix(whole.rotations)
+        w = (turned * (turned.inv() * rotations).mean() * rotations.inv()).as_rotvec()
+        turns = w.T @ w / len(w)
+        turns[2, :2] = turns[:2, 2] = 0.0  # the mirror image has the other sign
+        return float(np.sum(off**2) / np.sum(z**2)), turns, points

@@ -1,1 +1,0 @@
-"""The Euclidean metric of space, from affine cameras."""
