@@ -1,4 +1,6 @@
-"""Fits of single frames: exactness, invariances and degenerate input, all cameras."""
+"""The most probable camera, position and coefficients of frames, by Newton's method."""
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,8 +16,18 @@ from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import images, random_rotation, random_scene, with_gaps
 
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, frame_search
-from isa_nrsfm._frames.point_sums import frame_tracks
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.models import (
+    FrameMap,
+    PosteriorFrames,
+    frame_search,
+    spread_starts,
+)
+from isa_nrsfm._frames.newton import AffineSearch
+from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
+from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch, Minimum, State
+from isa_nrsfm._linalg.small_matrices import LANES, unpacked
 from isa_nrsfm._tables.blocks import block_slices
 
 NOISE = 0.02
@@ -254,10 +266,6 @@ class TestDegenerate:
         assert fits.motion.shape == (0, 2, 3)
 
 
-CAMERAS = ["affine", "weak_perspective", "orthographic"]
-NOISE = 0.02
-
-
 def model_and_tracks(camera, seed=0, *, extent=(1.0, 1.0, 0.5), n_components=3):
     scene = scenes.random_scene(
         seed, 40, 12, n_components, camera=camera, noise=NOISE, extent=extent
@@ -333,3 +341,340 @@ def test_no_block_of_several_has_one_frame(n, length):
     lengths = [part.stop - part.start for part in slices]
     assert all(1 < each <= length + 1 for each in lengths[-1:] if n > 1)
     assert lengths[:-1] == [length] * (len(slices) - 1)
+
+
+def noisy_scene(seed, noise=NOISE, n_frames=30):
+    """Return tracks, shapes (n_components + 1, 3, n_points) and what made them."""
+    scene = scenes.random_scene(seed, n_frames, noise=noise)
+    return scene.tracks, scene.shapes, camera_and_alpha(scene)
+
+
+def cost(tracks, shapes, variance, fits):
+    """Return f of each frame by its definition."""
+    difference = tracks - images(shapes, fits.motion, fits.translation, fits.alpha)
+    squares = np.nansum(difference**2, axis=(1, 2))
+    return squares + variance * np.sum(fits.alpha**2, axis=1)
+
+
+def energy_of(tracks):
+    """Return the largest energy of a frame; rounding errors are relative to it."""
+    centred = tracks - np.nanmean(tracks, axis=1, keepdims=True)
+    return np.nansum(centred**2, axis=(1, 2)).max()
+
+
+def problem_of(tracks, shapes, variance, weights=None):
+    """Return the search for shapes, and the frames as it takes them."""
+    search = AffineSearch(shapes)
+    products = frame_sums(
+        frame_tracks(tracks.transpose(0, 2, 1), weights), search.shared
+    )
+    return search, search.problem(products, np.full(len(tracks), variance))
+
+
+class TestOptimum:
+    @pytest.mark.parametrize("gaps", [False, True])
+    def test_objective_by_definition_rises_in_every_direction(self, gaps):
+        tracks, shapes, _ = noisy_scene(0)
+        if gaps:
+            tracks = with_gaps(tracks)
+        rng = np.random.default_rng(1)
+        fits = fit_posterior(tracks, shapes, NOISE**2)
+        least = cost(tracks, shapes, NOISE**2, fits)
+        assert_allclose(fits.objective, least, atol=1e-12 * energy_of(tracks))
+        for _ in range(20):
+            change = [rng.normal(size=each.shape) for each in camera_and_alpha(fits)]
+            rises = []
+            for size in (-1e-4, 1e-4):
+                moved = [
+                    x + size * d
+                    for x, d in zip(camera_and_alpha(fits), change, strict=True)
+                ]
+                moved = fits._replace(
+                    motion=moved[0], translation=moved[1], alpha=moved[2]
+                )
+                rises.append(cost(tracks, shapes, NOISE**2, moved) - least)
+            # Equal on both sides: the slope is zero, not only small.
+            assert (np.array(rises) > 0).all()
+            assert_allclose(rises[0], rises[1], rtol=1e-2)
+
+    def test_derivatives_by_differences(self):
+        tracks, shapes, _ = noisy_scene(0, n_frames=5)
+        weights = np.random.default_rng(1).uniform(0, 2, tracks.shape[:2])
+        for w in (None, weights):
+            search, problem = problem_of(tracks, shapes, NOISE, w)
+            alpha = np.random.default_rng(2).normal(size=(3, 5))
+            state = search.evaluate(problem, alpha)
+            h = 1e-5
+            for k in range(3):
+                e = h * np.eye(3)[:, [k]]
+                above = search.evaluate(problem, alpha + e)
+                below = search.evaluate(problem, alpha - e)
+                slope = (below.value - above.value) / (4 * h)
+                assert_allclose(state.slope[k], slope, rtol=1e-6, atol=1e-7)
+                bend = (below.slope - above.slope) / (2 * h)
+                assert_allclose(
+                    unpacked(state.hessian)[:, k], bend, rtol=1e-6, atol=1e-6
+                )
+
+    @pytest.mark.parametrize("gaps", [False, True])
+    def test_covariance_is_that_of_all_unknowns_together(self, gaps):
+        tracks, shapes, _ = noisy_scene(0, n_frames=4)
+        if gaps:
+            tracks = with_gaps(tracks)
+        fits = fit_posterior(tracks, shapes, NOISE**2)
+
+        def f(i, x):
+            one = fits._replace(
+                motion=x[None, :6].reshape(1, 2, 3),
+                translation=x[None, 6:8],
+                alpha=x[None, 8:],
+            )
+            return cost(tracks[i : i + 1], shapes, NOISE**2, one)[0]
+
+        h = 1e-3
+        for i in range(len(tracks)):
+            x = np.concatenate([each[i].ravel() for each in camera_and_alpha(fits)])
+            hessian = np.empty((11, 11))
+            for p in range(11):
+                for q in range(11):
+                    a, b = h * np.eye(11)[p], h * np.eye(11)[q]
+                    corners = f(i, x + a + b) + f(i, x - a - b)
+                    corners -= f(i, x + a - b) + f(i, x - a + b)
+                    hessian[p, q] = corners / (4 * h * h)
+            # The posterior density is exp(-f / (2 s2)).
+            expected = np.linalg.inv(hessian / (2 * NOISE**2))[8:, 8:]
+            assert_allclose(fits.covariance[i], expected, rtol=1e-3, atol=1e-7)
+
+
+class TestSpecial:
+    @pytest.mark.parametrize("n_frames", [30, 32])
+    def test_complete_frames_among_others(self, n_frames):
+        tracks, shapes, _ = noisy_scene(0, n_frames=32)
+        tracks[::7] = with_gaps(tracks[::7], 0)
+        expected = fit_posterior(tracks[:23], shapes, NOISE**2)
+        fits = fit_posterior(tracks[:n_frames], shapes, NOISE**2)
+        assert_array_equal(fits.motion[:23], expected.motion)
+
+    def test_flat_shapes_have_cameras_that_are_zero_across(self):
+        tracks, shapes, _ = noisy_scene(0)
+        shapes[:, 2] = 0
+        R = random_rotation(0)
+        fits = fit_posterior(tracks, R @ shapes, NOISE**2)
+        assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
+        fits = fit_posterior(tracks, (R @ shapes)[:1], NOISE**2)
+        assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def mocap(load_data):
+    """Return the tracks of a moving body, and shapes that explain them."""
+    return fitted_shapes(load_data("akhter_yoga")["W2d"], 2)
+
+
+def fitted_shapes(tracks, n_components):
+    """Return unit-scaled tracks, shapes, starts and noise variance of a fit to them."""
+    model = AffineNRSfM(n_components, random_state=0)
+    model.fit(tracks.reshape(len(tracks), -1).astype(float))
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    size = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+    frames = model._model.frames
+    return centred / size, frames.shapes, frames.starts, frames.noise_variance
+
+
+class TestStarts:
+    def best(self, tracks, shapes, variance):
+        """Return the least objectives from twenty random starts."""
+        rng = np.random.default_rng(0)
+        starts = rng.normal(size=(20, len(shapes) - 1)) * np.repeat([1, 2], 10)[:, None]
+        found = [fit_posterior(tracks, shapes, variance).objective]
+        for start in starts:
+            initial = np.tile(start, (len(tracks), 1))
+            fits = fit_posterior(tracks, shapes, variance, initial=initial)
+            found.append(fits.objective)
+        return np.min(found, axis=0)
+
+    def test_large_motion_needs_them(self, mocap):
+        tracks, shapes, starts, variance = mocap
+        least = self.best(tracks, shapes, variance)
+        zero = fit_posterior(tracks, shapes, variance)
+        fits = fit_posterior(tracks, shapes, variance, starts=starts)
+        assert (fits.objective <= zero.objective).all()
+        assert (zero.objective > 1.1 * least).any()
+        assert np.mean(fits.objective <= 1.001 * least) >= 0.995
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("gaps", [0.0, 0.4])
+    def test_faces_do_not(self, load_data, gaps):
+        tracks = load_data("faces_wild_68_combined")["W2d"][::8]
+        tracks, shapes, _, variance = fitted_shapes(tracks, 9)
+        tracks = with_gaps(tracks[::2], gaps)
+        least = self.best(tracks, shapes, variance)
+        fits = fit_posterior(tracks, shapes, variance)
+        assert np.mean(fits.objective <= 1.001 * least) >= 0.995
+        assert fits.converged.all()
+
+    def test_every_search_ends_in_a_minimum(self, mocap):
+        tracks, shapes, _, variance = mocap
+        search, problem = problem_of(tracks, shapes, variance)
+        rng = np.random.default_rng(0)
+        for size in (0.0, 1.0, 3.0):
+            start = size * rng.normal(size=(len(shapes) - 1, len(tracks)))
+            before = search.evaluate(problem, start)
+            found, there = search.descend(problem, before, MAX_STEPS)
+            state = search.evaluate(problem, found)
+            assert (state.value <= before.value + 1e-12 * problem.energy).all()
+            assert there.mean() > 0.995
+            assert (np.linalg.eigvalsh(unpacked(state.hessian).T)[there] > 0).all()
+            step, _ = search.step(state, np.zeros(len(tracks)))
+            assert np.abs(step[:, there]).max() < 1e-7
+
+    def test_frames_that_the_noise_explains_keep_theirs(self):
+        tracks, shapes, _ = noisy_scene(0)
+        starts = np.random.default_rng(1).normal(size=(5, 3))
+        tracks[3] += 0.5 * np.random.default_rng(2).normal(size=(20, 2))
+        # By the chi-squared distribution of their objectives
+        poor = fit_posterior(tracks, shapes, NOISE**2).objective > 3 * 32 * NOISE**2
+        assert poor[3]
+        assert np.sum(poor) <= 2
+        expected = fit_posterior(tracks, shapes, NOISE**2)
+        fits = fit_posterior(tracks, shapes, NOISE**2, starts=starts)
+        assert_same_fits(fits, expected, atol=1e-11)
+
+
+class TestSpreadStarts:
+    def test_by_hand(self):
+        alpha = np.array([[1.0, 0], [0, 4], [0, -3], [3, 0], [np.nan, 9], [0, 3.9]])
+        assert_array_equal(spread_starts(alpha, 3), [[0, 4], [0, -3], [3, 0]])
+
+    def test_order_of_the_frames(self):
+        alpha = np.random.default_rng(0).normal(size=(50, 3))
+        assert_array_equal(spread_starts(alpha[::-1], 5), spread_starts(alpha, 5))
+
+    def test_fewer_than_wanted(self):
+        assert_array_equal(spread_starts(np.array([[1.0], [1.0]]), 4), [[1.0]])
+        assert spread_starts(np.zeros((5, 2)), 4).shape == (0, 2)
+        assert spread_starts(np.zeros((0, 2)), 4).shape == (0, 2)
+        assert spread_starts(np.zeros((5, 0)), 4).shape == (0, 0)
+
+
+class Frames(NamedTuple):
+    a: np.ndarray
+    energy: np.ndarray
+
+
+class Wells(FrameSearch):
+    """The functions ``x^4 / 4 - a x^2 / 2`` of frames, with minima ``+- sqrt(a)``."""
+
+    def __init__(self, a, energy=1.0):
+        a = np.array(a, dtype=float)
+        self.problem = Frames(a, np.full_like(a, energy))
+        self.tried = []  # numbers of frames
+        self.model = CAMERAS["affine"]  # steps are added
+
+    def value(self, x, a):
+        return x[0] ** 4 / 4 - a * x[0] ** 2 / 2
+
+    def evaluate(self, problem, x):
+        self.tried.append(x.shape[1])
+        slope, hessian = problem.a * x - x**3, 3 * x**2 - problem.a
+        value = self.value(x, problem.a)
+        return State(x, value, slope / 2, np.ones_like(x), hessian / 2)
+
+
+def ended(wells, start, max_steps=60, known=None):
+    start = wells.evaluate(wells.problem, np.array([start], dtype=float))
+    found, converged = wells.descend(wells.problem, start, max_steps, known)
+    return found[0], converged
+
+
+class TestMinima:
+    def test_are_those_of_the_side_that_frames_start_from(self):
+        a = np.array([1.0, 4.0, 0.25, 9.0, 1.0])
+        start = np.array([0.1, -0.1, 3.0, -20.0, 1.0])
+        found, converged = ended(Wells(a), start)
+        assert_allclose(found, np.sign(start) * np.sqrt(a), rtol=1e-7)
+        assert converged.all()
+
+    def test_frames_are_separate(self):
+        a, start = [1.0, 4.0, 0.25], [0.1, -7.0, 3.0]
+        together, _ = ended(Wells(a), start)
+        alone = [ended(Wells([x]), [y])[0][0] for x, y in zip(a, start, strict=True)]
+        assert_array_equal(together, alone)
+
+    @pytest.mark.parametrize("max_steps", range(8))
+    def test_value_never_rises(self, max_steps):
+        problem = Wells([1.0, 4.0, 2.0])
+        start = np.array([0.01, 1.2, -0.6])
+        ends = (ended(problem, start, n)[0] for n in range(max_steps + 1))
+        values = [problem.value(end[None], problem.problem.a) for end in ends]
+        assert (np.diff(values, axis=0) <= 1e-13).all()
+
+    def test_steps_that_raise_the_value_are_refused(self):
+        # The Newton step from here, x = 0.6, is beyond the other minimum and higher.
+        problem = Wells([1.0])
+        state = problem.evaluate(problem.problem, np.array([[0.6]]))
+        step, _ = problem.step(state, np.zeros(1))
+        assert problem.value(state.position + step, 1.0) > state.value
+        found, converged = ended(problem, [0.6])
+        assert_allclose(np.abs(found), 1.0, rtol=1e-7)
+        assert converged.all()
+        assert_array_equal(ended(problem, [0.6], 1)[0], [0.6])
+
+
+class TestEnds:
+    def test_start_is_the_end_without_steps(self):
+        start = np.array([0.5, 2.0])
+        found, converged = ended(Wells([1.0, 1.0]), start, 0)
+        assert_array_equal(found, start)
+        assert not converged.any()
+
+    def test_converged_start_is_told_without_a_step(self):
+        problem = Wells([1.0, 4.0])
+        found, converged = ended(problem, [1.0, 2.0 + 1e-9], 0)
+        assert converged.all()
+        assert_allclose(found, [1.0, 2.0], rtol=1e-15)
+
+    def test_frames_that_have_ended_are_not_evaluated(self):
+        # Those that are left are filled up to a multiple of LANES.
+        problem = Wells([1.0] * 3 * LANES)
+        starts = np.repeat([1.0, 1.0 + 1e-3, 20.0], LANES)
+        ended(problem, starts)
+        assert problem.tried[:2] == [3 * LANES, 2 * LANES]
+        assert problem.tried == sorted(problem.tried, reverse=True)
+        assert problem.tried[-1] == LANES
+
+    def test_tolerance_is_a_share_of_the_energy(self):
+        exact, _ = ended(Wells([1.0]), [3.0])
+        rough, _ = ended(Wells([1.0], energy=1e10), [3.0])
+        assert 1e-9 < abs(rough[0] - 1.0) < 0.1
+        assert abs(exact[0] - 1.0) < 1e-12
+
+    def test_search_is_given_up_where_the_known_minimum_is_out_of_reach(self):
+        # The minimum of both is -1/4.
+        known = Minimum(np.zeros((1, 2)), np.array([-10.0, -0.2]), np.zeros(2))
+        problem = Wells([1.0, 1.0])
+        found, converged = ended(problem, [1.1, 1.1], known=known)
+        assert_array_equal(converged, [False, True])
+        assert found[0] == 1.1
+        assert_allclose(found[1], 1.0, rtol=1e-7)
+
+    def test_search_is_given_up_in_the_well_of_the_known_minimum(self):
+        known = Minimum(np.ones((1, 2)), np.full(2, -0.3), np.array([0.2, 0.01]))
+        found, converged = ended(Wells([1.0, 1.0]), [1.5, 1.5], 3, known)
+        steps = [ended(Wells([1.0]), [1.5], n)[0][0] for n in range(4)]
+        first = next(x for x in steps if abs(x - 1.0) < 0.2)
+        assert found[0] == first
+        assert abs(found[1] - 1.0) < abs(found[0] - 1.0)
+        assert not converged[0]
+
+    def test_largest_damping_ends_the_search(self):
+        # A value that is always higher than at the start: no step is taken.
+        class Walls(Wells):
+            def value(self, x, a):
+                return np.where(x[0] == 0.5, 0.0, 1.0)
+
+        problem = Walls([1.0])
+        found, converged = ended(problem, [0.5], 1000)
+        assert_array_equal(found, [0.5])
+        assert not converged.any()
+        assert len(problem.tried) < 30

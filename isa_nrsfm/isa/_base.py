@@ -1,8 +1,13 @@
-"""Base class of the strategies of independent subspace analysis."""
+"""Base class of the strategies of independent subspace analysis, and their steps.
+
+The steps are the density, the fixed-point iteration of FastISA on a batch of starts,
+and the grouping of signals into subspaces by greedy pairwise swaps.
+"""
 
 from abc import ABCMeta, abstractmethod
+from collections.abc import Callable
 from numbers import Integral, Real
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +20,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import Interval
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
 from isa_nrsfm._tables.sources import unmasked
 
 
@@ -102,3 +107,284 @@ def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
         )
     whitening = (axes / np.sqrt(variance)) @ axes.T / scale
     return np.ascontiguousarray(whitening @ centred.T), whitening
+
+
+class SubspaceDensity(Protocol):
+    """Density of FastISA: F(u) ~ log p and its first two derivatives."""
+
+    def log_density(self, energy: NDArray) -> NDArray:
+        """Return F(u)."""
+        ...
+
+    def derivatives(self, energy: NDArray) -> tuple[NDArray, NDArray]:
+        """Return F'(u) and F''(u)."""
+        ...
+
+
+class SqrtDensity(BaseEstimator):
+    """
+    The heavy-tailed density ``F(u) = -sqrt(u + eps)`` of a subspace's energy u.
+
+    Up to a constant, ``F`` is the logarithm of the density of a point of the subspace.
+    The energy u is the squared norm of the point. Sources have unit variance.
+
+    Parameters
+    ----------
+    eps : float, default=0.1
+        Smoothing of the density at the origin. Must be positive.
+
+    References
+    ----------
+    A. Hyvarinen, U. Koster, "FastISA: A fast fixed-point algorithm for independent
+    subspace analysis", ESANN 2006.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.isa import SqrtDensity
+    >>> float(SqrtDensity(eps=0.25).log_density(2.0))
+    -1.5
+    """
+
+    def __init__(self, eps: float = 0.1):
+        self.eps = eps
+
+    def log_density(self, energy: NDArray) -> NDArray:
+        """
+        Return F(u).
+
+        Parameters
+        ----------
+        energy : ndarray
+            The energies u, non-negative.
+
+        Returns
+        -------
+        ndarray
+            F at each energy.
+        """
+        return -np.sqrt(energy + self._checked_eps())
+
+    def derivatives(self, energy: NDArray) -> tuple[NDArray, NDArray]:
+        """
+        Return the first two derivatives g = F' and g' = F''.
+
+        Parameters
+        ----------
+        energy : ndarray
+            The energies u, non-negative.
+
+        Returns
+        -------
+        g : ndarray
+            F' at each energy.
+        dg : ndarray
+            F'' at each energy.
+        """
+        root = 1.0 / np.sqrt(energy + self._checked_eps())
+        return -0.5 * root, 0.25 * root**2 * root
+
+    def _checked_eps(self) -> float:
+        """Return eps, or raise an error if it is not positive."""
+        if not self.eps > 0:
+            raise ValueError(f"eps must be above zero; got {self.eps}")
+        return self.eps
+
+
+def orthogonalise(W: NDArray) -> NDArray:
+    """Return the orthogonal matrices ``(W W^T)^(-1/2) W`` nearest to W (n_batch, n, n).
+
+    Eigenvectors of ``W W^T`` take two thirds of the time of an SVD of W. One Newton
+    step restores the precision that squaring costs (Higham 2008, chapter 8).
+    """
+    values, axes = np.linalg.eigh(W @ W.swapaxes(-1, -2))
+    poor = values[:, 0] <= 1e-8 * values[:, -1]  # nearly singular
+    values[poor] = 1.0
+    nearest = (axes / np.sqrt(values)[:, None]) @ (axes.swapaxes(-1, -2) @ W)
+    error = nearest @ nearest.swapaxes(-1, -2) - np.eye(W.shape[-1])
+    nearest -= 0.5 * error @ nearest
+    if poor.any():
+        U, _, Vt = np.linalg.svd(W[poor])
+        nearest[poor] = U @ Vt
+    return nearest
+
+
+def log_likelihood(
+    W: NDArray, Z: NDArray, subspace_size: int, density: SubspaceDensity
+) -> NDArray:
+    """Return ``sum_k E F(u_k)``, the mean log-likelihood of a sample up to a constant.
+
+    W is (..., n_signals, n_signals), orthogonal, Z (n_signals, n_samples), white.
+    """
+    Y = W @ Z
+    u = (Y * Y).reshape(*W.shape[:-2], -1, subspace_size, Z.shape[1]).sum(axis=-2)
+    return density.log_density(u).mean(axis=-1).sum(axis=-1)
+
+
+def fixed_point_step(
+    W: NDArray,
+    Z: NDArray,
+    subspace_size: int,
+    density: SubspaceDensity,
+    length: NDArray | float = 1.0,
+) -> NDArray:
+    """Return W (n_batch, n, n) after one step of FastISA (Hyvarinen and Koster 2006).
+
+    A row w of subspace k, with y = w z, becomes ``E[z y g(u_k)] - E[g(u_k) + 2 y^2
+    g'(u_k)] w``. Then W is orthogonalised. If the step length (n_batch,) is below 1.0,
+    a multiple of w is added. Each row then turns by about this share of the full step.
+    The fixed points are the same.
+    """
+    n_batch, n_signals, n_samples = len(W), *Z.shape
+    Y = (W @ Z).reshape(n_batch, -1, subspace_size, n_samples)
+    square = Y * Y
+    g, dg = density.derivatives(square.sum(axis=2))
+    curvature = g.sum(axis=-1)[..., None] + 2.0 * np.vecdot(square, dg[:, :, None])
+    Y *= g[:, :, None]
+    step = Y.reshape(n_batch, n_signals, n_samples) @ Z.T
+    step -= curvature.reshape(n_batch, n_signals, 1) * W
+    kept = np.vecdot(step, W) * (1.0 / np.reshape(length, (-1, 1)) - 1.0)
+    step += kept[..., None] * W
+    return orthogonalise(step)
+
+
+def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
+    """
+    Return the largest change (n_batch,) of a subspace between two orthogonal matrices.
+
+    It is ``||P_k - P_new,k||_F^2 / (2 d)`` with projectors ``P_k = W_k^T W_k``, the
+    mean square sine of the d principal angles: rows may rotate inside their subspace.
+    """
+    shape = (len(W), -1, subspace_size, W.shape[-1])
+    cosines = W.reshape(shape) @ W_new.reshape(shape).swapaxes(-1, -2)
+    return np.max(1.0 - np.sum(cosines**2, axis=(-1, -2)) / subspace_size, axis=1)
+
+
+def iterate(
+    W: NDArray,
+    Z: NDArray,
+    subspace_size: int,
+    density: SubspaceDensity,
+    *,
+    max_iter: int,
+    tol: float,
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Repeat `fixed_point_step` on each start until `subspace_change` is below `tol`.
+
+    With few samples the published iteration mostly ends in cycles. If a start cycles,
+    its step length is halved. Returns the last iterates (n_batch, n, n), and for each
+    start the number of steps and whether it has converged.
+    """
+    W = W.copy()
+    n_iter = np.zeros(len(W), dtype=int)
+    converged = np.zeros(len(W), dtype=bool)
+    running = np.arange(len(W))
+    length = np.ones(len(W))
+    least_change = np.full(len(W), np.inf)
+    waited = np.zeros(len(W), dtype=int)
+    for _ in range(max_iter):
+        # A step of each running start. Its change is scaled to a step of length 1.
+        lengths = length[running]
+        new = fixed_point_step(W[running], Z, subspace_size, density, lengths)
+        change = subspace_change(W[running], new, subspace_size) / lengths**2
+        W[running] = new
+        n_iter[running] += 1
+
+        # Halve the step length of starts whose change has not fallen for ten steps.
+        nearer = change < least_change[running]
+        least_change[running[nearer]] = change[nearer]
+        waited[running] = np.where(nearer, 0, waited[running] + 1)
+        cycling = running[waited[running] >= 10]
+        length[cycling] = np.maximum(length[cycling] / 2, 1 / 16)
+        waited[cycling] = 0
+
+        # Starts that have converged stop.
+        still = change < tol
+        converged[running[still]] = True
+        running = running[~still]
+        if not len(running):
+            break
+    return W, n_iter, converged
+
+
+# Takes an assignment (n_signals,) of signals to subspaces. Returns the gain (n_signals,
+# n_signals) of the objective by a swap of any two signals. Also returns the size of the
+# objective, to which rounding errors are relative.
+Gains = Callable[[NDArray], tuple[NDArray, float]]
+
+
+def swap_until_best(assignment: NDArray, gains: Gains) -> NDArray:
+    """Swap the two signals with the largest gain, until no swap has a gain."""
+    assignment = assignment.copy()
+    while True:
+        gain, size = gains(assignment)
+        gain = np.where(assignment[:, None] == assignment, 0.0, gain)
+        a, b = np.unravel_index(np.argmax(gain), gain.shape)
+        if not gain[a, b] > OF_DIFFERENCES * size:
+            return assignment
+        assignment[[a, b]] = assignment[[b, a]]
+
+
+def rows_by_subspace(assignment: NDArray) -> NDArray:
+    """Return an order (n_signals,) of the signals that makes subspaces consecutive."""
+    _, first, group = np.unique(assignment, return_index=True, return_inverse=True)
+    return np.argsort(first[group], kind="stable")
+
+
+def covariance_gains(covariance: NDArray) -> Gains:
+    """Return the gains for pooling by a covariance (n_signals, n_signals).
+
+    The objective is the energy of the covariance inside the diagonal blocks of the
+    subspaces (Brandt et al. 2018, section 3.3).
+    """
+    energy = covariance**2
+    total = float(energy.sum())
+    diagonal = np.diag(energy)
+
+    def gains(assignment: NDArray) -> tuple[NDArray, float]:
+        member = assignment[:, None] == np.arange(assignment.max() + 1)
+        # Half the gain of signal a in a swap with b. It gains the energy shared with
+        # the subspace of b, without b, and loses that shared with its own subspace.
+        with_subspace = energy @ member  # (n_signals, n_subspaces)
+        with_b = with_subspace[:, assignment]  # of a with the subspace of b
+        minus_own = diagonal - np.diag(with_b)
+        gain = with_b - energy + minus_own[:, None]
+        return gain + gain.T, total
+
+    return gains
+
+
+def value_gains(value: Callable[[NDArray], NDArray], n_signals: int) -> Gains:
+    """Return the gains for a sum of values of groups (n_groups, subspace_size)."""
+    # with_b[a, b] is the value of the subspace of a with a replaced by b. Row a depends
+    # only on the mates of a, the signals of its subspace. A swap changes the mates of
+    # two subspaces, so only their rows are computed again.
+    with_b = np.zeros((n_signals, n_signals))
+    mates_before = np.zeros((n_signals, n_signals), dtype=bool)
+    everyone = np.arange(n_signals)
+
+    def gains(assignment: NDArray) -> tuple[NDArray, float]:
+        mates = assignment[:, None] == assignment
+        for a in np.flatnonzero((mates != mates_before).any(axis=1)):
+            rest = np.flatnonzero(mates[a] & (everyone != a))  # the mates of a
+            instead = np.flatnonzero(~mates[a] | (everyone == a))
+            groups = np.column_stack([np.tile(rest, (len(instead), 1)), instead])
+            with_b[a, instead] = value(groups)
+        mates_before[:] = mates
+        own = np.diag(with_b)
+        gain = with_b - own[:, None]
+        return gain + gain.T, float(np.abs(own).sum())
+
+    return gains
+
+
+def likelihood_gains(signals: NDArray, density: SubspaceDensity) -> Gains:
+    """Return the gains for the likelihood ``sum_k E F(u_k)`` of white signals."""
+    square = signals**2
+
+    def value(groups: NDArray) -> NDArray:
+        energy = np.zeros((len(groups), square.shape[1]))
+        for member in groups.T:
+            energy += square[member]
+        return density.log_density(energy).mean(axis=1)
+
+    return value_gains(value, len(signals))

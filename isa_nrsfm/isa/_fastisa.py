@@ -12,8 +12,8 @@ from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import HasMethods, fit_context
-from isa_nrsfm.isa._base import BaseSubspaceAnalysis
-from isa_nrsfm.isa._steps import (
+from isa_nrsfm.isa._base import (
+    BaseSubspaceAnalysis,
     SqrtDensity,
     SubspaceDensity,
     iterate,

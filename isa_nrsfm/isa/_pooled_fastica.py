@@ -11,8 +11,8 @@ from sklearn.utils import check_array, check_random_state
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import StrOptions, fit_context
-from isa_nrsfm.isa._base import BaseSubspaceAnalysis
-from isa_nrsfm.isa._steps import (
+from isa_nrsfm.isa._base import (
+    BaseSubspaceAnalysis,
     Gains,
     SqrtDensity,
     covariance_gains,
