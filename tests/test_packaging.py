@@ -27,7 +27,7 @@ before = set(sys.modules)
 from isa_nrsfm import AffineNRSfM
 print(*(set(sys.modules) - before))
 """
-OWN_PARTS = ("baselines", "calibration", "cli", "datasets", "io", "metrics", "plotting")
+OWN_PARTS = ("baselines", "cli", "datasets", "io", "metrics", "plotting")
 FIT_OF_AN_ARRAY = """
 import sys
 

@@ -18,7 +18,6 @@ import numpy as np
 
 from isa_nrsfm._compat.texts import as_utf8, first_items
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._selection import NO_SHAPE
 from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
@@ -344,6 +343,9 @@ def _choice(choice: dict[str, Any]) -> Section:
     ]
     cells = Cells(["K", "held-out error", "standard error", ""], rows)
     if min(errors) >= 1:
+        # Other reports do not wait for scikit-learn's model selection.
+        from isa_nrsfm._selection import NO_SHAPE
+
         return [cells, NO_SHAPE]
     parts: list[str | Cells] = [cells, "errors in frames held out of the fit"]
     if choice["chosen"] == tried[-1]:
