@@ -234,7 +234,6 @@ def fit_table(
         if errors and camera != "affine":
             certainty = depth_certainty(model, table.rows, table.weights)
             model = replace(model, certainty=certainty)
-            attributes["depth_uncertainty_"] = certainty.total
         if settings.refinement == "consensus":
             # A residual below the noise of the spectrum leaves nothing for groups.
             n_numbers, square = tracks.totals
@@ -243,6 +242,8 @@ def fit_table(
                 model = _consensus_model(table, model, joint, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
+        if errors and camera != "affine":
+            attributes["depth_uncertainty_"] = model.certainty.total
         fitted, frames, measures = _joint_frames(table, model, tracks, settings)
         converged = fit.converged
     else:
@@ -411,11 +412,10 @@ def _consensus_model(
         most = most_components(len(table.sizes), table.n_points, settings.camera)
         wanted = min(most, MOST_COMPONENTS)
     merged = consensus(model, table.rows, settings, wanted, free)
-    shapes, noise, alpha, variances = merged
-    # If the object hardly turns, groups share the errors of the depths.
+    shapes, noise, alpha, squares = merged
     certainty = model.certainty
-    if variances is not None and certainty.determined:
-        certainty = certainty._replace(points=variances, leverage=1.0)
+    if squares is not None:
+        certainty = certainty.of_consensus(*squares)
     model = _frame_model(shapes, noise, alpha, settings)
     return replace(model, certainty=certainty)
 

@@ -27,14 +27,9 @@ from isa_nrsfm._linalg.small_matrices import frames_last, padded
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.tracks import seen_points
 
-# Rotations are not determined if their standard deviation is a larger share of their
-# spread. This share is 0.2 to 0.3 for faces of known shape that turn by 10 degrees, 0.9
-# to 1.3 by 4 degrees; 0.5 for bodies that turn by 20 degrees, 1 by 10 degrees. Depth
-# errors above this share are warned of as well: they are at most 0.47 where rotations
-# are determined (mean of ten tables, ``python -m benchmarks.depth``).
+# Depths are not determined above this error, relative to their root mean square:
+# docs/depth.md, "Undetermined depth".
 LARGEST_SHARE = 0.55
-# RMS turning out of the image plane, if all sides of a half sphere are seen as often.
-HALF_SPHERE = np.sqrt(np.pi - 2)
 
 
 class DepthCertainty(NamedTuple):
@@ -44,11 +39,12 @@ class DepthCertainty(NamedTuple):
     Attributes
     ----------
     total : float
-        RMS error of the depths, relative to their RMS.
-    turning : float
-        RMS rotation of the cameras out of the image plane from their mean, in radians.
-        The part that the coefficients predict is left out, because it cannot be
-        distinguished from deformation.
+        RMS error of the depths, relative to their RMS. Its square is the sum of that of
+        the jackknife and `deformation`.
+    deformation : float
+        ``exp(-r)``, with the rise r of -2 log L of a frame if depths are a thousand
+        times as large, and cameras hardly turn: near one if deformation explains the
+        images as well as rotations do.
     turns : ndarray of shape (3, 3) or None
         Covariance of the rotation vectors, in radians squared, in the camera's axes.
     points : ndarray of shape (n_points,) or None
@@ -59,21 +55,24 @@ class DepthCertainty(NamedTuple):
     """
 
     total: float = np.nan
-    turning: float = np.nan
+    deformation: float = np.nan
     turns: NDArray | None = None
     points: NDArray | None = None
     leverage: float | None = None
 
     @property
-    def turning_deviation(self) -> float:
-        """Standard deviation of the rotations out of the image plane, in radians."""
-        turns = self.turns
-        return np.nan if turns is None else float(turns[:2, :2].trace() ** 0.5)
-
-    @property
     def determined(self) -> bool:
         """Whether the table determines depths and rotations; True if not estimated."""
-        return not self.turning_deviation > LARGEST_SHARE * self.turning
+        return not self.total > LARGEST_SHARE
+
+    def of_consensus(self, errors: NDArray, depths: NDArray) -> "DepthCertainty":
+        """Return that of a consensus with mean squares of errors and depths (J,).
+
+        Groups cannot tell turning from deformation better than all points together.
+        """
+        points = errors + self.deformation * depths
+        total = float(np.sqrt(points.sum() / depths.sum()))
+        return self._replace(total=total, points=points, leverage=1.0)
 
     def variances(self, alpha: NDArray) -> NDArray:
         """Return variances of depths (n, n_points) of frames of size one."""
@@ -85,23 +84,24 @@ class DepthCertainty(NamedTuple):
     @property
     def advice(self) -> str:
         """Reason and remedy for depths that are not determined."""
-        turning, deviation = np.degrees([self.turning, self.turning_deviation])
-        other = (
-            "fit a table in which the objects turn further, and transform this one "
-            "with that model"
-        )
-        if self.turning > HALF_SPHERE:
-            other = (
-                "make sure that x and y have the same unit, unlike shares of the width "
-                "and height of an image"
+        if self.deformation > self.total**2 / 2:
+            reason = "deformation explains the images as well as rotations do"
+            remedy = (
+                "fit a table in which the objects turn further, and transform this one "
+                "with that model"
+            )
+        else:
+            reason = "parts of the points lead to different depths"
+            remedy = (
+                'try more basis shapes or refinement="consensus", and make sure that x '
+                "and y have the same unit, unlike shares of the width and height of an "
+                "image"
             )
         return (
-            "the depth of the shapes is not determined: apart from their deformation "
-            f"the objects turn by {turning:.2g} degrees (root mean square) out of the "
-            "image plane, and these rotations have a standard deviation of "
-            f"{deviation:.2g} degrees. Use affine cameras for this table "
-            f'(camera="affine"), or {other}. See "How reliable is the depth?" in the '
-            "documentation"
+            "the depth of the shapes is not determined: its expected error is "
+            f"{100 * self.total:.2g} % of the depth, because {reason}. Use affine "
+            f'cameras for this table (camera="affine"), or {remedy}. See "How reliable '
+            'is the depth?" in the documentation'
         )
 
 
@@ -412,7 +412,8 @@ class PosteriorFrames:
         The variance of a depth is the sum of that of the shapes and that of the frame,
         ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
         depths by rotation vector, logarithm of the scale (if free) and coefficients.
-        Weights (n, J) multiply the squares.
+        Weights (n, J) multiply the squares. The variance of a frame is multiplied by
+        its squared Mahalanobis distance over the expected one, if that is larger.
         """
         unit = rows / sizes[:, None, None]
         fit = self.posterior(unit, covariances=False, weights=weights)
@@ -435,7 +436,11 @@ class PosteriorFrames:
             Z = changes[:, 2]
             variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
         variances += self.certainty.variances(fit.alpha)
-        return sizes[:, None] * np.sqrt(variances)
+        # Frames that the model explains less well than those of the fit
+        n_pose = 2 + CAMERAS[self.camera].n_parameters
+        freedom = np.maximum(2.0 * weights.sum(axis=1) - n_pose, 1.0)
+        excess = np.maximum(fit.objective / (self.noise_variance * freedom), 1.0)
+        return sizes[:, None] * np.sqrt(variances * excess[:, None])
 
     def posterior(
         self, rows: NDArray, covariances: bool = True, weights: NDArray | None = None

@@ -106,7 +106,7 @@ def consensus(
 
     Returns centred shapes (K + 1, 3, J) for coefficients of variance one, the noise
     variance of a coordinate, the coefficients (n, K) of some frames, and the mean
-    squared errors (J,) of the depths, None without groups.
+    squares (2, J) of errors and of depths, None without groups.
     """
     few = representative_frames(rows, MOST_FRAMES)
     part, fit = inlying_rows(model, np.asarray(rows.take(few), dtype=np.float64))
@@ -124,7 +124,7 @@ def consensus(
     price = 1.0 / (options.basis_std**2 * mean_square)
     floor = FLOOR_SHARE * options.least_noise * mean_square
     scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
-    noise, S, groups, variances = model.noise_variance, shapes, [], None
+    noise, S, groups, squares = model.noise_variance, shapes, [], None
     distances = neighbour_distances(shapes[:, :, chosen])
     # Groups cannot improve a fit whose noise is below their floor.
     if noise >= scene.floor:
@@ -135,7 +135,8 @@ def consensus(
         merged, moved = together(scene, groups, distances, scales, noise)
         noise -= (1.0 - LAST_SHARE) * scene.floor
         weights = interpolation(model.shapes[0], chosen)
-        variances = np.mean(centred(moved @ weights) ** 2, axis=0)
+        depths = moved @ weights, merged[:, 2] @ weights
+        squares = np.mean(centred(np.array(depths)) ** 2, axis=1)
         change = (merged - scene.first) @ weights
         others = np.setdiff1d(np.arange(n_points), chosen)
         off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
@@ -145,7 +146,7 @@ def consensus(
         S = aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S
     # Their principal components
     shapes, alpha, rest = principal_shapes(S, most, LEFT * noise if free else 0.0)
-    return shapes, noise + rest, alpha, variances
+    return shapes, noise + rest, alpha, squares
 
 
 def together(

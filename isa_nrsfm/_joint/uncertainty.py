@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
+    CameraModel,
     distances,
     full_rotations,
     stacked_motion,
@@ -39,7 +40,7 @@ from isa_nrsfm._frames.models import (
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JOINT_OPTIONS, JointState, refine_joint
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # With a robust loss, points with residuals above this threshold, in standard deviations
@@ -62,6 +63,8 @@ MOST_FRAMES, MOST_POINTS = 200, 200
 # Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
 # %, the floor changes no deviation by more than a third.
 LEAST_NOISE = 1e-6
+# Factor of the depths of a fit that hardly turns. 100 and 10,000 give the same.
+FAR = 1000.0
 
 
 def inlying_rows(
@@ -196,8 +199,8 @@ def depth_certainty(
 
     Weights (I, J) are numbers of observations, by default one.
     """
-    n_frames, n_points = rows.n_frames, frames.shapes.shape[2]
-    chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
+    n_points = frames.shapes.shape[2]
+    chosen = representative_frames(rows, MOST_FRAMES)
     part = np.asarray(rows.take(chosen), dtype=np.float64)
     w = None if weights is None else weights[chosen]
     part, fit = inlying_rows(frames, part, w)
@@ -211,43 +214,60 @@ def depth_certainty(
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], fit.motion[known]
-    tracks = part[known]
+    tracks, camera = part[known], CAMERAS[frames.camera]
 
-    def refit(kept: NDArray) -> _Refit:
-        """Return a fit of some points, by a few steps from the fit of all points."""
-        rows, chosen = tracks[:, :, kept], shapes[:, :, kept]
+    def refit(kept: NDArray, start: JointState, extents: float = 0.0) -> _Refit:
+        """Return a fit of some points, by a few steps from a start."""
+        rows = tracks[:, :, kept]
         blocks = FrameBlocks.of_array(rows, len(rows))
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
         penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
-        likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
+        likelihood = MarginalLikelihood(part, penalty, extents)
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         least = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
-        start = JointState(chosen - chosen.mean(axis=2, keepdims=True), motion, noise)
+        start = start._replace(noise=noise)
         limits: Any = {"least_noise": least, "max_iter": MOST_STEPS, "tol": TOL}
-        state = refine_joint(likelihood, start, CAMERAS[frames.camera], **limits).state
+        state = refine_joint(likelihood, start, camera, **limits).state
+        terms = likelihood._replace(extent_weight=0.0)(*state)
         rotations, scales = full_rotations(state.motion)
-        alpha = likelihood(*state).alpha
         z = np.einsum("ia,kaj->ikj", rotations[:, 2], state.shapes)
-        z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", alpha, z[:, 1:]))
-        return _Refit(kept, rotations, alpha, z - z.mean(axis=1, keepdims=True))
+        z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", terms.alpha, z[:, 1:]))
+        z -= z.mean(axis=1, keepdims=True)
+        return _Refit(kept, state, rotations, z, terms.value / len(rows))
 
-    whole = refit(np.ones(len(points), dtype=bool))
-    errors = [refit(~group).errors(whole) for group in left_out]
+    def start_of(kept: NDArray) -> JointState:
+        """Return the start from the fit of all points."""
+        chosen = shapes[:, :, kept]
+        return JointState(chosen - chosen.mean(axis=2, keepdims=True), motion, 0.0)
+
+    every = np.ones(len(points), dtype=bool)
+    whole = refit(every, start_of(every), EXTENT_WEIGHT)
+    far = refit(every, far_state(whole.state, camera))
+    deformation = float(np.exp(-max(far.value - whole.value, 0.0)))
+    errors = [refit(~group, start_of(~group)).errors(whole) for group in left_out]
     sums = (np.sum(terms, axis=0) for terms in zip(*errors, strict=True))
     total, turns, variances = ((N_GROUPS - 1) / N_GROUPS * each for each in sums)
     # Each point is left out of one of the fits
     variances *= N_GROUPS / (N_GROUPS - 1)
+    variances += deformation * np.mean(whole.depths**2, axis=0)
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
-    # Rotations out of the image plane, and their residuals of a regression on alpha.
-    mean_view = Rotation.from_matrix(whole.rotations).mean()
-    vectors = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
-    predictors = np.column_stack([np.ones(len(vectors)), whole.alpha])
-    rest = vectors[:, :2] - predictors @ np.linalg.lstsq(predictors, vectors[:, :2])[0]
-    freedom = max(len(rest) - predictors.shape[1], 1)
-    turning = float(np.sqrt(np.sum(rest**2) / freedom))
-    return DepthCertainty(float(np.sqrt(total)), turning, turns, variances[nearest])
+    return DepthCertainty(
+        float(np.sqrt(total + deformation)), deformation, turns, variances[nearest]
+    )
+
+
+def far_state(state: JointState, camera: CameraModel) -> JointState:
+    """Return depths FAR times as large, with rotations as many times smaller.
+
+    The depths are those along the mean line of sight.
+    """
+    views = full_rotations(state.motion)[0][:, 2]
+    axes = np.linalg.eigh(views.T @ views)[1]  # the mean line of sight is the last one
+    far = np.array([1.0, 1.0, FAR])
+    motion = camera.nearest(state.motion @ axes / far)
+    return state._replace(shapes=far[:, None] * (axes.T @ state.shapes), motion=motion)
 
 
 def neighbours(points: NDArray) -> NDArray:
@@ -264,12 +284,16 @@ def neighbours(points: NDArray) -> NDArray:
 
 
 class _Refit(NamedTuple):
-    """A fit of the kept points: rotations (I, 3, 3), alpha (I, K), centred depths."""
+    """A fit of the kept points: state, rotations (I, 3, 3), centred depths (I, n).
+
+    value: the objective for each frame, without the prior of the extents.
+    """
 
     kept: NDArray
+    state: JointState
     rotations: NDArray
-    alpha: NDArray
     depths: NDArray
+    value: float
 
     def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray]:
         """Compute squared differences from the fit of all points.

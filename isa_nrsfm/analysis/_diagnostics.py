@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import LEAST_RELIABILITY
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
@@ -148,7 +147,6 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
     image = estimator.mean_shape_ @ estimator.reference_motion_.T
     layout = find_skeleton(len(names), names, shape=image)
     messages = (
-        *_of_depth(frames.certainty),
         *_of_support(found, frames.loss),
         *_of_coefficients(found, coefficients, rows, layout),
     )
@@ -214,17 +212,6 @@ def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
         f"{first_items((rows[i] for i in frames), 5)}, most often the points "
         f"{first_items((names[j] for j in most), 5)}"
     )
-
-
-def _of_depth(certainty: DepthCertainty) -> Iterator[str]:
-    """Yield the message on uncertain depths, unless `fit` has warned of them."""
-    if certainty.determined and certainty.total > LARGEST_SHARE:
-        yield (
-            f"the depth is uncertain: its expected error is {100 * certainty.total:.2g}"
-            " % of the depth, so proportions and side views may be wrong. Try more "
-            "basis shapes, fit a table in which the objects turn further, or use "
-            'affine cameras (camera="affine")'
-        )
 
 
 def _of_support(found: Diagnostics, loss: str) -> Iterator[str]:

@@ -272,7 +272,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((N, K), ["alpha_", "alpha_std_"]),
         ((N, 3, 3), ["rotations_"]),
         ((N,), ["scales_", "sizes"]),
-        ((), single),
+        ((), [*single, "deformation"]),
     )
     for shape, name in ((shape, name) for shape, names in shapes for name in names):
         if (value := values.get(name)) is None:
@@ -304,7 +304,8 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "coefficient_starts": frames.starts,
         "mixing": frames.gauge.mixing,
         "space": frames.gauge.space,
-        "certainty": np.array(frames.certainty[:2]),
+        "certainty": np.array([frames.certainty.total, np.nan]),
+        "deformation": frames.certainty.deformation,
         "turns": frames.certainty.turns,
         "depth_variances": frames.certainty.points,
         "leverage": frames.certainty.leverage,
@@ -316,6 +317,8 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
     if "loss" not in entries:
         return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
     total, turning = entries["certainty"].tolist()
+    if np.isfinite(turning):  # of older versions, which judged the depth by rotations
+        total = max(total, np.trace(entries["turns"][:2, :2]) ** 0.5 / turning)
     return PosteriorFrames(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -325,7 +328,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
         camera=entries["camera"],
         certainty=DepthCertainty(
             total,
-            turning,
+            entries.get("deformation", np.nan),
             entries["turns"],
             entries["depth_variances"],
             entries.get("leverage"),
