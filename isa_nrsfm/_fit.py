@@ -425,7 +425,7 @@ def _joint_frames(
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of a joint fit in the independent gauge."""
     fits = fitted_frames(model, tracks, table.rows)
-    posteriors, motion, alpha, covariance = fits
+    posteriors, motion, alpha, covariance, residual = fits
     unknown = np.isnan(motion).any(axis=(1, 2))
     if unknown.any():
         row = np.flatnonzero(table.shown)[unknown.argmax()]
@@ -439,7 +439,8 @@ def _joint_frames(
     gauge, frame_map = independent_gauge(
         model.shapes, motion, alpha, s.independence, s.camera, unit
     )
-    certainty = model.certainty
+    residual /= table.n_observations.sum()
+    certainty = model.certainty._replace(residual=residual)
     if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     model = replace(model, gauge=frame_map, certainty=certainty)

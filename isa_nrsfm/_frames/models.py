@@ -52,6 +52,8 @@ class DepthCertainty(NamedTuple):
     leverage : float or None
         Mean of 1 + |alpha|^2 of the frames, if variances are proportional to it, as for
         equal errors of all shapes. None if all frames have the mean variance.
+    residual : float
+        Mean squared residual of a point of the fitted frames, of size one.
     """
 
     total: float = np.nan
@@ -59,6 +61,7 @@ class DepthCertainty(NamedTuple):
     turns: NDArray | None = None
     points: NDArray | None = None
     leverage: float | None = None
+    residual: float = np.nan
 
     @property
     def determined(self) -> bool:
@@ -413,7 +416,7 @@ class PosteriorFrames:
         ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
         depths by rotation vector, logarithm of the scale (if free) and coefficients.
         Weights (n, J) multiply the squares. The variance of a frame is multiplied by
-        its squared Mahalanobis distance over the expected one, if that is larger.
+        its squared residual over that of the fit, if it is larger.
         """
         unit = rows / sizes[:, None, None]
         fit = self.posterior(unit, covariances=False, weights=weights)
@@ -437,9 +440,9 @@ class PosteriorFrames:
             variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
         variances += self.certainty.variances(fit.alpha)
         # Frames that the model explains less well than those of the fit
-        n_pose = 2 + CAMERAS[self.camera].n_parameters
-        freedom = np.maximum(2.0 * weights.sum(axis=1) - n_pose, 1.0)
-        excess = np.maximum(fit.objective / (self.noise_variance * freedom), 1.0)
+        squares = fit.objective - self.noise_variance * np.vecdot(fit.alpha, fit.alpha)
+        excess = squares / weights.sum(axis=1) / self.certainty.residual
+        excess = np.fmax(excess, 1.0)
         return sizes[:, None] * np.sqrt(variances * excess[:, None])
 
     def posterior(

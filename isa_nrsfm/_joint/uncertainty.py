@@ -81,20 +81,25 @@ def inlying_rows(
 
 def fitted_frames(
     model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
-) -> tuple[FrameBlocks, NDArray, NDArray, NDArray]:
+) -> tuple[FrameBlocks, NDArray, NDArray, NDArray, float]:
     """Return the fits of all frames in blocks of FramePosterior, before the gauge.
 
-    Also returns cameras, coefficients, and the mean of their covariances (K, K).
+    Also returns cameras, coefficients, the mean of their covariances (K, K), and the
+    sum of the squared residuals.
     """
     if model.loss == "linear":
         model = replace(model, shapes=frames.coordinates(model.shapes))
         posteriors = frames.blocks.derive(model.prepared_posterior)
     else:
         posteriors = rows.derive(model.posterior)
-    parts = posteriors.map(lambda fit: (fit.motion, fit.alpha, fit.covariance.sum(0)))
-    motion, alpha, covariance = zip(*parts, strict=True)
+    parts = posteriors.map(
+        lambda fit: (fit.motion, fit.alpha, fit.covariance.sum(0), fit.objective.sum())
+    )
+    motion, alpha, covariance, objective = zip(*parts, strict=True)
+    motion, alpha = np.concatenate(motion), np.concatenate(alpha)
     total = np.sum(covariance, axis=0) / posteriors.n_frames
-    return posteriors, np.concatenate(motion), np.concatenate(alpha), total
+    residual = float(sum(objective) - model.noise_variance * np.sum(alpha**2))
+    return posteriors, motion, alpha, total, residual
 
 
 def shape_uncertainty(

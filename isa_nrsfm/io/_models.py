@@ -272,7 +272,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((N, K), ["alpha_", "alpha_std_"]),
         ((N, 3, 3), ["rotations_"]),
         ((N,), ["scales_", "sizes"]),
-        ((), [*single, "deformation"]),
+        ((), [*single, "deformation", "residual"]),
     )
     for shape, name in ((shape, name) for shape, names in shapes for name in names):
         if (value := values.get(name)) is None:
@@ -309,6 +309,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "turns": frames.certainty.turns,
         "depth_variances": frames.certainty.points,
         "leverage": frames.certainty.leverage,
+        "residual": frames.certainty.residual,
     }
 
 
@@ -332,6 +333,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
             entries["turns"],
             entries["depth_variances"],
             entries.get("leverage"),
+            entries.get("residual", np.nan),
         ),
     )
 
