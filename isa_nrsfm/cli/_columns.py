@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,38 +13,23 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis._frame_columns import (
-    checked_times,
-    group_numbers,
-    kind_of,
-    refuse_infinite,
-    sequences_of,
-)
+from isa_nrsfm.analysis import _frame_columns
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import read_times, video_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
-
-
-class Label(NamedTuple):
-    """A column with classes or numbers; values (n_known,), known (n_frames,)."""
-
-    name: str
-    kind: Literal["classes", "number"]
-    values: NDArray
-    known: NDArray
-
-    def is_of_classes(self, most: int) -> bool:
-        """Return whether the label has at most so many classes."""
-        return self.kind == "classes" and len(np.unique(self.values)) <= most
+from isa_nrsfm.export._viewer import MOST_LABELS
 
 
 class Columns(NamedTuple):
-    """The columns that a fit is asked about, for its usable frames."""
+    """The columns that a fit is asked about, for its usable frames.
 
-    labels: list[Label]
+    Labels are NaN where they are not known. Those of classes are categories.
+    """
+
+    labels: "list[pd.Series]"
     groups: NDArray | None
     times: NDArray | None
     time_unit: str
@@ -65,13 +50,13 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
             cells = cells_of(table, args.time, "--time")
             times, unit_of_times = read_times(cells, args.time_format)
     elif args.fps is not None:
-        images, name = frames.images
-        numbers = pd.Series(images, frames.other.index)[frames.usable]
-        times = video_times(numbers, name, groups) / args.fps
+        times = video_times(frames.images[frames.usable], groups) / args.fps
     if times is not None:
         try:
-            times_in_seconds = checked_times(times, len(table))
-            sequences_of(times_in_seconds, group_numbers(groups, len(table)), 1)
+            times_in_seconds = _frame_columns.checked_times(times, len(table))
+            _frame_columns.sequences_of(
+                times_in_seconds, _frame_columns.group_numbers(groups, len(table)), 1
+            )
         except ValueError as error:
             hint = " (--group: the rows that belong together)" * (groups is None)
             option = "--fps" if args.time is None else f"--time {args.time}"
@@ -135,12 +120,24 @@ def column_results(
     return report, X[[]].assign(**columns), smooth
 
 
-def class_means(label: Label, alpha: NDArray) -> dict[str, NDArray]:
+def has_classes(label: "pd.Series", most: float = np.inf) -> bool:
+    """Return whether a label has classes, and at most so many."""
+    classes = isinstance(label.dtype, pd.CategoricalDtype)
+    return classes and len(label.cat.categories) <= most
+
+
+def class_means(label: "pd.Series", alpha: NDArray) -> dict[str, NDArray]:
     """Return the mean of the standardised coefficients in each class."""
-    deviation, y = alpha.std(axis=0), label.values
+    deviation = alpha.std(axis=0)
     standard = (alpha - alpha.mean(axis=0)) / np.where(deviation > 0, deviation, np.inf)
-    known = standard[label.known]
-    return {str(name): known[y == name].mean(axis=0) for name in np.unique(y)}
+    return {str(c): standard[label == c].mean(axis=0) for c in label.cat.categories}
+
+
+def first_classes(labels: "list[pd.Series]") -> "pd.Series | None":
+    """Return the first label of few classes, which colours the frames in the viewer."""
+    few = (label for label in labels if has_classes(label, MOST_LABELS))
+    texts = (label.map(str, na_action="ignore").astype(object) for label in few)
+    return next(texts, None)
 
 
 def _numbered(
@@ -151,14 +148,12 @@ def _numbered(
         return point_numbers(pair, names)
 
 
-def _label(table: "pd.DataFrame", text: str) -> Label:
+def _label(table: "pd.DataFrame", text: str) -> "pd.Series":
     """Return the label of COLUMN, COLUMN:classes or COLUMN:number."""
     name, colon, kind = text.rpartition(":")
     if not colon or kind not in ("classes", "number"):
         name, kind = text, "auto"
-    column = cells_of(table, name, "--label")
-    known = column.notna()
-    names = _names(column[known])
+    names = _names(cells_of(table, name, "--label").dropna())
     if names.empty:
         raise ValueError(f"--label: no frame has a {name!r}")
     numbers = pd.to_numeric(names, errors="coerce")
@@ -172,9 +167,12 @@ def _label(table: "pd.DataFrame", text: str) -> Label:
     values = (numbers if kind == "number" else names).to_numpy()
     if values.dtype.kind not in "biuf":
         values = values.astype(str)
-    refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
+    _frame_columns.refuse_infinite(f"--label {text}", values, names.index.to_numpy())
     with errors_of(f"--label {text}"):
-        return Label(name, kind_of(values, kind), values, known.to_numpy())
+        dtype = (
+            "category" if _frame_columns.kind_of(values, kind) == "classes" else None
+        )
+    return pd.Series(values, names.index, dtype, name).reindex(table.index)
 
 
 def _groups(table: "pd.DataFrame", name: str) -> NDArray:
@@ -208,21 +206,21 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:
 
 
 def _label_report(
-    label: Label, alpha: NDArray, aligned: NDArray, asked: Columns, random_state: int
+    label: "pd.Series", alpha: NDArray, aligned: NDArray, asked: Columns, seed: int
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
-    known, classes = label.known, label.kind == "classes"
+    known, classes = label.notna().to_numpy(), has_classes(label)
     options: dict[str, Any] = {
-        "y": label.values,
+        "y": label.dropna().to_numpy(),
         "groups": None if asked.groups is None else asked.groups[known],
         "time": None if asked.times is None else asked.times[known],
-        "kind": label.kind,
-        "random_state": random_state,
+        "kind": "classes" if classes else "number",
+        "random_state": seed,
     }
     found = analysis.association(alpha[known], **options)
     report: dict[str, Any] = {
         "column": label.name,
-        "kind": label.kind,
+        "kind": found.kind,
         "n_frames": found.n_frames,
         "n_without_label": np.sum(~known),
         "statistic": "eta_squared" if classes else "spearman",
@@ -232,17 +230,14 @@ def _label_report(
         "score": "accuracy" if classes else "r_squared",
     }
     if classes:
-        names, counts = np.unique(label.values, return_counts=True)
-        report["classes"] = dict(zip(map(str, names), counts, strict=True))
-        report["largest_class"] = counts.max() / len(label.values)
+        counts = label.value_counts(sort=False)
+        report["classes"] = counts.rename(str).to_dict()
+        report["largest_class"] = counts.max() / counts.sum()
         report["class_means"] = class_means(label, alpha)
+    features = {"cross_validated": alpha, "cross_validated_pca": aligned}
     try:
-        report["cross_validated"] = analysis.predictability(
-            alpha[known], **options
-        ).mean()
-        report["cross_validated_pca"] = analysis.predictability(
-            aligned[known], **options
-        ).mean()
+        for name, values in features.items():
+            report[name] = analysis.predictability(values[known], **options).mean()
     except ValueError as error:  # too few frames of a class, or groups, for two folds
         report["not_cross_validated"] = str(error)
     return report

@@ -14,20 +14,13 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm.cli._columns import Columns, Label, class_means
+from isa_nrsfm.cli._columns import Columns, class_means, has_classes
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._report import MOST_CLASSES
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics._reprojection import frame_energies
-from isa_nrsfm.plotting._axes import (
-    MEAN_COLOUR,
-    VIEWS,
-    add_legend,
-    block_limits,
-    new_page,
-    wrap_title,
-)
+from isa_nrsfm.plotting import _axes
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
 # `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.
@@ -84,7 +77,7 @@ def figures_of(args: Namespace, asked: Columns) -> Figures:
             f"coefficients by {label.name}",
             partial(_by_label, label),
         )
-        if label.is_of_classes(MOST_CLASSES):
+        if has_classes(label, MOST_CLASSES):
             figures[f"label_{number}_shapes.png"] = (
                 f"mean shape of each {label.name}, and of all frames in grey",
                 partial(_shapes_by_label, label),
@@ -135,15 +128,15 @@ def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
     return display
 
 
-def _by_label(label: Label, fit: Fit) -> plotting.CoefficientsDisplay:
+def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients by a label."""
     alpha = fit.estimator.alpha_[:, :MOST_DRAWN]
     return plotting.CoefficientsDisplay(
-        alpha=alpha[label.known],
-        y=label.values,
-        label=label.name.replace("$", r"\$"),  # no mathematics
+        alpha=alpha[label.notna()],
+        y=label.dropna().to_numpy(),
+        label=str(label.name).replace("$", r"\$"),  # no mathematics
         component_names=names_of_components(None, alpha.shape[1]),
-    ).plot(kind=label.kind)
+    ).plot(kind="classes" if has_classes(label) else "number")
 
 
 def _in_time(asked: Columns, fit: Fit) -> plotting.CoefficientsDisplay:
@@ -165,35 +158,34 @@ def _in_time(asked: Columns, fit: Fit) -> plotting.CoefficientsDisplay:
     return shown
 
 
-def _shapes_by_label(label: Label, fit: Fit) -> plotting.BasisShapeDisplay:
+def _shapes_by_label(label: "pd.Series", fit: Fit) -> plotting.BasisShapeDisplay:
     """Draw the mean shape of each class over that of all frames."""
     whole = plotting.BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn)
     import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
     mean = whole.mean_shape
     means = [*class_means(label, fit.estimator.alpha_).values()]
     shapes = mean + np.tensordot(means, whole.basis, 1)
-    (limits,), _ = block_limits([np.concatenate([mean[None], shapes])])
-    axes = new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
-    classes, counts = np.unique(label.values, return_counts=True)
-    for shape, pair, name, count in zip(shapes, axes, classes, counts, strict=True):
-        for points, colour in ((mean, "0.8"), (shape, MEAN_COLOUR)):
+    (limits,), _ = _axes.block_limits([np.concatenate([mean[None], shapes])])
+    axes = _axes.new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
+    counts = label.value_counts(sort=False)
+    for shape, pair, (name, count) in zip(shapes, axes, counts.items(), strict=True):
+        for points, colour in ((mean, "0.8"), (shape, _axes.MEAN_COLOUR)):
             display = plotting.BasisShapeDisplay(
                 mean_shape=points,
                 basis=np.empty((0, *points.shape)),
                 edges=whole.skeleton,
                 origin=whole.origin,
             ).plot(pair, point_kw={"color": colour})
-        for axis, (x, y) in zip(pair, VIEWS, strict=True):
-            axis.set(xlim=limits[x], ylim=limits[y])
-            axis.yaxis.set_inverted(whole.origin == "upper")
+        for axis, view in zip(pair, _axes.VIEWS, strict=True):
+            _axes.show_view(axis, view, limits, whole.origin)
         pair[1].set_xlabel(whole.depth_note, loc="right", fontsize="x-small")
-        title = wrap_title(f"{name} ({count} frames)", pair)
+        title = _axes.wrap_title(f"{name} ({count} frames)", pair)
         pair[0].set_title(title, loc="left", fontsize="small", parse_math=False)
     line = import_optional("matplotlib.lines", extra="plot").Line2D
     style = {"marker": "o", "markersize": 3, "linewidth": 1.5}
     entries = [
         line([], [], color=colour, label=f"mean of {frames}", **style)
-        for frames, colour in (("all frames", "0.8"), ("the class", MEAN_COLOUR))
+        for frames, colour in (("all frames", "0.8"), ("the class", _axes.MEAN_COLOUR))
     ]
-    add_legend(display.figure_, entries, whole.skeleton)
+    _axes.add_legend(display.figure_, entries, whole.skeleton)
     return display

@@ -20,24 +20,14 @@ from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._selection import standard_errors
-from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
+from isa_nrsfm.cli import _outputs
+from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, NONE
-from isa_nrsfm.cli._outputs import (
-    REPORT,
-    RESULTS,
-    digests_of,
-    entry_of_report,
-    refuse_overwriting,
-    refuse_replacing,
-    write_alpha,
-    write_results,
-)
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
 from isa_nrsfm.cli._sections import fit_text, write_report
-from isa_nrsfm.export._viewer import MOST_LABELS
 from isa_nrsfm.io import write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 
@@ -79,18 +69,18 @@ def fit_table(
     asked = asked_columns(args, frames)
     figures = {} if args.no_figures else figures_of(args, asked)
     drawn = drawing(args, frames.columns.points, frames.skeleton)
-    results, inputs = RESULTS, drawing_files(args)
+    results, inputs = _outputs.RESULTS, drawing_files(args)
     if table is None:
         inputs.append(args.table)
     else:
         results = results | {Path(args.table).name: "the table"}
     with whole_files.folder_for_writing(folder):
-        files = [*results, *figures, REPORT]
-        refuse_overwriting(inputs, [folder / name for name in files])
+        files = [*results, *figures, _outputs.REPORT]
+        _outputs.refuse_overwriting(inputs, [folder / name for name in files])
         for name in files:
             whole_files.check_replaceable(folder / name)
         if not args.force:
-            refuse_replacing(folder, files)
+            _outputs.refuse_replacing(folder, files)
         removed = {*_old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
         estimator, search = _fitted(args, frames, asked.groups, clock)
@@ -101,13 +91,15 @@ def fit_table(
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             std = estimator.alpha_std_ if args.std else None
-            write_alpha(new / "alpha.csv", frames, estimator.alpha_, std, columns)
-            shown = {"labels": _first_classes(asked, X), "times": asked.times}
+            _outputs.write_alpha(
+                new / "alpha.csv", frames, estimator.alpha_, std, columns
+            )
+            shown = {"labels": first_classes(asked.labels), "times": asked.times}
             if args.std and estimator.camera_ != "affine":
                 shown["depth_std"] = estimator.reconstruct(
                     X, return_std=True, **frames.weighting
                 )[1]
-            write_results(new, estimator, frames, smooth, drawn, **shown)
+            _outputs.write_results(new, estimator, frames, smooth, drawn, **shown)
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
@@ -127,7 +119,7 @@ def fit_table(
             return report
         # A figure that fails, or takes long, costs no results: they are in place.
         with whole_files.files_together(folder) as new:
-            if digests_of(folder, report["sha256"]) != report["sha256"]:
+            if _outputs.digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
@@ -142,7 +134,7 @@ def fit_table(
 
 def _check_options(args: Namespace) -> None:
     """Raise before a long fit if options exclude each other or a library is absent."""
-    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in RESULTS)}
+    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in _outputs.RESULTS)}
     if Path(args.output).suffix.lower() in suffixes and not Path(args.output).is_dir():
         raise ValueError(
             f"--output {args.output}: expected a folder, because fit writes several "
@@ -204,22 +196,13 @@ def _fitted(
 
 def _old_figures(folder: Path, new: list[str]) -> list[str]:
     """Return the figures that the report of an earlier run lists; warn of others."""
-    old = [name for name in entry_of_report(folder, "files") if name.endswith(".png")]
+    files = _outputs.entry_of_report(folder, "files")
+    old = [name for name in files if name.endswith(".png")]
     others = sorted({*ALWAYS}.difference(old, new))
     others = [name for name in others if (folder / name).exists()]
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
     return old
-
-
-def _first_classes(asked: Columns, X: "pd.DataFrame") -> "pd.Series | None":
-    """Return the first label of few classes, which colours the frames in the viewer."""
-    for label in asked.labels:
-        if label.is_of_classes(MOST_LABELS):
-            values = pd.Series(None, index=X.index, dtype=object, name=label.name)
-            values[label.known] = [str(value) for value in label.values]
-            return values
-    return None
 
 
 def choose_n_components(

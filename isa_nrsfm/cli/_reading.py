@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, skeletons
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
@@ -35,13 +35,7 @@ from isa_nrsfm.io._landmark_columns import (
 )
 from isa_nrsfm.io._landmarks import Landmarks
 from isa_nrsfm.io._tables import confidences_in, tracks_in
-from isa_nrsfm.skeletons import (
-    SKELETONS,
-    Skeleton,
-    find_skeleton,
-    get_skeleton,
-    read_skeleton,
-)
+from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 
 # Options of one format, and that format.
@@ -59,7 +53,7 @@ class Frames(NamedTuple):
     are not skipped, by the number of the row in the table. ``usable`` marks the rows
     that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
     request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
-    numbers of the images that rows show, and the column that has them, if any.
+    numbers of the images that rows show, under the name of their column, if any.
     ``confidence`` has the confidences of the points if they are asked for as weights.
     """
 
@@ -71,7 +65,7 @@ class Frames(NamedTuple):
     n_rows: int
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
-    images: tuple[NDArray, str | None]
+    images: "pd.Series"
     confidence: "pd.DataFrame | None" = None
 
     @property
@@ -102,8 +96,8 @@ def read_frames(
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
-        given = {name: getattr(args, name) for name in _OF_FORMATS}
-        options = {name: given[name] for name in given if given[name] is not None}
+        given = ((name, getattr(args, name)) for name in _OF_FORMATS)
+        options = {name: value for name, value in given if value is not None}
         found = read_landmarks(
             args.table, args.format, min_confidence=args.min_confidence, **options
         )
@@ -150,7 +144,6 @@ def read_frames(
     if found is None:
         _warn_of_shares(tracks[report.usable])
         not_used = _sets_not_used(table, columns) | not_used
-    images, numbered_by = image_numbers(table)
     return Frames(
         points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
         other=table.loc[kept].drop(columns=names),
@@ -160,7 +153,7 @@ def read_frames(
         n_rows=len(table),
         left_out=[out for out in left_out if len(out[1])],
         skeleton=layout,
-        images=(images[rows], numbered_by),
+        images=image_numbers(table).iloc[rows],
         confidence=confidence,
     )
 
@@ -266,8 +259,7 @@ def _rows_to_keep(
     for column, expression in args.skip_rows:
         cells = column_named(table, column, "--skip-rows")
         texts = cells.astype(object).where(cells.notna(), "").astype(str)
-        found = [expression.search(text) is not None for text in texts]
-        matches = kept & np.array(found, dtype=bool)
+        matches = kept & texts.map(expression.search).notna().to_numpy()
         reason = f"{column} matches {expression.pattern!r}"
         skipped.append((reason, np.flatnonzero(matches), True))
         kept &= ~matches
@@ -440,14 +432,14 @@ def _layout(
     extended = report.size > 0
     images = centred[extended] / report.size[extended, None, None]
     shape = images.mean(axis=0).T if extended.any() else None
-    return find_skeleton(len(names), names, shape=shape)
+    return skeletons.find_skeleton(len(names), names, shape=shape)
 
 
 def _given_layout(skeleton: str, names: Sequence[str]) -> Skeleton:
     """Return the layout that --skeleton names, or that its configuration has."""
     if Path(skeleton).suffix.lower() in CONFIGURATIONS:
-        return read_skeleton(skeleton, names)
-    return get_skeleton(skeleton)
+        return skeletons.read_skeleton(skeleton, names)
+    return skeletons.get_skeleton(skeleton)
 
 
 def _part_of_layout(layout: Skeleton | None, points: Sequence[int]) -> Skeleton | None:
