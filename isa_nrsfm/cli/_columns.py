@@ -53,10 +53,9 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
         times = video_times(frames.images[frames.usable], groups) / args.fps
     if times is not None:
         try:
-            times_in_seconds = _frame_columns.checked_times(times, len(table))
-            _frame_columns.sequences_of(
-                times_in_seconds, _frame_columns.group_numbers(groups, len(table)), 1
-            )
+            seconds = _frame_columns.checked_times(times, len(table))
+            numbers = _frame_columns.group_numbers(groups, len(table))
+            _frame_columns.sequences_of(seconds, numbers, 1)
         except ValueError as error:
             hint = " (--group: the rows that belong together)" * (groups is None)
             option = "--fps" if args.time is None else f"--time {args.time}"
@@ -135,9 +134,10 @@ def class_means(label: "pd.Series", alpha: NDArray) -> dict[str, NDArray]:
 
 def first_classes(labels: "list[pd.Series]") -> "pd.Series | None":
     """Return the first label of few classes, which colours the frames in the viewer."""
-    few = (label for label in labels if has_classes(label, MOST_LABELS))
-    texts = (label.map(str, na_action="ignore").astype(object) for label in few)
-    return next(texts, None)
+    for label in labels:
+        if has_classes(label, MOST_LABELS):
+            return label.map(str, na_action="ignore").astype(object)
+    return None
 
 
 def _numbered(
@@ -169,9 +169,8 @@ def _label(table: "pd.DataFrame", text: str) -> "pd.Series":
         values = values.astype(str)
     _frame_columns.refuse_infinite(f"--label {text}", values, names.index.to_numpy())
     with errors_of(f"--label {text}"):
-        dtype = (
-            "category" if _frame_columns.kind_of(values, kind) == "classes" else None
-        )
+        kind = _frame_columns.kind_of(values, kind)
+    dtype = "category" if kind == "classes" else None
     return pd.Series(values, names.index, dtype, name).reindex(table.index)
 
 

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 from isa_nrsfm.skeletons._faces import IBUG_68
-from isa_nrsfm.skeletons._skeleton import Skeleton, run, sides_of_names
+from isa_nrsfm.skeletons._skeleton import named_skeleton, run, sides_of_names
 
 _BOTH = ("left", "right")
 _TOES = ("big_toe", "small_toe", "heel")
@@ -16,31 +16,25 @@ def _each(firsts: Iterable[str], seconds: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{first}_{second}" for first in firsts for second in seconds)
 
 
-def _of_both_sides(
-    parts: Iterable[str], sides: Sequence[str] = _BOTH
-) -> tuple[str, ...]:
-    """Return parts on two sides as names, one part after the other."""
+def _of_sides(parts: Iterable[str], sides: Sequence[str] = _BOTH) -> tuple[str, ...]:
+    """Return parts on the sides as names, one part after the other."""
     return tuple(f"{side}_{part}" for part in parts for side in sides)
 
 
-def _body(name: str, point_names: tuple[str, ...], **parts: Any) -> Skeleton:
-    """Return a layout of points whose names have the sides."""
-    left, right = sides_of_names(point_names)
-    return Skeleton(
-        name=name,
-        kind="body",
-        n_points=len(point_names),
-        point_names=point_names,
-        left=left,
-        right=right,
-        **parts,
-    )
+_body = partial(named_skeleton, kind="body")
 
-
-HAND_21 = Skeleton(
-    name="hand-21",
+_HAND_NAMES = (
+    "wrist",
+    *_each(["thumb"], ("cmc", "mcp", "ip", "tip")),
+    *_each(
+        ("index_finger", "middle_finger", "ring_finger", "pinky"),
+        ("mcp", "pip", "dip", "tip"),
+    ),
+)
+HAND_21 = named_skeleton(
+    "hand-21",
+    _HAND_NAMES,
     kind="hand",
-    n_points=21,
     curves=(
         run(0, 4),  # thumb
         *(run(first, first + 3) for first in (5, 9, 13, 17)),  # fingers
@@ -52,21 +46,13 @@ HAND_21 = Skeleton(
         "https://github.com/google-ai-edge/mediapipe, "
         "mediapipe/python/solutions/hands_connections.py"
     ),
-    point_names=(
-        "wrist",
-        *_each(["thumb"], ("cmc", "mcp", "ip", "tip")),
-        *_each(
-            ("index_finger", "middle_finger", "ring_finger", "pinky"),
-            ("mcp", "pip", "dip", "tip"),
-        ),
-    ),
     # A table of one hand does not determine the side that is seen, nor which hand.
     up=((0, 9),),
 )
 
 
 _ARM, _LEG = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
-_COCO_NAMES = ("nose", *_of_both_sides(("eye", "ear", *_ARM, *_LEG)))
+_COCO_NAMES = ("nose", *_of_sides(("eye", "ear", *_ARM, *_LEG)))
 COCO_17 = _body(
     "coco-17",
     _COCO_NAMES,
@@ -115,7 +101,7 @@ H36M_17 = _body(
 _BODY_25_NAMES = (
     *("nose", "neck", *_each(_RIGHT_FIRST, _ARM)),
     *("mid_hip", *_each(_RIGHT_FIRST, _LEG)),
-    *(*_of_both_sides(("eye", "ear"), _RIGHT_FIRST), *_each(_BOTH, _TOES)),
+    *(*_of_sides(("eye", "ear"), _RIGHT_FIRST), *_each(_BOTH, _TOES)),
 )
 BODY_25 = _body(
     "body-25",
@@ -141,7 +127,7 @@ _POSE_NAMES = (
     *("nose", "left_eye_inner", "left_eye", "left_eye_outer"),
     *("right_eye_inner", "right_eye", "right_eye_outer"),
     *("left_ear", "right_ear", "mouth_left", "mouth_right"),
-    *_of_both_sides((*_ARM, "pinky", "index", "thumb", *_LEG, "heel", "foot_index")),
+    *_of_sides((*_ARM, "pinky", "index", "thumb", *_LEG, "heel", "foot_index")),
 )
 POSE_33 = _body(
     "mediapipe-pose-33",
