@@ -50,7 +50,7 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
             cells = cells_of(table, args.time, "--time")
             times, unit_of_times = read_times(cells, args.time_format)
     elif args.fps is not None:
-        times = video_times(frames.images[frames.usable], groups) / args.fps
+        times = video_times(frames.images[table.index], groups) / args.fps
     if times is not None:
         try:
             seconds = _frame_columns.checked_times(times, len(table))

@@ -73,20 +73,15 @@ def figures_of(args: Namespace, asked: Columns) -> Figures:
             lambda fit: plotting.ComponentChoiceDisplay.from_estimator(fit.search),
         )
     for number, label in enumerate(asked.labels, 1):
-        figures[f"label_{number}.png"] = (
-            f"coefficients by {label.name}",
-            partial(_by_label, label),
-        )
+        caption = f"coefficients by {label.name}"
+        figures[f"label_{number}.png"] = caption, partial(_by_label, label)
         if has_classes(label, MOST_CLASSES):
-            figures[f"label_{number}_shapes.png"] = (
-                f"mean shape of each {label.name}, and of all frames in grey",
-                partial(_shapes_by_label, label),
-            )
+            caption = f"mean shape of each {label.name}, and of all frames in grey"
+            draw = partial(_shapes_by_label, label)
+            figures[f"label_{number}_shapes.png"] = caption, draw
     if asked.times is not None:
-        figures["time.png"] = (
-            "coefficients in time, with a band of one standard deviation",
-            partial(_in_time, asked),
-        )
+        caption = "coefficients in time, with a band of one standard deviation"
+        figures["time.png"] = caption, partial(_in_time, asked)
     return figures
 
 

@@ -4,7 +4,7 @@ import contextlib
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -183,7 +183,20 @@ def _fitted(
     search, X = None, frames.X
     if len(args.n_components) > 1:
         show_stage("choice of the number of basis shapes")
-        search = choose_n_components(estimator, X, args.n_components, groups)
+        splitter: Any = N_PARTS
+        if groups is not None:
+            n_groups = len(np.unique(groups.astype(str)))
+            if n_groups < 2:
+                raise ValueError(
+                    "--group: numbers of basis shapes are compared on held-out groups, "
+                    f"which needs two groups; got {n_groups}"
+                )
+            splitter = GroupKFold(min(N_PARTS, n_groups))
+        search = AffineNRSfMCV(
+            args.n_components, estimator=estimator, cv=splitter, verbose=1
+        )
+        with contextlib.redirect_stdout(sys.stderr):  # results are printed at once
+            search.fit(X, groups=groups)
         estimator = search.best_estimator_
         clock["choose"] = time.perf_counter() - search.refit_time_
     else:
@@ -203,27 +216,6 @@ def _old_figures(folder: Path, new: list[str]) -> list[str]:
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
     return old
-
-
-def choose_n_components(
-    estimator: AffineNRSfM, X: Any, candidates: Sequence[int], groups: NDArray | None
-) -> AffineNRSfMCV:
-    """Return the fitted search for the number that best predicts held-out frames.
-
-    Frames of one group are held out together. Results are printed at once.
-    """
-    splitter: Any = N_PARTS
-    if groups is not None:
-        n_groups = len(np.unique(groups.astype(str)))
-        if n_groups < 2:
-            raise ValueError(
-                "--group: numbers of basis shapes are compared on held-out groups, "
-                f"which needs two groups; got {n_groups}"
-            )
-        splitter = GroupKFold(min(N_PARTS, n_groups))
-    search = AffineNRSfMCV(candidates, estimator=estimator, cv=splitter, verbose=1)
-    with contextlib.redirect_stdout(sys.stderr):
-        return search.fit(X, groups=groups)
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:

@@ -53,8 +53,9 @@ class Frames(NamedTuple):
     are not skipped, by the number of the row in the table. ``usable`` marks the rows
     that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
     request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
-    numbers of the images that rows show, under the name of their column, if any.
-    ``confidence`` has the confidences of the points if they are asked for as weights.
+    numbers of the images that all rows show, under the name of their column, if any.
+    ``weighting`` has the weights of the points of X as an argument of `fit`, if asked
+    for.
     """
 
     points: "pd.DataFrame"
@@ -62,23 +63,15 @@ class Frames(NamedTuple):
     usable: NDArray
     columns: LandmarkColumns
     not_used: dict[str, int]
-    n_rows: int
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
     images: "pd.Series"
-    confidence: "pd.DataFrame | None" = None
+    weighting: dict[str, NDArray]
 
     @property
     def X(self) -> "pd.DataFrame":
         """The landmarks of the usable rows."""
         return self.points[self.usable]
-
-    @property
-    def weighting(self) -> dict[str, Any]:
-        """The weights of the points of X as an argument of `fit`, if asked for."""
-        if self.confidence is None:
-            return {}
-        return {"point_weight": self.confidence.to_numpy(np.float64)[self.usable]}
 
 
 def read_frames(
@@ -134,9 +127,10 @@ def read_frames(
     _refuse_lost_points(args, table[kept], columns, tracks)
     cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
     tracks = cleaned.mT
+    weights = None
     if confidence is not None:
-        confidence = confidence[list(columns.x)].iloc[rows]
-        tracks[confidence.to_numpy() == 0] = np.nan
+        weights = confidence[list(columns.x)].to_numpy(np.float64)[rows]
+        tracks[weights == 0] = np.nan
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
@@ -150,11 +144,10 @@ def read_frames(
         usable=report.usable,
         columns=columns,
         not_used=not_used,
-        n_rows=len(table),
         left_out=[out for out in left_out if len(out[1])],
         skeleton=layout,
-        images=image_numbers(table).iloc[rows],
-        confidence=confidence,
+        images=image_numbers(table),
+        weighting={} if weights is None else {"point_weight": weights[report.usable]},
     )
 
 

@@ -33,7 +33,7 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
     return {
         "path": str(Path(args.table).resolve()),
         "format": args.format,
-        "n_rows": frames.n_rows,
+        "n_rows": len(frames.images),
         "n_frames": len(X),
         "n_points": len(frames.columns.points),
         "missing_values": args.missing_value,

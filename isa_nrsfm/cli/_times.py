@@ -37,13 +37,12 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
     if column.dtype.kind == "M":
         dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
         return np.asarray(dates), "seconds"
-    column = column.astype(str).where(column.notna())
-    known = column[column.notna()]
-    numbers = pd.to_numeric(column, errors="coerce")
-    if format is None and numbers.notna().equals(column.notna()):
+    known = column.dropna().astype(str)
+    numbers = pd.to_numeric(known, errors="coerce")
+    if format is None and numbers.notna().all():
         of_frames = re.fullmatch(_NUMBER, str(column.name).strip(), re.IGNORECASE)
         unit = "frames" if of_frames else f"in the unit of the column {column.name}"
-        return np.asarray(numbers, dtype=float), unit
+        return np.asarray(numbers.reindex(column.index), dtype=float), unit
     zoned = known.str.fullmatch(f".*{_ZONE}")
     if zoned.any() and not zoned.all():
         raise ValueError(

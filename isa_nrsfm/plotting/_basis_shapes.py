@@ -9,15 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.plotting import _axes
-from isa_nrsfm.plotting._views import (
-    Edges,
-    Origin,
-    choose_lines,
-    depth_note,
-    upright_turn,
-    view_and_layout,
-)
+from isa_nrsfm.plotting import _axes, _views
+from isa_nrsfm.plotting._views import Edges, Origin
 from isa_nrsfm.skeletons._column_names import checked_names
 
 # Arrows in the units of the points, with the same width in all axes.
@@ -165,7 +158,8 @@ class BasisShapeDisplay:
         self.component_names = checked_names(
             "component_names", component_names, range(1, n_components + 1)
         )
-        _, self.skeleton, self.origin = choose_lines(edges, origin, self.mean_shape)
+        lines = _views.choose_lines(edges, origin, self.mean_shape)
+        _, self.skeleton, self.origin = lines
         self.edges = None if self.skeleton is None else self.skeleton.edges
 
     @classmethod
@@ -217,9 +211,10 @@ class BasisShapeDisplay:
             axes is not that of the shapes.
         """
         check_is_fitted(estimator, "mean_shape_")
-        view, layout, skeleton, origin = view_and_layout(estimator, edges, origin)
+        lines = _views.view_and_layout(estimator, edges, origin)
+        view, layout, skeleton, origin = lines
         shape = estimator.mean_shape_ @ view.T
-        view = upright_turn(shape, layout, origin) @ view
+        view = _views.upright_turn(shape, layout, origin) @ view
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
@@ -228,7 +223,7 @@ class BasisShapeDisplay:
             component_names=component_names,
             edges=skeleton,
             origin=origin,
-            depth_note=depth_note(estimator),
+            depth_note=_views.depth_note(estimator),
         )
         return display.plot(ax, **kw)
 
