@@ -66,7 +66,7 @@ class Frames(NamedTuple):
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
     images: "pd.Series"
-    weighting: dict[str, NDArray]
+    weighting: dict[str, Any]
 
     @property
     def X(self) -> "pd.DataFrame":
@@ -239,8 +239,7 @@ def _confidence(args: Namespace, found: Landmarks) -> "pd.DataFrame | None":
             f"--weights: {args.table} ({found.format}) has no confidences. Leave out "
             "--weights"
         )
-    x = list(found.points)[::2]
-    return found.confidence.set_axis(x, axis=1).fillna(1.0)
+    return found.confidence.set_axis(list(found.points)[::2], axis=1).fillna(1.0)
 
 
 def _rows_to_keep(
@@ -301,10 +300,8 @@ def _warn_of_code(tracks: NDArray) -> None:
         is_outside = value < np.nanmin(others) or value > np.nanmax(others)
         n_rows = there.any(axis=1).sum()
         is_origin = len(there) > 2 and not is_outside and not len(places)
-        if is_origin:
-            continue
         enough = n_rows > 2 and (is_outside or there[:, point].sum() > 3 * often)
-        if value and not enough:
+        if is_origin or (value and not enough):
             continue
         number = f"{value:.15g}"
         option = f"--missing-value {number}" if value else "--zeros-missing"
@@ -470,12 +467,10 @@ def _kept_points(
 
 def _range(part: str, numbers: dict[str, int], names: Sequence[str]) -> range:
     """Return the points of a name, a number, or two with a hyphen between them."""
-    if part in numbers:
-        return range(numbers[part], numbers[part] + 1)
-    for place in (i for i, letter in enumerate(part) if letter == "-"):
-        first = numbers.get(part[:place].strip())
-        last = numbers.get(part[place + 1 :].strip())
-        if first is not None and last is not None and first <= last:
+    places = [i for i, letter in enumerate(part) if letter == "-"]
+    for ends in [(part, part), *((part[:i], part[i + 1 :]) for i in places)]:
+        first, last = (numbers.get(end.strip(), -1) for end in ends)
+        if 0 <= first <= last:
             return range(first, last + 1)
     raise ValueError(
         f"--points: there are no points {part!r}; the {len(names)} points are "

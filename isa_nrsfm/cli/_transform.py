@@ -37,8 +37,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     alpha = std = np.empty((0, n_components))
     quality: Any = ["no frame was fitted"]
     if len(X):
-        fit = estimator.decompose(X, **frames.weighting)
-        motion, translation, alpha, std = fit
+        motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
         explained = estimator.inverse_transform(alpha, motion, translation)
         found = quality_report(estimator, X, explained, frames.weighting)
         quality = quality_section(found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
@@ -17,29 +17,6 @@ from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import _axes
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
 from isa_nrsfm.skeletons._column_names import checked_names
-
-
-def choose_frames(
-    X: Any, n_frames: int | None, frames: ArrayLike | None, random_state: Any
-) -> NDArray[np.intp]:
-    """Return the rows to draw: the given ones, or random ones in ascending order.
-
-    Random rows have enough points for a fit.
-    """
-    if frames is not None:
-        return _axes.chosen_numbers(frames, "frames", len(X), "row numbers of X")
-    n_coordinates = np.isfinite(np.asarray(unmasked(X), dtype=float)).sum(axis=1)
-    rows = np.flatnonzero(n_coordinates >= 2 * FEWEST_POINTS)
-    if n_frames is None:
-        n_frames = min(6, len(rows))
-    if not 1 <= n_frames <= len(rows):
-        raise ValueError(
-            f"n_frames must be between 1 and the {len(rows)} rows of X with at least "
-            f"{FEWEST_POINTS} points; got {n_frames}"
-        )
-    rng = check_random_state(random_state)
-    return np.sort(rng.choice(rows, size=n_frames, replace=False))
-
 
 PANEL_WIDTH = 2.3  # inches
 
@@ -217,7 +194,18 @@ class ReprojectionDisplay:
             `origin` is not of the kind given above.
         """
         check_is_fitted(estimator, "mean_shape_")
-        rows = choose_frames(X, n_frames, frames, random_state)
+        if frames is None:
+            coordinates = np.isfinite(np.asarray(unmasked(X), dtype=float))
+            rows = np.flatnonzero(coordinates.sum(axis=1) >= 2 * FEWEST_POINTS)
+            n_frames = min(6, len(rows)) if n_frames is None else n_frames
+            if not 1 <= n_frames <= len(rows):
+                raise ValueError(
+                    f"n_frames must be between 1 and the {len(rows)} rows of X with at "
+                    f"least {FEWEST_POINTS} points; got {n_frames}"
+                )
+            rng = check_random_state(random_state)
+            frames = np.sort(rng.choice(rows, size=n_frames, replace=False))
+        rows = _axes.chosen_numbers(frames, "frames", len(X), "row numbers of X")
         table = taken_rows(X, rows)
         _, _, skeleton, origin = view_and_layout(estimator, edges, origin)
         observed, reprojected = (
