@@ -90,10 +90,8 @@ def fit_table(
         with whole_files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
-            std = estimator.alpha_std_ if args.std else None
-            _outputs.write_alpha(
-                new / "alpha.csv", frames, estimator.alpha_, std, columns
-            )
+            alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
+            _outputs.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
             shown = {"labels": first_classes(asked.labels), "times": asked.times}
             if args.std and estimator.camera_ != "affine":
                 shown["depth_std"] = estimator.reconstruct(

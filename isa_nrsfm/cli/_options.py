@@ -406,8 +406,7 @@ def build_parser() -> argparse.ArgumentParser:
 def _settings(command: str, name: str) -> dict[str, Any]:
     """Return the settings of an option of a command for `add_argument`."""
     entries = {entry.partition(" ")[0]: entry for entry in HELP}
-    own = f"{command}.{name}"
-    key = own if own in entries else name
+    key = f"{command}.{name}" if f"{command}.{name}" in entries else name
     help, metavar = HELP[entries[key]], entries[key].partition(" ")[2]
     if not metavar and key not in CHOICES:
         return {"help": help, "action": "store_true"}

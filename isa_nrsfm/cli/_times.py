@@ -129,8 +129,7 @@ def _read(cells: "pd.Series", format: str) -> "pd.Series":
         dates = pd.to_datetime(cells, format=format, errors="coerce", utc=True)
         return dates.dt.tz_localize(None)
     parts = cells.str.extract(f"^{_DURATION}$").astype(float)
-    hours = parts[0].fillna(0.0)
-    seconds = 3600 * hours + 60 * parts[1] + parts[2]
+    seconds = 3600 * parts[0].fillna(0.0) + 60 * parts[1] + parts[2]
     if format == _MINUTES:
         return seconds
     if format == _ALL_THREE:

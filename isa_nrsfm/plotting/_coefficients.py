@@ -202,7 +202,11 @@ class CoefficientsDisplay:
             If `ax` has not one axes for each basis shape, or if `kind` needs `y`.
         """
         import_optional("matplotlib", extra="plot")
-        found = self._kind(kind)
+        found: Kind = "time"
+        if self.y is not None and kind != "time":
+            found = kind_of(self.y, kind)
+        elif kind not in ("auto", "time"):
+            raise ValueError(f"kind={kind!r} needs y, a label for each frame")
         n_components = self.alpha.shape[1]
         size = (_axes.PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
         self.axes_ = _axes.flat_axes(
@@ -224,14 +228,6 @@ class CoefficientsDisplay:
             title = f"the {MOST_GROUPS} of {n_groups} {parts} with the most frames"
             self.axes_[0].set_title(title, loc="left", fontsize="medium")
         return self
-
-    def _kind(self, kind: str) -> Kind:
-        """Return the kind of figure."""
-        if kind == "time" or (kind == "auto" and self.y is None):
-            return "time"
-        if self.y is None:
-            raise ValueError(f"kind={kind!r} needs y, a label for each frame")
-        return kind_of(self.y, kind)
 
     def _draw_classes(self, axes: Any, k: int) -> None:
         """Draw box plots and the frames of each class, scattered sideways."""

@@ -206,7 +206,8 @@ class ModeCovarianceDisplay:
         if absolute:
             values, label = np.abs(values), f"absolute {label}"
         largest = np.abs(values).max() or 1.0
-        limits = {"vmin": 0.0 if absolute else -largest, "vmax": largest}
+        low = 0.0 if absolute else -largest
+        limits: dict[str, Any] = {"vmin": low, "vmax": largest}
         if scale is None:
             scale = "linear" if normalize else "asinh"
         linear, asinh = Normalize(**limits), AsinhNorm(LINEAR_SHARE * largest, **limits)

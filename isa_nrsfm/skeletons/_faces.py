@@ -168,13 +168,8 @@ _LEFT_HALVES = (
     (2, 326, 327),
 )
 _BRIDGE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2)
-_MIRROR = {
-    right: left
-    for right, left in zip(
-        chain(*_RIGHT, *_RIGHT_HALVES), chain(*_LEFT, *_LEFT_HALVES), strict=True
-    )
-    if right != left
-}
+_SIDES = chain(*_RIGHT, *_RIGHT_HALVES), chain(*_LEFT, *_LEFT_HALVES)
+_MIRROR = {right: left for right, left in zip(*_SIDES, strict=True) if right != left}
 MESH_468 = Skeleton(
     name="mediapipe-face-468",
     kind="face",
