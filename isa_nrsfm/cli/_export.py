@@ -35,8 +35,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     if args.table is not None:
         frames = _reading.read_frames(args, estimator)
         stored = frames.skeleton
-        table = table_report(args, frames)
-        sections["Table"] = table_section(table, unusable="not shown")
+        sections["Table"] = table_section(table_report(args, frames), "not shown")
         options["X"] = _reading.as_fitted(estimator, frames.X)
         if args.label is not None:
             labels = _reading.cells_of(frames.other, args.label, "--label")

@@ -135,12 +135,16 @@ def read_frames(
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     _warn_of_code(tracks[report.usable])
+    other = table.drop(columns=names)
     if found is None:
         _warn_of_shares(tracks[report.usable])
-        not_used = _sets_not_used(table, columns) | not_used
+        sets = landmark_sets(other.columns)
+        if columns.z:
+            sets[f"{columns.z[0].strip()}, ... (third coordinate)"] = len(columns.z)
+        not_used = sets | not_used
     return Frames(
         points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
-        other=table.loc[kept].drop(columns=names),
+        other=other.loc[kept],
         usable=report.usable,
         columns=columns,
         not_used=not_used,
@@ -352,15 +356,6 @@ def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:
         "all points in one place": in_one_place,
         "points on one line, others missing": ~(report.usable | few | in_one_place),
     }
-
-
-def _sets_not_used(table: "pd.DataFrame", found: LandmarkColumns) -> dict[str, int]:
-    """Return patterns and numbers of points of the coordinates that are not used."""
-    chosen = {*found.x, *found.y}
-    not_used = landmark_sets([name for name in table.columns if name not in chosen])
-    if found.z:
-        not_used[f"{found.z[0].strip()}, ... (third coordinate)"] = len(found.z)
-    return not_used
 
 
 def _columns_of_model(

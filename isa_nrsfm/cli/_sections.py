@@ -121,10 +121,11 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
 
 def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cells]:
     """Return the quality of a fit, with a remark on its inverse SNR."""
-    weighted = (
-        " Points count by their weights here, and equally in the inverse SNR."
-        * quality["held_out_error_weighted"]
-    )
+    weighted = ""
+    if quality["held_out_error_weighted"]:
+        weighted = (
+            " Points count by their weights here, and equally in the inverse SNR."
+        )
     return [
         f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
         "squares) of the residuals, relative to that of the centred points.",

@@ -48,9 +48,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
-    table = table_report(args, frames)
     sections = {
-        "Table": table_section(table, unusable="without coefficients"),
+        "Table": table_section(table_report(args, frames), "without coefficients"),
         "Model": [args.model],
         "Quality": quality,
         "Output": [*map(str, outputs), f"{len(frames.points)} rows"],

@@ -10,7 +10,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.plotting import _axes, _views
-from isa_nrsfm.plotting._views import Edges, Origin
+from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
 from isa_nrsfm.skeletons._column_names import checked_names
 
 # Arrows in the units of the points, with the same width in all axes.
@@ -158,8 +158,7 @@ class BasisShapeDisplay:
         self.component_names = checked_names(
             "component_names", component_names, range(1, n_components + 1)
         )
-        lines = _views.choose_lines(edges, origin, self.mean_shape)
-        _, self.skeleton, self.origin = lines
+        _, self.skeleton, self.origin = choose_lines(edges, origin, self.mean_shape)
         self.edges = None if self.skeleton is None else self.skeleton.edges
 
     @classmethod
@@ -211,8 +210,7 @@ class BasisShapeDisplay:
             axes is not that of the shapes.
         """
         check_is_fitted(estimator, "mean_shape_")
-        lines = _views.view_and_layout(estimator, edges, origin)
-        view, layout, skeleton, origin = lines
+        view, layout, skeleton, origin = view_and_layout(estimator, edges, origin)
         shape = estimator.mean_shape_ @ view.T
         view = _views.upright_turn(shape, layout, origin) @ view
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]

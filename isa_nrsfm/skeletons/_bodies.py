@@ -40,12 +40,10 @@ HAND_21 = named_skeleton(
         *(run(first, first + 3) for first in (5, 9, 13, 17)),  # fingers
         (0, 5, 9, 13, 17, 0),  # palm
     ),
-    source=(
-        "T. Simon et al., Hand Keypoint Detection in Single Images using Multiview "
-        "Bootstrapping, CVPR 2017; F. Zhang et al., MediaPipe Hands, 2020; "
-        "https://github.com/google-ai-edge/mediapipe, "
-        "mediapipe/python/solutions/hands_connections.py"
-    ),
+    source="T. Simon et al., Hand Keypoint Detection in Single Images using Multiview "
+    "Bootstrapping, CVPR 2017; F. Zhang et al., MediaPipe Hands, 2020; "
+    "https://github.com/google-ai-edge/mediapipe, "
+    "mediapipe/python/solutions/hands_connections.py",
     # A table of one hand does not determine the side that is seen, nor which hand.
     up=((0, 9),),
 )
@@ -63,11 +61,9 @@ COCO_17 = _body(
         *((5, 7, 9), (6, 8, 10)),  # arms
         *((11, 13, 15), (12, 14, 16)),  # legs
     ),
-    source=(
-        "T.-Y. Lin et al., Microsoft COCO: Common Objects in Context, ECCV 2014; "
-        "https://cocodataset.org/#format-data, "
-        "annotations/person_keypoints_val2017.json"
-    ),
+    source="T.-Y. Lin et al., Microsoft COCO: Common Objects in Context, ECCV 2014; "
+    "https://cocodataset.org/#format-data, "
+    "annotations/person_keypoints_val2017.json",
     up=((11, 5), (12, 6)),
     front=((3, 0), (4, 0)),
     across=((6, 5), (12, 11)),
@@ -86,12 +82,10 @@ H36M_17 = _body(
         *((0, 1, 2, 3), (0, 4, 5, 6)),  # legs
         *((8, 11, 12, 13), (8, 14, 15, 16)),  # arms
     ),
-    source=(
-        "C. Ionescu et al., Human3.6M, IEEE Transactions on Pattern Analysis and "
-        "Machine Intelligence 36, 2014; the 17 joints as of J. Martinez et al., A "
-        "Simple yet Effective Baseline for 3D Human Pose Estimation, ICCV 2017, and "
-        "https://github.com/facebookresearch/VideoPose3D"
-    ),
+    source="C. Ionescu et al., Human3.6M, IEEE Transactions on Pattern Analysis and "
+    "Machine Intelligence 36, 2014; the 17 joints as of J. Martinez et al., A "
+    "Simple yet Effective Baseline for 3D Human Pose Estimation, ICCV 2017, and "
+    "https://github.com/facebookresearch/VideoPose3D",
     up=((0, 8),),
     # The nose is in front of the line from the thorax to the top of the head.
     front=((8, 9), (10, 9)),
@@ -113,11 +107,9 @@ BODY_25 = _body(
         *((8, 9, 10, 11, 22, 23), (11, 24)),  # right leg and foot
         *((8, 12, 13, 14, 19, 20), (14, 21)),  # left leg and foot
     ),
-    source=(
-        "Z. Cao et al., OpenPose, IEEE Transactions on Pattern Analysis and Machine "
-        "Intelligence 43, 2021; "
-        "https://github.com/CMU-Perceptual-Computing-Lab/openpose, doc/02_output.md"
-    ),
+    source="Z. Cao et al., OpenPose, IEEE Transactions on Pattern Analysis and Machine "
+    "Intelligence 43, 2021; "
+    "https://github.com/CMU-Perceptual-Computing-Lab/openpose, doc/02_output.md",
     up=((8, 1),),
     front=((17, 0), (18, 0), (21, 19), (24, 22)),
     across=((2, 5), (9, 12)),
@@ -139,11 +131,9 @@ POSE_33 = _body(
         *((11, 13, 15, 17, 19, 15, 21), (12, 14, 16, 18, 20, 16, 22)),  # arms, hands
         *((23, 25, 27, 29, 31, 27), (24, 26, 28, 30, 32, 28)),  # legs and feet
     ),
-    source=(
-        "V. Bazarevsky et al., BlazePose: On-device Real-time Body Pose Tracking, "
-        "2020; https://github.com/google-ai-edge/mediapipe, "
-        "mediapipe/python/solutions/pose_connections.py"
-    ),
+    source="V. Bazarevsky et al., BlazePose: On-device Real-time Body Pose Tracking, "
+    "2020; https://github.com/google-ai-edge/mediapipe, "
+    "mediapipe/python/solutions/pose_connections.py",
     up=((23, 11), (24, 12)),
     front=((7, 0), (8, 0), (29, 31), (30, 32)),
     across=((12, 11), (24, 23)),
@@ -178,12 +168,10 @@ WHOLE_BODY_133 = replace(
         *(_shifted(curve, _RIGHT_HAND) for curve in HAND_21.curves),
         *((9, _LEFT_HAND), (10, _RIGHT_HAND)),  # wrists
     ),
-    source=(
-        "S. Jin et al., Whole-Body Human Pose Estimation in the Wild, ECCV 2020; "
-        "https://github.com/jin-s13/COCO-WholeBody; names: "
-        "https://github.com/open-mmlab/mmpose, "
-        "configs/_base_/datasets/coco_wholebody.py"
-    ),
+    source="S. Jin et al., Whole-Body Human Pose Estimation in the Wild, ECCV 2020; "
+    "https://github.com/jin-s13/COCO-WholeBody; names: "
+    "https://github.com/open-mmlab/mmpose, "
+    "configs/_base_/datasets/coco_wholebody.py",
     point_names=_WHOLE_NAMES,
     left=(*_LEFT, *_shifted(IBUG_68.left)),
     right=(*_RIGHT, *_shifted(IBUG_68.right)),
