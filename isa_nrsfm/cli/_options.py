@@ -410,19 +410,20 @@ def _settings(command: str, name: str) -> dict[str, Any]:
     help, metavar = HELP[entries[key]], entries[key].partition(" ")[2]
     if not metavar and key not in CHOICES:
         return {"help": help, "action": "store_true"}
-    found: dict[str, Any] = {"default": DEFAULTS.get(key), "choices": CHOICES.get(key)}
+    default = DEFAULTS.get(key)
+    settings: dict[str, Any] = {"default": default, "choices": CHOICES.get(key)}
     if metavar:
-        found |= {"metavar": metavar, "type": TYPES.get(metavar)}
+        settings |= {"metavar": metavar, "type": TYPES.get(metavar)}
     if key == "export.table":
-        found["nargs"] = "?"
+        settings["nargs"] = "?"
+    if name == "output":
+        settings["required"] = default is None
     if key in FIRST:
-        help += f" (default: {found['default']})"
+        help += f" (default: {default})"
     if key in REPEATED:
         help += "; may be repeated"
-        found |= {"action": "append", "default": []}
-    if name == "output":
-        found["required"] = found["default"] is None
-    return found | {"help": help}
+        settings |= {"action": "append", "default": []}
+    return settings | {"help": help}
 
 
 def flag_of(name: str) -> str:
