@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,32 +23,21 @@ from isa_nrsfm.export._poses import point_numbers
 from isa_nrsfm.export._viewer import MOST_LABELS
 
 
-class Columns(NamedTuple):
-    """The columns that a fit is asked about, for its usable frames.
+def asked_columns(args: Namespace, frames: Frames) -> Frames:
+    """Return the frames with labels, groups and times; raise if these cannot be used.
 
-    Labels are NaN where they are not known. Those of classes are categories.
+    The points of distances in the options become their numbers.
     """
-
-    labels: "list[pd.Series]"
-    groups: NDArray | None
-    times: NDArray | None
-    time_unit: str
-    distances: list[tuple[int, int]]
-    unit: tuple[int, int] | None
-
-
-def asked_columns(args: Namespace, frames: Frames) -> Columns:
-    """Return the columns that the options name; raise if they cannot be used."""
     table, names = frames.other[frames.usable], frames.columns.points
     labels = [_label(table, text) for text in args.label]
     groups = None if args.group is None else _groups(table, args.group)
-    times, unit_of_times = None, "seconds"
+    times, unit = None, "seconds"
     if args.time_format is not None and args.time is None:
         raise ValueError("--time-format needs --time")
     if args.time is not None:
         with errors_of(f"--time {args.time}"):
             cells = cells_of(table, args.time, "--time")
-            times, unit_of_times = read_times(cells, args.time_format)
+            times, unit = read_times(cells, args.time_format)
     elif args.fps is not None:
         times = video_times(frames.images[table.index], groups) / args.fps
     if times is not None:
@@ -60,58 +49,59 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
             hint = " (--group: the rows that belong together)" * (groups is None)
             option = "--fps" if args.time is None else f"--time {args.time}"
             raise ValueError(f"{option}: {error}{hint}") from error
-    distances = [_numbered(pair, names, "--distance") for pair in args.distance]
-    unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
-    if unit is not None and not distances:
-        raise ValueError("--unit needs --distance")
-    if distances and unit is None and len(names) != 68:
+    args.distance = [_numbered(pair, names, "--distance") for pair in args.distance]
+    if args.unit is not None:
+        args.unit = _numbered(args.unit, names, "--unit")
+        if not args.distance:
+            raise ValueError("--unit needs --distance")
+    elif args.distance and len(names) != 68:
         raise ValueError(
             f"--distance needs --unit: the {len(names)} points are not the 68 of a "
             "face, whose outer corners of the eyes are the unit. Give two points, such "
             f"as --unit {names[0]},{names[1]}"
         )
-    return Columns(labels, groups, times, unit_of_times, distances, unit)
+    return frames._replace(labels=labels, groups=groups, times=times, time_unit=unit)
 
 
 def column_results(
-    args: Namespace, asked: Columns, estimator: AffineNRSfM, frames: Frames
+    args: Namespace, estimator: AffineNRSfM, frames: Frames
 ) -> tuple[dict[str, Any], "pd.DataFrame", Any]:
     """Return entries of the report, columns of alpha.csv and smoothed coefficients."""
     X, alpha, smooth = frames.X, estimator.alpha_, None
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
-    if asked.labels:
+    if frames.labels:
         aligned = _aligned_pca(estimator, X)
         report["labels"] = [
-            _label_report(label, alpha, aligned, asked, args.random_state)
-            for label in asked.labels
+            _label_report(label, alpha, aligned, frames, args.random_state)
+            for label in frames.labels
         ]
-    if asked.groups is not None:
+    if frames.groups is not None:
         report["groups"] = {"column": args.group}
         try:
-            report["groups"] |= analysis.between_share(alpha, asked.groups)._asdict()
+            report["groups"] |= analysis.between_share(alpha, frames.groups)._asdict()
         except ValueError as error:  # one group, or groups of one frame
             report["groups"]["not_divided"] = str(error)
-        within = analysis.WithinGroups().fit_transform(alpha, groups=asked.groups)
+        within = analysis.WithinGroups().fit_transform(alpha, groups=frames.groups)
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
-    if asked.times is not None and estimator.refinement in JOINT_REFINEMENTS:
+    if frames.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
         smooth = estimator.smooth(
-            X, time=asked.times, groups=asked.groups, **frames.weighting
+            X, time=frames.times, groups=frames.groups, **frames.weighting
         )
         found = smooth.alpha
         report["time"] = {
             "column": args.time or "seconds",
-            "unit": asked.time_unit,
+            "unit": frames.time_unit,
             "time_scales": smooth.time_scales,
             "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),
         }
         columns |= {f"alpha_{k}_smooth": each for k, each in enumerate(found.T, 1)}
-    if asked.distances:
-        names = [f"distance_{a}_{b}" for a, b in asked.distances]
+    if args.distance:
+        names = [f"distance_{a}_{b}" for a, b in args.distance]
         try:
             found = point_distances(
-                estimator, asked.distances, unit=asked.unit, length=args.length
+                estimator, args.distance, unit=args.unit, length=args.length
             )
             columns |= zip(names, found.T, strict=True)
         except ValueError as error:
@@ -132,7 +122,7 @@ def class_means(label: "pd.Series", alpha: NDArray) -> dict[str, NDArray]:
     return {str(c): standard[label == c].mean(axis=0) for c in label.cat.categories}
 
 
-def first_classes(labels: "list[pd.Series]") -> "pd.Series | None":
+def first_classes(labels: "Sequence[pd.Series]") -> "pd.Series | None":
     """Return the first label of few classes, which colours the frames in the viewer."""
     for label in labels:
         if has_classes(label, MOST_LABELS):
@@ -205,14 +195,14 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:
 
 
 def _label_report(
-    label: "pd.Series", alpha: NDArray, aligned: NDArray, asked: Columns, seed: int
+    label: "pd.Series", alpha: NDArray, aligned: NDArray, frames: Frames, seed: int
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
     known, classes = label.notna().to_numpy(), has_classes(label)
     options: dict[str, Any] = {
         "y": label.dropna().to_numpy(),
-        "groups": None if asked.groups is None else asked.groups[known],
-        "time": None if asked.times is None else asked.times[known],
+        "groups": None if frames.groups is None else frames.groups[known],
+        "time": None if frames.times is None else frames.times[known],
         "kind": "classes" if classes else "number",
         "random_state": seed,
     }

@@ -14,9 +14,10 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm.cli._columns import Columns, class_means, has_classes
+from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.cli._report import MOST_CLASSES
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics._reprojection import frame_energies
@@ -28,10 +29,10 @@ MOST_DRAWN = 12
 
 
 class Fit(NamedTuple):
-    """A fit to draw: model, table, search, smoothed coefficients, lines to draw."""
+    """A fit to draw: model, frames, search, smoothed coefficients, lines to draw."""
 
     estimator: AffineNRSfM
-    X: "pd.DataFrame"
+    frames: Frames
     search: AffineNRSfMCV | None
     smooth: Any
     drawn: dict[str, Any]
@@ -64,7 +65,7 @@ ALWAYS: Figures = {
 }
 
 
-def figures_of(args: Namespace, asked: Columns) -> Figures:
+def figures_of(args: Namespace, frames: Frames) -> Figures:
     """Return the figures that the options ask for."""
     figures = dict(ALWAYS)
     if len(args.n_components) > 1:
@@ -72,16 +73,16 @@ def figures_of(args: Namespace, asked: Columns) -> Figures:
             "held-out error by the number of basis shapes",
             lambda fit: plotting.ComponentChoiceDisplay.from_estimator(fit.search),
         )
-    for number, label in enumerate(asked.labels, 1):
+    for number, label in enumerate(frames.labels, 1):
         caption = f"coefficients by {label.name}"
         figures[f"label_{number}.png"] = caption, partial(_by_label, label)
         if has_classes(label, MOST_CLASSES):
             caption = f"mean shape of each {label.name}, and of all frames in grey"
             draw = partial(_shapes_by_label, label)
             figures[f"label_{number}_shapes.png"] = caption, draw
-    if asked.times is not None:
+    if frames.times is not None:
         caption = "coefficients in time, with a band of one standard deviation"
-        figures["time.png"] = caption, partial(_in_time, asked)
+        figures["time.png"] = caption, _in_time
     return figures
 
 
@@ -108,13 +109,13 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
 def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
     """Draw up to three frames about the median residual, and as many of the largest."""
     model = fit.estimator
-    energy, error, _ = frame_energies(fit.X, fitted_table(model), model.layout)
+    energy, error, _ = frame_energies(fit.frames.X, fitted_table(model), model.layout)
     order = np.argsort(error / energy)
     n_drawn = max(min(3, len(order) // 3), 1)
     start = (len(order) - n_drawn) // 2
     rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
     display = plotting.ReprojectionDisplay.from_estimator(
-        model, fit.X, frames=rows, **fit.drawn
+        model, fit.frames.X, frames=rows, **fit.drawn
     )
     for number, axes in enumerate(display.axes_):
         which = "median" if number < n_drawn else "largest"
@@ -134,9 +135,9 @@ def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:
     ).plot(kind="classes" if has_classes(label) else "number")
 
 
-def _in_time(asked: Columns, fit: Fit) -> plotting.CoefficientsDisplay:
+def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients in time, smoothed ones if there are any."""
-    alpha = fit.estimator.alpha_
+    frames, alpha = fit.frames, fit.estimator.alpha_
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
@@ -144,11 +145,11 @@ def _in_time(asked: Columns, fit: Fit) -> plotting.CoefficientsDisplay:
     shown = plotting.CoefficientsDisplay(
         alpha=alpha,
         alpha_std=None if deviation is None else deviation[:, :MOST_DRAWN],
-        time=asked.times,
-        groups=asked.groups,
+        time=frames.times,
+        groups=frames.groups,
         component_names=names_of_components(None, alpha.shape[1]),
     ).plot(kind="time")
-    if asked.time_unit == "seconds" and np.asarray(asked.times).dtype.kind != "M":
+    if frames.time_unit == "seconds" and np.asarray(frames.times).dtype.kind != "M":
         shown.axes_[-1].set_xlabel("time, seconds")
     return shown
 

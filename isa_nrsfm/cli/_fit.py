@@ -66,8 +66,8 @@ def fit_table(
     if X.empty:
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
-    asked = asked_columns(args, frames)
-    figures = {} if args.no_figures else figures_of(args, asked)
+    frames = asked_columns(args, frames)
+    figures = {} if args.no_figures else figures_of(args, frames)
     drawn = drawing(args, frames.columns.points, frames.skeleton)
     results, inputs = _outputs.RESULTS, drawing_files(args)
     if table is None:
@@ -83,16 +83,16 @@ def fit_table(
             _outputs.refuse_replacing(folder, files)
         removed = {*_old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
-        estimator, search = _fitted(args, frames, asked.groups, clock)
+        estimator, search = _fitted(args, frames, clock)
         show_stage("answers")
-        answers, columns, smooth = column_results(args, asked, estimator, frames)
+        answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
         with whole_files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
             _outputs.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
-            shown = {"labels": first_classes(asked.labels), "times": asked.times}
+            shown = {"labels": first_classes(frames.labels), "times": frames.times}
             if args.std and estimator.camera_ != "affine":
                 shown["depth_std"] = estimator.reconstruct(
                     X, return_std=True, **frames.weighting
@@ -122,7 +122,7 @@ def fit_table(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
                 )
-            fit = Fit(estimator, X, search, smooth, drawn)
+            fit = Fit(estimator, frames, search, smooth, drawn)
             captions = write_figures(new, figures, fit)
             clock["figures"] = time.perf_counter()
             report |= {"seconds": _seconds(clock), "files": results | captions}
@@ -161,7 +161,7 @@ def _seconds(clock: dict[str, float]) -> dict[str, float]:
 
 
 def _fitted(
-    args: Namespace, frames: Frames, groups: NDArray | None, clock: dict[str, float]
+    args: Namespace, frames: Frames, clock: dict[str, float]
 ) -> tuple[AffineNRSfM, AffineNRSfMCV | None]:
     """Return the model that the options ask for, and the search for its K."""
     isa = None
@@ -178,7 +178,7 @@ def _fitted(
         scale_frames=not args.no_scale_frames,
         **given,
     )
-    search, X = None, frames.X
+    search, X, groups = None, frames.X, frames.groups
     if len(args.n_components) > 1:
         show_stage("choice of the number of basis shapes")
         splitter: Any = N_PARTS

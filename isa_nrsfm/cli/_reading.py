@@ -55,7 +55,8 @@ class Frames(NamedTuple):
     request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
     numbers of the images that all rows show, under the name of their column, if any.
     ``weighting`` has the weights of the points of X as an argument of `fit`, if asked
-    for.
+    for. Labels, groups and times of the usable rows come from `asked_columns`. Labels
+    are NaN where they are not known. Those of classes are categories.
     """
 
     points: "pd.DataFrame"
@@ -67,6 +68,10 @@ class Frames(NamedTuple):
     skeleton: Skeleton | None
     images: "pd.Series"
     weighting: dict[str, Any]
+    labels: "Sequence[pd.Series]" = ()
+    groups: NDArray | None = None
+    times: NDArray | None = None
+    time_unit: str = "seconds"
 
     @property
     def X(self) -> "pd.DataFrame":
