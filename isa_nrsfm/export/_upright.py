@@ -21,7 +21,6 @@ from isa_nrsfm.calibration import (
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm.calibration._metric import unit_cameras
 from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,
@@ -85,7 +84,7 @@ def upright_space(
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
         transform = viewing_rotation(
-            unit_cameras(model.motion_ @ metric.Q),
+            model.motion_ @ metric.Q,
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )
