@@ -20,10 +20,8 @@ def choose_drawing(
 
     `edges` takes precedence over the layout.
     """
-    links = np.empty((0, 2), dtype=np.intp)
-    if edges is None or layout is None:
-        sides = np.zeros(n_points, dtype=np.intp)
-    else:
+    links, sides = np.empty((0, 2), np.intp), np.zeros(n_points, dtype=np.intp)
+    if edges is not None and layout is not None:
         links, sides = layout.edges, layout.sides
     if edges is not None and not isinstance(edges, str | Skeleton):
         links = checked_links("edges", edges, n_points, triangles=True)

@@ -310,21 +310,21 @@ _ALL = (
         "iBUG, 300-W",
         "'version: 1', 'n_points: N' and N lines 'x y' between braces",
         (".pts", _FOLDER),
-        "_annotation_files.pts",
+        "_keypoints.pts",
     ),
     LandmarkFormat(
         "wflw",
         "WFLW lists",
         "lines of 196 coordinates, 4 of a box, 6 attributes and the image",
         (".txt",),
-        "_annotation_files.wflw",
+        "_keypoints.wflw",
     ),
     LandmarkFormat(
         "deeplabcut",
         "DeepLabCut, Lightning Pose",
         "columns of the levels scorer, (individuals,) bodyparts, coords",
         (".csv", ".tsv", ".h5", ".hdf5"),
-        "_deeplabcut.deeplabcut",
+        "_animals.deeplabcut",
     ),
     LandmarkFormat(
         "sleap",
@@ -332,7 +332,7 @@ _ALL = (
         "the datasets tracks, node_names and track_names, or the columns track, "
         "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
         (".h5", ".hdf5", *_TABLES),
-        "_sleap.sleap",
+        "_animals.sleap",
     ),
     LandmarkFormat(
         "coco",
