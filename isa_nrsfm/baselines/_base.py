@@ -271,9 +271,8 @@ class ShapeSequenceNRSfM(
             reset=reset,
         )
         checked_range(X)
-        missing = np.isnan(X)
-        if missing.any():
-            rows = np.flatnonzero(missing.any(axis=1))
+        rows = np.flatnonzero(np.isnan(X).any(axis=1))
+        if len(rows):
             raise ValueError(
                 f"{type(self).__name__} takes no missing points (NaN), which "
                 f"{len(rows)} of {len(X)} rows have (first: row {rows[0]}). Remove "

@@ -34,6 +34,9 @@ from isa_nrsfm.calibration._metric import (
 
 # Growth of the penalty in each step; with 1.02 the end is far from stationary.
 GROWTH = 1.001
+# Fewest frames by whose cameras an atom is aligned. If few frames are shared, their
+# second blocks are small, and the result is often mirrored or wrong.
+FEWEST_SHARED = 10
 
 
 def group_sparse_atoms(
@@ -192,40 +195,6 @@ def _main_directions(frames: NDArray) -> NDArray:
     rows = frames.reshape(-1, frames.shape[2])
     triangle = np.linalg.qr(rows, mode="r") if len(rows) > rows.shape[1] else rows
     return np.linalg.svd(triangle, full_matrices=False)[2][:3]
-
-
-def block_ksvd(
-    frames: NDArray,
-    atoms: NDArray,
-    sparsity: int,
-    ridge: float,
-    max_iter: int,
-    tol: float,
-) -> tuple[NDArray, NDArray, NDArray, float, int]:
-    """Learn a dictionary by which each frame is a sum of at most `sparsity` blocks.
-
-    A sweep codes the frames, then updates the atoms. Sweeps end one after the relative
-    change of the residual falls to `tol`; in the last one no atom is replaced. Returns
-    atoms, blocks, active, the residual share of the energy, and the number of sweeps.
-    """
-    atoms = np.linalg.svd(atoms, full_matrices=False)[2]
-    energy = float(np.sum(frames**2))
-    residual, settled = np.inf, False
-    for n_iter in range(1, max_iter + 1):
-        last = settled or n_iter == max_iter
-        blocks, active = code_frames(frames, atoms, sparsity, ridge)
-        updated = update_atoms(frames, atoms, blocks, active, not last)
-        atoms, blocks, active, residuals = updated
-        before, residual = residual, float(np.sum(residuals**2)) / energy
-        if last:
-            break
-        settled = abs(before - residual) <= tol * residual
-    return atoms, blocks, active, residual, n_iter
-
-
-# Fewest frames by whose cameras an atom is aligned. If few frames are shared, their
-# second blocks are small, and the result is often mirrored or wrong.
-FEWEST_SHARED = 10
 
 
 def metric_correction(blocks: NDArray) -> NDArray:
@@ -497,10 +466,31 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         frames = (W @ basis.T).reshape(n_frames, 2, -1) / unit
         random_state = check_random_state(self.random_state)
         atoms = group_sparse_atoms(frames, n_atoms, self.penalty, random_state)
-        atoms, blocks, active, self.dictionary_residual_, self.n_iter_ = block_ksvd(
-            frames, atoms, self.sparsity, self.ridge, self.max_iter, self.tol
-        )
+        atoms, blocks, active = self._block_ksvd(frames, atoms)
         self.n_users_ = active.sum(axis=0)
         cameras, coefficients, atoms = chain_atoms(atoms, blocks, active)
         shapes = np.tensordot(coefficients, unit * (atoms @ basis), 1)
         return cameras, shapes.transpose(0, 2, 1)
+
+    def _block_ksvd(
+        self, frames: NDArray, atoms: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Learn a dictionary by which a frame is a sum of at most `sparsity` blocks.
+
+        A sweep codes the frames, then updates the atoms. Sweeps end one after the
+        relative change of the residual falls to `tol`; in the last one no atom is
+        replaced. Returns atoms, blocks and active.
+        """
+        atoms = np.linalg.svd(atoms, full_matrices=False)[2]
+        energy, residual, settled = float(np.sum(frames**2)), np.inf, False
+        for n_iter in range(1, self.max_iter + 1):
+            last = settled or n_iter == self.max_iter
+            blocks, active = code_frames(frames, atoms, self.sparsity, self.ridge)
+            updated = update_atoms(frames, atoms, blocks, active, not last)
+            atoms, blocks, active, residuals = updated
+            before, residual = residual, float(np.sum(residuals**2)) / energy
+            if last:
+                break
+            settled = abs(before - residual) <= self.tol * residual
+        self.dictionary_residual_, self.n_iter_ = residual, n_iter
+        return atoms, blocks, active

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from isa_nrsfm._compat.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from isa_nrsfm.export._gltf import write_glb as write_glb
     from isa_nrsfm.export._poses import (
         FramePoses as FramePoses,
         frame_poses as frame_poses,
@@ -26,6 +25,9 @@ if TYPE_CHECKING:
         write_pdm as write_pdm,
         write_shapes as write_shapes,
     )
-    from isa_nrsfm.export._viewer import write_viewer as write_viewer
+    from isa_nrsfm.export._viewer import (
+        write_glb as write_glb,
+        write_viewer as write_viewer,
+    )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -10,7 +10,6 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
-from sklearn.decomposition import PCA
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.damaged_files import reading
@@ -94,19 +93,14 @@ def shape_arrays(model: Any) -> ShapeArrays:
     check_class(model, "model")
     check_is_fitted(model)
     n_components = len(model.basis_)
-    kept = hasattr(model, "alpha_")
-    return ShapeArrays(
-        mean_shape=model.mean_shape_,
-        basis=model.basis_,
-        alpha=np.asarray(model.alpha_) if kept else np.empty((0, n_components)),
-        motion=np.asarray(model.motion_) if kept else np.empty((0, 2, 3)),
-        translation=np.asarray(model.translation_) if kept else np.empty((0, 2)),
-        energy_share=model.energy_share_,
-        reference_motion=model.reference_motion_,
-        reference_translation=model.reference_translation_,
-        point_names=np.array(names_of_points(model), dtype=str),
-        component_names=np.array(names_of_components(None, n_components), dtype=str),
-    )
+    # Those that were not kept are of no frames.
+    kept = {"alpha": (0, n_components), "motion": (0, 2, 3), "translation": (0, 2)}
+    arrays = [
+        np.asarray(getattr(model, f"{name}_", np.empty(kept.get(name, 0))))
+        for name in ShapeArrays._fields[:-2]
+    ]
+    names = names_of_points(model), names_of_components(None, n_components)
+    return ShapeArrays(*arrays, *(np.array(each, dtype=str) for each in names))
 
 
 def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
@@ -479,6 +473,9 @@ def _aligned(shapes: NDArray) -> NDArray:
 
 def _principal_axes(rows: NDArray) -> tuple[NDArray, NDArray]:
     """Return orthonormal principal axes of centred rows and the variances on them."""
+    # This imports all linear models, which the other functions do not need.
+    from sklearn.decomposition import PCA
+
     wide = len(rows) < rows.shape[1]
     pca = PCA(svd_solver="full" if wide else "covariance_eigh").fit(rows)
     variances = pca.explained_variance_ * (1 - 1 / len(rows))

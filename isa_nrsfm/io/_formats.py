@@ -80,10 +80,7 @@ class LandmarkFormat:
     def _function(self, kind: str) -> Callable[..., Any]:
         """Return the function of the reader that begins with "is" or "read"."""
         module, _, name = self.reader.partition(".")
-        found: Callable[..., Any] = getattr(
-            import_module(f"isa_nrsfm.io.{module}"), f"{kind}_{name}"
-        )
-        return found
+        return getattr(import_module(f"isa_nrsfm.io.{module}"), f"{kind}_{name}")
 
     def read(self, path: str | os.PathLike[str], **options: Any) -> "Landmarks":
         """
@@ -123,8 +120,7 @@ class LandmarkFormat:
                 f"{self.expected}, in {_listed(self.suffixes)}"
             )
         with reading(path, f"{self.name} ({self.title})", self.expected):
-            found: Landmarks = self._function("read")(path, **options)
-            return found
+            return self._function("read")(path, **options)
 
 
 def read_landmarks(
