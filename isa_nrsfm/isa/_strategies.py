@@ -346,7 +346,11 @@ class PooledFastICA(BaseSubspaceAnalysis):
         return self._fit_signals(signals, covariance=covariance, criterion=criterion)
 
     def _unmix(
-        self, Z: NDArray, whitening: NDArray, covariance: Any, criterion: Values | None
+        self,
+        Z: NDArray,
+        whitening: NDArray,
+        covariance: Any = None,
+        criterion: Values | None = None,
     ) -> NDArray:
         n_signals, size = len(Z), self.subspace_size
         if covariance is not None:
