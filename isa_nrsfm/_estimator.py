@@ -22,7 +22,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
-    CoefficientNamesMixin,
+    CoefficientsMixin,
     HasMethods,
     Interval,
     ShownEstimator,
@@ -32,8 +32,6 @@ from isa_nrsfm._compat.scikit_learn import (
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import (
     STEPWISE,
-    FitSettings,
-    Limits,
     fit_table,
     ready_table,
     stages_of,
@@ -42,6 +40,13 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
+from isa_nrsfm._joint.settings import (
+    JOINT_TOL,
+    LIMITS,
+    PAPER_TOL,
+    FitSettings,
+    Limits,
+)
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CALIBRATED_CAMERAS,
@@ -77,7 +82,7 @@ _NEEDS_CALIBRATED = (
 
 
 class AffineNRSfM(
-    CallbackSupportMixin, CoefficientNamesMixin, TransformerMixin, ShownEstimator
+    CallbackSupportMixin, CoefficientsMixin, TransformerMixin, ShownEstimator
 ):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
@@ -339,7 +344,7 @@ class AffineNRSfM(
 
     _model: TableModel
     _frame_sizes: NDArray
-    _limits: ClassVar[Limits] = Limits()  # others: `limited`
+    _limits: ClassVar[Limits] = LIMITS  # others: `limited`
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
@@ -510,35 +515,35 @@ class AffineNRSfM(
                     "table"
                 )
         table = ready_table(source, weights, n_components, settings)
-        fit = fit_table(
+        model, frames, converged, fitted = fit_table(
             table, n_components, isa, settings, progress, start, auto, errors
         )
-        if not fit.converged:
+        if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
-        attributes = {**vars(opened), **fit.attributes}
+        attributes = {**vars(opened), **fitted}
         if self.keep_frames:
-            kept = keep(fit.frames._asdict())
+            kept = keep(frames._asdict())
             frames = Decomposition(*map(source.as_collected, kept.values()))
             attributes |= {
                 f"{name}_": value for name, value in frames._asdict().items()
             }
-            attributes["_frame_sizes"] = fit.sizes
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
                 R, scales = full_rotations(frames.motion)
                 attributes |= {"rotations_": R, "scales_": scales}
-        certainty = fit.model.frames.certainty
+        else:
+            del attributes["_frame_sizes"]
+        certainty = model.frames.certainty
         if errors and not certainty.determined:
             warn_caller(certainty.advice)
         self.__dict__.update(attributes)
-        self._model, self._n_features_out = fit.model, len(fit.model.basis)
-        self.isa_, self.camera_ = fit.isa, self.camera
-        self.frames_scaled_ = settings.scale_frames
+        self._model, self._n_features_out = model, len(model.basis)
+        self.camera_, self.frames_scaled_ = self.camera, settings.scale_frames
 
     def _ready(
         self, X: Any, point_weight: Any = None
@@ -576,6 +581,8 @@ class AffineNRSfM(
             )
         source, weights = self._opened(X, point_weight, reset=True)
         params = self.get_params(deep=False)
+        if self.tol is None:
+            params["tol"] = JOINT_TOL if joint else PAPER_TOL
         settings = FitSettings(
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),
@@ -612,13 +619,6 @@ class AffineNRSfM(
         found = ("_model", "_frame_sizes", "_n_features_out")
         left = [name for name in vars(self) if not name.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in left if name not in found}
-
-    def __sklearn_tags__(self) -> Any:
-        """Return the estimator's tags."""
-        tags = super().__sklearn_tags__()
-        tags.transformer_tags.preserves_dtype = ["float64", "float32"]
-        tags.input_tags.allow_nan = True
-        return tags
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""
@@ -893,7 +893,7 @@ class AffineNRSfM(
             return self._model.shapes(X, metric, scaled)
         table, weights = self._opened(X, point_weight)
         if return_std:
-            return tuple(table.collect(self._model.uncertain_shapes, *weights))
+            return table.collect(self._model.uncertain_shapes, *weights)
         shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
         return table.collect(shapes, *weights)
 

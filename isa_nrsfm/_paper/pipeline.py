@@ -194,21 +194,6 @@ def _squared(block: NDArray, V: NDArray) -> NDArray:
     return ((matrix @ V.astype(matrix.dtype)).T @ matrix).T.astype(np.float64)
 
 
-class PaperResult(NamedTuple):
-    """Result of the paper's pipeline, before a gauge is chosen.
-
-    shapes (K + 1, 3, J): B_0 of the rigid factorisation, and ``B_k = E_k B_ISA,k``;
-    zero for subspaces without motion. mode_covariance (3K, 3K): ``(J / 2I) M_ISA^T
-    M_ISA``, in the order of the basis. n_iter: steps of the refinement, 1 without a
-    refinement.
-    """
-
-    shapes: NDArray
-    mode_covariance: NDArray
-    n_iter: int
-    converged: bool
-
-
 def run_paper_pipeline(
     factors: Factorisation,
     n_components: int,
@@ -218,8 +203,14 @@ def run_paper_pipeline(
     max_iter: int,
     tol: float,
     report: Callable[[str], None],
-) -> PaperResult:
-    """Fit the strategy `isa`, recover blocks and refine them unless max_iter is 0."""
+) -> tuple[NDArray, NDArray, int, bool]:
+    """Fit the strategy `isa`, recover blocks and refine them unless max_iter is 0.
+
+    Returns shapes (K + 1, 3, J): B_0 of the rigid factorisation, and ``B_k = E_k
+    B_ISA,k``, zero for subspaces without motion. The mode covariance (3K, 3K) ``(J /
+    2I) M_ISA^T M_ISA``, in the order of the basis. The number of steps of the
+    refinement, 1 without one, and its convergence.
+    """
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = motion_products(factors.rigid_motion, factors.motion)
     moments = lifted_moments(products)
@@ -248,7 +239,7 @@ def run_paper_pipeline(
     shapes[1 : len(E) + 1] = E @ (components @ factors.signals).reshape(len(E), 3, -1)
     covariance = np.zeros((3 * n_components, 3 * n_components))
     covariance[: 3 * len(E), : 3 * len(E)] = products.gram * (n_points / n_rows)
-    return PaperResult(shapes, covariance, n_iter, converged)
+    return shapes, covariance, n_iter, converged
 
 
 def _independent_subspaces(

@@ -271,4 +271,4 @@ def _rigid_noise(rows: NDArray) -> float:
         W = rows.reshape(-1, rows.shape[2])
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
         return max(float(energy[:-3].sum()), 0.0) / W.size
-    return completion_model(rows, rank=3).noise
+    return completion_model(rows, rank=3)[1]

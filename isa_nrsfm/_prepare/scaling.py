@@ -23,7 +23,9 @@ from isa_nrsfm._tables.tracks import (
     centred_frames,
     check_frames,
     seen_points,
+    warn_of_half_points,
     weighted_sizes,
+    without_half_points,
 )
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
@@ -85,8 +87,12 @@ def scaled_table(
     """
     n_points, dtype = blocks.empty.shape[2], blocks.empty.dtype
     check_size(blocks.n_frames, n_points, n_components, camera)
-    examined = blocks.map(partial(_examine, robust=robust))
-    visible, largest, *rest = map(np.concatenate, zip(*examined, strict=True))
+    n_half, first, visible, largest, *rest = blocks.joined(
+        partial(_examine, robust=robust)
+    )
+    if n_half.any():
+        warn_of_half_points(n_half, first, layout, names)
+        blocks = blocks.derive(lambda rows: without_half_points(rows)[0])
     report = FrameReport(*rest)
     check_frames(report, n_points)
     shown = report.n_seen > 0
@@ -140,7 +146,8 @@ def scaled_table(
 
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
-    """Return visible points, magnitudes and reports of rows (n, 2, J)."""
+    """Return half and visible points, magnitudes and reports of rows (n, 2, J)."""
+    rows, *half = without_half_points(rows)
     _, report = centred_frames(rows)
     shown = report.n_seen > 0
     if robust and shown.any():
@@ -148,7 +155,7 @@ def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
         centred, report.translation[shown] = robustly_centred(rows[shown])
         report.size[shown] = robust_sizes(centred)
     largest = np.fmax.reduce(np.abs(rows), axis=(1, 2), initial=0.0)
-    return visible_points(rows), largest, *report
+    return *half, visible_points(rows), largest, *report
 
 
 def _unit_rows(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._linalg.small_matrices import energies
+from isa_nrsfm._linalg.small_matrices import energies, like
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048
@@ -127,7 +127,7 @@ class FrameBlocks:
         """Join the results of a function of each block: arrays, or tuples of them."""
         parts = list(self.map(function, *by_frame)) or [function(self.empty)]
         if isinstance(parts[0], tuple):
-            return type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
+            return like(parts[0], map(np.concatenate, zip(*parts, strict=True)))
         return np.concatenate(parts)
 
     # On dask the result stays on the workers.
@@ -201,18 +201,17 @@ class DaskBlocks(FrameBlocks):
     def collect(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
         """Return dask arrays, or a named tuple of them, that are not computed yet."""
         array = import_optional("dask.array", extra="dask")
-        tasks, like = self._tasks(function, *by_frame), function(self.empty)
+        tasks, empty = self._tasks(function, *by_frame), function(self.empty)
 
-        def joined(like: NDArray, tasks: list[Any]) -> Any:
-            shapes = [(length, *like.shape[1:]) for length in self.lengths]
-            parts = map(array.from_delayed, tasks, shapes, [like.dtype] * len(tasks))
+        def joined(empty: NDArray, tasks: list[Any]) -> Any:
+            shapes = [(length, *empty.shape[1:]) for length in self.lengths]
+            parts = map(array.from_delayed, tasks, shapes, [empty.dtype] * len(tasks))
             return array.concatenate(list(parts))
 
-        if not isinstance(like, tuple):
-            return joined(like, tasks)
-        return type(like)(
-            *(joined(each, [task[i] for task in tasks]) for i, each in enumerate(like))
-        )
+        if not isinstance(empty, tuple):
+            return joined(empty, tasks)
+        columns = ([task[i] for task in tasks] for i in range(len(empty)))
+        return like(empty, map(joined, empty, columns))
 
     def as_collected(self, values: NDArray) -> Any:
         """Return an array (n_frames, ...) as a dask array with these blocks' chunks."""
