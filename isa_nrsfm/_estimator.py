@@ -101,11 +101,11 @@ class AffineNRSfM(
         K, the number of basis shapes. K needs at least 3K + 4 points and
         ``ceil(8 (K + 2) / 5)`` frames. Calibrated cameras allow up to 2J - 7 basis
         shapes of J points, if there are enough frames (joint refinement only): for 17
-        points 27 instead of 4. "auto" takes the relevant ones of twelve, or of
-        as many as the table allows (joint refinement only); ``len(basis_)`` is the
-        number found. With ``refinement="consensus"`` the joint fit has at most twelve,
-        and the result has K principal components of the merged shapes; "auto" keeps up
-        to 60, all that exceed the noise.
+        points 27 instead of 4. "auto" fits twelve basis shapes, or as many as the table
+        allows, and keeps the relevant ones (joint refinement only); their number is
+        ``len(basis_)``. With ``refinement="consensus"`` the joint fit has at most
+        twelve, and the result has K principal components of the merged shapes; "auto"
+        keeps those that exceed the noise, at most 60.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
@@ -496,8 +496,8 @@ class AffineNRSfM(
     ) -> None:
         """Fit a table, and set all attributes at once.
 
-        The joint fit starts from the model of a similar table, if given.
-        `errors`: estimate those of the depths, and warn of those not determined.
+        The joint fit starts from the model of a similar table, if given. `errors`:
+        estimate the errors of the depths, and warn if depths are not determined.
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
@@ -548,9 +548,9 @@ class AffineNRSfM(
     def _ready(
         self, X: Any, point_weight: Any = None
     ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
-        """Check parameters and a table of a fit; return it, its weights and settings.
+        """Check the parameters and the table of a fit, and set the columns' attributes.
 
-        Sets the attributes of the columns.
+        Returns the table, the weights of its points and the settings.
         """
         joint = self.refinement in JOINT_REFINEMENTS
         if not joint:
@@ -616,9 +616,9 @@ class AffineNRSfM(
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""
-        found = ("_model", "_frame_sizes", "_n_features_out")
-        left = [name for name in vars(self) if not name.endswith("_")]
-        self.__dict__ = {name: vars(self)[name] for name in left if name not in found}
+        private = ("_model", "_frame_sizes", "_n_features_out")
+        names = [n for n in vars(self) if n not in private and not n.endswith("_")]
+        self.__dict__ = {name: vars(self)[name] for name in names}
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""
@@ -782,10 +782,10 @@ class AffineNRSfM(
         table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("rotation_covariance", calibrated=True)
         space, certainty = frames.gauge.rotation, frames.certainty
-        found = table.joined(self._model.posterior, *weights)
-        covariance = space @ found.turn_covariance @ space.T
+        posterior = table.joined(self._model.posterior, *weights)
+        covariance = space @ posterior.turn_covariance @ space.T
         if certainty.turns is not None:
-            R, _ = full_rotations(found.motion @ space.T)
+            R, _ = full_rotations(posterior.motion @ space.T)
             covariance = covariance + R.mT @ certainty.turns @ R
         return np.asarray(covariance).astype(table.empty.dtype, copy=False)
 
@@ -922,21 +922,21 @@ class AffineNRSfM(
         True
         """
         check_is_fitted(self)
-        found, dtype = copy.copy(self), self.mean_shape_.dtype
+        mirror, dtype = copy.copy(self), self.mean_shape_.dtype
         for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
             if hasattr(self, name):
-                setattr(found, name, getattr(self, name) * MIRROR.astype(dtype))
+                setattr(mirror, name, getattr(self, name) * MIRROR.astype(dtype))
         if hasattr(self, "rotations_"):
             turned = MIRROR[:, None] * self.rotations_ * MIRROR
-            found.rotations_ = turned.astype(dtype, copy=False)
+            mirror.rotations_ = turned.astype(dtype, copy=False)
         signs = np.tile(MIRROR, len(self.basis_))
-        found.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
-        found._model = self._model._replace(
+        mirror.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
+        mirror._model = self._model._replace(
             frames=self._model.frames.mirrored(),
-            mean_shape=found.mean_shape_,
-            basis=found.basis_,
+            mean_shape=mirror.mean_shape_,
+            basis=mirror.basis_,
         )
-        return found
+        return mirror
 
     def reproject(self, X: Any) -> NDArray:
         """

@@ -130,8 +130,8 @@ def fit_table(
     """Fit a table with K basis shapes and a clone of the strategy `isa`.
 
     The joint fit starts from the model of a similar table, if `start` is given, instead
-    of the paper's result. `free`: a consensus has all components that exceed the noise
-    instead of K. `errors`: estimate those of the depths.
+    of the paper's result. `free`: the consensus keeps all components that exceed the
+    noise, instead of K. `errors`: estimate the errors of the depths.
 
     Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
     without visible points; convergence; and the other attributes of `AffineNRSfM`.
@@ -171,7 +171,7 @@ def fit_table(
             # A residual below the noise of the spectrum leaves nothing for groups.
             n_numbers, square = tracks.totals
             noise = factorised.noise_level(n_components) * square / n_numbers
-            if wanted > n_components or fit.left > noise:
+            if wanted > n_components or fit.misfit > noise:
                 model = _consensus_model(table, model, settings, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)

@@ -266,9 +266,9 @@ class FrameSearch:
             motion = frames_first(M)
             spreads = fits.covariance[block], fits.turn_covariance[block]
             if covariances:
-                covariance, turns = self.covariances(problem, M, alpha)
-                turns = self.space.T @ frames_first(turns) @ self.space
-                spreads = frames_first(covariance), turns
+                spreads = self.covariances(problem, M, alpha)
+                covariance, turns = map(frames_first, spreads)
+                spreads = covariance, self.space.T @ turns @ self.space
             minima = FramePosterior(
                 motion @ self.space,
                 products.positions(motion, alpha.T),

@@ -227,7 +227,7 @@ def _first_fit(
         raced = map(partial(refined, max_iter=min(max_iter, 5)), states)
         states = [min(raced, key=_end).state]
     other = min(map(partial(refined, max_iter=max_iter), states), key=_end)
-    ratio = fit.left / min(other.left, fit.left)
+    ratio = fit.misfit / min(other.misfit, fit.misfit)
     if cameras.calibrated:
         return fit._replace(camera_noise_ratio=ratio), starts[0]
     return other._replace(camera_noise_ratio=ratio), rigid

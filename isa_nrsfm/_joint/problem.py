@@ -101,7 +101,7 @@ class JointFit(NamedTuple):
     gradient_norm: ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D
     of the approximate Hessian and the number N of coordinates. Its square is about half
     to twice the possible further decrease of the objective per coordinate.
-    left: the maximum of the noise variance and the mean square residual at the
+    misfit: the maximum of the noise variance and the mean square residual at the
     posterior means of the coefficients. camera_noise_ratio: noise variance with
     calibrated cameras divided by that with affine ones, for the sample of
     `fit_jointly`. NaN with given starts.
@@ -111,7 +111,7 @@ class JointFit(NamedTuple):
     history: NDArray
     gradient_norm: float
     converged: bool
-    left: float
+    misfit: float
     camera_noise_ratio: float = np.nan
 
 
@@ -264,7 +264,7 @@ def refine_joint(
     slope = iterate.gradient @ iterate.precondition(iterate.gradient)
     norm = float(np.sqrt(max(slope, 0.0) / n_seen))
     converged = small_steps >= 2 and bool(np.isfinite(iterate.value))
-    return JointFit(iterate.state, np.array(history), norm, converged, iterate.left)
+    return JointFit(iterate.state, np.array(history), norm, converged, iterate.misfit)
 
 
 class _Iterate:
@@ -285,7 +285,7 @@ class _Iterate:
         self.M, noise = frames_last(state.motion), state.noise
         self.n_seen = likelihood.frames.totals[0]
         self.value = passed.value
-        self.left = max(noise, passed.residual / self.n_seen)
+        self.misfit = max(noise, passed.residual / self.n_seen)
         at_floor = noise <= floor * (1 + 1e-6)
         # At its lower bound the noise variance may only rise.
         by_noise = min(passed.noise_gradient, 0.0 if at_floor else np.inf)

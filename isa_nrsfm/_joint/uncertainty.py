@@ -44,12 +44,12 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # With a robust loss, points with residuals above this threshold, in standard deviations
-# of a coordinate, are left out. Without outliers this is one point in 3,000.
+# of a coordinate, are left out: docs/benchmarks/README.md, "Thresholds".
 OUTLYING = 4.0
 # Directions of the coefficients with a lower reliability are not supported by the
 # table. Pure noise has reliability zero.
 LEAST_RELIABILITY = 0.1
-# Groups have equal size. With k-means groups the errors are half too large.
+# Groups have equal size: docs/benchmarks/README.md, "Thresholds".
 N_GROUPS = 5
 # Largest number of steps of a fit, and its convergence tolerance. 30 steps understate
 # the errors of undetermined depths. A tolerance of 1e-6 changes determined ones by less

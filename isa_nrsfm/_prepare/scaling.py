@@ -11,7 +11,6 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.checks import (
     check_points,
     check_size,
-    visible_points,
     warn_if_other_layout,
 )
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
@@ -155,7 +154,8 @@ def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
         centred, report.translation[shown] = robustly_centred(rows[shown])
         report.size[shown] = robust_sizes(centred)
     largest = np.fmax.reduce(np.abs(rows), axis=(1, 2), initial=0.0)
-    return *half, visible_points(rows), largest, *report
+    visible = np.packbits(seen_points(rows), axis=1)
+    return *half, visible, largest, *report
 
 
 def _unit_rows(

@@ -27,8 +27,9 @@ class FrameBlocks:
 
     A block is an array with a row for each of some consecutive frames, or the result of
     a function given to `derive`. `read` returns the block of a given number, and
-    `lengths` are the numbers of frames. Derived blocks are computed once if `cached`,
-    and otherwise at each reading. `n_threads` threads work on blocks at the same time.
+    `lengths` are the numbers of frames, `n_frames` their sum. Derived blocks are
+    computed once if `cached`, and otherwise at each reading. `n_threads` threads work
+    on blocks at the same time.
     `empty` is a block without frames, known for blocks of `open_table`.
     """
 
@@ -42,7 +43,7 @@ class FrameBlocks:
         n_threads: int = 1,
     ):
         self.read, self.cached, self.n_threads = read, cached, n_threads
-        self.lengths = list(lengths)
+        self.lengths, self.n_frames = list(lengths), sum(lengths)
         ends = np.cumsum(self.lengths, dtype=int).tolist()
         self.slices = list(map(slice, [0, *ends[:-1]], ends))
 
@@ -71,11 +72,6 @@ class FrameBlocks:
         parts = block_slices(n_frames, block_frames)
         lengths = [part.stop - part.start for part in parts]
         return cls(lambda number: rows(parts[number]), lengths, False, n_threads)
-
-    @property
-    def n_frames(self) -> int:
-        """The number of frames of all blocks."""
-        return sum(self.lengths)
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """Return the results of a function of each block, and of its rows of arrays."""

@@ -31,11 +31,13 @@ from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 # Bound on the ratio of stretches of space by a root Q of the metric G. It is exceeded
-# if the cameras hardly determine the depth, which noise can then stretch without limit.
+# if the cameras hardly determine the depth, which noise can then stretch without limit:
+# docs/benchmarks/README.md, "Thresholds".
 LARGEST_STRETCH = 20.0
 
 # Bound on the ratio of stretches of a metric to start from, in the space in which the
-# cameras see all directions alike. Nearly singular metrics are near saddle points.
+# cameras see all directions alike. Nearly singular metrics are near saddle points:
+# docs/benchmarks/README.md, "Thresholds".
 STRETCH_OF_START = 3.0
 
 # Matrices whose products with ``[[xx, xy], [xy, yy]]`` are xx - yy, 2 xy and xx + yy.
@@ -280,7 +282,7 @@ def refine_metric(
             normal_equations(*linearised(motion[part] @ Q, alpha[part], strain, camera))
             for part in gen_batches(len(motion), BLOCK_FRAMES)
         ]
-        cost, curvature, gradient = (sum(each) for each in zip(*terms, strict=True))
+        cost, curvature, gradient = (sum(parts) for parts in zip(*terms, strict=True))
         numbers = np.einsum("kab,nab->kn", metric, basis).ravel()
         values = np.linalg.eigvalsh(Q.T @ gram @ Q)
         deep = values[0] > OF_RANKS * values[-1]

@@ -23,7 +23,7 @@ from isa_nrsfm.calibration._metric import (
 )
 
 # Above this condition number the cameras hardly determine the metric. It is that of
-# rotations by about five degrees.
+# rotations by about five degrees: docs/benchmarks/README.md, "Thresholds".
 LARGEST_CONDITION = 50.0
 
 
