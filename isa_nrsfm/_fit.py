@@ -378,7 +378,7 @@ def _joint_frames(
     if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     model = replace(model, gauge=frame_map, certainty=certainty)
-    weight = table.n_observations
+    weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)

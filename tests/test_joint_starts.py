@@ -202,7 +202,7 @@ class TestAffineStart:
         scene = random_scene(amplitude=0.0)
         problem = problem_of(scene)
         state = affine_start(problem, scene.W, paper_shapes(scene.factors))
-        floor = problem.settings.options.least_noise * np.mean(scene.rows**2)
+        floor = problem.settings.limits.least_noise * np.mean(scene.rows**2)
         assert state.noise == pytest.approx(floor)
 
     def test_basis_shapes_are_one_deviation_of_their_coefficients(self):
@@ -284,8 +284,8 @@ def counted(problem, state, threshold=None):
     """Return the number of relevant shapes, by another threshold of shares."""
     settings = problem.settings
     if threshold is not None:
-        options = settings.options._replace(determined=threshold)
-        settings = settings._replace(options=options)
+        limits = settings.limits._replace(determined=threshold)
+        settings = settings._replace(limits=limits)
     return relevant_components(replace(problem, settings=settings), state)
 
 

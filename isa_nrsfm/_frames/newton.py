@@ -275,7 +275,7 @@ class CalibratedSearch(FrameSearch):
         cameras, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
         tried = padded(tried)
         if len(tried):
-            problem, M, limit = (of_frames(p, tried) for p in (problem, M, limit))
+            problem, M, limit = of_frames((problem, M, limit), tried)
             start = self.evaluate(problem, M * REVERSED)
             # The reversed camera and M differ in the third column.
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])

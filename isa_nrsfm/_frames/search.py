@@ -340,9 +340,8 @@ class FrameSearch:
                 if leaving.all():
                     return ends, converged
                 left = padded(np.flatnonzero(~leaving))
-                problem, state, step, running, damping, known = (
-                    of_frames(part, left)
-                    for part in (problem, state, step, running, damping, known)
+                problem, state, step, running, damping, known = of_frames(
+                    (problem, state, step, running, damping, known), left
                 )
             if not n_left:
                 break

@@ -10,7 +10,6 @@ results are finite for any matrix.
 """
 
 import math
-from collections.abc import Iterable
 from functools import cache
 from itertools import repeat
 from typing import Any
@@ -215,15 +214,11 @@ def of_frames(values: Any, frames: NDArray | slice) -> Any:
     The frames stay the last axis in memory. None stays None.
     """
     if isinstance(values, tuple):
-        return like(values, map(of_frames, values, repeat(frames)))
+        parts = map(of_frames, values, repeat(frames))
+        return getattr(values, "_make", tuple)(parts)
     if not isinstance(values, np.ndarray):
         return values if values is None else values.of_frames(frames)
     return values[..., frames] if isinstance(frames, slice) else values.take(frames, -1)
-
-
-def like(values: tuple[Any, ...], parts: Iterable[Any]) -> Any:
-    """Return parts as a tuple, or as a named tuple of the type of the values."""
-    return getattr(values, "_make", tuple)(parts)
 
 
 def frames_last(motion: NDArray) -> NDArray:

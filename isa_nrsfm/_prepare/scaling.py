@@ -59,11 +59,6 @@ class ScaledTable(NamedTuple):
     weights: NDArray | None = None
 
     @property
-    def n_observations(self) -> NDArray:
-        """Numbers of observations (I,) of the frames."""
-        return self.n_seen if self.weights is None else self.weights.sum(axis=1)
-
-    @property
     def complete(self) -> bool:
         """Whether all points are seen."""
         return bool((self.n_seen == self.n_points).all())

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._linalg.small_matrices import energies, like
+from isa_nrsfm._linalg.small_matrices import energies
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048
@@ -123,7 +123,8 @@ class FrameBlocks:
         """Join the results of a function of each block: arrays, or tuples of them."""
         parts = list(self.map(function, *by_frame)) or [function(self.empty)]
         if isinstance(parts[0], tuple):
-            return like(parts[0], map(np.concatenate, zip(*parts, strict=True)))
+            joined = map(np.concatenate, zip(*parts, strict=True))
+            return getattr(parts[0], "_make", tuple)(joined)
         return np.concatenate(parts)
 
     # On dask the result stays on the workers.
@@ -207,7 +208,7 @@ class DaskBlocks(FrameBlocks):
         if not isinstance(empty, tuple):
             return joined(empty, tasks)
         columns = ([task[i] for task in tasks] for i in range(len(empty)))
-        return like(empty, map(joined, empty, columns))
+        return getattr(empty, "_make", tuple)(map(joined, empty, columns))
 
     def as_collected(self, values: NDArray) -> Any:
         """Return an array (n_frames, ...) as a dask array with these blocks' chunks."""
