@@ -202,9 +202,10 @@ def supported_components(
     settings = settings._replace(refinement="joint")
     possible = most_components(len(table.sizes), table.n_points, settings.camera)
     most = min(MOST_FIRST, possible)
-    factorised = _factorised(table, most, settings, NoProgress())
-    factors, isa, quiet = factorised.factors, clone(isa), NoProgress()
-    shapes, *_ = _paper_result(factors, most, isa, settings, quiet)
+    quiet = NoProgress()
+    factorised = _factorised(table, most, settings, quiet)
+    factors = factorised.factors
+    shapes, *_ = _paper_result(factors, most, clone(isa), settings, quiet)
     supported = count_components(factorised, shapes, settings)
     # Down-weighted outliers look like basis shapes: fit again with the final weights.
     while supported > 1 and settings.loss != "linear":
@@ -251,9 +252,10 @@ def _factorised(
 
 
 def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointState:
-    """Return shapes and noise of a model, in units of a table, without cameras.
+    """Return a start of K basis shapes from a model, in units of a table, no cameras.
 
-    Missing basis shapes are directions of the residuals of at most 200 frames.
+    Basis shapes that the model lacks are directions of the residuals of at most 200
+    frames.
     """
     frames, unit = model.frames, (model.unit or 1.0) / (table.unit or 1.0)
     assert isinstance(frames, PosteriorFrames)

@@ -442,9 +442,7 @@ class AffineNRSfMCV(
         cv = check_cv(3 if self.cv is None else self.cv)
         return GridSearchCV(estimator, {}, scoring=scorer, cv=cv)
 
-    def _routed(
-        self, method: str, params: dict[str, Any]
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _routed(self, method: str, params: dict[str, Any]) -> tuple[Any, Any]:
         """Return the metadata for the splitter and for the scorer."""
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params)

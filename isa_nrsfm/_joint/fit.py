@@ -61,10 +61,10 @@ def fit_jointly(
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
-    A fit from a given start uses only its shapes and noise, and of `paper_shapes` (K +
-    1, 3, J) only the shape. Returns the fit, the fitted frames, and alpha (n_chosen, K)
-    of the sample. Shapes are centred and mixed such that alpha ~ N(0, I). The noise is
-    corrected for degrees of freedom.
+    The shapes and the noise of a given start replace the paper's shapes (K + 1, 3, J).
+    Returns the fit, the fitted frames, and alpha (n_chosen, K) of the sample. Shapes
+    are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
+    of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
     first, sampled = problems[0], len(problems) > 1

@@ -140,7 +140,7 @@ def scaled_table(
 
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
-    """Return half and visible points, magnitudes and reports of rows (n, 2, J)."""
+    """Return half points, visible points, magnitudes, reports of rows (n, 2, J)."""
     rows, *half = without_half_points(rows)
     _, report = centred_frames(rows)
     shown = report.n_seen > 0

@@ -43,8 +43,8 @@ def open_table(
 ) -> FrameBlocks:
     """Return a table in blocks of rows (n, 2, n_points), float32 or float64.
 
-    Points with one coordinate become missing, with a warning. If they are `counted`,
-    those of a table that is read later stay, for `scaled_table`.
+    Points with one coordinate become missing, with a warning. With `counted`, those of
+    a table that is read later stay: `scaled_table` counts them and leaves them out.
 
     Arrays in memory must be checked already. `n_jobs` threads share their blocks and
     those of memory maps. Chunks of dask stay on its workers. Blocks of tables that are
