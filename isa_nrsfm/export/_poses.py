@@ -1,6 +1,7 @@
 """Head pose of frames, and distances between points."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,12 @@ from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.export._names import frames_of_table
-from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
+from isa_nrsfm.export._upright import (
+    Camera,
+    UprightSpace,
+    upright_frames,
+    upright_space,
+)
 from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -170,26 +176,29 @@ def pose_function(
     if camera is None:
         raise ValueError("angles need calibrated cameras; got camera=None")
     space = upright_space(model, camera, origin, mirrored, edges)
+    return partial(_poses, space, model)
+
+
+def _poses(
+    space: UprightSpace, model: Any, X: Any, point_weight: Any = None
+) -> FramePoses:
+    """Return the poses of frames in an upright space."""
+    motion, alpha = frames_of_table(model, X, point_weight)
+    _, rotations, scales = upright_frames(space, model, motion, alpha)
     # The fitted table must determine the depth.
     determined = frames_of(model).certainty.determined
     if space.metric is not None:
         determined = space.metric.condition_number <= LARGEST_CONDITION
-    certain = space.metric is None and model.refinement in JOINT_REFINEMENTS
-
-    def poses(X: Any, point_weight: Any = None) -> FramePoses:
-        motion, alpha = frames_of_table(model, X, point_weight)
-        _, rotations, scales = upright_frames(space, model, motion, alpha)
-        if not determined:
-            rotations = np.full_like(rotations, np.nan)
-        angles = view_angles(rotations)
-        deviations = np.full((3, len(scales)), np.nan)
-        if certain and not (X is None or isinstance(X, Decomposition)):
-            covariance = model.rotation_covariance(X, point_weight=point_weight)
-            turned = space.transform @ covariance @ space.transform.T
-            deviations = np.array(angle_deviations(angles, turned))
-        return FramePoses(*angles, np.asarray(scales), *deviations)
-
-    return poses
+    if not determined:
+        rotations = np.full_like(rotations, np.nan)
+    angles = view_angles(rotations)
+    deviations = np.full((3, len(scales)), np.nan)
+    is_table = not (X is None or isinstance(X, Decomposition))
+    if is_table and space.metric is None and model.refinement in JOINT_REFINEMENTS:
+        covariance = model.rotation_covariance(X, point_weight=point_weight)
+        turned = space.transform @ covariance @ space.transform.T
+        deviations = np.array(angle_deviations(angles, turned))
+    return FramePoses(*angles, np.asarray(scales), *deviations)
 
 
 def point_distances(
