@@ -29,7 +29,7 @@ from benchmarks._sets import (
 )
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit import Limits
+from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 PAPER = {
@@ -138,7 +138,7 @@ def errors_in_camera(truth, found, scale=False):
 def noise(options):
     """Noise without floor and prior, to that of the spectrum.
 
-    Models are right up to a ratio of `JointOptions.right`.
+    Models are right up to a ratio of `Limits.right`.
     """
     for kind in ("weak_perspective", "affine"):
         for K, fitted in ((2, 2), (2, 4), (4, 4), (4, 6), (4, 3), (4, 2)):
@@ -162,9 +162,7 @@ def noise_ratio(X, camera, n_components):
 
     Neither is corrected for the unknowns of the fit.
     """
-    limits = Limits()
-    limits = limits._replace(joint=limits.joint._replace(right=np.inf))
-    model = fit_set(X, camera, n_components, limits)
+    model = fit_set(X, camera, n_components, Limits(right=np.inf))
     n_frames, n_others, n_shapes = len(X), X.shape[1] // 2 - 1, n_components + 1
     spectrum = model.rank_floor_ * n_others / (n_others - 3 * n_shapes)
     unknowns = N_POSE[camera] * n_frames + n_shapes * (3 * n_others - n_shapes) - 8

@@ -1,10 +1,11 @@
 """
 Halve and double what steers the stages of a fit, one by one: errors and CPU seconds.
 
-Run ``python -m benchmarks.sensitivity [stage ...]``. Stages are "fit", for the numbers
-of `Limits`, and the tuples in `Limits`. The first line of each is that of the values as
-they are; then a line a value follows. Errors in 3D are `affine_shape_error` in percent,
-"SNR" is inverse SNR in percent, "auto" the mean number of basis shapes that it finds.
+Run ``python -m benchmarks.sensitivity [stage ...]``. Stages are "fit", for the first
+numbers of `Limits`, and "joint", for those of the joint fit. The first line of each is
+that of the values as they are; then a line a value follows. Errors in 3D are
+`affine_shape_error` in percent, "SNR" is inverse SNR in percent, "auto" the mean number
+of basis shapes that it finds.
 Of missing points of real tables it is their error in percent of the size of frames.
 Tables are small: every few frames of real ones, and artificial ones. "s" are the CPU
 seconds of all fits.
@@ -19,7 +20,7 @@ import numpy as np
 from benchmarks._run import run_sections
 from benchmarks._sets import is_present, load
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit import Limits
+from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -128,10 +129,11 @@ JOINT = {
     "auto, K=2": partial(counted, K=2),
     "auto, 5 %": partial(counted, noise=0.05, K=4),
 }
-# The cases that show the options of each stage.
+# The limits of each stage, and the cases that show them.
+FIRST = Limits._fields.index("basis_std")
 STAGES = {
-    "fit": {**LARGE, **MATRIX},
-    "joint": JOINT,
+    "fit": (Limits._fields[:FIRST], {**LARGE, **MATRIX}),
+    "joint": (Limits._fields[FIRST:], JOINT),
 }
 
 
@@ -142,13 +144,6 @@ def changed(value, factor):
     if isinstance(value, int):
         return max(round(factor * value), 1)
     return factor * value
-
-
-def replaced(limits, stage, name, value):
-    """Return limits with a field of a stage set to a value."""
-    if stage == "fit":
-        return limits._replace(**{name: value})
-    return limits._replace(**{stage: getattr(limits, stage)._replace(**{name: value})})
 
 
 def measured(limits, cases):
@@ -166,32 +161,30 @@ def row(title, figures, seconds):
     print(f"{title:34}{listed}{seconds:8.1f}", flush=True)
 
 
-def stage(name, cases, options):
-    """Vary the options of a stage."""
+def stage(fields, cases, options):
+    """Vary the limits of a stage."""
     cases = {
         title: case
         for title, case in cases.items()
         if getattr(case, "func", None) is not of_set or is_present(case.args[0])
     }
-    known = Limits() if name == "fit" else getattr(Limits(), name)
     print(" " * 34 + "".join(f"{title:>12}" for title in cases) + "       s")
     measured(Limits(), cases)  # not counted: tables are made
     row("as it is", *measured(Limits(), cases))
-    for field, value in known._asdict().items():
-        if value is None or hasattr(value, "_fields"):
-            continue
+    for field in fields:
+        value = getattr(Limits(), field)
         for factor in (0.5, 2.0):
             other = changed(value, factor)
             if other == value:
                 continue
-            limits = replaced(Limits(), name, field, other)
+            limits = Limits(**{field: other})
             shown = f"{other:g}" if np.isscalar(other) else "x".join(map(str, other))
             row(f"{field} {shown}", *measured(limits, cases))
 
 
 def section(name):
     """Return the section of a stage, with its heading."""
-    function = partial(stage, name, STAGES[name])
+    function = partial(stage, *STAGES[name])
     function.__doc__ = f"{name}: each value halved and doubled."
     return function
 

@@ -22,7 +22,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
-    CoefficientNamesMixin,
+    CoefficientsMixin,
     HasMethods,
     Interval,
     ShownEstimator,
@@ -32,8 +32,6 @@ from isa_nrsfm._compat.scikit_learn import (
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import (
     STEPWISE,
-    FitSettings,
-    Limits,
     fit_table,
     ready_table,
     stages_of,
@@ -42,6 +40,13 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
+from isa_nrsfm._joint.settings import (
+    JOINT_TOL,
+    LIMITS,
+    PAPER_TOL,
+    FitSettings,
+    Limits,
+)
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CALIBRATED_CAMERAS,
@@ -77,7 +82,7 @@ _NEEDS_CALIBRATED = (
 
 
 class AffineNRSfM(
-    CallbackSupportMixin, CoefficientNamesMixin, TransformerMixin, ShownEstimator
+    CallbackSupportMixin, CoefficientsMixin, TransformerMixin, ShownEstimator
 ):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
@@ -96,11 +101,11 @@ class AffineNRSfM(
         K, the number of basis shapes. K needs at least 3K + 4 points and
         ``ceil(8 (K + 2) / 5)`` frames. Calibrated cameras allow up to 2J - 7 basis
         shapes of J points, if there are enough frames (joint refinement only): for 17
-        points 27 instead of 4. "auto" takes the relevant ones of twelve, or of
-        as many as the table allows (joint refinement only); ``len(basis_)`` is the
-        number found. With ``refinement="consensus"`` the joint fit has at most twelve,
-        and the result has K principal components of the merged shapes; "auto" keeps up
-        to 60, all that exceed the noise.
+        points 27 instead of 4. "auto" fits twelve basis shapes, or as many as the table
+        allows, and keeps the relevant ones (joint refinement only); their number is
+        ``len(basis_)``. With ``refinement="consensus"`` the joint fit has at most
+        twelve, and the result has K principal components of the merged shapes; "auto"
+        keeps those that exceed the noise, at most 60.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
@@ -339,7 +344,7 @@ class AffineNRSfM(
 
     _model: TableModel
     _frame_sizes: NDArray
-    _limits: ClassVar[Limits] = Limits()  # others: `limited`
+    _limits: ClassVar[Limits] = LIMITS  # others: `limited`
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
@@ -491,8 +496,8 @@ class AffineNRSfM(
     ) -> None:
         """Fit a table, and set all attributes at once.
 
-        The joint fit starts from the model of a similar table, if given.
-        `errors`: estimate those of the depths, and warn of those not determined.
+        The joint fit starts from the model of a similar table, if given. `errors`:
+        estimate the errors of the depths, and warn if depths are not determined.
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
@@ -510,42 +515,42 @@ class AffineNRSfM(
                     "table"
                 )
         table = ready_table(source, weights, n_components, settings)
-        fit = fit_table(
+        model, frames, converged, fitted = fit_table(
             table, n_components, isa, settings, progress, start, auto, errors
         )
-        if not fit.converged:
+        if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
-        attributes = {**vars(opened), **fit.attributes}
+        attributes = {**vars(opened), **fitted}
         if self.keep_frames:
-            kept = keep(fit.frames._asdict())
+            kept = keep(frames._asdict())
             frames = Decomposition(*map(source.as_collected, kept.values()))
             attributes |= {
                 f"{name}_": value for name, value in frames._asdict().items()
             }
-            attributes["_frame_sizes"] = fit.sizes
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
                 R, scales = full_rotations(frames.motion)
                 attributes |= {"rotations_": R, "scales_": scales}
-        certainty = fit.model.frames.certainty
+        else:
+            del attributes["_frame_sizes"]
+        certainty = model.frames.certainty
         if errors and not certainty.determined:
             warn_caller(certainty.advice)
         self.__dict__.update(attributes)
-        self._model, self._n_features_out = fit.model, len(fit.model.basis)
-        self.isa_, self.camera_ = fit.isa, self.camera
-        self.frames_scaled_ = settings.scale_frames
+        self._model, self._n_features_out = model, len(model.basis)
+        self.camera_, self.frames_scaled_ = self.camera, settings.scale_frames
 
     def _ready(
         self, X: Any, point_weight: Any = None
     ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
-        """Check parameters and a table of a fit; return it, its weights and settings.
+        """Check the parameters and the table of a fit, and set the columns' attributes.
 
-        Sets the attributes of the columns.
+        Returns the table, the weights of its points and the settings.
         """
         joint = self.refinement in JOINT_REFINEMENTS
         if not joint:
@@ -576,6 +581,8 @@ class AffineNRSfM(
             )
         source, weights = self._opened(X, point_weight, reset=True)
         params = self.get_params(deep=False)
+        if self.tol is None:
+            params["tol"] = JOINT_TOL if joint else PAPER_TOL
         settings = FitSettings(
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),
@@ -609,16 +616,9 @@ class AffineNRSfM(
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""
-        found = ("_model", "_frame_sizes", "_n_features_out")
-        left = [name for name in vars(self) if not name.endswith("_")]
-        self.__dict__ = {name: vars(self)[name] for name in left if name not in found}
-
-    def __sklearn_tags__(self) -> Any:
-        """Return the estimator's tags."""
-        tags = super().__sklearn_tags__()
-        tags.transformer_tags.preserves_dtype = ["float64", "float32"]
-        tags.input_tags.allow_nan = True
-        return tags
+        private = ("_model", "_frame_sizes", "_n_features_out")
+        names = [n for n in vars(self) if n not in private and not n.endswith("_")]
+        self.__dict__ = {name: vars(self)[name] for name in names}
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""
@@ -782,10 +782,10 @@ class AffineNRSfM(
         table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("rotation_covariance", calibrated=True)
         space, certainty = frames.gauge.rotation, frames.certainty
-        found = table.joined(self._model.posterior, *weights)
-        covariance = space @ found.turn_covariance @ space.T
+        posterior = table.joined(self._model.posterior, *weights)
+        covariance = space @ posterior.turn_covariance @ space.T
         if certainty.turns is not None:
-            R, _ = full_rotations(found.motion @ space.T)
+            R, _ = full_rotations(posterior.motion @ space.T)
             covariance = covariance + R.mT @ certainty.turns @ R
         return np.asarray(covariance).astype(table.empty.dtype, copy=False)
 
@@ -893,7 +893,7 @@ class AffineNRSfM(
             return self._model.shapes(X, metric, scaled)
         table, weights = self._opened(X, point_weight)
         if return_std:
-            return tuple(table.collect(self._model.uncertain_shapes, *weights))
+            return table.collect(self._model.uncertain_shapes, *weights)
         shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
         return table.collect(shapes, *weights)
 
@@ -922,21 +922,21 @@ class AffineNRSfM(
         True
         """
         check_is_fitted(self)
-        found, dtype = copy.copy(self), self.mean_shape_.dtype
+        mirror, dtype = copy.copy(self), self.mean_shape_.dtype
         for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
             if hasattr(self, name):
-                setattr(found, name, getattr(self, name) * MIRROR.astype(dtype))
+                setattr(mirror, name, getattr(self, name) * MIRROR.astype(dtype))
         if hasattr(self, "rotations_"):
             turned = MIRROR[:, None] * self.rotations_ * MIRROR
-            found.rotations_ = turned.astype(dtype, copy=False)
+            mirror.rotations_ = turned.astype(dtype, copy=False)
         signs = np.tile(MIRROR, len(self.basis_))
-        found.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
-        found._model = self._model._replace(
+        mirror.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
+        mirror._model = self._model._replace(
             frames=self._model.frames.mirrored(),
-            mean_shape=found.mean_shape_,
-            basis=found.basis_,
+            mean_shape=mirror.mean_shape_,
+            basis=mirror.basis_,
         )
-        return found
+        return mirror
 
     def reproject(self, X: Any) -> NDArray:
         """

@@ -2,7 +2,7 @@
 
     FrameBlocks -> ScaledTable -> FactorisedTable -> PaperResult -> JointFit
     checks, size   outliers,       SVD, ISA,          maximum      gauge, measures
-                   completion      blocks             likelihood   -> TableFit
+                   completion      blocks             likelihood   -> TableModel
 
 1. The table is checked, scaled and, where points are missing, completed.
 2. Factorisation of the measurement matrix, of the frames of a sample if there are many.
@@ -13,14 +13,14 @@
 6. Measures of the fit.
 
 Stages 1, 5 and 6 use all frames, the other stages those of the sample. No function here
-has an estimator: `fit_table` returns a `TableFit`, and `AffineNRSfM.fit` shows it.
+has an estimator: `AffineNRSfM.fit` sets the attributes that `fit_table` returns.
 """
 
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,10 +55,9 @@ from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import (
     FactorisedTable,
-    JointOptions,
-    JointSettings,
     JointState,
 )
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
     LEAST_RELIABILITY,
@@ -69,9 +68,7 @@ from isa_nrsfm._joint.uncertainty import (
     shown_frames,
 )
 from isa_nrsfm._paper.pipeline import (
-    DENSE,
     Factorisation,
-    PaperResult,
     block_triplets,
     factorise,
     run_paper_pipeline,
@@ -83,81 +80,12 @@ from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm._tables.tracks import Layout, of_all_rows
+from isa_nrsfm._tables.tracks import of_all_rows
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
 # Stages that report steps.
 STEPWISE = JOINT_STAGE, CONSENSUS_STAGE
-# Default tolerances. JOINT_TOL: decrease of the objective of the joint refinement per
-# frame. PAPER_TOL: gain of the paper's refinement, as a share of the explained energy.
-JOINT_TOL, PAPER_TOL = 0.025, 1e-10
-
-
-class Limits(NamedTuple):
-    """Numbers that tests and benchmarks vary.
-
-    dense: a table with more points and rows of images is not factorised as a whole.
-    sample: number of frames of the first sample of a large table.
-    small_table: tables with fewer coordinates are fitted without a sample.
-    model_frames: most frames from which outliers and missing points are modelled.
-    """
-
-    dense: int = DENSE
-    sample: int = 600
-    small_table: int = 150_000
-    model_frames: int = 5_000
-    joint: JointOptions = JointOptions()
-
-
-class FitSettings(NamedTuple):
-    """The parameters of `AffineNRSfM` of the same names, and limits.
-
-    scale_frames: False with orthographic cameras. names: those of the columns, if any.
-    silent_isa: whether a strategy that only starts the joint fit may end early.
-    """
-
-    refinement: str | None
-    camera: str
-    loss: str
-    independence: str | None
-    block_recovery: str
-    layout: Layout
-    scale_frames: bool
-    max_iter: int
-    tol: float | None
-    n_jobs: int | None
-    names: NDArray | None
-    silent_isa: bool
-    limits: Limits
-
-    @property
-    def joint(self) -> bool:
-        """Whether the refinement is the joint fit, or begins with it."""
-        return self.refinement in JOINT_REFINEMENTS
-
-    def of_joint_fit(self, on_step: Callable[[], None] | None = None) -> JointSettings:
-        """Return the settings of the joint refinement."""
-        tol = JOINT_TOL if self.tol is None else self.tol
-        given = self.camera, self.loss, self.max_iter, tol, on_step, self.n_jobs
-        return JointSettings(*given, self.limits.joint)
-
-
-class TableFit(NamedTuple):
-    """The fit of a table.
-
-    model: the model of new tables. frames: cameras and coefficients of all rows, NaN
-    for rows without visible points. sizes (n_rows,): those of the frames. isa: the
-    fitted strategy, None if the fit started from another one. attributes: the other
-    public attributes of `AffineNRSfM`, by name.
-    """
-
-    model: TableModel
-    frames: Decomposition
-    sizes: NDArray
-    isa: Any
-    converged: bool
-    attributes: dict[str, Any]
 
 
 def stages_of(refinement: str | None) -> list[str]:
@@ -198,12 +126,15 @@ def fit_table(
     start: TableModel | None = None,
     free: bool = False,
     errors: bool = False,
-) -> TableFit:
+) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
     """Fit a table with K basis shapes and a clone of the strategy `isa`.
 
     The joint fit starts from the model of a similar table, if `start` is given, instead
-    of the paper's result. `free`: a consensus has all components that exceed the noise
-    instead of K. `errors`: estimate those of the depths.
+    of the paper's result. `free`: the consensus keeps all components that exceed the
+    noise, instead of K. `errors`: estimate the errors of the depths.
+
+    Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
+    without visible points; convergence; and the other attributes of `AffineNRSfM`.
     """
     camera, wanted = settings.camera, n_components
     if settings.refinement == "consensus":
@@ -211,19 +142,20 @@ def fit_table(
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
-    paper = given = None
+    given = None
     if start is None:
         isa = clone(isa)
-        paper = _paper_result(factorised.factors, n_components, isa, settings, progress)
-        shapes = paper.shapes
+        shapes, covariance, n_iter, converged = _paper_result(
+            factorised.factors, n_components, isa, settings, progress
+        )
     else:
         isa, given = None, _started(table, start, n_components)
         shapes = given.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
-        joint = settings.of_joint_fit(progress.step)
-        fit, tracks, alpha = fit_jointly(factorised, shapes, joint, given)
-        model = _frame_model(fit.state.shapes, fit.state.noise, alpha, joint)
+        settings = settings._replace(on_step=progress.step)
+        fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
+        model = _frame_model(fit.state.shapes, fit.state.noise, alpha, settings)
         progress(JOINT_STAGE)
         attributes = {
             "camera_noise_ratio_": fit.camera_noise_ratio,
@@ -238,8 +170,8 @@ def fit_table(
             # A residual below the noise of the spectrum leaves nothing for groups.
             n_numbers, square = tracks.totals
             noise = factorised.noise_level(n_components) * square / n_numbers
-            if wanted > n_components or fit.left > noise:
-                model = _consensus_model(table, model, joint, wanted, free)
+            if wanted > n_components or fit.misfit > noise:
+                model = _consensus_model(table, model, settings, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
         if errors and camera != "affine":
@@ -247,17 +179,17 @@ def fit_table(
         fitted, frames, measures = _joint_frames(table, model, tracks, settings)
         converged = fit.converged
     else:
-        assert paper is not None
         fitted, frames, measures = _paper_frames(
-            table, factorised.factors, paper, settings
+            table, factorised.factors, shapes, covariance, settings
         )
-        attributes, converged = {"n_iter_": paper.n_iter}, paper.converged
+        attributes = {"n_iter_": n_iter}
     # 6. Measures of the fit
     attributes |= measures | _measures(table, factorised, fitted, frames, settings)
     progress("gauge and coefficients")
     rows = (of_all_rows(part.astype(table.dtype), table.shown) for part in frames)
     sizes = of_all_rows(table.sizes, table.shown)
-    return TableFit(fitted, Decomposition(*rows), sizes, isa, converged, attributes)
+    attributes |= {"isa_": isa, "_frame_sizes": sizes}
+    return fitted, Decomposition(*rows), converged, attributes
 
 
 @one_blas_thread
@@ -271,14 +203,16 @@ def supported_components(
     settings = settings._replace(refinement="joint")
     possible = most_components(len(table.sizes), table.n_points, settings.camera)
     most = min(MOST_FIRST, possible)
-    factorised = _factorised(table, most, settings, NoProgress())
-    paper = _paper_result(factorised.factors, most, clone(isa), settings, NoProgress())
-    supported = count_components(factorised, paper.shapes, settings.of_joint_fit())
+    quiet = NoProgress()
+    factorised = _factorised(table, most, settings, quiet)
+    factors = factorised.factors
+    shapes, *_ = _paper_result(factors, most, clone(isa), settings, quiet)
+    supported = count_components(factorised, shapes, settings)
     # Down-weighted outliers look like basis shapes: fit again with the final weights.
     while supported > 1 and settings.loss != "linear":
         with warnings.catch_warnings(action="ignore"):
-            fit = fit_table(table, supported, isa, settings, NoProgress())
-        reliable = fit.attributes["reliability_"] >= LEAST_RELIABILITY
+            *_, fitted = fit_table(table, supported, isa, settings, quiet)
+        reliable = fitted["reliability_"] >= LEAST_RELIABILITY
         before, supported = supported, max(int(reliable.sum()), 1)
         if supported == before:
             break
@@ -319,9 +253,10 @@ def _factorised(
 
 
 def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointState:
-    """Return shapes and noise of a model, in units of a table, without cameras.
+    """Return a start of K basis shapes from a model, in units of a table, no cameras.
 
-    Missing basis shapes are directions of the residuals of at most 200 frames.
+    Basis shapes that the model lacks are directions of the residuals of at most 200
+    frames.
     """
     frames, unit = model.frames, (model.unit or 1.0) / (table.unit or 1.0)
     assert isinstance(frames, PosteriorFrames)
@@ -342,10 +277,9 @@ def _paper_result(
     isa: Any,
     settings: FitSettings,
     report: Callable[[str], None],
-) -> PaperResult:
+) -> tuple[NDArray, NDArray, int, bool]:
     """Return the result of the paper's pipeline, and fit its strategy."""
-    max_iter = settings.max_iter if settings.refinement else 0
-    tol = PAPER_TOL if settings.tol is None else settings.tol
+    max_iter, tol = settings.max_iter if settings.refinement else 0, settings.tol
     with warnings.catch_warnings():
         if settings.joint:  # it only starts from this result
             max_iter, tol = 200, 1e-5
@@ -364,10 +298,13 @@ def _paper_result(
 
 
 def _paper_frames(
-    table: ScaledTable, factors: Factorisation, paper: PaperResult, s: FitSettings
+    table: ScaledTable,
+    factors: Factorisation,
+    shapes: NDArray,
+    covariance: NDArray,
+    s: FitSettings,
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of the paper's pipeline in its gauge."""
-    shapes = paper.shapes
     if s.camera != "affine":
         scaled = s.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
@@ -377,7 +314,7 @@ def _paper_frames(
         return TableModel(frames, mean_shape, basis, s.layout, table.unit)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
-    gauge, frames = rigid_gauge(
+    mean_shape, basis, order, frames = rigid_gauge(
         shapes[0].T,
         shapes[1:].mT,
         table.sizes,
@@ -387,13 +324,13 @@ def _paper_frames(
         camera=s.camera,
         dtype=table.dtype,
     )
-    covariance = reorder_blocks(paper.mode_covariance, gauge.order)
+    covariance = reorder_blocks(covariance, order)
     attributes = {"mode_covariance_": (table.unit or 1.0) ** 2 * covariance}
-    return fitted(gauge.mean_shape, gauge.basis), frames, attributes
+    return fitted(mean_shape, basis), frames, attributes
 
 
 def _frame_model(
-    shapes: NDArray, noise: float, alpha: NDArray, settings: JointSettings
+    shapes: NDArray, noise: float, alpha: NDArray, settings: FitSettings
 ) -> PosteriorFrames:
     """Return the model of a frame for shapes (K + 1, 3, J), before the gauge."""
     starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
@@ -403,7 +340,7 @@ def _frame_model(
 def _consensus_model(
     table: ScaledTable,
     model: PosteriorFrames,
-    settings: JointSettings,
+    settings: FitSettings,
     wanted: int,
     free: bool,
 ) -> PosteriorFrames:
@@ -436,7 +373,7 @@ def _joint_frames(
         )
     # Gauge of shapes, cameras and coefficients
     unit = table.unit if s.camera == "orthographic" else None
-    gauge, frame_map = independent_gauge(
+    mean_shape, basis, frame_map = independent_gauge(
         model.shapes, motion, alpha, s.independence, s.camera, unit
     )
     residual /= table.n_observations.sum()
@@ -444,7 +381,7 @@ def _joint_frames(
     if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     model = replace(model, gauge=frame_map, certainty=certainty)
-    weight = table.n_observations
+    weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
@@ -452,7 +389,7 @@ def _joint_frames(
         *posteriors.map(last_pass, table.sizes, table.n_seen, weight), strict=True
     )
     frames = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
-    mean_shape, basis = (part.astype(table.dtype) for part in gauge[:2])
+    mean_shape, basis = mean_shape.astype(table.dtype), basis.astype(table.dtype)
     cameras = frames.motion / table.sizes[:, None, None]
     square = (table.unit or 1.0) ** 2
     attributes = {

@@ -25,16 +25,6 @@ from isa_nrsfm._tables.tracks import (
 from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 
 
-class UncertainShapes(NamedTuple):
-    """Shapes (n, n_points, 3), and standard deviations of their depths (n, n_points).
-
-    Both are in units of the shapes.
-    """
-
-    shapes: NDArray
-    depth_std: NDArray
-
-
 class TableModel(NamedTuple):
     """Model of a frame, shapes and layout: all that is needed to fit a new table.
 
@@ -117,17 +107,16 @@ class TableModel(NamedTuple):
 
     def uncertain_shapes(
         self, rows: NDArray, weights: NDArray | None = None
-    ) -> UncertainShapes:
-        """Return the shapes of frames and standard deviations of their depths."""
+    ) -> tuple[NDArray, NDArray]:
+        """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
         assert isinstance(self.frames, PosteriorFrames)
         fit = self.decompose(rows, weights, deviations=False)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
         deviations = self.frames.depth_deviations(centred, sizes, weights)
         deviations = of_all_rows(deviations, usable).astype(rows.dtype, copy=False)
         _, scales = full_rotations(fit.motion)
-        return UncertainShapes(
-            self.shapes(fit, None, scaled=False), deviations / scales[:, None]
-        )
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        return shapes, deviations / scales[:, None]
 
     def reproject(self, rows: NDArray) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""

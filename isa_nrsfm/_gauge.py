@@ -17,7 +17,7 @@ independent basis they are fixed as well:
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +27,6 @@ from isa_nrsfm._frames.models import Decomposition, FrameMap
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
-
-
-class Gauge(NamedTuple):
-    """Canonical shapes."""
-
-    mean_shape: NDArray  # (n_points, 3), in the canonical space
-    basis: NDArray  # (n_components, n_points, 3), in canonical order and scale
-    order: NDArray  # (n_components,), index of each basis shape in the given basis
-    factors: NDArray  # (n_components,), their factors, zero for those without motion
 
 
 def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
@@ -84,13 +75,16 @@ def euclidean_space(
 
 def canonical_gauge(
     mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray, space: NDArray
-) -> Gauge:
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return the canonical shapes among those that fit equally well, in a space (3, 3).
 
     The basis is sorted by decreasing energy in the images, ``sum_i ||alpha_ik M_i
     B_k||_F^2``, with cameras (I, 2, 3) of frames of size one. Coefficients (I, K) get
     unit variance (mean square where they do not vary) and non-negative skewness. A
     basis shape without motion becomes zero.
+
+    Returns the mean shape (J, 3), the basis (K, J, 3), and for each basis shape its
+    index in the given basis and its factor (K,), zero for those without motion.
     """
     energy = image_energies(motion, basis, alpha)
     order = np.argsort(-energy, kind="stable")
@@ -99,7 +93,7 @@ def canonical_gauge(
     moving = energy > OF_RANKS**2 * rigid
     factors = np.where(moving, orientations(alpha.T) * coefficient_sizes(alpha), 0.0)
     scaled = factors[:, None, None] * basis
-    return Gauge(mean_shape @ space.T, scaled[order] @ space.T, order, factors[order])
+    return mean_shape @ space.T, scaled[order] @ space.T, order, factors[order]
 
 
 def rigid_gauge(
@@ -110,8 +104,8 @@ def rigid_gauge(
     *,
     camera: str,
     dtype: Any,
-) -> tuple[Gauge, Decomposition]:
-    """Return the gauge of the paper's pipeline, and the fit of the frames in it.
+) -> tuple[NDArray, NDArray, NDArray, Decomposition]:
+    """Return mean shape, basis, its order, and frames of the paper's pipeline.
 
     The gauge is that of a fit to visible points, not to completed frames. `fitted`
     returns the fit for a mean shape (J, 3) and a basis (K, J, 3), rounded to a dtype.
@@ -125,16 +119,18 @@ def rigid_gauge(
         else:
             size = 1.0 if camera == "orthographic" else None
             space = euclidean_space(mean_shape, motion, size)
-        gauge = canonical_gauge(mean_shape, basis, motion, frames.alpha, space)
-        order = order[gauge.order]
-        mean_shape, basis = gauge.mean_shape.astype(dtype), gauge.basis.astype(dtype)
+        mean_shape, basis, new_order, _ = canonical_gauge(
+            mean_shape, basis, motion, frames.alpha, space
+        )
+        order = order[new_order]
+        mean_shape, basis = mean_shape.astype(dtype), basis.astype(dtype)
         frames = fitted(mean_shape, basis)
         # Coefficients scale with the basis shapes. If a frame does not determine its
         # coefficients, their solution of minimum norm changes.
         off = coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
         if np.abs(off).max(initial=0.0) <= 1e-6:
             break
-    return Gauge(mean_shape, basis, order, gauge.factors), frames
+    return mean_shape, basis, order, frames
 
 
 def coefficient_sizes(alpha: NDArray) -> NDArray:
@@ -179,8 +175,8 @@ def independent_gauge(
     independence: str | None,
     camera: str = "affine",
     unit: float | None = None,
-) -> tuple[Gauge, FrameMap]:
-    """Return the independent basis of a fit as a gauge, and the map of frames to it.
+) -> tuple[NDArray, NDArray, FrameMap]:
+    """Return mean shape and independent basis of a fit, and the map of frames to it.
 
     Shapes (K + 1, 3, J) are centred. Cameras (I, 2, 3) belong to frames of size one.
     "shapes" makes basis shapes independent over the points, "coefficients" makes
@@ -204,13 +200,14 @@ def independent_gauge(
         mixing = _principal_axes(white, alpha)
     basis = np.tensordot(mixing, shapes[1:], 1).mT
     unmixing = np.linalg.inv(mixing).T
-    gauge = canonical_gauge(shapes[0].T, basis, motion, alpha @ unmixing.T, space)
+    mean_shape, basis, order, factors = canonical_gauge(
+        shapes[0].T, basis, motion, alpha @ unmixing.T, space
+    )
     # Coefficients (1, alpha_i) change by the inverse transpose of the mixing of shapes.
-    factors = gauge.factors
     scale = np.divide(1.0, factors, where=factors != 0, out=np.zeros_like(factors))
     coefficients = np.linalg.inv(shift).T
-    coefficients[1:] = scale[:, None] * (unmixing @ coefficients[1:])[gauge.order]
-    return gauge, FrameMap(coefficients, space)
+    coefficients[1:] = scale[:, None] * (unmixing @ coefficients[1:])[order]
+    return mean_shape, basis, FrameMap(coefficients, space)
 
 
 def _centred(

@@ -20,14 +20,14 @@ from sklearn.base import BaseEstimator, MetaEstimatorMixin, TransformerMixin, cl
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.metrics import check_scoring
 from sklearn.model_selection import GridSearchCV, check_cv, cross_validate
-from sklearn.utils import get_tags, indexable
+from sklearn.utils import indexable
 from sklearn.utils.metadata_routing import UNUSED, MetadataRouter, process_routing
-from sklearn.utils.validation import check_is_fitted
+from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
-    CoefficientNamesMixin,
+    CoefficientsMixin,
     HasMethods,
     Interval,
     StrOptions,
@@ -35,9 +35,11 @@ from isa_nrsfm._compat.scikit_learn import (
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._fit import JOINT_TOL, ready_table
+from isa_nrsfm._fit import ready_table
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
+from isa_nrsfm._joint.settings import JOINT_TOL
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 
 # For held-out errors of 100 % and more.
@@ -68,13 +70,13 @@ class StartedNRSfM(AffineNRSfM):
 
 
 class AffineNRSfMCV(
-    CoefficientNamesMixin, TransformerMixin, MetaEstimatorMixin, BaseEstimator
+    CoefficientsMixin, TransformerMixin, MetaEstimatorMixin, BaseEstimator
 ):
     """
     `AffineNRSfM` with the number of basis shapes chosen by cross-validation.
 
     Each number of basis shapes is fitted to parts of the frames and scored on the
-    others. The fits form a path: each starts from earlier ones, which takes less than
+    others. The fits form a path: each starts from an earlier one, which takes less than
     half the time of a plain search with `GridSearchCV`. Then the whole table is fitted
     with the chosen number, as by `AffineNRSfM`.
 
@@ -138,13 +140,11 @@ class AffineNRSfMCV(
 
     Notes
     -----
-    The table is checked, centred and scaled once. A fit of all frames starts from the
-    previous one: from its shapes and the leading directions of the residuals. The fit
-    of a part of the frames starts from the fit of all frames, and from the previous fit
-    of the same part. The one with the lower objective on that part continues until it
-    has converged; the other is dropped before. Held-out frames can contribute a start,
-    but have no other influence on the score. ``python -m benchmarks.choice`` compares
-    errors and choices with those of a plain search.
+    A fit of all frames starts from the previous one: from its shapes and the leading
+    directions of the residuals. The fit of a part of the frames starts from the fit of
+    all frames with the same number of basis shapes. Held-out frames contribute to this
+    start, but have no other influence on the score. ``python -m benchmarks.choice``
+    compares errors and choices with those of a plain search.
 
     With ``refinement="consensus"`` the search compares joint fits. Only the chosen K is
     fitted with the consensus. With ``refinement="alternating"`` or None no fit can
@@ -234,27 +234,27 @@ class AffineNRSfMCV(
             As in `AffineNRSfM.fit`, and if fits of the path have not converged or all
             held-out errors are above 100 %.
         """
-        estimator, scorer = self._estimator(), self._scorer()
-        candidates = checked_candidates(self.n_components)
+        plain, candidates = self._plain_search(), checked_candidates(self.n_components)
+        estimator, scorer = plain.estimator, plain.scoring
         if is_on_dask(X) or isinstance(X, StoredTable):
             raise ValueError(
                 "choosing n_components needs a table in memory or a memory map; got a "
                 f"{type(X).__name__}: take some thousand of its frames"
             )
         X, y = indexable(X, y)
-        routed = self._routed("fit", params)
-        splits = list(self._splitter().split(X, y, **routed["splitter"]))
+        for_splitter, for_scorer = self._routed("fit", params)
+        splits = list(plain.cv.split(X, y, **for_splitter))
         trial = StartedNRSfM(**estimator.get_params(deep=False))
         trial.set_params(frames_folder=None)
-        if trial.refinement == "consensus":  # only of the chosen K
+        joint = trial.refinement in JOINT_REFINEMENTS
+        if joint:  # a consensus only with the chosen K
             trial.set_params(refinement="joint")
-        joint = trial.refinement == "joint"
         if self.scoring is None and joint:  # the score does not depend on the basis
             trial.set_params(independence=None)
         check_rows(trial, X, [train for train, _ in splits], candidates[-1])
         # Fits of all frames are only starts: their tolerance is larger.
-        whole = copy.copy(trial)
-        whole.set_params(tol=4.0 * (JOINT_TOL if trial.tol is None else trial.tol))
+        tol = 4.0 * (JOINT_TOL if trial.tol is None else trial.tol)
+        whole = copy.copy(trial).set_params(tol=tol)
         parts, n_unconverged = [], []
         for k in candidates:
             since = time.perf_counter()
@@ -268,7 +268,7 @@ class AffineNRSfMCV(
                 y,
                 cv=splits,
                 scoring=scorer,
-                params=routed["scorer"],
+                params=for_scorer,
                 n_jobs=self.n_jobs,
                 return_estimator=True,
                 error_score="raise",
@@ -280,8 +280,7 @@ class AffineNRSfMCV(
                 seconds += sum(part["fit_time"] + part["score_time"])
                 text = line(k, part["test_score"], self.scoring is None)
                 print(f"[{type(self).__name__}] {text}, {seconds:.1f} s", flush=True)
-        if any(n_unconverged):
-            which = [str(candidates[i]) for i in np.flatnonzero(n_unconverged)]
+        if which := [str(candidates[i]) for i in np.flatnonzero(n_unconverged)]:
             warn_caller(
                 "not all fits converged while n_components was chosen: "
                 f"{sum(n_unconverged)} with n_components of {', '.join(which)} did "
@@ -299,32 +298,9 @@ class AffineNRSfMCV(
         self.best_estimator_, self.scorer_ = fitted, scorer
         self.best_index_, self.n_components_ = best, candidates[best]
         self.n_splits_, self.best_score_ = len(splits), float(scores[best].mean())
-        for name in ("n_features_in_", "feature_names_in_", "_n_features_out"):
-            self.__dict__.pop(name, None)
-            if hasattr(fitted, name):
-                setattr(self, name, getattr(fitted, name))
+        validate_data(self, X, skip_check_array=True)  # number and names of columns
+        self._n_features_out = self.n_components_
         return self
-
-    def fit_transform(self, X: Any, y: Any = None, **params: Any) -> NDArray:
-        """
-        Choose the number of basis shapes, and return the coefficients of the frames.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            The table.
-        y : array-like of shape (n_frames,), default=None
-            As in `fit`.
-        **params : dict
-            As in `fit`.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, `n_components_`)
-            The coefficients.
-        """
-        fitted = self.fit(X, y, **params).best_estimator_
-        return fitted.alpha_.copy() if fitted.keep_frames else fitted.transform(X)
 
     def transform(self, X: Any) -> NDArray:
         """
@@ -438,8 +414,8 @@ class AffineNRSfMCV(
             The score; larger is better.
         """
         check_is_fitted(self)
-        routed = self._routed("score", params)
-        return float(self.scorer_(self.best_estimator_, X, y, **routed["scorer"]))
+        _, for_scorer = self._routed("score", params)
+        return float(self.scorer_(self.best_estimator_, X, y, **for_scorer))
 
     def get_metadata_routing(self) -> MetadataRouter:
         """
@@ -450,59 +426,42 @@ class AffineNRSfMCV(
         MetadataRouter
             From `fit` to the splitter and the scorer, from `score` to the scorer.
         """
-        cv, scorer = self._splitter(), self._scorer()
-        plain = GridSearchCV(self._estimator(), {}, scoring=scorer, cv=cv)
-        return plain.get_metadata_routing()
-
-    def __sklearn_tags__(self) -> Any:
-        """Return the tags of the estimator that is fitted."""
-        tags, inner = super().__sklearn_tags__(), get_tags(self._estimator())
-        tags.transformer_tags.preserves_dtype = inner.transformer_tags.preserves_dtype
-        tags.input_tags.allow_nan = inner.input_tags.allow_nan
-        return tags
+        return self._plain_search().get_metadata_routing()
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""
         return hasattr(self, "best_estimator_")
 
-    def _estimator(self) -> AffineNRSfM:
-        """Return the estimator to be fitted."""
+    def _plain_search(self) -> GridSearchCV:
+        """Return a search with a clone of the estimator, its scorer and splitter."""
         estimator = AffineNRSfM() if self.estimator is None else self.estimator
         check_class(estimator, "estimator")
-        copied: AffineNRSfM = clone(estimator)
-        return copied
-
-    def _scorer(self) -> Any:
-        """Return the scorer of fitted estimators."""
-        return check_scoring(self._estimator(), self.scoring)
-
-    def _splitter(self) -> Any:
-        """Return the splitter of the rows of a table."""
+        estimator, scorer = clone(estimator), check_scoring(estimator, self.scoring)
         # More blocks cost more, and hardly change the choice. Neighbours are alike:
         # large blocks keep them together.
-        return check_cv(3 if self.cv is None else self.cv)
+        cv = check_cv(3 if self.cv is None else self.cv)
+        return GridSearchCV(estimator, {}, scoring=scorer, cv=cv)
 
-    def _routed(self, method: str, params: dict[str, Any]) -> dict[str, dict[str, Any]]:
-        """Return the metadata for the splitter and the scorer."""
-        if get_config().get("enable_metadata_routing"):
+    def _routed(self, method: str, params: dict[str, Any]) -> tuple[Any, Any]:
+        """Return the metadata for the splitter and for the scorer."""
+        if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params)
-            splitter = routed.splitter.split if method == "fit" else {}
-            return {"splitter": splitter, "scorer": routed.scorer.score}
+            return routed.splitter.get("split", {}), routed.scorer.score
         others = sorted(set(params) - ({"groups"} if method == "fit" else set()))
         if others:
             raise TypeError(
                 f"{method} takes metadata {', '.join(others)} only with metadata "
                 "routing: sklearn.set_config(enable_metadata_routing=True)"
             )
-        return {"splitter": params, "scorer": {}}
+        return params, {}
 
 
 def checked_candidates(n_components: Any) -> list[int]:
     """Return different numbers of basis shapes above zero in ascending order."""
     given = np.atleast_1d(np.asarray(n_components))
-    candidates = sorted(set(given.ravel().tolist()))
-    whole = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"
-    if not whole or candidates[0] < 1 or len(candidates) < len(given):
+    candidates, whole = np.unique(given).tolist(), given.dtype.kind in "iu"
+    different = given.ndim == 1 and len(candidates) == len(given) > 0
+    if not (whole and different and candidates[0] > 0):
         raise ValueError(
             "n_components must be numbers of basis shapes, such as range(1, 9), "
             f"different numbers of at least 1; got {n_components!r}"

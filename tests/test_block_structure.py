@@ -72,13 +72,13 @@ def published_irls(scene, k, n_frames, n_iter=50):
 class TestProducts:
     def test_definitions(self):
         scene = structured_motion(0, noise=0.3)
-        products = motion_products(scene.rigid, scene.motion)
+        cross, rigid, gram = motion_products(scene.rigid, scene.motion)
         M_0 = scene.rigid.reshape(-1, 2, 3)
         for i, M_i in enumerate(scene.motion.reshape(len(M_0), 2, -1)):
-            assert_allclose(products.cross[i], M_0[i].T @ M_i, atol=1e-13)
-            rigid = products.rigid[i].reshape(3, 3)
-            assert_allclose(rigid, M_0[i].T @ M_0[i], atol=1e-13)
-        assert_allclose(products.gram, scene.motion.T @ scene.motion, atol=1e-12)
+            assert_allclose(cross[i], M_0[i].T @ M_i, atol=1e-13)
+            square = rigid[i].reshape(3, 3)
+            assert_allclose(square, M_0[i].T @ M_0[i], atol=1e-13)
+        assert_allclose(gram, scene.motion.T @ scene.motion, atol=1e-12)
 
 
 @ALL_METHODS

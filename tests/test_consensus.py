@@ -27,12 +27,12 @@ from isa_nrsfm._joint.consensus import (
     principal_shapes,
     weighted,
 )
-from isa_nrsfm._joint.problem import JointSettings
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
-SETTINGS = JointSettings("orthographic", "linear", 300, 0.025)
+SETTINGS = FitSettings(camera="orthographic", max_iter=300)
 
 
 def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):

@@ -11,7 +11,7 @@ from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import FastISA
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit import Limits
+from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm._tables.blocks import DaskBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 

@@ -17,7 +17,7 @@ from refusals import refused
 from scipy.io import savemat
 
 from isa_nrsfm.datasets import _muct, _shark, fetch_muct, fetch_shark
-from isa_nrsfm.datasets._remote import RemoteFile, fetch_file
+from isa_nrsfm.datasets._remote import fetch_file
 from isa_nrsfm.io import landmark_table
 
 CONTENT = bytes(range(256)) * 100
@@ -26,11 +26,11 @@ TAGS = ["0", "22", "2", "0"]
 
 
 def described(content=CONTENT, url="http://256.0.0.0/thing.bin"):
-    return RemoteFile(url.split("/")[-1], url, hashlib.sha256(content).hexdigest())
+    return url, hashlib.sha256(content).hexdigest()
 
 
 def by_hand(remote):
-    url, sha256 = remote.url, remote.sha256
+    url, sha256 = remote
     return f"To put it there by hand, take it from {url}; its sha256 is {sha256}"
 
 
@@ -61,10 +61,9 @@ def put(tmp_path, monkeypatch):
     """Return a function that puts a file in the place of the one of a module."""
 
     def put_file(module, content, url):
-        remote = described(content, url)
-        (tmp_path / remote.name).write_bytes(content)
-        fetch = partial(fetch_file, remote)
-        monkeypatch.setattr(module, "fetch_file", lambda known, *args: fetch(*args))
+        (tmp_path / url.split("/")[-1]).write_bytes(content)
+        fetch = partial(fetch_file, *described(content, url))
+        monkeypatch.setattr(module, "fetch_file", lambda *args: fetch(*args[2:]))
 
     return put_file
 
@@ -100,10 +99,10 @@ def test_files_that_are_there_need_no_pooch_and_no_network(
     remote, path = described(), tmp_path / "isa_nrsfm" / "thing.bin"
     path.parent.mkdir()
     path.write_bytes(CONTENT)
-    assert fetch_file(remote, path.parent) == path
-    assert fetch_file(remote, str(path.parent), download_if_missing=False) == path
+    assert fetch_file(*remote, path.parent) == path
+    assert fetch_file(*remote, str(path.parent), download_if_missing=False) == path
     monkeypatch.setenv("SCIKIT_LEARN_DATA", str(tmp_path))
-    assert fetch_file(remote) == path
+    assert fetch_file(*remote) == path
 
 
 def test_other_contents_are_refused_and_kept(tmp_path, served):
@@ -112,7 +111,7 @@ def test_other_contents_are_refused_and_kept(tmp_path, served):
     remote, path = described(url=url), tmp_path / "thing.bin"
     path.write_bytes(b"mine")
     message = "is damaged, or it is another file"
-    told = str(refused(message, fetch_file, remote, tmp_path, error=OSError))
+    told = str(refused(message, fetch_file, *remote, tmp_path, error=OSError))
     for part in (str(path), hashlib.sha256(b"mine").hexdigest(), by_hand(remote)):
         assert part in told
     assert path.read_bytes() == b"mine"
@@ -123,14 +122,14 @@ class TestDownloads:
         (served[0] / "thing.bin").write_bytes(CONTENT)
         remote, folder = described(url=served[1]), tmp_path / "new" / "folder"
         message, options = "download_if_missing is False", {"error": OSError}
-        error = refused(message, fetch_file, remote, folder, False, **options)
+        error = refused(message, fetch_file, *remote, folder, False, **options)
         assert by_hand(remote) in str(error)
         assert not folder.exists()
-        path = fetch_file(remote, folder)
+        path = fetch_file(*remote, folder)
         assert path == folder / "thing.bin"
         assert path.read_bytes() == CONTENT
         (served[0] / "thing.bin").unlink()
-        assert fetch_file(remote, folder) == path
+        assert fetch_file(*remote, folder) == path
         assert list(folder.iterdir()) == [path]
 
     @pytest.mark.parametrize(
@@ -149,30 +148,32 @@ class TestDownloads:
         if answer is not None:
             (folder / "thing.bin").write_bytes(answer)
         remote = described(url=url)
-        message = str(refused(reason, fetch_file, remote, tmp_path, error=OSError))
+        message = str(refused(reason, fetch_file, *remote, tmp_path, error=OSError))
         start = f"thing.bin is not in the folder {tmp_path}, and it could not be down"
         assert message.startswith(start)
         assert message.endswith(by_hand(remote))
         assert list(tmp_path.iterdir()) == []
         # The next try may succeed.
         (folder / "thing.bin").write_bytes(CONTENT)
-        assert fetch_file(remote, tmp_path).read_bytes() == CONTENT
+        assert fetch_file(*remote, tmp_path).read_bytes() == CONTENT
 
     def test_need_pooch(self, tmp_path, without_pooch):
         remote = described()
         message = r'pooch is needed.*pip install "isa-nrsfm\[datasets\]"'
-        told = str(refused(message, fetch_file, remote, tmp_path, error=ImportError))
+        told = str(refused(message, fetch_file, *remote, tmp_path, error=ImportError))
         assert str(tmp_path) in told
         assert by_hand(remote) in told
 
 
-@pytest.mark.parametrize("remote", [_shark.JAWS, _muct.MUCT], ids=lambda r: r.name)
-def test_addresses_name_one_version_of_one_file(remote):
+@pytest.mark.parametrize(
+    ("module", "name"), [(_shark, "jaws.mat"), (_muct, "muct76-opencv.csv")]
+)
+def test_addresses_name_one_version_of_one_file(module, name):
     # A branch or an abbreviated commit may come to mean another one.
     host = re.escape("https://raw.githubusercontent.com/")
-    path = rf"[\w.-]+/[\w.-]+/[0-9a-f]{{40}}/(\w+/)?{re.escape(remote.name)}"
-    assert re.fullmatch(host + path, remote.url)
-    assert re.fullmatch("[0-9a-f]{64}", remote.sha256)
+    path = rf"[\w.-]+/[\w.-]+/[0-9a-f]{{40}}/(\w+/)?{re.escape(name)}"
+    assert re.fullmatch(host + path, module.URL)
+    assert re.fullmatch("[0-9a-f]{64}", module.SHA256)
 
 
 @pytest.mark.parametrize("fetch", [fetch_shark, fetch_muct])

@@ -14,7 +14,6 @@ from isa_nrsfm._frames.models import FrameMap, LinearisedFrames
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
 from isa_nrsfm.analysis._smoothing import (
     Dynamics,
-    Observations,
     estimated_dynamics,
     expected_gradient,
     smooth,
@@ -62,7 +61,7 @@ def observed(x, rng, noise=0.3):
     # Parameters of cameras are relative to these fits.
     change[:, K:] += np.diff(fit[:, K:], axis=0, prepend=0.0)
     fit[:, K:] = 0.0
-    return Observations(precision, fit, change)
+    return precision, fit, change
 
 
 def alone(x, rng, noise=0.3):
@@ -87,19 +86,20 @@ def smooth_people(frames, groups):
 def dense_posterior(data, dynamics):
     """Return mean, covariance and log-likelihood of all steps as one normal density."""
     F, Q, first, shown = dynamics.matrices()
-    n_steps, (n, size) = len(data.fit), shown.shape
+    precision, fit, change = data
+    n_steps, (n, size) = len(fit), shown.shape
     # All states from the first one and all noise, in order
     before = np.kron(np.eye(n_steps, k=-1), F)
     across = np.kron(np.eye(n_steps), shown) @ np.linalg.inv(
         np.eye(len(before)) - before
     )
     prior = across @ block_diag(first, *[Q] * (n_steps - 1)) @ across.T
-    change = np.pad(data.change, ((0, 0), (0, size - n)))
+    change = np.pad(change, ((0, 0), (0, size - n)))
     change[0] = 0.0
     mean, fit, L = (
         -across @ change.ravel(),
-        data.fit.ravel(),
-        block_diag(*data.precision),
+        fit.ravel(),
+        block_diag(*precision),
     )
     growth, far = np.eye(len(prior)) + L @ prior, mean - fit
     covariance, off = np.linalg.solve(growth.T, prior).T, fit - L @ far

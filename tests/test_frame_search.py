@@ -26,7 +26,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.newton import AffineSearch
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
-from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch, Minimum, State
+from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch, State
 from isa_nrsfm._linalg.small_matrices import LANES, unpacked
 from isa_nrsfm._tables.blocks import block_slices
 
@@ -651,7 +651,7 @@ class TestEnds:
 
     def test_search_is_given_up_where_the_known_minimum_is_out_of_reach(self):
         # The minimum of both is -1/4.
-        known = Minimum(np.zeros((1, 2)), np.array([-10.0, -0.2]), np.zeros(2))
+        known = np.zeros((1, 2)), np.array([-10.0, -0.2]), np.zeros(2)
         problem = Wells([1.0, 1.0])
         found, converged = ended(problem, [1.1, 1.1], known=known)
         assert_array_equal(converged, [False, True])
@@ -659,7 +659,7 @@ class TestEnds:
         assert_allclose(found[1], 1.0, rtol=1e-7)
 
     def test_search_is_given_up_in_the_well_of_the_known_minimum(self):
-        known = Minimum(np.ones((1, 2)), np.full(2, -0.3), np.array([0.2, 0.01]))
+        known = np.ones((1, 2)), np.full(2, -0.3), np.array([0.2, 0.01])
         found, converged = ended(Wells([1.0, 1.0]), [1.5, 1.5], 3, known)
         steps = [ended(Wells([1.0]), [1.5], n)[0][0] for n in range(4)]
         first = next(x for x in steps if abs(x - 1.0) < 0.2)

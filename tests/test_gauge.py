@@ -1,5 +1,6 @@
 """The canonical space, order, scale and sign, and the independent basis."""
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +40,9 @@ class Scene:
 
     def canonical(self):
         A = canonical_space(self.mean_shape, self.motion)
-        gauge = canonical_gauge(self.mean_shape, self.basis, self.motion, self.alpha, A)
+        fit = self.mean_shape, self.basis, self.motion, self.alpha
+        mean_shape, basis, order, _ = canonical_gauge(*fit, A)
+        gauge = SimpleNamespace(mean_shape=mean_shape, basis=basis, order=order)
         return gauge, self.motion @ np.linalg.inv(A)
 
     def scattered(self):
@@ -254,13 +257,13 @@ def regauged(fit, seed=1, shift=0.05):
 
 def canonical(fit, *options):
     """Return the canonical fit, and the standard deviations for unit covariances."""
-    gauge, frames = independent_gauge(*fit, *(options or ["shapes"]))
+    mean_shape, basis, frames = independent_gauge(*fit, *(options or ["shapes"]))
     n_frames, n_components = fit.alpha.shape
     covariance = np.broadcast_to(
         np.eye(n_components), (n_frames,) + 2 * (n_components,)
     )
     motion, alpha, deviation = frames.apply(fit.motion, fit.alpha, covariance)
-    shapes = np.concatenate([gauge.mean_shape[None], gauge.basis])
+    shapes = np.concatenate([mean_shape[None], basis])
     return Fit(shapes.transpose(0, 2, 1), motion, alpha), deviation
 
 
@@ -286,7 +289,7 @@ class TestSameFit:
         frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
         assert affine_shape_error(*frames) < 1e-10
         # The affinity is that of the map.
-        space = independent_gauge(*fit, independence)[1].space
+        space = independent_gauge(*fit, independence)[-1].space
         scales = np.linalg.norm(space @ fit.frames(), axis=(1, 2))
         scales /= np.linalg.norm(result.frames(), axis=(1, 2))
         expected = scales[:, None, None] * result.frames()
@@ -382,7 +385,7 @@ class TestCalibratedCameras:
         fit = calibrated(random_fit(), camera)
         options = independence, camera, unit
         result, _ = canonical(fit, *options)
-        space = independent_gauge(*fit, *options)[1].space
+        space = independent_gauge(*fit, *options)[-1].space
         assert_allclose(result.images(), fit.images(), atol=1e-10)
         size = np.linalg.norm(space, axis=0)
         assert_allclose(space @ space.T, size[0] ** 2 * np.eye(3), atol=1e-10)
@@ -429,7 +432,7 @@ class TestStandardDeviations:
     @EACH
     def test_are_those_of_random_coefficients(self, independence):
         fit = random_fit()
-        frames = independent_gauge(*fit, independence)[1]
+        frames = independent_gauge(*fit, independence)[-1]
         rng = np.random.default_rng(3)
         root = 0.03 * rng.normal(size=(60, 3, 3))
         covariance = root @ root.swapaxes(1, 2)
@@ -453,7 +456,7 @@ class TestStandardDeviations:
         moved = np.stack(slopes, axis=2) / (2 * step) @ root
         other = regauged(fit)
         deviations = [
-            independent_gauge(*one, "shapes")[1].apply(
+            independent_gauge(*one, "shapes")[-1].apply(
                 one.motion, one.alpha, each @ each.swapaxes(1, 2)
             )[2]
             for one, each in ((fit, root), (other, moved))
@@ -542,5 +545,5 @@ class TestDegenerate:
         assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
         assert_allclose(result.alpha.std(axis=0), 1)
         # No frame is turned inside out, and none changes its scale.
-        space = independent_gauge(*fit, independence)[1].space
+        space = independent_gauge(*fit, independence)[-1].space
         assert_allclose(space @ fit.frames(), result.frames(), atol=1e-9)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from groupings import energy_inside
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, spherical_sources
 from scipy.integrate import quad
@@ -12,10 +11,8 @@ from scipy.optimize import linear_sum_assignment
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.isa import SqrtDensity, _shared_mixing
 from isa_nrsfm.isa._base import (
-    covariance_gains,
     fixed_point_step,
     iterate,
-    likelihood_gains,
     orthogonalise,
     subspace_change,
     whiten,
@@ -99,55 +96,6 @@ class TestChange:
                 difference = a.swapaxes(1, 2) @ a - b.swapaxes(1, 2) @ b
                 expected.append(np.max(np.sum(difference**2, axis=(1, 2))) / 2 / size)
             assert_allclose(subspace_change(W, V, size), expected)
-
-
-def likelihood(signals, assignment):
-    groups = (signals[assignment == k] for k in range(assignment.max() + 1))
-    return sum(np.mean(DENSITY.log_density(np.sum(s**2, axis=0))) for s in groups)
-
-
-def random_covariance(seed, n=9, dof=12):
-    A = np.random.default_rng(seed).normal(size=(n, dof))
-    return A @ A.T
-
-
-def random_assignments(seed, n, n_signals=9, size=3):
-    rng = np.random.default_rng(seed)
-    return [rng.permutation(np.arange(n_signals) // size) for _ in range(n)]
-
-
-class TestGains:
-    """The gain of every swap, against the difference of the objective."""
-
-    def check(self, gains, objective, assignment):
-        gain, size = gains(assignment)
-        assert_allclose(gain, gain.T)
-        assert size > 0
-        now = objective(assignment)
-        for a in range(len(assignment)):
-            for b in range(len(assignment)):
-                if assignment[a] != assignment[b]:
-                    swapped = assignment.copy()
-                    swapped[[a, b]] = swapped[[b, a]]
-                    difference = objective(swapped) - now
-                    assert_allclose(gain[a, b], difference, atol=1e-12 * size)
-
-    @pytest.mark.parametrize("seed", range(3))
-    @pytest.mark.parametrize("size", [1, 2, 3, 4])
-    def test_covariance(self, seed, size):
-        C = random_covariance(seed, 12)
-        for assignment in random_assignments(seed, 3, 12, size):
-            gains = covariance_gains(C)
-            self.check(gains, lambda z: energy_inside(C, z) / 2, assignment)
-
-    @pytest.mark.parametrize("seed", range(3))
-    @pytest.mark.parametrize("size", [1, 2, 3, 4])
-    def test_likelihood(self, seed, size):
-        signals = spherical_sources(seed, 60, 4).T
-        gains = likelihood_gains(signals, DENSITY)
-        # The same function for several assignments: what it remembers is not stale.
-        for assignment in random_assignments(seed, 3, 12, size):
-            self.check(gains, lambda z: likelihood(signals, z), assignment)
 
 
 def sources(kinds, seed, n_samples, size):

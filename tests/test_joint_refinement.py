@@ -1,7 +1,7 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -325,17 +325,17 @@ class TestLeastNoise:
         assert end.noise_gradient > 0.1 * likelihood.frames.totals[0]
         assert result.gradient_norm < 1e-3
         assert (
-            result.left
+            result.misfit
             == result.state.noise
             > end.residual / likelihood.frames.totals[0]
         )
 
-    def test_left_is_the_noise_or_the_mean_square_residual(self):
+    def test_misfit_is_the_noise_or_the_mean_square_residual(self):
         scene = random_scene()
         result = refined(scene)
         rest = scene.tracks.swapaxes(1, 2) - images(scene, result)
         largest = max(np.mean(rest**2), result.state.noise)
-        assert result.left == pytest.approx(largest)
+        assert result.misfit == pytest.approx(largest)
 
 
 class TestWithoutNoise:
@@ -369,24 +369,28 @@ class Parabola:
         return SimpleNamespace(t=step[0], noise=max(np.exp(step[1]), 0.5))
 
 
+def searched(a, direction):
+    return _line_search(Parabola(a), direction, partial(Parabola, a))
+
+
 class TestLineSearch:
     @pytest.mark.parametrize(
         ("a", "expected"),
         [(1.0, 1.0), (1.99, 1.0), (2.0, 0.5), (4.0, 0.25), (40, 1 / 40)],
     )
     def test_takes_the_whole_step_or_the_minimum_of_the_parabola(self, a, expected):
-        reached, step = _line_search(Parabola(a), np.array([1.0, 0.0]))
+        reached, step = searched(a, np.array([1.0, 0.0]))
         assert reached.state.t == pytest.approx(expected)
         assert_allclose(step, [expected, 0.0])
 
     def test_noise_changes_by_a_limited_factor_and_not_below_its_floor(self):
-        reached, step = _line_search(Parabola(0.5), np.array([1.0, -3.0]))
+        reached, step = searched(0.5, np.array([1.0, -3.0]))
         assert reached.state.t == pytest.approx(0.5)
         assert_allclose(step, [0.5, np.log(0.5)])
 
     def test_no_step_where_the_objective_rises(self):
         direction = np.array([-1.0, 0.0])
-        reached, step = _line_search(Parabola(1.0), direction)
+        reached, step = searched(1.0, direction)
         assert reached is None
         assert step is direction
 

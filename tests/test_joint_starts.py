@@ -17,9 +17,9 @@ from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import (
     FactorisedTable,
     JointProblem,
-    JointSettings,
     JointState,
 )
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
@@ -144,7 +144,7 @@ class TestLiftedShapes:
 def problem_of(scene, thorough=True):
     rows = FrameBlocks.of_array(scene.rows, 64)
     frames = JointFrames.from_points(rows, True)
-    settings = JointSettings("orthographic", "linear", 1000, 0.01)
+    settings = FitSettings(camera="orthographic", tol=0.01)
     return JointProblem(frames, settings, thorough)
 
 
@@ -202,7 +202,7 @@ class TestAffineStart:
         scene = random_scene(amplitude=0.0)
         problem = problem_of(scene)
         state = affine_start(problem, scene.W, paper_shapes(scene.factors))
-        floor = problem.settings.options.least_noise * np.mean(scene.rows**2)
+        floor = problem.settings.limits.least_noise * np.mean(scene.rows**2)
         assert state.noise == pytest.approx(floor)
 
     def test_basis_shapes_are_one_deviation_of_their_coefficients(self):
@@ -275,7 +275,7 @@ def random_problem(kind="complete", n_frames=30, **options):
         directions = np.linalg.svd(shapes.reshape(-1, FEW_POINTS))[2][: FEW_POINTS - 1]
         frames = JointFrames.from_directions(rows, directions)
         shapes = frames.coordinates(shapes)
-    settings = JointSettings("affine", "linear", 100, 1e-3)
+    settings = FitSettings(max_iter=100, tol=1e-3)
     problem = JointProblem(frames, settings, penalty=0.02)
     return problem, JointState(shapes, scene.motion, NOISE**2)
 
@@ -284,8 +284,8 @@ def counted(problem, state, threshold=None):
     """Return the number of relevant shapes, by another threshold of shares."""
     settings = problem.settings
     if threshold is not None:
-        options = settings.options._replace(determined=threshold)
-        settings = settings._replace(options=options)
+        limits = settings.limits._replace(determined=threshold)
+        settings = settings._replace(limits=limits)
     return relevant_components(replace(problem, settings=settings), state)
 
 

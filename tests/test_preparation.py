@@ -424,11 +424,11 @@ def log_likelihood(B, noise, rows):
 
 
 def test_missing_points_are_conditional_expectations(small):
-    model = completion_model(small, 6)
+    B, noise = model = completion_model(small, 6)
     filled = filled_in(small, model)
     filled += np.nanmean(small - filled, axis=2, keepdims=True)
     far = 1e7  # variance of the translation, which may be anything
-    covariance = model.B.T @ model.B + model.noise * np.eye(9) + far
+    covariance = B.T @ B + noise * np.eye(9) + far
     for frame, result in zip(small, filled, strict=True):
         mask = ~np.isnan(frame[0])
         inverse = np.linalg.inv(covariance[np.ix_(mask, mask)])
@@ -578,5 +578,5 @@ def test_noise_of_a_rigid_object(missing):
     scene = make_nonrigid_tracks(500, 30, 0, noise=0.05, random_state=0)
     tracks = hide(scene.tracks, random_mask((500, 30), missing, 0))
     rows, _ = centred_frames(tracks.transpose(0, 2, 1))
-    variance = completion_model(rows, 3).noise
+    variance = completion_model(rows, 3)[1]
     assert_allclose(variance, scene.noise_variance, rtol=0.05)

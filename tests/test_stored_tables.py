@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit import Limits
+from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -133,7 +133,7 @@ def test_fit_is_that_in_memory(tmp_path, kind, memory, limits, params, given):
 def test_of_many_points_of_which_some_are_missing(tmp_path, loss):
     # Completed frames along directions first: the end is that of the seen points.
     X, params = table(0.1, n_points=210, n_frames=80), {"loss": loss, "tol": 1e-4}
-    few = Limits(joint=ALL.joint._replace(many_points=999))
+    few = Limits(many_points=999)
     at_once, model = (estimator(each, **params).fit(X) for each in (few, ALL))
     assert_allclose(model.basis_, at_once.basis_, rtol=0, atol=1e-4)
     assert_allclose(model.alpha_, at_once.alpha_, rtol=0, atol=1e-3)

@@ -58,8 +58,15 @@ def checked_parameters(
     return decorate
 
 
-class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
-    """Names of the columns of the results of `transform`."""
+class CoefficientsMixin(ClassNamePrefixFeaturesOutMixin):
+    """Names and number types of coefficients; tables may have missing points."""
+
+    def __sklearn_tags__(self) -> Any:
+        """Return the estimator's tags."""
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = ["float64", "float32"]
+        tags.input_tags.allow_nan = True
+        return tags
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray:
         """

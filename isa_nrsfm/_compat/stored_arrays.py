@@ -40,11 +40,11 @@ def array_in(content: bytes) -> NDArray:
         shape, _, dtype = np.lib.format.read_array_header_1_0(stored)
     else:
         shape, _, dtype = np.lib.format.read_array_header_2_0(stored)
-    found, expected = len(content) - stored.tell(), math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or found != expected:
+    n_bytes, expected = len(content) - stored.tell(), math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or n_bytes != expected:
         raise ValueError(
             f"an array of shape {shape} and type {dtype} should have {expected} bytes; "
-            f"got {found}"
+            f"got {n_bytes}"
         )
     stored.seek(0)
     return np.lib.format.read_array(stored, allow_pickle=False)

@@ -219,7 +219,7 @@ def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
     p, q, r = np.vecdot(x, x) + d, np.vecdot(x, y), np.vecdot(y, y) + d
     t, flat = np.sqrt(1.0 + 2.0 * d), ~(d > 0.1)
     divisor = np.where(flat, 1.0, d * t)
-    p, q, r = ((each / divisor)[:, None] for each in (p, q, r))
+    p, q, r = (np.stack([p, q, r]) / divisor)[..., None]
     rows, scales = np.stack([r * x - q * y, p * y - q * x], axis=1), 0.5 * t * size
     if flat.any():
         rows[flat], values, _ = polar(motion[flat])

@@ -60,7 +60,7 @@ from isa_nrsfm._frames.point_sums import (
     whitened,
     with_one,
 )
-from isa_nrsfm._frames.search import FrameProblem, FrameSearch, Minimum, State
+from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     ROWS,
@@ -275,11 +275,11 @@ class CalibratedSearch(FrameSearch):
         cameras, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
         tried = padded(tried)
         if len(tried):
-            problem, M, limit = (of_frames(p, tried) for p in (problem, M, limit))
+            problem, M, limit = of_frames((problem, M, limit), tried)
             start = self.evaluate(problem, M * REVERSED)
             # The reversed camera and M differ in the third column.
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
-            known = Minimum(M, limit, radius)
+            known = M, limit, radius
             other, converged[tried] = self.descend(problem, start, max_steps, known)
             better[tried] = lower = _value(problem, _posterior(problem, other)) < limit
             cameras[..., tried] = np.where(lower, other, M)

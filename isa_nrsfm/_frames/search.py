@@ -128,22 +128,9 @@ class State(NamedTuple):
         return unpacked(inverse)
 
 
-class Minimum(NamedTuple):
-    """Known minima of frames, below which others are searched.
-
-    position (..., n): their positions. value (n,): objectives to fall below. radius
-    (n,): distance within which a search is in the same well.
-    """
-
-    position: NDArray
-    value: NDArray
-    radius: NDArray
-
-    def excludes(self, state: State, gain: NDArray) -> NDArray:
-        """Return a mask (n,) of searches that are not expected to end below."""
-        square = (state.position - self.position) ** 2
-        near = square.sum(axis=tuple(range(square.ndim - 1))) < self.radius**2
-        return near | (state.value - 10.0 * gain > self.value)
+# Minima below which lower ones are searched: positions (..., n), values (n,) to fall
+# below, and distances (n,) from the positions within which a search is in the same well
+Minima = tuple[NDArray, NDArray, NDArray]
 
 
 class FrameSearch:
@@ -279,9 +266,9 @@ class FrameSearch:
             motion = frames_first(M)
             spreads = fits.covariance[block], fits.turn_covariance[block]
             if covariances:
-                covariance, turns = self.covariances(problem, M, alpha)
-                turns = self.space.T @ frames_first(turns) @ self.space
-                spreads = frames_first(covariance), turns
+                spreads = self.covariances(problem, M, alpha)
+                covariance, turns = map(frames_first, spreads)
+                spreads = covariance, self.space.T @ turns @ self.space
             minima = FramePosterior(
                 motion @ self.space,
                 products.positions(motion, alpha.T),
@@ -327,7 +314,7 @@ class FrameSearch:
         problem: FrameProblem,
         state: State,
         max_steps: int,
-        known: Minimum | None = None,
+        known: Minima | None = None,
     ) -> tuple[NDArray, NDArray]:
         """Minimise the objectives; return iterates (..., n) and convergence (n,).
 
@@ -344,7 +331,7 @@ class FrameSearch:
             small = (damping == 0) & (gain <= 1e-12 * problem.energy)
             leaving = small | (damping >= LARGEST_DAMPING)
             if known is not None:
-                leaving |= known.excludes(state, gain)
+                leaving |= _hopeless(state, gain, *known)
             # Remove frames that have ended; converged ones take a last step.
             if leaving.any():
                 last = self.model.moved(state.position, np.where(small, step, 0.0))
@@ -353,9 +340,8 @@ class FrameSearch:
                 if leaving.all():
                     return ends, converged
                 left = padded(np.flatnonzero(~leaving))
-                problem, state, step, running, damping, known = (
-                    of_frames(part, left)
-                    for part in (problem, state, step, running, damping, known)
+                problem, state, step, running, damping, known = of_frames(
+                    (problem, state, step, running, damping, known), left
                 )
             if not n_left:
                 break
@@ -388,6 +374,15 @@ class FrameSearch:
             still = ~positive & (damping[failing] < LARGEST_DAMPING)
             failing = padded(np.unique(failing[still]))
         return self.model.limited(step), damping
+
+
+def _hopeless(
+    state: State, gain: NDArray, known: NDArray, value: NDArray, radius: NDArray
+) -> NDArray:
+    """Return a mask (n,) of searches that are not expected to end below `Minima`."""
+    square = (state.position - known) ** 2
+    near = square.sum(axis=tuple(range(square.ndim - 1))) < radius**2
+    return near | (state.value - 10.0 * gain > value)
 
 
 def raised(damping: NDArray) -> NDArray:

@@ -44,8 +44,9 @@ def common_coordinates(
     The noise variance includes its floor, which falls from step to step.
     """
     unknown = np.concatenate([np.isnan(images), np.ones_like(images[:, :1], bool)], 1)
-    unknown, first = (each.transpose(2, 1, 0) for each in (unknown, first))
-    # The frame is the last index: coordinates (n, 3, I), rotations (3, 3, n_frames).
+    # From here on the frame is the last index: coordinates (n, 3, I), rotations (3, 3,
+    # n_frames).
+    unknown, first = unknown.transpose(2, 1, 0), first.transpose(2, 1, 0)
     Y = np.where(unknown, first, 0.0)
     Y[:, :2] += np.nan_to_num(images.transpose(2, 1, 0))
     axes = [axis for axis in range(3) if unknown[:, axis].any()]

@@ -33,7 +33,8 @@ from isa_nrsfm._joint.common_depths import (
     common_coordinates,
 )
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.problem import JointSettings, JointState, refine_joint
+from isa_nrsfm._joint.problem import JointState, refine_joint
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._joint.uncertainty import inlying_rows
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
@@ -94,7 +95,7 @@ class Group(NamedTuple):
 def consensus(
     model: PosteriorFrames,
     rows: FrameBlocks,
-    settings: JointSettings,
+    settings: FitSettings,
     most: int,
     free: bool,
 ) -> tuple[NDArray, float, NDArray, NDArray | None]:
@@ -118,11 +119,11 @@ def consensus(
     first = scales[:, None, None] * rotations @ shapes
     first[:, :2] += fit.translation[:, :, None]
     # Groups of some of the points
-    n_points, options = part.shape[2], settings.options
+    n_points, limits = part.shape[2], settings.limits
     chosen = spread(np.arange(n_points), min(n_points, MOST_POINTS))
     mean_square = float(np.nanmean(part**2))
-    price = 1.0 / (options.basis_std**2 * mean_square)
-    floor = FLOOR_SHARE * options.least_noise * mean_square
+    price = 1.0 / (limits.basis_std**2 * mean_square)
+    floor = FLOOR_SHARE * limits.least_noise * mean_square
     scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
     noise, S, groups, squares = model.noise_variance, shapes, [], None
     distances = neighbour_distances(shapes[:, :, chosen])
@@ -174,7 +175,7 @@ def together(
 
 
 def fitted_groups(
-    scene: Scene, distances: NDArray, n_components: int, settings: JointSettings
+    scene: Scene, distances: NDArray, n_components: int, settings: FitSettings
 ) -> list[Group]:
     """Return the fits of all groups."""
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
@@ -234,7 +235,7 @@ def neighbourhoods(distances: NDArray, size: int) -> list[tuple[NDArray, int]]:
 
 @one_blas_thread
 def group_fit(
-    scene: Scene, n_components: int, settings: JointSettings
+    scene: Scene, n_components: int, settings: FitSettings
 ) -> tuple[NDArray, NDArray, float] | None:
     """Return frames, coordinates and noise of a group; None if too few frames show it.
 

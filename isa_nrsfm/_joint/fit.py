@@ -36,10 +36,10 @@ from isa_nrsfm._joint.problem import (
     FactorisedTable,
     JointFit,
     JointProblem,
-    JointSettings,
     JointState,
     regular,
 )
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import (
     FIXED_STEPS,
     affine_start,
@@ -56,15 +56,15 @@ from isa_nrsfm._tables.blocks import representative_frames
 def fit_jointly(
     table: FactorisedTable,
     paper_shapes: NDArray,
-    settings: JointSettings,
+    settings: FitSettings,
     start: JointState | None = None,
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
-    A fit from a given start uses only its shapes and noise, and of `paper_shapes` (K +
-    1, 3, J) only the shape. Returns the fit, the fitted frames, and alpha (n_chosen, K)
-    of the sample. Shapes are centred and mixed such that alpha ~ N(0, I). The noise is
-    corrected for degrees of freedom.
+    The shapes and the noise of a given start replace the paper's shapes (K + 1, 3, J).
+    Returns the fit, the fitted frames, and alpha (n_chosen, K) of the sample. Shapes
+    are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
+    of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
     first, sampled = problems[0], len(problems) > 1
@@ -111,7 +111,7 @@ def fit_jointly(
 
 
 def count_components(
-    table: FactorisedTable, paper_shapes: NDArray, settings: JointSettings
+    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings
 ) -> int:
     """Return the number of basis shapes that a table supports, at least one.
 
@@ -153,7 +153,7 @@ def relevant_components(problem: JointProblem, state: JointState) -> int:
         determined = np.maximum(determined, 1e-9)
         variance = np.maximum(energy / (n_numbers * determined), 1e-9 * energy.max())
         penalty = 1.0 / (variance * n_frames)
-    return int(np.sum(determined > problem.settings.options.determined))
+    return int(np.sum(determined > problem.settings.limits.determined))
 
 
 def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
@@ -163,7 +163,7 @@ def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
 
 
 def _problems(
-    table: FactorisedTable, paper_shapes: NDArray, settings: JointSettings
+    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings
 ) -> tuple[list[JointProblem], JointFrames | None]:
     """Return the problems of growing samples and of all frames.
 
@@ -172,8 +172,8 @@ def _problems(
     points.
     """
     n_shapes, _, n_points = paper_shapes.shape
-    options, seen = settings.options, None
-    if n_points > max(24 * n_shapes, options.many_points):
+    limits, seen = settings.limits, None
+    if n_points > max(24 * n_shapes, limits.many_points):
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         frames = JointFrames.from_directions(table.completed, directions)
@@ -182,8 +182,8 @@ def _problems(
             seen = _visible_frames(table)
     else:
         frames = _visible_frames(table)
-    thorough = frames.n_frames <= options.few_frames
-    penalty = frames.basis_penalty(options.basis_std)
+    thorough = frames.n_frames <= limits.few_frames
+    penalty = frames.basis_penalty(limits.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
     # Each parameter that fits noise only lowers -2 log L by about one. Steps on a
     # sample end when they gain less than 3 % of the number of shape parameters.
@@ -227,7 +227,7 @@ def _first_fit(
         raced = map(partial(refined, max_iter=min(max_iter, 5)), states)
         states = [min(raced, key=_end).state]
     other = min(map(partial(refined, max_iter=max_iter), states), key=_end)
-    ratio = fit.left / min(other.left, fit.left)
+    ratio = fit.misfit / min(other.misfit, fit.misfit)
     if cameras.calibrated:
         return fit._replace(camera_noise_ratio=ratio), starts[0]
     return other._replace(camera_noise_ratio=ratio), rigid
@@ -252,12 +252,12 @@ def judged(
     fitted again, with a noise floor as high as that deformation; orthographic ones only
     if their noise is at the lower floor.
     """
-    options, mean_square = problem.settings.options, problem.mean_square
-    cameras, least_noise = problem.cameras, options.least_noise
+    limits, mean_square = problem.settings.limits, problem.mean_square
+    cameras, least_noise = problem.cameras, limits.least_noise
     n_components = len(start.shapes) - 1
     noise_level = table.noise_level(n_components)
     # A spectrum of only 3K + 3 singular values has no noise.
-    threshold = max(options.right * noise_level, 1e-10) * mean_square
+    threshold = max(limits.right * noise_level, 1e-10) * mean_square
     at_floor = fit.state.noise < (1 + 1e-3) * least_noise * mean_square
     # Sufficient: without floor and prior
     if at_floor or fit.state.noise < threshold:
@@ -268,8 +268,8 @@ def judged(
     # Not sufficient: with a floor as high as the missing deformation
     follows = cameras.scaled or at_floor
     if cameras.calibrated and follows and noise_level > 0:
-        missing = options.cut_off * table.missing_share(n_components)
-        least_noise = np.clip(missing, least_noise, options.most_noise)
+        missing = limits.cut_off * table.missing_share(n_components)
+        least_noise = np.clip(missing, least_noise, limits.most_noise)
         fit = problem.unreversed(fit.state, cameras, least_noise=least_noise)
     return fit, least_noise, False
 

@@ -9,8 +9,8 @@ maximisation.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
 from isa_nrsfm._paper.pipeline import Factorisation
@@ -33,44 +34,6 @@ NOISE_FLOOR = 1e-11
 
 # Steps, changes of the gradient, and their inner products.
 Memory = deque[tuple[NDArray, NDArray, float]]
-
-
-class JointOptions(NamedTuple):
-    """Thresholds of the joint fit; docs/benchmarks/README.md has their effects."""
-
-    # Prior standard deviation of the coordinates of the image of a basis shape with
-    # coefficient one, as a share of the size of the frame
-    basis_std: float = 0.008
-    # Floor of the noise variance while K may be too small, as a share of the mean
-    # square. Unmodelled deformation must be absorbed by the noise; otherwise it
-    # distorts the depths.
-    least_noise: float = 5e-5
-    # K is sufficient if the noise variance does not exceed this multiple of the noise
-    # level of the spectrum. The ratio is 0.8 to 1.0 for artificial tables with the true
-    # K or more, 1.3 to 1.8 with fewer basis shapes, 1.9 and more for motion capture.
-    right: float = 1.4
-    # Floor of the noise variance for calibrated cameras and too few basis shapes: a
-    # multiple of the share of energy beyond K + 3 singular values, and its upper bound,
-    # because large motion adds to the spectrum
-    cut_off: float = 3.0
-    most_noise: float = 5e-4
-    # Largest number of frames of a small table, with several minima. In large tables
-    # all starts lead to the same minimum.
-    few_frames: int = 2000
-    # Columns of the mixtures from which cameras start, three for each shape
-    widths: tuple[int, ...] = (6, 9, 12, 18, 24, 36)
-    # Convergence tolerance of compared starts, for each frame. The objectives of
-    # different minima differ by tens per frame.
-    compared_tol: float = 0.5
-    # Frames with more points are represented by directions.
-    many_points: int = 200
-    # Threshold of a relevant basis shape, the share of its numbers that the table
-    # determines. On artificial tables with 2 % noise true shapes have 0.998 and more,
-    # others 0.83 and less.
-    determined: float = 0.95
-
-
-JOINT_OPTIONS = JointOptions()
 
 
 class FactorisedTable(NamedTuple):
@@ -123,18 +86,6 @@ class FactorisedTable(NamedTuple):
         return float(self.rest_share + (1 - self.rest_share) * beyond)
 
 
-class JointSettings(NamedTuple):
-    """Settings of the joint fit, as in `AffineNRSfM` and `refine_joint`."""
-
-    camera: str
-    loss: str
-    max_iter: int
-    tol: float
-    on_step: Callable[[], None] | None = None
-    n_jobs: int | None = None
-    options: JointOptions = JOINT_OPTIONS
-
-
 class JointState(NamedTuple):
     """Shapes (n_shapes, 3, J), cameras (I, 2, 3) and noise variance of a coordinate."""
 
@@ -150,7 +101,7 @@ class JointFit(NamedTuple):
     gradient_norm: ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D
     of the approximate Hessian and the number N of coordinates. Its square is about half
     to twice the possible further decrease of the objective per coordinate.
-    left: the maximum of the noise variance and the mean square residual at the
+    misfit: the maximum of the noise variance and the mean square residual at the
     posterior means of the coefficients. camera_noise_ratio: noise variance with
     calibrated cameras divided by that with affine ones, for the sample of
     `fit_jointly`. NaN with given starts.
@@ -160,7 +111,7 @@ class JointFit(NamedTuple):
     history: NDArray
     gradient_norm: float
     converged: bool
-    left: float
+    misfit: float
     camera_noise_ratio: float = np.nan
 
 
@@ -173,7 +124,7 @@ class JointProblem:
     """
 
     frames: JointFrames
-    settings: JointSettings
+    settings: FitSettings
     thorough: bool = False
     penalty: NDArray | float = 0.0
 
@@ -216,7 +167,7 @@ class JointProblem:
         cameras, settings = cameras or self.cameras, self.settings
         extents = 0.0 if cameras.name == "affine" else EXTENT_WEIGHT
         given = {
-            "least_noise": settings.options.least_noise,
+            "least_noise": settings.limits.least_noise,
             "max_iter": settings.max_iter,
             "tol": settings.tol * (0.1 if self.thorough else 1.0),
             "on_step": settings.on_step,
@@ -277,7 +228,8 @@ def refine_joint(
     n_frames, (n_seen, square) = likelihood.frames.n_frames, likelihood.frames.totals
     floor = least_noise * square / n_seen
     start = start._replace(noise=max(start.noise, floor))
-    iterate = _Iterate(likelihood, cameras, start, floor)
+    evaluated = partial(_Iterate, likelihood, cameras, floor)
+    iterate = evaluated(start)
     # At most 20 pairs, fewer if they would exceed 2^25 numbers, but never less than 3
     most = 2**25 // (2 * iterate.gradient.size)
     memory: Memory = deque(maxlen=max(min(most, 20), 3))
@@ -290,7 +242,7 @@ def refine_joint(
         if not iterate.gradient @ direction < 0:
             memory.clear()
             direction = -iterate.precondition(iterate.gradient)
-        reached, step = _line_search(iterate, direction)
+        reached, step = _line_search(iterate, direction, evaluated)
         if reached is None:
             if not memory:  # even the gradient fails: only rounding errors remain
                 small_steps = 2
@@ -312,32 +264,32 @@ def refine_joint(
     slope = iterate.gradient @ iterate.precondition(iterate.gradient)
     norm = float(np.sqrt(max(slope, 0.0) / n_seen))
     converged = small_steps >= 2 and bool(np.isfinite(iterate.value))
-    return JointFit(iterate.state, np.array(history), norm, converged, iterate.left)
+    return JointFit(iterate.state, np.array(history), norm, converged, iterate.misfit)
 
 
-@dataclass(eq=False)
 class _Iterate:
     """A state with the objective, its gradient and its approximate curvature.
 
     The unknowns as one vector: shapes, parameters of the cameras, log noise variance.
     """
 
-    likelihood: MarginalLikelihood
-    cameras: CameraModel
-    state: JointState
-    floor: float
-
-    def __post_init__(self) -> None:
-        """Evaluate the objective, its gradient and curvature."""
-        passed = self.likelihood(*self.state)
-        self.M, noise = frames_last(self.state.motion), self.state.noise
-        self.n_seen = self.likelihood.frames.totals[0]
+    def __init__(
+        self,
+        likelihood: MarginalLikelihood,
+        cameras: CameraModel,
+        floor: float,
+        state: JointState,
+    ):
+        self.cameras, self.floor, self.state = cameras, floor, state
+        passed = likelihood(*state)
+        self.M, noise = frames_last(state.motion), state.noise
+        self.n_seen = likelihood.frames.totals[0]
         self.value = passed.value
-        self.left = max(noise, passed.residual / self.n_seen)
-        at_floor = noise <= self.floor * (1 + 1e-6)
+        self.misfit = max(noise, passed.residual / self.n_seen)
+        at_floor = noise <= floor * (1 + 1e-6)
         # At its lower bound the noise variance may only rise.
         by_noise = min(passed.noise_gradient, 0.0 if at_floor else np.inf)
-        by_cameras = self.cameras.gradient(self.M, passed.motion_gradient)
+        by_cameras = cameras.gradient(self.M, passed.motion_gradient)
         self.gradient = _stacked(passed.shape_gradient, by_cameras, by_noise)
         self.curvature = passed.shape_curvature, passed.motion_curvature
 
@@ -408,7 +360,7 @@ def _inverse_hessian_product(iterate: _Iterate, memory: Memory) -> NDArray:
 
 
 def _line_search(
-    iterate: _Iterate, direction: NDArray
+    iterate: _Iterate, direction: NDArray, evaluated: Callable[[JointState], _Iterate]
 ) -> tuple[_Iterate | None, NDArray]:
     """Return the first iterate that meets the Armijo condition, or None, and step."""
     slope = iterate.gradient @ direction
@@ -418,7 +370,7 @@ def _line_search(
     length = min(1.0, of_noise, of_cameras)
     while length > 1e-8:
         step = length * direction
-        reached = replace(iterate, state=iterate.moved(step))
+        reached = evaluated(iterate.moved(step))
         if reached.value <= iterate.value + 1e-4 * length * slope:
             # The lower bound may have shortened the change of the noise.
             step[-1] = np.log(reached.state.noise / iterate.state.noise)

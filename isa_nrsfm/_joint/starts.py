@@ -20,11 +20,11 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._joint.problem import (
-    JOINT_OPTIONS,
     FactorisedTable,
     JointProblem,
     JointState,
 )
+from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._paper.pipeline import Factorisation, rigid_energy
@@ -60,7 +60,7 @@ def mixed_cameras(
     rows: NDArray,
     scales: NDArray | None,
     chosen: NDArray,
-    widths: tuple[int, ...] = JOINT_OPTIONS.widths,
+    widths: tuple[int, ...] = LIMITS.widths,
 ) -> Iterator[NDArray]:
     """Yield calibrated cameras (I, 2, 3), mixtures of more and more columns.
 
@@ -131,14 +131,14 @@ def best_starts(
     problem: JointProblem, table: FactorisedTable, paper: NDArray, cameras: CameraModel
 ) -> list[JointState]:
     """Return the likeliest starts, best first: three of small tables, one of others."""
-    frames, options = problem.frames, problem.settings.options
+    frames, limits = problem.frames, problem.settings.limits
     factors, thorough = table.factors, problem.thorough
     # Frames for the comparison, spread evenly from the most to the least rigid
     rows = frames.coordinates(table.W).reshape(frames.n_frames, 2, -1)
     order = np.argsort(rigid_energy(rows, frames.coordinates(factors.rigid_shape)))
     few = np.sort(spread(order, min(400 if thorough else 200, len(order))))
     # No prior: with the large noise of a start it would make basis shapes vanish.
-    part = replace(problem.part(few, tol=options.compared_tol), penalty=0.0)
+    part = replace(problem.part(few, tol=limits.compared_tol), penalty=0.0)
     seen, n_components = rows[few], len(paper) - 1
     trials: list[tuple[float, JointState, NDArray]] = []
 
@@ -161,7 +161,7 @@ def best_starts(
     families = [scales, None] if thorough else [scales]
     for given in families if cameras.scaled else [None]:
         before = np.inf
-        for mixed in mixed_cameras(rows, given, few, options.widths):
+        for mixed in mixed_cameras(rows, given, few, limits.widths):
             compare(mixed)
             if not thorough and trials[-1][0] > before:
                 break
@@ -183,7 +183,7 @@ def _first_state(
 ) -> JointState:
     """Return a state whose noise is a tenth of the residual of the mean shape."""
     noise = 0.1 * np.mean((rows - motion @ shapes[0]) ** 2)
-    least_noise = problem.settings.options.least_noise * problem.mean_square
+    least_noise = problem.settings.limits.least_noise * problem.mean_square
     return JointState(shapes, motion, max(noise, least_noise))
 
 

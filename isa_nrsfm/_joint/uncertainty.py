@@ -39,17 +39,18 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.problem import JOINT_OPTIONS, JointState, refine_joint
+from isa_nrsfm._joint.problem import JointState, refine_joint
+from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # With a robust loss, points with residuals above this threshold, in standard deviations
-# of a coordinate, are left out. Without outliers this is one point in 3,000.
+# of a coordinate, are left out: docs/benchmarks/README.md, "Thresholds".
 OUTLYING = 4.0
 # Directions of the coefficients with a lower reliability are not supported by the
 # table. Pure noise has reliability zero.
 LEAST_RELIABILITY = 0.1
-# Groups have equal size. With k-means groups the errors are half too large.
+# Groups have equal size: docs/benchmarks/README.md, "Thresholds".
 N_GROUPS = 5
 # Largest number of steps of a fit, and its convergence tolerance. 30 steps understate
 # the errors of undetermined depths. A tolerance of 1e-6 changes determined ones by less
@@ -228,10 +229,10 @@ def depth_certainty(
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
-        penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
+        penalty = part.basis_penalty(LIMITS.basis_std)
         likelihood = MarginalLikelihood(part, penalty, extents)
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
-        least = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
+        least = min(noise * n_numbers / energy, LIMITS.least_noise)
         start = start._replace(noise=noise)
         limits: Any = {"least_noise": least, "max_iter": MOST_STEPS, "tol": TOL}
         state = refine_joint(likelihood, start, camera, **limits).state

@@ -209,12 +209,13 @@ def padded(frames: NDArray) -> NDArray:
 
 
 def of_frames(values: Any, frames: NDArray | slice) -> Any:
-    """Return some frames of an array (..., n), or of each part of a named tuple.
+    """Return some frames of an array (..., n), or of each part of a tuple.
 
     The frames stay the last axis in memory. None stays None.
     """
     if isinstance(values, tuple):
-        return type(values)(*map(of_frames, values, repeat(frames)))
+        parts = map(of_frames, values, repeat(frames))
+        return getattr(values, "_make", tuple)(parts)
     if not isinstance(values, np.ndarray):
         return values if values is None else values.of_frames(frames)
     return values[..., frames] if isinstance(frames, slice) else values.take(frames, -1)

@@ -194,21 +194,6 @@ def _squared(block: NDArray, V: NDArray) -> NDArray:
     return ((matrix @ V.astype(matrix.dtype)).T @ matrix).T.astype(np.float64)
 
 
-class PaperResult(NamedTuple):
-    """Result of the paper's pipeline, before a gauge is chosen.
-
-    shapes (K + 1, 3, J): B_0 of the rigid factorisation, and ``B_k = E_k B_ISA,k``;
-    zero for subspaces without motion. mode_covariance (3K, 3K): ``(J / 2I) M_ISA^T
-    M_ISA``, in the order of the basis. n_iter: steps of the refinement, 1 without a
-    refinement.
-    """
-
-    shapes: NDArray
-    mode_covariance: NDArray
-    n_iter: int
-    converged: bool
-
-
 def run_paper_pipeline(
     factors: Factorisation,
     n_components: int,
@@ -218,19 +203,25 @@ def run_paper_pipeline(
     max_iter: int,
     tol: float,
     report: Callable[[str], None],
-) -> PaperResult:
-    """Fit the strategy `isa`, recover blocks and refine them unless max_iter is 0."""
+) -> tuple[NDArray, NDArray, int, bool]:
+    """Fit the strategy `isa`, recover blocks and refine them unless max_iter is 0.
+
+    Returns shapes (K + 1, 3, J): B_0 of the rigid factorisation, and ``B_k = E_k
+    B_ISA,k``, zero for subspaces without motion. The mode covariance (3K, 3K) ``(J /
+    2I) M_ISA^T M_ISA``, in the order of the basis. The number of steps of the
+    refinement, 1 without one, and its convergence.
+    """
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = motion_products(factors.rigid_motion, factors.motion)
-    moments = lifted_moments(products)
-    covariance = products.gram * (n_points / n_rows)
+    moments, (cross, rigid, gram) = lifted_moments(products), products
+    covariance = gram * (n_points / n_rows)
     components = _independent_subspaces(isa, factors.signals, covariance, moments)
     report("independent subspaces")
 
     # Block structure, for the motion ``M' A`` with ``A^T = components``. E_k is the
     # inverse of D_k.
-    gram = components @ products.gram @ components.T
-    products = products._replace(cross=products.cross @ components.T, gram=gram)
+    gram = components @ gram @ components.T
+    products = cross @ components.T, rigid, gram
     E = np.linalg.pinv(recover_blocks(products, block_recovery), rcond=OF_RANKS)
     n_iter, converged = 1, True
     if max_iter:
@@ -247,8 +238,8 @@ def run_paper_pipeline(
     shapes[0] = factors.rigid_shape
     shapes[1 : len(E) + 1] = E @ (components @ factors.signals).reshape(len(E), 3, -1)
     covariance = np.zeros((3 * n_components, 3 * n_components))
-    covariance[: 3 * len(E), : 3 * len(E)] = products.gram * (n_points / n_rows)
-    return PaperResult(shapes, covariance, n_iter, converged)
+    covariance[: 3 * len(E), : 3 * len(E)] = gram * (n_points / n_rows)
+    return shapes, covariance, n_iter, converged
 
 
 def _independent_subspaces(
@@ -280,27 +271,10 @@ def _independent_subspaces(
     return U @ Vt
 
 
-class MotionProducts(NamedTuple):
-    """Products of the rigid motion M_0^i and the motion M^i of n_signals signals.
-
-    ``M_0^iT M^i`` (I, 3, n_signals), ``M_0^iT M_0^i`` (I, 9), row by row, and ``sum_i
-    M^iT M^i`` (n_signals, n_signals).
-    """
-
-    cross: NDArray
-    rigid: NDArray
-    gram: NDArray
-
-    def blocks(self) -> NDArray:
-        """Return ``M_0^iT M_ik`` as (n_blocks, n_frames, 9), each matrix row by row."""
-        n_frames, _, n_signals = self.cross.shape
-        split = self.cross.reshape(n_frames, 3, n_signals // 3, 3)
-        blocks = np.ascontiguousarray(split.transpose(2, 0, 1, 3))
-        return blocks.reshape(-1, n_frames, 9)
-
-    def rigid_energies(self) -> NDArray:
-        """Return ``||M_0^i||^2`` (n_frames,)."""
-        return np.asarray(self.rigid[:, ::4].sum(axis=1))
+# Products of the rigid motion M_0^i and the motion M^i of n_signals signals: ``M_0^iT
+# M^i`` (I, 3, n_signals), ``M_0^iT M_0^i`` (I, 9), row by row, and ``sum_i M^iT M^i``
+# (n_signals, n_signals)
+MotionProducts = tuple[NDArray, NDArray, NDArray]
 
 
 def motion_products(rigid_motion: NDArray, motion: NDArray) -> MotionProducts:
@@ -308,7 +282,15 @@ def motion_products(rigid_motion: NDArray, motion: NDArray) -> MotionProducts:
     M_0 = rigid_motion.reshape(-1, 2, 3)
     transposed = M_0.mT
     cross = transposed @ motion.reshape(len(M_0), 2, -1)
-    return MotionProducts(cross, (transposed @ M_0).reshape(-1, 9), motion.T @ motion)
+    return cross, (transposed @ M_0).reshape(-1, 9), motion.T @ motion
+
+
+def _blocks_of(cross: NDArray) -> NDArray:
+    """Return ``M_0^iT M_ik`` as (n_blocks, n_frames, 9), each matrix row by row."""
+    n_frames, _, n_signals = cross.shape
+    split = cross.reshape(n_frames, 3, n_signals // 3, 3)
+    blocks = np.ascontiguousarray(split.transpose(2, 0, 1, 3))
+    return blocks.reshape(-1, n_frames, 9)
 
 
 def recover_blocks(products: MotionProducts, method: str) -> NDArray:
@@ -320,11 +302,11 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
     `BLOCK_RECOVERIES` differ in how they exclude ``D_k = 0``. D_k has norm one and
     arbitrary sign, and is zero for a subspace without motion.
     """
-    energy = products.rigid_energies()
-    blocks = products.blocks()
+    cross, rigid, grams = products
+    energy, blocks = rigid[:, ::4].sum(axis=1), _blocks_of(cross)  # ||M_0^i||^2
     D = np.zeros((len(blocks), 3, 3))
     for k, P in enumerate(blocks):
-        gram = products.gram[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        gram = grams[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
         if not np.trace(gram) > 0:
             continue
         # m_i is M_ik^T M_0^i, row by row: <M_ik D, M_0^i> = m_i . vec(D).
@@ -364,11 +346,12 @@ def lifted_moments(products: MotionProducts) -> NDArray:
     columns of L_i are nearly ``alpha_ik E_k``, and the leading eigenvector of their
     moments E_k.
     """
-    n_frames, _, n_signals = products.cross.shape
-    energy = products.rigid_energies()
+    cross, rigid, _ = products
+    n_frames, _, n_signals = cross.shape
+    energy = rigid[:, ::4].sum(axis=1)  # ||M_0^i||^2
     ridge = 0.1 * np.where(energy > 0, energy, 1.0)
-    regular = products.rigid.reshape(-1, 3, 3) + ridge[:, None, None] * np.eye(3)
-    L = np.linalg.solve(regular, products.cross).reshape(n_frames, -1)
+    regular = rigid.reshape(-1, 3, 3) + ridge[:, None, None] * np.eye(3)
+    L = np.linalg.solve(regular, cross).reshape(n_frames, -1)
     return (L.T @ L).reshape(3, n_signals, 3, n_signals).transpose(0, 2, 1, 3)
 
 
@@ -408,11 +391,12 @@ def refine_alternating(
     steps; and convergence.
     """
     E, n_iter, converged = np.zeros((len(starts), 3, 3)), 1, True
-    for k, P in enumerate(products.blocks()):
+    cross, rigid, _ = products
+    for k, P in enumerate(_blocks_of(cross)):
         tried = starts[k]
         for _ in range(6):
-            _, tried = _step(P, products.rigid, tried)
-        explained, after = _step(P, products.rigid, tried)
+            _, tried = _step(P, rigid, tried)
+        explained, after = _step(P, rigid, tried)
         best = np.argmax(explained)
         energy, after = explained[best], after[best : best + 1]
         if not energy > 0:
@@ -420,7 +404,7 @@ def refine_alternating(
         for n_steps in range(1, max_iter + 1):
             n_iter = max(n_iter, n_steps)
             E[k], before = after[0], energy
-            (energy,), after = _step(P, products.rigid, after)
+            (energy,), after = _step(P, rigid, after)
             if energy - before <= tol * energy:
                 break
         else:

@@ -171,11 +171,6 @@ def check_size(
         )
 
 
-def visible_points(rows: NDArray) -> NDArray:
-    """Return a mask of visible points of rows (I, 2, J), eight points in a byte."""
-    return np.packbits(seen_points(rows), axis=1)
-
-
 def check_points(
     visible: NDArray,
     n_points: int,
@@ -185,10 +180,10 @@ def check_points(
 ) -> None:
     """Refuse tables whose visible points do not determine the shapes.
 
-    `visible` is packed by `visible_points`. The numbers of equations and unknowns are
-    compared, a necessary condition. A point has 3 (K + 1) unknowns, and two equations
-    per frame that shows it. A frame of n points has 2 n equations, and 8 + K unknowns
-    of its own.
+    `visible` (I, J) is packed, eight points in a byte. The numbers of equations and
+    unknowns are compared, a necessary condition. A point has 3 (K + 1) unknowns, and
+    two equations per frame that shows it. A frame of n points has 2 n equations, and 8
+    + K unknowns of its own.
     """
     if (visible == np.packbits(np.ones(n_points, dtype=bool))).all():
         return
@@ -256,7 +251,7 @@ def warn_if_other_layout(
         squares = [np.mean(report.size**2) for report in reports]
         sizes = np.full_like(sizes, np.sqrt(min(squares)))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    noise, swapped = (_rigid_noise(each / sizes[:, None, None]) for each in centred)
+    noise, swapped = (_rigid_noise(part / sizes[:, None, None]) for part in centred)
     # On real tables the right layout leaves 0.04 to 0.5 of the energy of the other.
     if noise > OF_DIFFERENCES and swapped < 0.6 * noise:
         warn_caller(
@@ -271,4 +266,4 @@ def _rigid_noise(rows: NDArray) -> float:
         W = rows.reshape(-1, rows.shape[2])
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
         return max(float(energy[:-3].sum()), 0.0) / W.size
-    return completion_model(rows, rank=3).noise
+    return completion_model(rows, rank=3)[1]

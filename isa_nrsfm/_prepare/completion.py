@@ -12,7 +12,6 @@ its seen points. It is computed once for each pattern.
 """
 
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +21,9 @@ from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
 from isa_nrsfm._linalg.small_matrices import unpacked
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
-
-class CompletionModel(NamedTuple):
-    """Low-rank model of the rows of a measurement matrix."""
-
-    B: NDArray  # (rank, n_points), rows centred
-    noise: float  # variance of a coordinate
-
-    @property
-    def ridge(self) -> float:
-        """The noise variance, bounded below so that matrices can be inverted."""
-        return max(self.noise, OF_STEPS)
+# Low-rank model of the rows of a measurement matrix: B (rank, n_points), rows centred,
+# and the noise variance of a coordinate
+Model = tuple[NDArray, float]
 
 
 def complete_rows(
@@ -52,7 +43,7 @@ def complete_rows(
 
 def completion_model(
     rows: NDArray, rank: int, tol: float = 0.02, max_iter: int = 200
-) -> CompletionModel:
+) -> Model:
     """
     Fit the low-rank model to frames (I, 2, J) by EM, to a relative tolerance `tol`.
 
@@ -62,18 +53,18 @@ def completion_model(
     # Centred points have n_points - 1 directions, of which the noise needs one.
     model = _principal_axes(frames[0], max(1, min(rank, rows.shape[2] - 2)))
     for step in range(max_iter):
-        before = model.noise
+        _, before = model
         model, mean_square = _em_step(model, *frames)
-        stands_still = step > 0 and model.noise > (1.0 - tol) * before
+        stands_still = step > 0 and model[1] > (1.0 - tol) * before
         if stands_still or mean_square < 1e-20:
             break
     return model
 
 
-def filled_in(rows: NDArray, model: CompletionModel) -> NDArray:
+def filled_in(rows: NDArray, model: Model) -> NDArray:
     """Return frames (n_frames, 2, n_points), NaN filled in by the model, centred."""
-    z, t, *_ = _posterior(*_frames(rows), model)
-    filled = np.where(np.isnan(rows), z @ model.B + t, rows)
+    z, t, *_ = _posterior(*_frames(rows), *model)
+    filled = np.where(np.isnan(rows), z @ model[0] + t, rows)
     return filled - filled.mean(axis=2, keepdims=True)
 
 
@@ -91,7 +82,7 @@ def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     return np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1)
 
 
-def _principal_axes(rows: NDArray, rank: int) -> CompletionModel:
+def _principal_axes(rows: NDArray, rank: int) -> Model:
     """Return the model of rows (n_frames, 2, n_points) by principal components."""
     W = rows.reshape(-1, rows.shape[2])
     n_rows, n_points = W.shape
@@ -106,11 +97,11 @@ def _principal_axes(rows: NDArray, rank: int) -> CompletionModel:
     variances = np.maximum(values, 1e-3 * max(values[-1], OF_STEPS))
     B = (axes * np.sqrt(variances)).T
     noise = max(rest, 1e-6 * values[-1], OF_STEPS)
-    return CompletionModel(B - B.mean(axis=1, keepdims=True), noise)
+    return B - B.mean(axis=1, keepdims=True), noise
 
 
 def _posterior(
-    rows: NDArray, patterns: NDArray, pattern: NDArray, model: CompletionModel
+    rows: NDArray, patterns: NDArray, pattern: NDArray, B: NDArray, noise: float
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return the posterior of coefficients z and translations t.
 
@@ -118,18 +109,19 @@ def _posterior(
     (n_patterns, rank, rank), and that of z with -t (n_patterns, rank), both over the
     noise variance.
 
-    Let B_c be the seen columns of B, its rows centred over them. Then ``C = (B_c B_c^T
-    + ridge I)^-1`` is the posterior covariance over the noise variance, and ``z = w B^T
-    C``, ``t = -z . mean(B)`` are the posterior means.
+    Let B_c be the seen columns of B, its rows centred over them, and the ridge the
+    noise variance, bounded below so that matrices can be inverted. Then ``C = (B_c
+    B_c^T + ridge I)^-1`` is the posterior covariance over the noise variance, and ``z =
+    w B^T C``, ``t = -z . mean(B)`` are the posterior means.
     """
-    B, rank = model.B, len(model.B)
+    rank = len(B)
     upper = np.triu_indices(rank)
     sums = patterns @ B.T
     means = sums / patterns.sum(axis=1)[:, None]
     # B_c B_c^T for each pattern. Centring integrates the translation out.
     gram = _symmetric(patterns @ (B[upper[0]] * B[upper[1]]).T)
     gram -= sums[:, :, None] * means[:, None]
-    gram[:, range(rank), range(rank)] += model.ridge
+    gram[:, range(rank), range(rank)] += max(noise, OF_STEPS)
     covariance = np.linalg.inv(gram)
     cross = (covariance @ means[:, :, None])[:, :, 0]
     z = (rows @ B.T) @ covariance[pattern]
@@ -137,22 +129,21 @@ def _posterior(
 
 
 def _em_step(
-    model: CompletionModel, rows: NDArray, patterns: NDArray, pattern: NDArray
-) -> tuple[CompletionModel, float]:
+    model: Model, rows: NDArray, patterns: NDArray, pattern: NDArray
+) -> tuple[Model, float]:
     """Return the model after one step of EM, and the mean square residual before it."""
-    (n_frames, _, n_points), rank = rows.shape, len(model.B)
+    (n_frames, _, n_points), (B, variance) = rows.shape, model
+    rank, noise = len(B), max(variance, OF_STEPS)
     upper = np.triu_indices(rank)
-    z, t, covariance, cross = _posterior(rows, patterns, pattern, model)
+    z, t, covariance, cross = _posterior(rows, patterns, pattern, *model)
     # E step: residuals, E[z z^T] of each frame, packed, and E[(w - t) z] of each point
     seen = patterns[pattern]
     moved = (rows - t) * seen[:, None]
-    energy = float(np.sum((moved - (z @ model.B) * seen[:, None]) ** 2))
-    noise = 2.0 * model.ridge
-    squares = (z.swapaxes(1, 2) @ z + noise * covariance[pattern])[
-        :, upper[0], upper[1]
-    ]
+    energy = float(np.sum((moved - (z @ B) * seen[:, None]) ** 2))
+    squares = z.swapaxes(1, 2) @ z + 2.0 * noise * covariance[pattern]
+    squares = squares[:, upper[0], upper[1]]
     products = moved.reshape(-1, n_points).T @ z.reshape(-1, rank)
-    products += seen.T @ (noise * cross[pattern])
+    products += seen.T @ (2.0 * noise * cross[pattern])
     # M step: least squares for each point. A point that is seen in fewer rows than the
     # rank needs the ridge. The translation takes the mean of the points.
     moments = _symmetric(seen.T @ squares)
@@ -166,11 +157,11 @@ def _em_step(
     # Noise variance: residual energy over degrees of freedom. This is the fixed point
     # of EM's own step for the variance (MacKay 1992). The parameters of a row are its
     # translation and the coefficients that its points determine, rather than the prior.
-    determined = rank - model.ridge * np.trace(covariance, axis1=1, axis2=2)
+    determined = rank - noise * np.trace(covariance, axis1=1, axis2=2)
     n_numbers = 2.0 * seen.sum()
     freedom = n_numbers - 2.0 * np.sum(determined[pattern] + 1.0)
     variance = energy / max(freedom, 0.02 * n_numbers)
-    return CompletionModel(B, variance), energy / n_numbers
+    return (B, variance), energy / n_numbers
 
 
 def _symmetric(packed: NDArray) -> NDArray:

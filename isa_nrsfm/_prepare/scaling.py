@@ -11,7 +11,6 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.checks import (
     check_points,
     check_size,
-    visible_points,
     warn_if_other_layout,
 )
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
@@ -23,7 +22,9 @@ from isa_nrsfm._tables.tracks import (
     centred_frames,
     check_frames,
     seen_points,
+    warn_of_half_points,
     weighted_sizes,
+    without_half_points,
 )
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
@@ -58,11 +59,6 @@ class ScaledTable(NamedTuple):
     weights: NDArray | None = None
 
     @property
-    def n_observations(self) -> NDArray:
-        """Numbers of observations (I,) of the frames."""
-        return self.n_seen if self.weights is None else self.weights.sum(axis=1)
-
-    @property
     def complete(self) -> bool:
         """Whether all points are seen."""
         return bool((self.n_seen == self.n_points).all())
@@ -85,8 +81,12 @@ def scaled_table(
     """
     n_points, dtype = blocks.empty.shape[2], blocks.empty.dtype
     check_size(blocks.n_frames, n_points, n_components, camera)
-    examined = blocks.map(partial(_examine, robust=robust))
-    visible, largest, *rest = map(np.concatenate, zip(*examined, strict=True))
+    n_half, first, visible, largest, *rest = blocks.joined(
+        partial(_examine, robust=robust)
+    )
+    if n_half.any():
+        warn_of_half_points(n_half, first, layout, names)
+        blocks = blocks.derive(lambda rows: without_half_points(rows)[0])
     report = FrameReport(*rest)
     check_frames(report, n_points)
     shown = report.n_seen > 0
@@ -140,7 +140,8 @@ def scaled_table(
 
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
-    """Return visible points, magnitudes and reports of rows (n, 2, J)."""
+    """Return half points, visible points, magnitudes, reports of rows (n, 2, J)."""
+    rows, *half = without_half_points(rows)
     _, report = centred_frames(rows)
     shown = report.n_seen > 0
     if robust and shown.any():
@@ -148,7 +149,8 @@ def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
         centred, report.translation[shown] = robustly_centred(rows[shown])
         report.size[shown] = robust_sizes(centred)
     largest = np.fmax.reduce(np.abs(rows), axis=(1, 2), initial=0.0)
-    return visible_points(rows), largest, *report
+    visible = np.packbits(seen_points(rows), axis=1)
+    return *half, visible, largest, *report
 
 
 def _unit_rows(

@@ -27,8 +27,9 @@ class FrameBlocks:
 
     A block is an array with a row for each of some consecutive frames, or the result of
     a function given to `derive`. `read` returns the block of a given number, and
-    `lengths` are the numbers of frames. Derived blocks are computed once if `cached`,
-    and otherwise at each reading. `n_threads` threads work on blocks at the same time.
+    `lengths` are the numbers of frames, `n_frames` their sum. Derived blocks are
+    computed once if `cached`, and otherwise at each reading. `n_threads` threads work
+    on blocks at the same time.
     `empty` is a block without frames, known for blocks of `open_table`.
     """
 
@@ -42,7 +43,7 @@ class FrameBlocks:
         n_threads: int = 1,
     ):
         self.read, self.cached, self.n_threads = read, cached, n_threads
-        self.lengths = list(lengths)
+        self.lengths, self.n_frames = list(lengths), sum(lengths)
         ends = np.cumsum(self.lengths, dtype=int).tolist()
         self.slices = list(map(slice, [0, *ends[:-1]], ends))
 
@@ -71,11 +72,6 @@ class FrameBlocks:
         parts = block_slices(n_frames, block_frames)
         lengths = [part.stop - part.start for part in parts]
         return cls(lambda number: rows(parts[number]), lengths, False, n_threads)
-
-    @property
-    def n_frames(self) -> int:
-        """The number of frames of all blocks."""
-        return sum(self.lengths)
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """Return the results of a function of each block, and of its rows of arrays."""
@@ -127,7 +123,8 @@ class FrameBlocks:
         """Join the results of a function of each block: arrays, or tuples of them."""
         parts = list(self.map(function, *by_frame)) or [function(self.empty)]
         if isinstance(parts[0], tuple):
-            return type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
+            joined = map(np.concatenate, zip(*parts, strict=True))
+            return getattr(parts[0], "_make", tuple)(joined)
         return np.concatenate(parts)
 
     # On dask the result stays on the workers.
@@ -201,18 +198,17 @@ class DaskBlocks(FrameBlocks):
     def collect(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
         """Return dask arrays, or a named tuple of them, that are not computed yet."""
         array = import_optional("dask.array", extra="dask")
-        tasks, like = self._tasks(function, *by_frame), function(self.empty)
+        tasks, empty = self._tasks(function, *by_frame), function(self.empty)
 
-        def joined(like: NDArray, tasks: list[Any]) -> Any:
-            shapes = [(length, *like.shape[1:]) for length in self.lengths]
-            parts = map(array.from_delayed, tasks, shapes, [like.dtype] * len(tasks))
+        def joined(empty: NDArray, tasks: list[Any]) -> Any:
+            shapes = [(length, *empty.shape[1:]) for length in self.lengths]
+            parts = map(array.from_delayed, tasks, shapes, [empty.dtype] * len(tasks))
             return array.concatenate(list(parts))
 
-        if not isinstance(like, tuple):
-            return joined(like, tasks)
-        return type(like)(
-            *(joined(each, [task[i] for task in tasks]) for i, each in enumerate(like))
-        )
+        if not isinstance(empty, tuple):
+            return joined(empty, tasks)
+        columns = ([task[i] for task in tasks] for i in range(len(empty)))
+        return getattr(empty, "_make", tuple)(map(joined, empty, columns))
 
     def as_collected(self, values: NDArray) -> Any:
         """Return an array (n_frames, ...) as a dask array with these blocks' chunks."""

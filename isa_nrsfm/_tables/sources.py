@@ -19,7 +19,6 @@ from isa_nrsfm._tables.tracks import (
     clean_rows,
     refuse_odd,
     table_to_rows,
-    warn_of_half_points,
     without_half_points,
 )
 
@@ -44,8 +43,8 @@ def open_table(
 ) -> FrameBlocks:
     """Return a table in blocks of rows (n, 2, n_points), float32 or float64.
 
-    Points with one coordinate become missing, with a warning. Of tables that are read
-    later it counts them only if they are `counted`, which reads the table once.
+    Points with one coordinate become missing, with a warning. With `counted`, those of
+    a table that is read later stay: `scaled_table` counts them and leaves them out.
 
     Arrays in memory must be checked already. `n_jobs` threads share their blocks and
     those of memory maps. Chunks of dask stay on its workers. Blocks of tables that are
@@ -81,28 +80,20 @@ def open_table(
             n_threads = 1
         read = partial(read_rows, X)
         blocks = FrameBlocks.read_later(read, X.shape[0], most, n_threads)
-    if counted and blocks.n_frames:
-        half = zip(*blocks.map(partial(_half_points, layout=layout)), strict=True)
-        n_half, first = map(np.concatenate, half)
-        warn_of_half_points(n_half, first, layout, names)
-    blocks = blocks.derive(partial(_rows, layout=layout, warn=not counted))
+    blocks = blocks.derive(partial(_rows, layout=layout, counted=counted))
     blocks.empty = empty
     return blocks
 
 
-def _half_points(X: Any, layout: Layout) -> tuple[NDArray, NDArray]:
-    """Return how many points of each row have one coordinate, and the first of them."""
-    return without_half_points(table_to_rows(checked_rows(X), layout))[1:]
-
-
-def _rows(X: Any, layout: Layout, warn: bool) -> NDArray:
-    """Return the rows (n, 2, n_points) of a block; warn without row numbers."""
-    rows, n_half, _ = without_half_points(table_to_rows(checked_rows(X), layout))
-    if warn and n_half.any():
+def _rows(X: Any, layout: Layout, counted: bool) -> NDArray:
+    """Return the rows (n, 2, n_points) of a block, as `open_table` describes."""
+    given = table_to_rows(checked_rows(X), layout)
+    rows, n_half, _ = without_half_points(given)
+    if n_half.any() and not counted:
         warn_caller(
             "some points have only one of their two coordinates. They count as missing"
         )
-    return rows
+    return given if counted else rows
 
 
 def is_read_later(X: Any) -> bool:

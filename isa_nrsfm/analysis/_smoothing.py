@@ -66,16 +66,10 @@ FIRST_RATE = np.log(0.3)
 WALK = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
 
 
-class Observations(NamedTuple):
-    """Likelihoods of the frames of a sequence, coefficients first, then cameras.
-
-    L_t (n_steps, p, p) and f_t (n_steps, p), zero for unseen frames, and the changes
-    (n_steps, p) of the origin of the parameters from the frame before.
-    """
-
-    precision: NDArray
-    fit: NDArray
-    change: NDArray
+# Likelihoods of the frames of a sequence, coefficients first, then cameras: L_t
+# (n_steps, p, p) and f_t (n_steps, p), zero for unseen frames, and the changes
+# (n_steps, p) of the origin of the parameters from the frame before.
+Observations = tuple[NDArray, NDArray, NDArray]
 
 
 class Dynamics(NamedTuple):
@@ -199,12 +193,12 @@ def _smoothed_frames(
     )
     # Parameters of cameras in units of their changes and deviations
     precision = np.median(np.diagonal(alone.precision[known], 0, 1, 2), axis=0)
-    square = np.mean(np.concatenate([each.change for each in observed]) ** 2, axis=0)
+    square = np.mean(np.concatenate([each[2] for each in observed]) ** 2, axis=0)
     square += np.divide(1.0, precision, where=precision > 0, out=0.0 * precision)
     square[:K], square[square == 0] = 1.0, 1.0
     scale = np.sqrt(square)
     observed = tuple(
-        Observations(scale[:, None] * L * scale, fit / scale, change / scale)
+        (scale[:, None] * L * scale, fit / scale, change / scale)
         for L, fit, change in observed
     )
     dynamics = estimate(observed, K)
@@ -238,18 +232,16 @@ def _observations(
     The origin is the last known row, before the first one the first one.
     """
     n_steps, (_, n, _), K = steps[-1] + 1, alone.precision.shape, alone.alpha.shape[1]
-    data = Observations(
-        np.zeros((n_steps, n, n)), np.zeros((n_steps, n)), np.zeros((n_steps, n))
-    )
+    precision, fit, change = np.zeros((n_steps, n, n)), *np.zeros((2, n_steps, n))
     seen = known[rows]
     chosen, at = rows[seen], steps[seen]
-    if not len(chosen):
-        return rows, data
-    data.precision[at], data.fit[at, :K] = alone.precision[chosen], alone.alpha[chosen]
     if len(chosen) > 1:
         motion = alone.motion[chosen]
-        data.change[at[1:], K:] = camera.steps_between(motion[:-1], motion[1:])
-    return chosen[np.maximum(np.cumsum(seen) - 1, 0)], data
+        change[at[1:], K:] = camera.steps_between(motion[:-1], motion[1:])
+    if len(chosen):
+        precision[at], fit[at, :K] = alone.precision[chosen], alone.alpha[chosen]
+        rows = chosen[np.maximum(np.cumsum(seen) - 1, 0)]
+    return rows, (precision, fit, change)
 
 
 def smoothed(
@@ -262,12 +254,13 @@ def smoothed(
     of ``E z_t+1 z_t+1^T``, ``E z_t+1 z_t^T``, ``E z_t z_t^T``, and ``E z_1 z_1^T``.
     """
     F, Q, first, shown = dynamics.matrices()
-    n_steps, n = observed.fit.shape
+    precision, fits, change = observed
+    n_steps, n = fits.shape
     mean, covariance = np.empty((n_steps, len(F))), np.empty((n_steps, *F.shape))
-    change = observed.change @ np.eye(n, len(F))
+    change = change @ np.eye(n, len(F))
     m, P, log_likelihood = np.zeros(len(F)), first, 0.0
     # Filter: prediction, then update by ``P - P H^T (I + L S)^-1 L H P``, S = H P H^T
-    for t, (L, fit, _) in enumerate(zip(*observed, strict=True)):
+    for t, (L, fit) in enumerate(zip(precision, fits, strict=True)):
         if t:
             m, P = F @ m - change[t], F @ P @ F.T + Q
         across, far = shown @ P, shown @ m - fit
@@ -305,14 +298,14 @@ def estimated_dynamics(
     tol: float,
 ) -> Dynamics | None:
     """Return the most likely dynamics of sequences; None without strong evidence."""
-    n_walks = sequences[0].fit.shape[1] - n_components
+    n_walks = sequences[0][1].shape[1] - n_components
     found, splits = [], (n_components, n_components + n_walks)
 
     def minus_log_likelihood(parameters: NDArray) -> tuple[float, NDArray]:
         dynamics = Dynamics(*np.split(parameters, splits))
         ends = (smoothed(each, dynamics) for each in sequences)
         _, _, values, moments = zip(*ends, strict=True)
-        n_pairs = sum(len(each.fit) - 1 for each in sequences)
+        n_pairs = sum(len(fit) - 1 for _, fit, _ in sequences)
         total = np.sum(moments, axis=0)
         slope = expected_gradient(dynamics, total, n_pairs, len(sequences))
         return -sum(values), -slope

@@ -125,7 +125,6 @@ class ShapeSequenceNRSfM(
             scale_frames=self.scale_frames,
             robust=False,
         )
-        sizes = table.sizes
         W = table.rows.whole().reshape(2 * len(X), -1).astype(np.float64)
 
         cameras, shapes = self._factorise(W)
@@ -143,7 +142,7 @@ class ShapeSequenceNRSfM(
 
         # Without the scaling of frames the shapes have the unit of the table.
         self._unit = table.unit or 1.0
-        scales = (sizes / self._unit)[:, None, None]
+        scales = (table.sizes / self._unit)[:, None, None]
         dtype = X.dtype
         self.mean_shape_ = (self._unit * mean_shape).astype(dtype)
         self.basis_ = (self._unit * basis).astype(dtype)
@@ -272,9 +271,8 @@ class ShapeSequenceNRSfM(
             reset=reset,
         )
         checked_range(X)
-        missing = np.isnan(X)
-        if missing.any():
-            rows = np.flatnonzero(missing.any(axis=1))
+        rows = np.flatnonzero(np.isnan(X).any(axis=1))
+        if len(rows):
             raise ValueError(
                 f"{type(self).__name__} takes no missing points (NaN), which "
                 f"{len(rows)} of {len(X)} rows have (first: row {rows[0]}). Remove "

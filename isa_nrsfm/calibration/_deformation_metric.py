@@ -15,9 +15,9 @@ from isa_nrsfm.calibration._metric import (
 )
 from isa_nrsfm.calibration._metric_upgrade import (
     fit_metric,
+    quality,
     symmetric_upgrade,
     usable_cameras,
-    warn_if_degenerate,
 )
 
 
@@ -127,10 +127,9 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     cameras, weights = cameras[usable], weights[usable]
     fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
     # The symmetric Q is the fitted one times a rotation, which turns the strains.
-    turn, Q = symmetric_upgrade(fit.metric[0], cameras)
-    strain = turn @ fit.metric[1:] @ turn.T
-    warn_if_degenerate(fit.condition_number)
-    return DeformationMetric(Q, strain, fit.residual, fit.condition_number)
+    turn, Q = symmetric_upgrade(fit[0][0], cameras)
+    strain = turn @ fit[0][1:] @ turn.T
+    return DeformationMetric(Q, strain, *quality(*fit, len(cameras)))
 
 
 def euclidean_frames(
@@ -242,27 +241,28 @@ def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
 
     Starts without strains. Usable cameras are (I, 2, 3), coefficients (I, K).
     """
-    size = len(rigid.curvature)
-    n_equations = 2 * len(cameras)
-    noise = max(rigid.cost / n_equations, OF_DIFFERENCES**2)
+    rigid_metric, cost, curvature = rigid
+    size, n_equations = len(curvature), 2 * len(cameras)
+    noise = max(cost / n_equations, OF_DIFFERENCES**2)
     # Larger strains than these are taken for errors of the affine cameras.
     variance = most_variance = 0.3**2
-    metric = np.concatenate([rigid.metric, np.zeros((alpha.shape[1], 3, 3))])
+    metric = np.concatenate([rigid_metric, np.zeros((alpha.shape[1], 3, 3))])
     for _ in range(15):
         ridge = noise / variance
-        fit = refine_metric(cameras, alpha, metric, "weak_perspective", ridge, 1e-4)
-        metric = fit.metric
+        metric, cost, curvature = refine_metric(
+            cameras, alpha, metric, "weak_perspective", ridge, 1e-4
+        )
         # Curvature in the strains, with the common metric eliminated (a Schur
         # complement), and the effective number of strain parameters from it.
-        mixed = fit.curvature[:size, size:]
-        inverse = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
-        own = fit.curvature[size:, size:] - mixed.T @ inverse @ mixed
+        mixed = curvature[:size, size:]
+        inverse = np.linalg.pinv(curvature[:size, :size], hermitian=True)
+        own = curvature[size:, size:] - mixed.T @ inverse @ mixed
         values = np.maximum(np.linalg.eigvalsh(own), ridge)
         n_effective = float(np.sum(1.0 - ridge / values))
         # The two variances: sums of squares over effective numbers (MacKay).
         freedom = max(n_equations - size - n_effective, 0.1 * n_equations)
         previous = noise, variance
-        noise = max(fit.cost / freedom, OF_DIFFERENCES**2)
+        noise = max(cost / freedom, OF_DIFFERENCES**2)
         variance = np.sum(metric[1:] ** 2) / max(n_effective, 1e-3)
         variance = np.clip(variance, OF_DIFFERENCES, most_variance)
         if np.abs(np.log([noise, variance]) - np.log(previous)).max() < 0.05:

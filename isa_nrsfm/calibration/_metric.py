@@ -21,7 +21,7 @@ with respect to these.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,13 @@ from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 # Bound on the ratio of stretches of space by a root Q of the metric G. It is exceeded
-# if the cameras hardly determine the depth, which noise can then stretch without limit.
+# if the cameras hardly determine the depth, which noise can then stretch without limit:
+# docs/benchmarks/README.md, "Thresholds".
 LARGEST_STRETCH = 20.0
 
 # Bound on the ratio of stretches of a metric to start from, in the space in which the
-# cameras see all directions alike. Nearly singular metrics are near saddle points.
+# cameras see all directions alike. Nearly singular metrics are near saddle points:
+# docs/benchmarks/README.md, "Thresholds".
 STRETCH_OF_START = 3.0
 
 # Matrices whose products with ``[[xx, xy], [xy, yy]]`` are xx - yy, 2 xy and xx + yy.
@@ -123,35 +125,11 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     return G if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None
 
 
-class MetricFit(NamedTuple):
-    """A metric of least residuals.
-
-    metric (K + 1, 3, 3): Q with ``G = Q Q^T``, the metric of frames without
-    deformation, and the strains E_k, symmetric with trace zero.
-    n_frames: number of cameras.
-    cost: sum of the squared residuals.
-    curvature: ``J^T J`` with the Jacobian of the residuals in the coordinates of E_0,
-    E_1, ... in `strain_basis`, plus the ridge of the strains.
-    """
-
-    metric: NDArray
-    n_frames: int
-    cost: float
-    curvature: NDArray
-
-    @property
-    def residual(self) -> float:
-        """Root mean square over the frames of the norm of the residuals."""
-        return float(np.sqrt(self.cost / self.n_frames))
-
-    @property
-    def condition_number(self) -> float:
-        """Condition number of the residuals as functions of the common metric."""
-        size = len(self.curvature) // len(self.metric)
-        values = np.linalg.eigvalsh(self.curvature[:size, :size])
-        if values[0] <= OF_PRODUCTS * values[-1]:
-            return np.inf
-        return float(np.sqrt(values[-1] / values[0]))
+# A metric of least residuals: Q with ``G = Q Q^T`` and the strains E_k, symmetric with
+# trace zero (K + 1, 3, 3); the sum of the squared residuals; and ``J^T J`` with the
+# Jacobian of the residuals in the coordinates of E_0, E_1, ... in `strain_basis`, plus
+# the ridge of the strains.
+MetricFit = tuple[NDArray, float, NDArray]
 
 
 def linearised(
@@ -280,7 +258,7 @@ def refine_metric(
             normal_equations(*linearised(motion[part] @ Q, alpha[part], strain, camera))
             for part in gen_batches(len(motion), BLOCK_FRAMES)
         ]
-        cost, curvature, gradient = (sum(each) for each in zip(*terms, strict=True))
+        cost, curvature, gradient = (sum(parts) for parts in zip(*terms, strict=True))
         numbers = np.einsum("kab,nab->kn", metric, basis).ravel()
         values = np.linalg.eigvalsh(Q.T @ gram @ Q)
         deep = values[0] > OF_RANKS * values[-1]
@@ -299,4 +277,4 @@ def refine_metric(
         evaluated, moved, start, max_steps=200, shortest_step=shortest_step
     )
     cost -= ridge * float(np.sum(metric[1:] ** 2))
-    return MetricFit(metric, len(motion), cost, curvature)
+    return metric, cost, curvature

@@ -1,6 +1,6 @@
 """Metric upgrade of affine cameras of a rigid shape, and Euclidean shapes."""
 
-from operator import attrgetter
+from operator import itemgetter
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -9,7 +9,7 @@ from scipy import linalg
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
-from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS
 from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS
 from isa_nrsfm._tables.tracks import of_all_rows
 from isa_nrsfm.calibration._metric import (
@@ -23,7 +23,7 @@ from isa_nrsfm.calibration._metric import (
 )
 
 # Above this condition number the cameras hardly determine the metric. It is that of
-# rotations by about five degrees.
+# rotations by about five degrees: docs/benchmarks/README.md, "Thresholds".
 LARGEST_CONDITION = 50.0
 
 
@@ -167,14 +167,13 @@ def metric_upgrade(
     if camera not in CALIBRATED_CAMERAS:
         raise ValueError(f"camera must be one of {CALIBRATED_CAMERAS}; got {camera!r}")
     fit = fit_metric(cameras[usable], camera)
-    _, Q = symmetric_upgrade(fit.metric[0], cameras[usable])
+    _, Q = symmetric_upgrade(fit[0][0], cameras[usable])
     rows, scales = nearest_calibrated(cameras[usable] @ Q)
     if camera == "orthographic":
         scales = np.ones_like(scales)
     parts = full_rotations(rows)[0], scales
     rotations, scales = (of_all_rows(values, usable) for values in parts)
-    warn_if_degenerate(fit.condition_number)
-    return MetricUpgrade(Q, rotations, scales, fit.residual, fit.condition_number)
+    return MetricUpgrade(Q, rotations, scales, *quality(*fit, usable.sum()))
 
 
 def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
@@ -245,7 +244,7 @@ def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> MetricFit:
         metrics.append(G)
     starts = [safe_start(cameras, G, camera)[None] for G in metrics]
     fits = [refine_metric(cameras, alpha, start, camera) for start in starts]
-    return min(fits, key=attrgetter("cost"))
+    return min(fits, key=itemgetter(1))
 
 
 def best_metric(motion: NDArray) -> NDArray:
@@ -255,10 +254,10 @@ def best_metric(motion: NDArray) -> NDArray:
     """
     cameras, usable = usable_cameras(motion)
     try:
-        fit = fit_metric(cameras[usable], "weak_perspective")
+        metric, *_ = fit_metric(cameras[usable], "weak_perspective")
     except ValueError:
         return np.eye(3)
-    return symmetric_upgrade(fit.metric[0], cameras[usable])[1]
+    return symmetric_upgrade(metric[0], cameras[usable])[1]
 
 
 def symmetric_upgrade(Q: NDArray, cameras: NDArray) -> tuple[NDArray, NDArray]:
@@ -274,12 +273,23 @@ def symmetric_upgrade(Q: NDArray, cameras: NDArray) -> tuple[NDArray, NDArray]:
     return turn, Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))
 
 
-def warn_if_degenerate(condition_number: float) -> None:
-    """Warn if the cameras hardly determine the metric."""
-    if condition_number > LARGEST_CONDITION:
+def quality(
+    metric: NDArray, cost: float, curvature: NDArray, n_frames: int
+) -> tuple[float, float]:
+    """Return residual and condition number; warn if cameras hardly determine a metric.
+
+    The root mean square over the frames of the norm of the residuals, and the condition
+    number of the residuals as functions of the common metric.
+    """
+    size = len(curvature) // len(metric)
+    values = np.linalg.eigvalsh(curvature[:size, :size])
+    known = values[0] > OF_PRODUCTS * values[-1]
+    condition = float(np.sqrt(values[-1] / values[0])) if known else np.inf
+    if condition > LARGEST_CONDITION:
         warn_caller(
             f"the cameras hardly determine the metric of space: its condition number "
-            f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
+            f"is {condition:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
             "may have wrong depth and angles. Take frames that are seen from more "
             "sides, or more frames, or affine shapes"
         )
+    return float(np.sqrt(cost / n_frames)), condition

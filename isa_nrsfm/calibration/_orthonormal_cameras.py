@@ -106,8 +106,8 @@ def orthonormal_cameras(
     >>> cameras = Rotation.random(20, np.random.default_rng(0)).as_matrix()[:, :2]
     >>> shape = np.random.default_rng(0).normal(size=(3, 9))
     >>> U, S, _ = np.linalg.svd(cameras.reshape(-1, 3) @ shape, full_matrices=False)
-    >>> found = orthonormal_cameras(U[:, :3])
-    >>> np.allclose(found.cameras @ found.cameras.transpose(0, 2, 1), np.eye(2))
+    >>> result = orthonormal_cameras(U[:, :3])
+    >>> np.allclose(result.cameras @ result.cameras.mT, np.eye(2))
     True
     """
     P = check_array(motion, dtype=np.float64, input_name="motion", ensure_min_samples=2)
@@ -124,10 +124,10 @@ def orthonormal_cameras(
     for n in range(3, n_columns + STEP, STEP):
         n = min(n, n_columns)
         roots = np.sqrt(price) * inverse[:n, :n]
-        found, cost = orthonormal_mixture(basis[:, :n], mixing, roots, max_iter)
+        wider, cost = orthonormal_mixture(basis[:, :n], mixing, roots, max_iter)
         if not cost < least:
             break
-        mixing, least = found, cost
+        mixing, least = wider, cost
     n = len(mixing)
     cameras = (basis[:, :n] @ mixing).reshape(-1, 2, 3)
     Q = np.zeros((P.shape[1], 3))

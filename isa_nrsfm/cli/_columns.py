@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,121 +13,95 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis._frame_columns import (
-    checked_times,
-    group_numbers,
-    kind_of,
-    refuse_infinite,
-    sequences_of,
-)
+from isa_nrsfm.analysis import _frame_columns
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import read_times, video_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
+from isa_nrsfm.export._viewer import MOST_LABELS
 
 
-class Label(NamedTuple):
-    """A column with classes or numbers; values (n_known,), known (n_frames,)."""
+def asked_columns(args: Namespace, frames: Frames) -> Frames:
+    """Return the frames with labels, groups and times; raise if these cannot be used.
 
-    name: str
-    kind: Literal["classes", "number"]
-    values: NDArray
-    known: NDArray
-
-    def is_of_classes(self, most: int) -> bool:
-        """Return whether the label has at most so many classes."""
-        return self.kind == "classes" and len(np.unique(self.values)) <= most
-
-
-class Columns(NamedTuple):
-    """The columns that a fit is asked about, for its usable frames."""
-
-    labels: list[Label]
-    groups: NDArray | None
-    times: NDArray | None
-    time_unit: str
-    distances: list[tuple[int, int]]
-    unit: tuple[int, int] | None
-
-
-def asked_columns(args: Namespace, frames: Frames) -> Columns:
-    """Return the columns that the options name; raise if they cannot be used."""
+    The points of distances in the options become their numbers.
+    """
     table, names = frames.other[frames.usable], frames.columns.points
     labels = [_label(table, text) for text in args.label]
     groups = None if args.group is None else _groups(table, args.group)
-    times, unit_of_times = None, "seconds"
+    times, unit = None, "seconds"
     if args.time_format is not None and args.time is None:
         raise ValueError("--time-format needs --time")
     if args.time is not None:
         with errors_of(f"--time {args.time}"):
             cells = cells_of(table, args.time, "--time")
-            times, unit_of_times = read_times(cells, args.time_format)
+            times, unit = read_times(cells, args.time_format)
     elif args.fps is not None:
-        images, name = frames.images
-        numbers = pd.Series(images, frames.other.index)[frames.usable]
-        times = video_times(numbers, name, groups) / args.fps
+        times = video_times(frames.images[table.index], groups) / args.fps
     if times is not None:
         try:
-            times_in_seconds = checked_times(times, len(table))
-            sequences_of(times_in_seconds, group_numbers(groups, len(table)), 1)
+            seconds = _frame_columns.checked_times(times, len(table))
+            numbers = _frame_columns.group_numbers(groups, len(table))
+            _frame_columns.sequences_of(seconds, numbers, 1)
         except ValueError as error:
             hint = " (--group: the rows that belong together)" * (groups is None)
             option = "--fps" if args.time is None else f"--time {args.time}"
             raise ValueError(f"{option}: {error}{hint}") from error
-    distances = [_numbered(pair, names, "--distance") for pair in args.distance]
-    unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
-    if unit is not None and not distances:
-        raise ValueError("--unit needs --distance")
-    if distances and unit is None and len(names) != 68:
+    args.distance = [_numbered(pair, names, "--distance") for pair in args.distance]
+    if args.unit is not None:
+        args.unit = _numbered(args.unit, names, "--unit")
+        if not args.distance:
+            raise ValueError("--unit needs --distance")
+    elif args.distance and len(names) != 68:
         raise ValueError(
             f"--distance needs --unit: the {len(names)} points are not the 68 of a "
             "face, whose outer corners of the eyes are the unit. Give two points, such "
             f"as --unit {names[0]},{names[1]}"
         )
-    return Columns(labels, groups, times, unit_of_times, distances, unit)
+    return frames._replace(labels=labels, groups=groups, times=times, time_unit=unit)
 
 
 def column_results(
-    args: Namespace, asked: Columns, estimator: AffineNRSfM, frames: Frames
+    args: Namespace, estimator: AffineNRSfM, frames: Frames
 ) -> tuple[dict[str, Any], "pd.DataFrame", Any]:
     """Return entries of the report, columns of alpha.csv and smoothed coefficients."""
     X, alpha, smooth = frames.X, estimator.alpha_, None
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
-    if asked.labels:
+    if frames.labels:
         aligned = _aligned_pca(estimator, X)
         report["labels"] = [
-            _label_report(label, alpha, aligned, asked, args.random_state)
-            for label in asked.labels
+            _label_report(label, alpha, aligned, frames, args.random_state)
+            for label in frames.labels
         ]
-    if asked.groups is not None:
+    if frames.groups is not None:
         report["groups"] = {"column": args.group}
         try:
-            report["groups"] |= analysis.between_share(alpha, asked.groups)._asdict()
+            report["groups"] |= analysis.between_share(alpha, frames.groups)._asdict()
         except ValueError as error:  # one group, or groups of one frame
             report["groups"]["not_divided"] = str(error)
-        within = analysis.WithinGroups().fit_transform(alpha, groups=asked.groups)
+        within = analysis.WithinGroups().fit_transform(alpha, groups=frames.groups)
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
-    if asked.times is not None and estimator.refinement in JOINT_REFINEMENTS:
+    if frames.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
         smooth = estimator.smooth(
-            X, time=asked.times, groups=asked.groups, **frames.weighting
+            X, time=frames.times, groups=frames.groups, **frames.weighting
         )
         found = smooth.alpha
         report["time"] = {
             "column": args.time or "seconds",
-            "unit": asked.time_unit,
+            "unit": frames.time_unit,
             "time_scales": smooth.time_scales,
             "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),
         }
         columns |= {f"alpha_{k}_smooth": each for k, each in enumerate(found.T, 1)}
-    if asked.distances:
-        names = [f"distance_{a}_{b}" for a, b in asked.distances]
+    if args.distance:
+        names = [f"distance_{a}_{b}" for a, b in args.distance]
         try:
             found = point_distances(
-                estimator, asked.distances, unit=asked.unit, length=args.length
+                estimator, args.distance, unit=args.unit, length=args.length
             )
             columns |= zip(names, found.T, strict=True)
         except ValueError as error:
@@ -135,12 +109,25 @@ def column_results(
     return report, X[[]].assign(**columns), smooth
 
 
-def class_means(label: Label, alpha: NDArray) -> dict[str, NDArray]:
+def has_classes(label: "pd.Series", most: float = np.inf) -> bool:
+    """Return whether a label has classes, and at most so many."""
+    classes = isinstance(label.dtype, pd.CategoricalDtype)
+    return classes and len(label.cat.categories) <= most
+
+
+def class_means(label: "pd.Series", alpha: NDArray) -> dict[str, NDArray]:
     """Return the mean of the standardised coefficients in each class."""
-    deviation, y = alpha.std(axis=0), label.values
+    deviation = alpha.std(axis=0)
     standard = (alpha - alpha.mean(axis=0)) / np.where(deviation > 0, deviation, np.inf)
-    known = standard[label.known]
-    return {str(name): known[y == name].mean(axis=0) for name in np.unique(y)}
+    return {str(c): standard[label == c].mean(axis=0) for c in label.cat.categories}
+
+
+def first_classes(labels: "Sequence[pd.Series]") -> "pd.Series | None":
+    """Return the first label of few classes, which colours the frames in the viewer."""
+    for label in labels:
+        if has_classes(label, MOST_LABELS):
+            return label.map(str, na_action="ignore").astype(object)
+    return None
 
 
 def _numbered(
@@ -151,14 +138,12 @@ def _numbered(
         return point_numbers(pair, names)
 
 
-def _label(table: "pd.DataFrame", text: str) -> Label:
+def _label(table: "pd.DataFrame", text: str) -> "pd.Series":
     """Return the label of COLUMN, COLUMN:classes or COLUMN:number."""
     name, colon, kind = text.rpartition(":")
     if not colon or kind not in ("classes", "number"):
         name, kind = text, "auto"
-    column = cells_of(table, name, "--label")
-    known = column.notna()
-    names = _names(column[known])
+    names = _names(cells_of(table, name, "--label").dropna())
     if names.empty:
         raise ValueError(f"--label: no frame has a {name!r}")
     numbers = pd.to_numeric(names, errors="coerce")
@@ -172,9 +157,11 @@ def _label(table: "pd.DataFrame", text: str) -> Label:
     values = (numbers if kind == "number" else names).to_numpy()
     if values.dtype.kind not in "biuf":
         values = values.astype(str)
-    refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
+    _frame_columns.refuse_infinite(f"--label {text}", values, names.index.to_numpy())
     with errors_of(f"--label {text}"):
-        return Label(name, kind_of(values, kind), values, known.to_numpy())
+        kind = _frame_columns.kind_of(values, kind)
+    dtype = "category" if kind == "classes" else None
+    return pd.Series(values, names.index, dtype, name).reindex(table.index)
 
 
 def _groups(table: "pd.DataFrame", name: str) -> NDArray:
@@ -208,21 +195,21 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:
 
 
 def _label_report(
-    label: Label, alpha: NDArray, aligned: NDArray, asked: Columns, random_state: int
+    label: "pd.Series", alpha: NDArray, aligned: NDArray, frames: Frames, seed: int
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
-    known, classes = label.known, label.kind == "classes"
+    known, classes = label.notna().to_numpy(), has_classes(label)
     options: dict[str, Any] = {
-        "y": label.values,
-        "groups": None if asked.groups is None else asked.groups[known],
-        "time": None if asked.times is None else asked.times[known],
-        "kind": label.kind,
-        "random_state": random_state,
+        "y": label.dropna().to_numpy(),
+        "groups": None if frames.groups is None else frames.groups[known],
+        "time": None if frames.times is None else frames.times[known],
+        "kind": "classes" if classes else "number",
+        "random_state": seed,
     }
     found = analysis.association(alpha[known], **options)
     report: dict[str, Any] = {
         "column": label.name,
-        "kind": label.kind,
+        "kind": found.kind,
         "n_frames": found.n_frames,
         "n_without_label": np.sum(~known),
         "statistic": "eta_squared" if classes else "spearman",
@@ -232,17 +219,14 @@ def _label_report(
         "score": "accuracy" if classes else "r_squared",
     }
     if classes:
-        names, counts = np.unique(label.values, return_counts=True)
-        report["classes"] = dict(zip(map(str, names), counts, strict=True))
-        report["largest_class"] = counts.max() / len(label.values)
+        counts = label.value_counts(sort=False)
+        report["classes"] = counts.rename(str).to_dict()
+        report["largest_class"] = counts.max() / counts.sum()
         report["class_means"] = class_means(label, alpha)
+    features = {"cross_validated": alpha, "cross_validated_pca": aligned}
     try:
-        report["cross_validated"] = analysis.predictability(
-            alpha[known], **options
-        ).mean()
-        report["cross_validated_pca"] = analysis.predictability(
-            aligned[known], **options
-        ).mean()
+        for name, values in features.items():
+            report[name] = analysis.predictability(values[known], **options).mean()
     except ValueError as error:  # too few frames of a class, or groups, for two folds
         report["not_cross_validated"] = str(error)
     return report

@@ -68,17 +68,14 @@ def _compare(faces: Bunch, estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
     )
     n_true, names = len(faces.basis), estimator.get_feature_names_out()
     correlation = np.corrcoef(faces.alpha.T, estimator.alpha_.T)[:n_true, n_true:]
-    pairs = zip(faces.component_names, matching, strict=True)
+    basis = {
+        "name": faces.component_names,
+        "found_as": names[matching],
+        "similarity": similarity,
+        "correlation": abs(correlation[range(n_true), matching]),
+    }
     return {
         "shape_error": affine_shape_error(faces.shapes, shapes),
         "mean_shape_error": affine_shape_error(faces.shapes, rigid),
-        "basis": [
-            {
-                "name": name,
-                "found_as": names[found],
-                "similarity": similarity[k],
-                "correlation": abs(correlation[k, found]),
-            }
-            for k, (name, found) in enumerate(pairs)
-        ],
+        "basis": pd.DataFrame(basis).to_dict("records"),
     }

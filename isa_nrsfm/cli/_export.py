@@ -5,15 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from isa_nrsfm import export
+from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
 from isa_nrsfm.cli._outputs import read_model, refuse_overwriting
-from isa_nrsfm.cli._reading import (
-    as_fitted,
-    cells_of,
-    drawing,
-    drawing_files,
-    read_frames,
-)
 from isa_nrsfm.cli._report import table_report
 from isa_nrsfm.cli._sections import table_section, text_of
 from isa_nrsfm.skeletons._column_names import names_of_points
@@ -34,22 +28,21 @@ def run(args: Namespace, warned: list[str]) -> str:
     content = _content(output, args.content)
     options = _given(args, content)
     estimator = read_model(args)
-    sources = filter(None, (args.model, args.table, *drawing_files(args)))
+    sources = filter(None, (args.model, args.table, *_reading.drawing_files(args)))
     refuse_overwriting(sources, [output])
     sections: dict[str, Any] = {"Model": [args.model]}
     stored = None
     if args.table is not None:
-        frames = read_frames(args, estimator)
+        frames = _reading.read_frames(args, estimator)
         stored = frames.skeleton
-        table = table_report(args, frames)
-        sections["Table"] = table_section(table, unusable="not shown")
-        options["X"] = as_fitted(estimator, frames.X)
+        sections["Table"] = table_section(table_report(args, frames), "not shown")
+        options["X"] = _reading.as_fitted(estimator, frames.X)
         if args.label is not None:
-            labels = cells_of(frames.other, args.label, "--label")
+            labels = _reading.cells_of(frames.other, args.label, "--label")
             options["labels"] = labels[frames.usable]
     if "edges" in _OPTIONS[content]:
         names = names_of_points(estimator)
-        options |= drawing(args, names, stored, surfaces=content == "glb")
+        options |= _reading.drawing(args, names, stored, surfaces=content == "glb")
     if options.get("camera") == NONE:
         options["camera"] = None
 

@@ -14,20 +14,14 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm.cli._columns import Columns, Label, class_means
+from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.cli._report import MOST_CLASSES
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics._reprojection import frame_energies
-from isa_nrsfm.plotting._axes import (
-    MEAN_COLOUR,
-    VIEWS,
-    add_legend,
-    block_limits,
-    new_page,
-    wrap_title,
-)
+from isa_nrsfm.plotting import _axes
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
 # `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.
@@ -35,10 +29,10 @@ MOST_DRAWN = 12
 
 
 class Fit(NamedTuple):
-    """A fit to draw: model, table, search, smoothed coefficients, lines to draw."""
+    """A fit to draw: model, frames, search, smoothed coefficients, lines to draw."""
 
     estimator: AffineNRSfM
-    X: "pd.DataFrame"
+    frames: Frames
     search: AffineNRSfMCV | None
     smooth: Any
     drawn: dict[str, Any]
@@ -71,7 +65,7 @@ ALWAYS: Figures = {
 }
 
 
-def figures_of(args: Namespace, asked: Columns) -> Figures:
+def figures_of(args: Namespace, frames: Frames) -> Figures:
     """Return the figures that the options ask for."""
     figures = dict(ALWAYS)
     if len(args.n_components) > 1:
@@ -79,21 +73,16 @@ def figures_of(args: Namespace, asked: Columns) -> Figures:
             "held-out error by the number of basis shapes",
             lambda fit: plotting.ComponentChoiceDisplay.from_estimator(fit.search),
         )
-    for number, label in enumerate(asked.labels, 1):
-        figures[f"label_{number}.png"] = (
-            f"coefficients by {label.name}",
-            partial(_by_label, label),
-        )
-        if label.is_of_classes(MOST_CLASSES):
-            figures[f"label_{number}_shapes.png"] = (
-                f"mean shape of each {label.name}, and of all frames in grey",
-                partial(_shapes_by_label, label),
-            )
-    if asked.times is not None:
-        figures["time.png"] = (
-            "coefficients in time, with a band of one standard deviation",
-            partial(_in_time, asked),
-        )
+    for number, label in enumerate(frames.labels, 1):
+        caption = f"coefficients by {label.name}"
+        figures[f"label_{number}.png"] = caption, partial(_by_label, label)
+        if has_classes(label, MOST_CLASSES):
+            caption = f"mean shape of each {label.name}, and of all frames in grey"
+            draw = partial(_shapes_by_label, label)
+            figures[f"label_{number}_shapes.png"] = caption, draw
+    if frames.times is not None:
+        caption = "coefficients in time, with a band of one standard deviation"
+        figures["time.png"] = caption, _in_time
     return figures
 
 
@@ -120,13 +109,13 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
 def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
     """Draw up to three frames about the median residual, and as many of the largest."""
     model = fit.estimator
-    energy, error, _ = frame_energies(fit.X, fitted_table(model), model.layout)
+    energy, error, _ = frame_energies(fit.frames.X, fitted_table(model), model.layout)
     order = np.argsort(error / energy)
     n_drawn = max(min(3, len(order) // 3), 1)
     start = (len(order) - n_drawn) // 2
     rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
     display = plotting.ReprojectionDisplay.from_estimator(
-        model, fit.X, frames=rows, **fit.drawn
+        model, fit.frames.X, frames=rows, **fit.drawn
     )
     for number, axes in enumerate(display.axes_):
         which = "median" if number < n_drawn else "largest"
@@ -135,20 +124,20 @@ def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
     return display
 
 
-def _by_label(label: Label, fit: Fit) -> plotting.CoefficientsDisplay:
+def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients by a label."""
     alpha = fit.estimator.alpha_[:, :MOST_DRAWN]
     return plotting.CoefficientsDisplay(
-        alpha=alpha[label.known],
-        y=label.values,
-        label=label.name.replace("$", r"\$"),  # no mathematics
+        alpha=alpha[label.notna()],
+        y=label.dropna().to_numpy(),
+        label=str(label.name).replace("$", r"\$"),  # no mathematics
         component_names=names_of_components(None, alpha.shape[1]),
-    ).plot(kind=label.kind)
+    ).plot(kind="classes" if has_classes(label) else "number")
 
 
-def _in_time(asked: Columns, fit: Fit) -> plotting.CoefficientsDisplay:
+def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients in time, smoothed ones if there are any."""
-    alpha = fit.estimator.alpha_
+    frames, alpha = fit.frames, fit.estimator.alpha_
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
@@ -156,44 +145,43 @@ def _in_time(asked: Columns, fit: Fit) -> plotting.CoefficientsDisplay:
     shown = plotting.CoefficientsDisplay(
         alpha=alpha,
         alpha_std=None if deviation is None else deviation[:, :MOST_DRAWN],
-        time=asked.times,
-        groups=asked.groups,
+        time=frames.times,
+        groups=frames.groups,
         component_names=names_of_components(None, alpha.shape[1]),
     ).plot(kind="time")
-    if asked.time_unit == "seconds" and np.asarray(asked.times).dtype.kind != "M":
+    if frames.time_unit == "seconds" and np.asarray(frames.times).dtype.kind != "M":
         shown.axes_[-1].set_xlabel("time, seconds")
     return shown
 
 
-def _shapes_by_label(label: Label, fit: Fit) -> plotting.BasisShapeDisplay:
+def _shapes_by_label(label: "pd.Series", fit: Fit) -> plotting.BasisShapeDisplay:
     """Draw the mean shape of each class over that of all frames."""
     whole = plotting.BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn)
     import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
     mean = whole.mean_shape
     means = [*class_means(label, fit.estimator.alpha_).values()]
     shapes = mean + np.tensordot(means, whole.basis, 1)
-    (limits,), _ = block_limits([np.concatenate([mean[None], shapes])])
-    axes = new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
-    classes, counts = np.unique(label.values, return_counts=True)
-    for shape, pair, name, count in zip(shapes, axes, classes, counts, strict=True):
-        for points, colour in ((mean, "0.8"), (shape, MEAN_COLOUR)):
+    (limits,), _ = _axes.block_limits([np.concatenate([mean[None], shapes])])
+    axes = _axes.new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
+    counts = label.value_counts(sort=False)
+    for shape, pair, (name, count) in zip(shapes, axes, counts.items(), strict=True):
+        for points, colour in ((mean, "0.8"), (shape, _axes.MEAN_COLOUR)):
             display = plotting.BasisShapeDisplay(
                 mean_shape=points,
                 basis=np.empty((0, *points.shape)),
                 edges=whole.skeleton,
                 origin=whole.origin,
             ).plot(pair, point_kw={"color": colour})
-        for axis, (x, y) in zip(pair, VIEWS, strict=True):
-            axis.set(xlim=limits[x], ylim=limits[y])
-            axis.yaxis.set_inverted(whole.origin == "upper")
+        for axis, view in zip(pair, _axes.VIEWS, strict=True):
+            _axes.show_view(axis, view, limits, whole.origin)
         pair[1].set_xlabel(whole.depth_note, loc="right", fontsize="x-small")
-        title = wrap_title(f"{name} ({count} frames)", pair)
+        title = _axes.wrap_title(f"{name} ({count} frames)", pair)
         pair[0].set_title(title, loc="left", fontsize="small", parse_math=False)
     line = import_optional("matplotlib.lines", extra="plot").Line2D
     style = {"marker": "o", "markersize": 3, "linewidth": 1.5}
     entries = [
         line([], [], color=colour, label=f"mean of {frames}", **style)
-        for frames, colour in (("all frames", "0.8"), ("the class", MEAN_COLOUR))
+        for frames, colour in (("all frames", "0.8"), ("the class", _axes.MEAN_COLOUR))
     ]
-    add_legend(display.figure_, entries, whole.skeleton)
+    _axes.add_legend(display.figure_, entries, whole.skeleton)
     return display

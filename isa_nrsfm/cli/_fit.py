@@ -4,7 +4,7 @@ import contextlib
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,24 +20,14 @@ from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._selection import standard_errors
-from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
+from isa_nrsfm.cli import _outputs
+from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, NONE
-from isa_nrsfm.cli._outputs import (
-    REPORT,
-    RESULTS,
-    digests_of,
-    entry_of_report,
-    refuse_overwriting,
-    refuse_replacing,
-    write_alpha,
-    write_results,
-)
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
 from isa_nrsfm.cli._sections import fit_text, write_report
-from isa_nrsfm.export._viewer import MOST_LABELS
 from isa_nrsfm.io import write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 
@@ -76,38 +66,38 @@ def fit_table(
     if X.empty:
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
-    asked = asked_columns(args, frames)
-    figures = {} if args.no_figures else figures_of(args, asked)
+    frames = asked_columns(args, frames)
+    figures = {} if args.no_figures else figures_of(args, frames)
     drawn = drawing(args, frames.columns.points, frames.skeleton)
-    results, inputs = RESULTS, drawing_files(args)
+    results, inputs = _outputs.RESULTS, drawing_files(args)
     if table is None:
         inputs.append(args.table)
     else:
         results = results | {Path(args.table).name: "the table"}
     with whole_files.folder_for_writing(folder):
-        files = [*results, *figures, REPORT]
-        refuse_overwriting(inputs, [folder / name for name in files])
+        files = [*results, *figures, _outputs.REPORT]
+        _outputs.refuse_overwriting(inputs, [folder / name for name in files])
         for name in files:
             whole_files.check_replaceable(folder / name)
         if not args.force:
-            refuse_replacing(folder, files)
+            _outputs.refuse_replacing(folder, files)
         removed = {*_old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
-        estimator, search = _fitted(args, frames, asked.groups, clock)
+        estimator, search = _fitted(args, frames, clock)
         show_stage("answers")
-        answers, columns, smooth = column_results(args, asked, estimator, frames)
+        answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
         with whole_files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
-            std = estimator.alpha_std_ if args.std else None
-            write_alpha(new / "alpha.csv", frames, estimator.alpha_, std, columns)
-            shown = {"labels": _first_classes(asked, X), "times": asked.times}
+            alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
+            _outputs.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
+            shown = {"labels": first_classes(frames.labels), "times": frames.times}
             if args.std and estimator.camera_ != "affine":
                 shown["depth_std"] = estimator.reconstruct(
                     X, return_std=True, **frames.weighting
                 )[1]
-            write_results(new, estimator, frames, smooth, drawn, **shown)
+            _outputs.write_results(new, estimator, frames, smooth, drawn, **shown)
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
@@ -127,12 +117,12 @@ def fit_table(
             return report
         # A figure that fails, or takes long, costs no results: they are in place.
         with whole_files.files_together(folder) as new:
-            if digests_of(folder, report["sha256"]) != report["sha256"]:
+            if _outputs.digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
                 )
-            fit = Fit(estimator, X, search, smooth, drawn)
+            fit = Fit(estimator, frames, search, smooth, drawn)
             captions = write_figures(new, figures, fit)
             clock["figures"] = time.perf_counter()
             report |= {"seconds": _seconds(clock), "files": results | captions}
@@ -142,7 +132,7 @@ def fit_table(
 
 def _check_options(args: Namespace) -> None:
     """Raise before a long fit if options exclude each other or a library is absent."""
-    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in RESULTS)}
+    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in _outputs.RESULTS)}
     if Path(args.output).suffix.lower() in suffixes and not Path(args.output).is_dir():
         raise ValueError(
             f"--output {args.output}: expected a folder, because fit writes several "
@@ -171,7 +161,7 @@ def _seconds(clock: dict[str, float]) -> dict[str, float]:
 
 
 def _fitted(
-    args: Namespace, frames: Frames, groups: NDArray | None, clock: dict[str, float]
+    args: Namespace, frames: Frames, clock: dict[str, float]
 ) -> tuple[AffineNRSfM, AffineNRSfMCV | None]:
     """Return the model that the options ask for, and the search for its K."""
     isa = None
@@ -188,10 +178,23 @@ def _fitted(
         scale_frames=not args.no_scale_frames,
         **given,
     )
-    search, X = None, frames.X
+    search, X, groups = None, frames.X, frames.groups
     if len(args.n_components) > 1:
         show_stage("choice of the number of basis shapes")
-        search = choose_n_components(estimator, X, args.n_components, groups)
+        splitter: Any = N_PARTS
+        if groups is not None:
+            n_groups = len(np.unique(groups.astype(str)))
+            if n_groups < 2:
+                raise ValueError(
+                    "--group: numbers of basis shapes are compared on held-out groups, "
+                    f"which needs two groups; got {n_groups}"
+                )
+            splitter = GroupKFold(min(N_PARTS, n_groups))
+        search = AffineNRSfMCV(
+            args.n_components, estimator=estimator, cv=splitter, verbose=1
+        )
+        with contextlib.redirect_stdout(sys.stderr):  # results are printed at once
+            search.fit(X, groups=groups)
         estimator = search.best_estimator_
         clock["choose"] = time.perf_counter() - search.refit_time_
     else:
@@ -204,43 +207,13 @@ def _fitted(
 
 def _old_figures(folder: Path, new: list[str]) -> list[str]:
     """Return the figures that the report of an earlier run lists; warn of others."""
-    old = [name for name in entry_of_report(folder, "files") if name.endswith(".png")]
+    files = _outputs.entry_of_report(folder, "files")
+    old = [name for name in files if name.endswith(".png")]
     others = sorted({*ALWAYS}.difference(old, new))
     others = [name for name in others if (folder / name).exists()]
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
     return old
-
-
-def _first_classes(asked: Columns, X: "pd.DataFrame") -> "pd.Series | None":
-    """Return the first label of few classes, which colours the frames in the viewer."""
-    for label in asked.labels:
-        if label.is_of_classes(MOST_LABELS):
-            values = pd.Series(None, index=X.index, dtype=object, name=label.name)
-            values[label.known] = [str(value) for value in label.values]
-            return values
-    return None
-
-
-def choose_n_components(
-    estimator: AffineNRSfM, X: Any, candidates: Sequence[int], groups: NDArray | None
-) -> AffineNRSfMCV:
-    """Return the fitted search for the number that best predicts held-out frames.
-
-    Frames of one group are held out together. Results are printed at once.
-    """
-    splitter: Any = N_PARTS
-    if groups is not None:
-        n_groups = len(np.unique(groups.astype(str)))
-        if n_groups < 2:
-            raise ValueError(
-                "--group: numbers of basis shapes are compared on held-out groups, "
-                f"which needs two groups; got {n_groups}"
-            )
-        splitter = GroupKFold(min(N_PARTS, n_groups))
-    search = AffineNRSfMCV(candidates, estimator=estimator, cv=splitter, verbose=1)
-    with contextlib.redirect_stdout(sys.stderr):
-        return search.fit(X, groups=groups)
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:

@@ -29,7 +29,8 @@ def run(argv: Sequence[str] | None = None) -> int:
             # Each command is a module, which is only loaded now: help does not wait.
             command = importlib.import_module(f"isa_nrsfm.cli._{args.command}")
             report = command.run(args, warned)
-        _show(report)
+        encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+        print(report.encode(encoding, "backslashreplace").decode(encoding), flush=True)
     except BrokenPipeError:
         # Python flushes the standard output once more at exit.
         with contextlib.suppress(OSError, ValueError):
@@ -76,12 +77,6 @@ def _with_options(text: str, args: Namespace) -> str:
     if hasattr(args, "n_components"):
         text = re.sub(r"(?<![\w'\"-])n_components\b", "--n-components", text)
     return text
-
-
-def _show(report: str) -> None:
-    """Write the report to the standard output, in any encoding."""
-    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
-    print(report.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 def _say(text: str) -> None:

@@ -7,7 +7,7 @@ compares the defaults with those of `AffineNRSfM` and its strategies.
 import argparse
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from isa_nrsfm import __version__
@@ -147,235 +147,128 @@ TYPES: dict[str, Callable[[str], Any]] = {
 }
 
 
-def _arg(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
-    """Return the arguments of `add_argument` for an option with a value."""
-    return {"help": help, "metavar": metavar, "type": TYPES.get(metavar)} | settings
-
-
-def _flag(help: str) -> dict[str, Any]:
-    """Return the arguments of `add_argument` for an option without a value."""
-    return {"help": help, "action": "store_true"}
-
-
-def _list(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
-    """Return the arguments of `add_argument` for an option that may be repeated."""
-    settings |= {"action": "append", "default": []}
-    return _arg(metavar, f"{help}; may be repeated", **settings)
-
-
-def _choice(of: tuple[str, ...], help: str) -> dict[str, Any]:
-    """Return the arguments of `add_argument` for a choice, whose first one is taken."""
-    return {"help": f"{help} (default: {of[0]})", "choices": of, "default": of[0]}
-
-
 # Arguments without a leading -- in the command line.
 POSITIONAL = ("table", "model")
 SHORT = {"output": ["-o"], "n_components": ["-k"]}
-OPTIONS: dict[str, dict[str, Any]] = {
-    "model": _arg("MODEL", "model.npz, written by fit"),
+# The help of each option, by its name and its value if it has one. An option may have
+# another help in one command.
+HELP = {
+    "model MODEL": "model.npz, written by fit",
     # The table.
-    "table": _arg(
-        "TABLE", "a .csv, .tsv or .parquet file, or a file or folder of another format"
-    ),
-    "format": _arg(
-        "FORMAT",
-        "the program that wrote the table: "
-        f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for "
-        "any table with named columns (default: auto, recognised by the beginning of "
-        "the file)",
-        choices=["auto", *FORMATS],
-        default="auto",
-    ),
-    "columns": _arg(
-        "PATTERN",
-        "patterns of the x and y columns, if their names are ambiguous: # for a "
-        "number, * for any text, such as 'x_#,y_#' or '*.px,*.py'",
-    ),
-    "skip_rows": _list(
-        "COLUMN=REGEX",
-        "leave out rows whose column matches the expression, such as 'name=^ir'",
-    ),
-    "zeros_missing": _flag("treat points at exactly (0, 0) as missing"),
-    "missing_value": _list(
-        "VALUE", "treat points whose x and y are this number, such as -1, as missing"
-    ),
-    "min_confidence": _arg(
-        "CONFIDENCE", "treat points with a lower confidence as missing"
-    ),
-    "weights": _arg(
-        "WEIGHTS",
-        "weight the points of the joint refinement by their confidences in the file "
-        "(confidence); points of confidence zero are missing",
-        choices=["confidence"],
-    ),
-    "image_size": _arg(
-        "WIDTHxHEIGHT", "size of the images for MediaPipe, in pixels, such as 1920x1080"
-    ),
-    "part": _arg(
-        "PART",
-        "the points of OpenPose to read, if the files have several: "
-        f"{', '.join(choices.OPENPOSE_PARTS)}",
-        choices=choices.OPENPOSE_PARTS,
-    ),
-    "points": _arg(
-        "POINTS",
-        "fit some of the points: inner (without the visible outline of a face, which "
-        "slides over the surface as the head turns), or names, numbers and ranges such "
-        "as nose,36-47 or without:0-16",
-    ),
+    "table TABLE": "a .csv, .tsv or .parquet file, or a file or folder of another "
+    "format",
+    "export.table TABLE": "for .html, the table whose frames are shown",
+    "format FORMAT": "the program that wrote the table: "
+    f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for any table "
+    "with named columns (default: auto, recognised by the beginning of the file)",
+    "columns PATTERN": "patterns of the x and y columns, if their names are ambiguous: "
+    "# for a number, * for any text, such as 'x_#,y_#' or '*.px,*.py'",
+    "skip_rows COLUMN=REGEX": "leave out rows whose column matches the expression, "
+    "such as 'name=^ir'",
+    "zeros_missing": "treat points at exactly (0, 0) as missing",
+    "missing_value VALUE": "treat points whose x and y are this number, such as -1, as "
+    "missing",
+    "min_confidence CONFIDENCE": "treat points with a lower confidence as missing",
+    "weights WEIGHTS": "weight the points of the joint refinement by their confidences "
+    "in the file (confidence); points of confidence zero are missing",
+    "image_size WIDTHxHEIGHT": "size of the images for MediaPipe, in pixels, such as "
+    "1920x1080",
+    "part PART": "the points of OpenPose to read, if the files have several: "
+    f"{', '.join(choices.OPENPOSE_PARTS)}",
+    "points POINTS": "fit some of the points: inner (without the visible outline of a "
+    "face, which slides over the surface as the head turns), or names, numbers and "
+    "ranges such as nose,36-47 or without:0-16",
     # What is written.
-    "output": _arg("DIR", "folder for the results, created if absent", required=True),
-    "force": _flag("replace files in the folder that are of no earlier run"),
-    "no_figures": _flag("write no figures (png), and remove those of an earlier run"),
-    "std": _flag(
-        "add the standard deviation of each coefficient, in columns such as "
-        "alpha_1_std; with calibrated cameras the viewer has error bars of the depths"
-    ),
-    "viewer": _arg("FILE", "write a page that shows the new frames in 3D (.html)"),
-    "edges": _arg(
-        "FILE",
-        "lines to draw between points: a .csv file with the names or numbers of two "
-        "points per line, or of three for a surface; 'none' draws only points",
-    ),
-    "skeleton": _arg(
-        "LAYOUT",
-        "the layout of the points, if names, number and order of the points do not "
-        f"determine it: {', '.join(choices.SKELETON_NAMES)}, or the config.yaml of "
-        "DeepLabCut",
-    ),
-    "origin": {
-        "help": "where y is zero: upper in images, whose y points down, lower if y "
-        "points up (default: auto, lower for faces that would be upside down)",
-        "choices": ["auto", "upper", "lower"],
-    },
+    "output DIR": "folder for the results, created if absent",
+    "transform.output FILE": "the .csv, .tsv or .parquet file to write",
+    "export.output FILE": "the file to write",
+    "demo.output DIR": "folder for the results (default: ./isa-nrsfm-demo)",
+    "force": "replace files in the folder that are of no earlier run",
+    "no_figures": "write no figures (png), and remove those of an earlier run",
+    "std": "add the standard deviation of each coefficient, in columns such as "
+    "alpha_1_std; with calibrated cameras the viewer has error bars of the depths",
+    "viewer FILE": "write a page that shows the new frames in 3D (.html)",
+    "edges FILE": "lines to draw between points: a .csv file with the names or numbers "
+    "of two points per line, or of three for a surface; 'none' draws only points",
+    "skeleton LAYOUT": "the layout of the points, if names, number and order of the "
+    f"points do not determine it: {', '.join(choices.SKELETON_NAMES)}, or the "
+    "config.yaml of DeepLabCut",
+    "origin": "where y is zero: upper in images, whose y points down, lower if y "
+    "points up (default: auto, lower for faces that would be upside down)",
     # Other columns.
-    "label": _list(
-        "COLUMN",
-        "a class or a number for each frame, such as an expression or an age: reports "
-        "the dependence of the coefficients on it. Whole numbers are classes unless "
-        "given as COLUMN:number",
-    ),
-    "group": _arg(
-        "COLUMN",
-        "people, videos or files: reports the variance between and within groups. "
-        "Held-out frames come from other groups; smoothing stops at their borders",
-    ),
-    "distance": _list(
-        "POINT,POINT",
-        "add the distance of two points of the 3D shapes to alpha.csv, in units of the "
-        "distance between the outer corners of the eyes",
-    ),
-    "unit": _arg(
-        "POINT,POINT",
-        "two points whose distance in the mean shape is the unit of --distance",
-    ),
-    "length": _arg(
-        "NUMBER",
-        "the length of that unit, such as 90 for millimetres (default: 1)",
-        default=1.0,
-    ),
-    "time": _arg(
-        "COLUMN", "times of the frames, numbers or dates: adds smoothed coefficients"
-    ),
-    "time_format": _arg(
-        "FORMAT",
-        "how the cells of --time are written, if that is ambiguous: %%d/%%m/%%Y (day "
-        "first), %%M:%%S (minutes and seconds), or other codes of strptime",
-    ),
-    "fps": _arg(
-        "NUMBER",
-        "instead of --time, the frames per second of a video; frames "
-        "have the numbers of the column frame, or of the rows",
-    ),
+    "label COLUMN": "a class or a number for each frame, such as an expression or an "
+    "age: reports the dependence of the coefficients on it. Whole numbers are classes "
+    "unless given as COLUMN:number",
+    "export.label COLUMN": "for .html, the column of TABLE that determines the colours "
+    "of frames",
+    "group COLUMN": "people, videos or files: reports the variance between and within "
+    "groups. Held-out frames come from other groups; smoothing stops at their borders",
+    "distance POINT,POINT": "add the distance of two points of the 3D shapes to "
+    "alpha.csv, in units of the distance between the outer corners of the eyes",
+    "unit POINT,POINT": "two points whose distance in the mean shape is the unit of "
+    "--distance",
+    "length NUMBER": "the length of that unit, such as 90 for millimetres (default: 1)",
+    "time COLUMN": "times of the frames, numbers or dates: adds smoothed coefficients",
+    "time_format FORMAT": "how the cells of --time are written, if that is ambiguous: "
+    "%%d/%%m/%%Y (day first), %%M:%%S (minutes and seconds), or other codes of "
+    "strptime",
+    "fps NUMBER": "instead of --time, the frames per second of a video; frames have "
+    "the numbers of the column frame, or of the rows",
     # The method.
-    "n_components": _arg(
-        "K",
-        "number of basis shapes (default: 3). Of several, such as 1-8 or 3,6,9, the "
-        "best in cross-validation is used; auto uses as many as the table determines, "
-        "at most twelve",
-        default="3",
-    ),
-    "camera": _choice(
-        choices.CAMERA_NAMES,
-        "camera model: affine (no assumption), weak_perspective (a rotation and a "
-        "scale per frame), or orthographic (one scale). The last two estimate "
-        "depth and proportions",
-    ),
-    "isa": _choice(
-        ("pooled", "fast"),
-        "independent subspace analysis: FastICA with pooled components, or FastISA",
-    ),
-    "n_init": _arg(
-        "STARTS", "number of random starts (default: 16 of pooled, 30 of fast)"
-    ),
-    "block_recovery": _choice(
-        choices.BLOCK_RECOVERIES, "algorithm that finds the block structure"
-    ),
-    "refinement": _choice(
-        (*choices.REFINEMENTS, NONE),
-        "joint: cameras, coefficients and basis shapes together; consensus: "
-        "afterwards groups of neighbouring points, for the truest shapes of "
-        "calibrated cameras; alternating: the refinement of the paper, with cameras "
-        "of the rigid part",
-    ),
-    "independence": _choice(
-        (*choices.INDEPENDENCE, NONE),
-        "joint refinement: independent basis shapes, or independent coefficients",
-    ),
-    "loss": _choice(
-        choices.LOSSES,
-        "joint refinement: all but linear limit the influence of outliers",
-    ),
-    "no_scale_frames": _flag(
-        "weight frames by their size in the image, as orthographic cameras always do"
-    ),
-    "random_state": _arg("SEED", "seed of the random starts (default: 0)", default=0),
-    "n_jobs": _arg(
-        "N", "processes for the random starts, -1 for all processors (default: 1)"
-    ),
+    "n_components K": "number of basis shapes (default: 3). Of several, such as 1-8 or "
+    "3,6,9, the best in cross-validation is used; auto uses as many as the table "
+    "determines, at most twelve",
+    "camera": "camera model: affine (no assumption), weak_perspective (a rotation and "
+    "a scale per frame), or orthographic (one scale). The last two estimate depth and "
+    "proportions",
+    "export.camera": "camera model for a model with affine cameras; none exports "
+    "affine shapes, whose angles and depth are not true (default: weak_perspective)",
+    "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
+    "n_init STARTS": "number of random starts (default: 16 of pooled, 30 of fast)",
+    "block_recovery": "algorithm that finds the block structure",
+    "refinement": "joint: cameras, coefficients and basis shapes together; consensus: "
+    "afterwards groups of neighbouring points, for the truest shapes of calibrated "
+    "cameras; alternating: the refinement of the paper, with cameras of the rigid part",
+    "independence": "joint refinement: independent basis shapes, or independent "
+    "coefficients",
+    "loss": "joint refinement: all but linear limit the influence of outliers",
+    "no_scale_frames": "weight frames by their size in the image, as orthographic "
+    "cameras always do",
+    "random_state SEED": "seed of the random starts (default: 0)",
+    "n_jobs N": "processes for the random starts, -1 for all processors (default: 1)",
     # Export.
-    "content": {
-        "help": "contents of the file, if the suffix leaves it open: pdm for a point "
-        "distribution model as .mat (M, V and E) or .npz",
-        "choices": list(SUFFIXES),
-    },
-    "n_modes": _arg(
-        "MODES",
-        "for a point distribution model, the number of modes, or the share of the "
-        "variance that they explain, such as 0.98 (default: number of basis shapes)",
-    ),
-    "names": _arg("NAMES", "for .html and .glb, names of the basis shapes with commas"),
-    "n_frames": _arg("N", "for .html, the largest number of frames (default: 1000)"),
-    "mirrored": _flag("take the mirror image in depth, which has the same images"),
+    "content": "contents of the file, if the suffix leaves it open: pdm for a point "
+    "distribution model as .mat (M, V and E) or .npz",
+    "n_modes MODES": "for a point distribution model, the number of modes, or the "
+    "share of the variance that they explain, such as 0.98 (default: number of basis "
+    "shapes)",
+    "names NAMES": "for .html and .glb, names of the basis shapes with commas",
+    "n_frames N": "for .html, the largest number of frames (default: 1000)",
+    "mirrored": "take the mirror image in depth, which has the same images",
 }
-# Where an option of one command differs from that of the others.
-DIFFERENT: dict[tuple[str, str], dict[str, Any]] = {
-    ("transform", "output"): {
-        "metavar": "FILE",
-        "help": "the .csv, .tsv or .parquet file to write",
-    },
-    ("export", "output"): {"metavar": "FILE", "help": "the file to write"},
-    ("demo", "output"): {
-        "required": False,
-        "default": "isa-nrsfm-demo",
-        "help": "folder for the results (default: ./isa-nrsfm-demo)",
-    },
-    ("export", "table"): {
-        "nargs": "?",
-        "help": "for .html, the table whose frames are shown",
-    },
-    ("export", "label"): {
-        "action": "store",
-        "default": None,
-        "help": "for .html, the column of TABLE that determines the colours of frames",
-    },
-    ("export", "camera"): {
-        "choices": ["weak_perspective", NONE],
-        "default": None,
-        "help": "camera model for a model with affine cameras; none exports affine "
-        "shapes, whose angles and depth are not true (default: weak_perspective)",
-    },
+# The values of options that have few.
+CHOICES: dict[str, Sequence[str]] = {
+    "format": ("auto", *FORMATS),
+    "weights": ("confidence",),
+    "part": choices.OPENPOSE_PARTS,
+    "origin": ("auto", "upper", "lower"),
+    "camera": choices.CAMERA_NAMES,
+    "export.camera": ("weak_perspective", NONE),
+    "isa": ("pooled", "fast"),
+    "block_recovery": choices.BLOCK_RECOVERIES,
+    "refinement": (*choices.REFINEMENTS, NONE),
+    "independence": (*choices.INDEPENDENCE, NONE),
+    "loss": choices.LOSSES,
+    "content": tuple(SUFFIXES),
 }
+# Options whose first choice is their value by default, which the help states.
+FIRST = ("camera", "isa", "block_recovery", "refinement", "independence", "loss")
+DEFAULTS = {
+    **{name: CHOICES[name][0] for name in ("format", *FIRST)},
+    **{"length": 1.0, "n_components": "3", "random_state": 0},
+    "demo.output": "isa-nrsfm-demo",
+}
+REPEATED = ("skip_rows", "missing_value", "label", "distance")
 TABLE_OPTIONS = (
     *("format", "columns", "skip_rows", "zeros_missing", "missing_value"),
     *("min_confidence", "image_size", "part"),
@@ -503,10 +396,34 @@ def build_parser() -> argparse.ArgumentParser:
                 is_one = isinstance(entry, str)
                 place = group if is_one else group.add_mutually_exclusive_group()
                 for name in [entry] if is_one else entry:
-                    settings = OPTIONS[name] | DIFFERENT.get((command, name), {})
                     flag = name if name in POSITIONAL else flag_of(name)
-                    place.add_argument(*SHORT.get(name, []), flag, **settings)
+                    place.add_argument(
+                        *SHORT.get(name, []), flag, **_settings(command, name)
+                    )
     return top
+
+
+def _settings(command: str, name: str) -> dict[str, Any]:
+    """Return the settings of an option of a command for `add_argument`."""
+    entries = {entry.partition(" ")[0]: entry for entry in HELP}
+    key = f"{command}.{name}" if f"{command}.{name}" in entries else name
+    help, metavar = HELP[entries[key]], entries[key].partition(" ")[2]
+    if not metavar and key not in CHOICES:
+        return {"help": help, "action": "store_true"}
+    default = DEFAULTS.get(key)
+    settings: dict[str, Any] = {"default": default, "choices": CHOICES.get(key)}
+    if metavar:
+        settings |= {"metavar": metavar, "type": TYPES.get(metavar)}
+    if key == "export.table":
+        settings["nargs"] = "?"
+    if name == "output":
+        settings["required"] = default is None
+    if key in FIRST:
+        help += f" (default: {default})"
+    if key in REPEATED:
+        help += "; may be repeated"
+        settings |= {"action": "append", "default": []}
+    return settings | {"help": help}
 
 
 def flag_of(name: str) -> str:

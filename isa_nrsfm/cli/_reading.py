@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, skeletons
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
@@ -35,13 +35,7 @@ from isa_nrsfm.io._landmark_columns import (
 )
 from isa_nrsfm.io._landmarks import Landmarks
 from isa_nrsfm.io._tables import confidences_in, tracks_in
-from isa_nrsfm.skeletons import (
-    SKELETONS,
-    Skeleton,
-    find_skeleton,
-    get_skeleton,
-    read_skeleton,
-)
+from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 
 # Options of one format, and that format.
@@ -59,8 +53,10 @@ class Frames(NamedTuple):
     are not skipped, by the number of the row in the table. ``usable`` marks the rows
     that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
     request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
-    numbers of the images that rows show, and the column that has them, if any.
-    ``confidence`` has the confidences of the points if they are asked for as weights.
+    numbers of the images that all rows show, under the name of their column, if any.
+    ``weighting`` has the weights of the points of X as an argument of `fit`, if asked
+    for. Labels, groups and times of the usable rows come from `asked_columns`. Labels
+    are NaN where they are not known. Those of classes are categories.
     """
 
     points: "pd.DataFrame"
@@ -68,23 +64,19 @@ class Frames(NamedTuple):
     usable: NDArray
     columns: LandmarkColumns
     not_used: dict[str, int]
-    n_rows: int
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
-    images: tuple[NDArray, str | None]
-    confidence: "pd.DataFrame | None" = None
+    images: "pd.Series"
+    weighting: dict[str, Any]
+    labels: "Sequence[pd.Series]" = ()
+    groups: NDArray | None = None
+    times: NDArray | None = None
+    time_unit: str = "seconds"
 
     @property
     def X(self) -> "pd.DataFrame":
         """The landmarks of the usable rows."""
         return self.points[self.usable]
-
-    @property
-    def weighting(self) -> dict[str, Any]:
-        """The weights of the points of X as an argument of `fit`, if asked for."""
-        if self.confidence is None:
-            return {}
-        return {"point_weight": self.confidence.to_numpy(np.float64)[self.usable]}
 
 
 def read_frames(
@@ -102,8 +94,8 @@ def read_frames(
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
-        given = {name: getattr(args, name) for name in _OF_FORMATS}
-        options = {name: given[name] for name in given if given[name] is not None}
+        given = ((name, getattr(args, name)) for name in _OF_FORMATS)
+        options = {name: value for name, value in given if value is not None}
         found = read_landmarks(
             args.table, args.format, min_confidence=args.min_confidence, **options
         )
@@ -140,28 +132,31 @@ def read_frames(
     _refuse_lost_points(args, table[kept], columns, tracks)
     cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
     tracks = cleaned.mT
+    weights = None
     if confidence is not None:
-        confidence = confidence[list(columns.x)].iloc[rows]
-        tracks[confidence.to_numpy() == 0] = np.nan
+        weights = confidence[list(columns.x)].to_numpy(np.float64)[rows]
+        tracks[weights == 0] = np.nan
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     _warn_of_code(tracks[report.usable])
+    other = table.drop(columns=names)
     if found is None:
         _warn_of_shares(tracks[report.usable])
-        not_used = _sets_not_used(table, columns) | not_used
-    images, numbered_by = image_numbers(table)
+        sets = landmark_sets(other.columns)
+        if columns.z:
+            sets[f"{columns.z[0].strip()}, ... (third coordinate)"] = len(columns.z)
+        not_used = sets | not_used
     return Frames(
         points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
-        other=table.loc[kept].drop(columns=names),
+        other=other.loc[kept],
         usable=report.usable,
         columns=columns,
         not_used=not_used,
-        n_rows=len(table),
         left_out=[out for out in left_out if len(out[1])],
         skeleton=layout,
-        images=(images[rows], numbered_by),
-        confidence=confidence,
+        images=image_numbers(table),
+        weighting={} if weights is None else {"point_weight": weights[report.usable]},
     )
 
 
@@ -253,8 +248,7 @@ def _confidence(args: Namespace, found: Landmarks) -> "pd.DataFrame | None":
             f"--weights: {args.table} ({found.format}) has no confidences. Leave out "
             "--weights"
         )
-    x = list(found.points)[::2]
-    return found.confidence.set_axis(x, axis=1).fillna(1.0)
+    return found.confidence.set_axis(list(found.points)[::2], axis=1).fillna(1.0)
 
 
 def _rows_to_keep(
@@ -266,8 +260,7 @@ def _rows_to_keep(
     for column, expression in args.skip_rows:
         cells = column_named(table, column, "--skip-rows")
         texts = cells.astype(object).where(cells.notna(), "").astype(str)
-        found = [expression.search(text) is not None for text in texts]
-        matches = kept & np.array(found, dtype=bool)
+        matches = kept & texts.map(expression.search).notna().to_numpy()
         reason = f"{column} matches {expression.pattern!r}"
         skipped.append((reason, np.flatnonzero(matches), True))
         kept &= ~matches
@@ -316,10 +309,8 @@ def _warn_of_code(tracks: NDArray) -> None:
         is_outside = value < np.nanmin(others) or value > np.nanmax(others)
         n_rows = there.any(axis=1).sum()
         is_origin = len(there) > 2 and not is_outside and not len(places)
-        if is_origin:
-            continue
         enough = n_rows > 2 and (is_outside or there[:, point].sum() > 3 * often)
-        if value and not enough:
+        if is_origin or (value and not enough):
             continue
         number = f"{value:.15g}"
         option = f"--missing-value {number}" if value else "--zeros-missing"
@@ -370,15 +361,6 @@ def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:
         "all points in one place": in_one_place,
         "points on one line, others missing": ~(report.usable | few | in_one_place),
     }
-
-
-def _sets_not_used(table: "pd.DataFrame", found: LandmarkColumns) -> dict[str, int]:
-    """Return patterns and numbers of points of the coordinates that are not used."""
-    chosen = {*found.x, *found.y}
-    not_used = landmark_sets([name for name in table.columns if name not in chosen])
-    if found.z:
-        not_used[f"{found.z[0].strip()}, ... (third coordinate)"] = len(found.z)
-    return not_used
 
 
 def _columns_of_model(
@@ -440,14 +422,14 @@ def _layout(
     extended = report.size > 0
     images = centred[extended] / report.size[extended, None, None]
     shape = images.mean(axis=0).T if extended.any() else None
-    return find_skeleton(len(names), names, shape=shape)
+    return skeletons.find_skeleton(len(names), names, shape=shape)
 
 
 def _given_layout(skeleton: str, names: Sequence[str]) -> Skeleton:
     """Return the layout that --skeleton names, or that its configuration has."""
     if Path(skeleton).suffix.lower() in CONFIGURATIONS:
-        return read_skeleton(skeleton, names)
-    return get_skeleton(skeleton)
+        return skeletons.read_skeleton(skeleton, names)
+    return skeletons.get_skeleton(skeleton)
 
 
 def _part_of_layout(layout: Skeleton | None, points: Sequence[int]) -> Skeleton | None:
@@ -485,12 +467,10 @@ def _kept_points(
 
 def _range(part: str, numbers: dict[str, int], names: Sequence[str]) -> range:
     """Return the points of a name, a number, or two with a hyphen between them."""
-    if part in numbers:
-        return range(numbers[part], numbers[part] + 1)
-    for place in (i for i, letter in enumerate(part) if letter == "-"):
-        first = numbers.get(part[:place].strip())
-        last = numbers.get(part[place + 1 :].strip())
-        if first is not None and last is not None and first <= last:
+    places = [i for i, letter in enumerate(part) if letter == "-"]
+    for ends in [(part, part), *((part[:i], part[i + 1 :]) for i in places)]:
+        first, last = (numbers.get(end.strip(), -1) for end in ends)
+        if 0 <= first <= last:
             return range(first, last + 1)
     raise ValueError(
         f"--points: there are no points {part!r}; the {len(names)} points are "

@@ -15,12 +15,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis._diagnostics import (
-    Diagnostics,
-    camera_advice,
-    camera_meaning,
-    outlier_advice,
-)
+from isa_nrsfm.analysis import _diagnostics
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
@@ -38,7 +33,7 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
     return {
         "path": str(Path(args.table).resolve()),
         "format": args.format,
-        "n_rows": frames.n_rows,
+        "n_rows": len(frames.images),
         "n_frames": len(X),
         "n_points": len(frames.columns.points),
         "missing_values": args.missing_value,
@@ -86,6 +81,12 @@ def model_report(
     certainty = frames_of(estimator).certainty
     advice = certainty.advice.replace('camera="affine"', "--camera affine")
     _, layout, lines, _ = view_and_layout(estimator, edges)
+    meaning, camera_advice = None, ""
+    if ratio is not None:
+        meaning = _diagnostics.camera_meaning(ratio)
+        camera_advice = _diagnostics.camera_advice(
+            estimator.camera_, ratio, certainty.determined
+        )
     is_joint = estimator.refinement in JOINT_REFINEMENTS
     found = estimator.diagnostics(X) if is_joint else None
     for message in () if found is None else found.messages:
@@ -116,13 +117,11 @@ def model_report(
         "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
-        "camera_meaning": None if ratio is None else camera_meaning(ratio),
+        "camera_meaning": meaning,
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "depth_advice": "" if certainty.determined else advice,
-        "camera_advice": ""
-        if ratio is None
-        else camera_advice(estimator.camera_, ratio, certainty.determined),
+        "camera_advice": camera_advice,
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
         "n_edges": None if edges is None else 0 if lines is None else len(lines.edges),
@@ -133,16 +132,16 @@ def model_report(
     }
 
 
-def _outliers(found: Diagnostics, estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
+def _outliers(found: _diagnostics.Diagnostics, model: Any, X: Any) -> dict[str, Any]:
     """Describe the gross residuals of a table, by its rows and names of points."""
-    names = names_of_points(estimator)
+    names = names_of_points(model)
     largest = found.outliers[:MOST_LISTED]
     return {
         "share": found.outlier_share,
         "n_points": len(found.outliers),
         "n_frames": len(np.unique(found.outliers[:, 0])),
         "largest": [{"row": X.index[i], "point": names[j]} for i, j in largest],
-        "message": outlier_advice(found, X.index, names),
+        "message": _diagnostics.outlier_advice(found, X.index, names),
     }
 
 

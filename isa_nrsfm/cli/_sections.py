@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import as_utf8, first_items
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._options import AUTO, PROGRAM
@@ -120,10 +121,11 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
 
 def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cells]:
     """Return the quality of a fit, with a remark on its inverse SNR."""
-    weighted = (
-        " Points count by their weights here, and equally in the inverse SNR."
-        * quality["held_out_error_weighted"]
-    )
+    weighted = ""
+    if quality["held_out_error_weighted"]:
+        weighted = (
+            " Points count by their weights here, and equally in the inverse SNR."
+        )
     return [
         f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
         "squares) of the residuals, relative to that of the centred points.",
@@ -304,21 +306,19 @@ def _cameras(model: dict[str, Any]) -> Section:
 
 def _alpha(coefficients: list[dict[str, Any]]) -> Section:
     """Return the distribution of the coefficients, and what the pose predicts."""
-    rows = []
-    for row in coefficients:
-        share = row["pose_share"]
-        known = share is not None and not math.isnan(share)
-        rows.append(
-            [
-                row["name"],
-                f"{100 * row['energy_share']:.1f} %",
-                *(f"{row[key]:z.2f}" for key in ("mean", "std", "min")),
-                f"{row['row_of_min']}",
-                f"{row['max']:z.2f}",
-                f"{row['row_of_max']}",
-                f"{100 * max(share, 0):.0f} %" if known else "",
-            ]
-        )
+    shares = [row["pose_share"] for row in coefficients]
+    rows = [
+        [
+            row["name"],
+            f"{100 * row['energy_share']:.1f} %",
+            *(f"{row[key]:z.2f}" for key in ("mean", "std", "min")),
+            f"{row['row_of_min']}",
+            f"{row['max']:z.2f}",
+            f"{row['row_of_max']}",
+            f"{100 * max(share, 0):.0f} %" if pd.notna(share) else "",
+        ]
+        for row, share in zip(coefficients, shares, strict=True)
+    ]
     parts: list[str | Cells] = [
         Cells(["", "energy", "mean", "std", "min", "row", "max", "row", "pose"], rows),
         "energy: share of the deformation in the images (sum of squares)",
@@ -370,7 +370,7 @@ def _label(label: dict[str, Any]) -> Section:
         statistic, meaning = "eta squared", "share of the variance between classes"
     tests = [*zip(names, label["values"], label["p_values"], strict=True)]
     rows = [[name, f"{value:z.2f}", f"{p:.3f}"] for name, value, p in tests]
-    means = _class_means(label, names)
+    means = _class_means(label, names) if "class_means" in label else []
     if means:
         means.insert(0, "mean of each class if p < 0.05, in standard deviations:")
     if "not_cross_validated" in label:
@@ -397,14 +397,12 @@ def _label(label: dict[str, Any]) -> Section:
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
     lines = []
-    for k, (name, p) in enumerate(zip(names, label["p_values"], strict=True)):
-        means = {each: mean[k] for each, mean in label.get("class_means", {}).items()}
-        if means and p < 0.05:
-            order = sorted(means, key=lambda each: -abs(means[each]))
-            listed = [f"{each} {means[each]:+.1f}" for each in order]
-            shown = first_items(listed, MOST_CLASSES)
-            rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
-            lines.append(f"{name}: {shown}{rest}.")
+    means = pd.DataFrame(label["class_means"], names)
+    for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
+        largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
+        listed = [f"{each} {mean:+.1f}" for each, mean in largest.items()]
+        rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
+        lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{rest}.")
     return lines
 
 

@@ -17,6 +17,10 @@ _DATES = (
     "%B{0}%d,{0}%Y",
 )
 _OF_DAY = ("%H:%M", "%H:%M:%S", "%H:%M:%S.%f", "%I:%M %p", "%I:%M:%S %p")
+_DAYS = [date.format(sign) for date, sign in product(_DATES, "/-. ")]
+_TIMES = [" ".join(pair) for pair in product(_DAYS, _OF_DAY)]
+# The ways in which dates and durations are usually written.
+_FORMATS = ("ISO8601", *_DAYS, *_TIMES, *_OF_DAY[3:], _MINUTES, _HOURS)
 _ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
 # Columns with the number of a frame, and others that name an image.
 _NUMBER = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number))?"
@@ -33,23 +37,21 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
     if column.dtype.kind == "M":
         dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
         return np.asarray(dates), "seconds"
-    column = column.astype(str).where(column.notna())
-    known = column[column.notna()]
-    numbers = pd.to_numeric(column, errors="coerce")
-    if format is None and numbers.notna().equals(column.notna()):
+    known = column.dropna().astype(str)
+    numbers = pd.to_numeric(known, errors="coerce")
+    if format is None and numbers.notna().all():
         of_frames = re.fullmatch(_NUMBER, str(column.name).strip(), re.IGNORECASE)
         unit = "frames" if of_frames else f"in the unit of the column {column.name}"
-        return np.asarray(numbers, dtype=float), unit
+        return np.asarray(numbers.reindex(column.index), dtype=float), unit
     zoned = known.str.fullmatch(f".*{_ZONE}")
     if zoned.any() and not zoned.all():
         raise ValueError(
             f"{zoned.sum()} of {len(known)} frames have a time zone, such as Z or "
             f"+01:00, and others have none (first: {_cell(known, ~zoned)})"
         )
-    formats = [format] if format else _formats()
     readings = {
         each: _read(known, each)
-        for each in formats
+        for each in ([format] if format else _FORMATS)
         if format or _read(known.iloc[:1], each).notna().all()
     }
     whole = {each: read for each, read in readings.items() if read.notna().all()}
@@ -62,13 +64,12 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
             f"{len(column)} are not (first: {_cell(known, wrong)}). Name how they are "
             "written with --time-format, such as %d.%m.%Y, or use numbers"
         )
-    first, *others = whole.values()
-    if differing := [other for other in others if not other.equals(first)]:
-        row = (differing[0] != first).idxmax()
+    chosen, first = next(iter(whole.items()))
+    if others := {name: read for name, read in whole.items() if not read.equals(first)}:
+        row = (next(iter(others.values())) != first).idxmax()
         listed = [
-            f"{_shown(read[row])} (--time-format '{each}')"
-            for each, read in whole.items()
-            if each == next(iter(whole)) or any(read is other for other in differing)
+            f"{_shown(read[row])} (--time-format '{name}')"
+            for name, read in ({chosen: first} | others).items()
         ]
         raise ValueError(
             f"{known[row]!r} in row {row} can be {' or '.join(listed)}, and no other "
@@ -77,8 +78,8 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
     return np.asarray(first.reindex(column.index)), "seconds"
 
 
-def image_numbers(table: "pd.DataFrame") -> tuple[NDArray, str | None]:
-    """Return the number of the image of each row, and the column that has it.
+def image_numbers(table: "pd.DataFrame") -> "pd.Series":
+    """Return the number of the image of each row, under the name of its column.
 
     It is the number of the frame, or of the image among all. Otherwise rows count.
     """
@@ -88,23 +89,20 @@ def image_numbers(table: "pd.DataFrame") -> tuple[NDArray, str | None]:
                 continue
             numbers = pd.to_numeric(table[name], errors="coerce")
             if expression == _NUMBER and np.isfinite(numbers).all():
-                return np.asarray(numbers, dtype=float), str(name).strip()
+                return numbers.astype(float).rename(str(name).strip())
             codes = pd.factorize(table[name])[0]
             if expression == _IMAGE and (codes >= 0).all():
-                return codes, str(name).strip()
-    return np.arange(len(table)), None
+                return pd.Series(codes, name=str(name).strip())
+    return pd.Series(range(len(table)))
 
 
-def video_times(
-    numbers: "pd.Series", name: str | None, groups: NDArray | None
-) -> NDArray:
+def video_times(numbers: "pd.Series", groups: NDArray | None) -> NDArray:
     """Return the numbers of images, which must be a sequence within each group.
 
-    `name` is the column that has them. Without one they are those of rows, which must
-    follow one another.
+    Numbers without a name are those of rows, which must follow one another.
     """
     found = pd.DataFrame({"image": numbers, "group": 0 if groups is None else groups})
-    again = found.duplicated()
+    again, name = found.duplicated(), numbers.name
     if again.any():
         raise ValueError(
             f"--fps: {again.sum()} of {len(again)} frames show the same image as an "
@@ -122,13 +120,6 @@ def video_times(
     return np.asarray(numbers)
 
 
-def _formats() -> list[str]:
-    """Return the ways in which dates and durations are usually written."""
-    dates = [date.format(sign) for date, sign in product(_DATES, "/-. ")]
-    of_day = [" ".join(pair) for pair in product(dates, _OF_DAY)]
-    return ["ISO8601", *dates, *of_day, *_OF_DAY[3:], _MINUTES, _HOURS]
-
-
 def _read(cells: "pd.Series", format: str) -> "pd.Series":
     """Return the dates or seconds of a format, missing where cells are not written so.
 
@@ -138,8 +129,7 @@ def _read(cells: "pd.Series", format: str) -> "pd.Series":
         dates = pd.to_datetime(cells, format=format, errors="coerce", utc=True)
         return dates.dt.tz_localize(None)
     parts = cells.str.extract(f"^{_DURATION}$").astype(float)
-    hours = parts[0].fillna(0.0)
-    seconds = 3600 * hours + 60 * parts[1] + parts[2]
+    seconds = 3600 * parts[0].fillna(0.0) + 60 * parts[1] + parts[2]
     if format == _MINUTES:
         return seconds
     if format == _ALL_THREE:

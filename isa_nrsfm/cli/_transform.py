@@ -9,14 +9,8 @@ import numpy as np
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, write_alpha
-from isa_nrsfm.cli._reading import (
-    as_fitted,
-    drawing,
-    drawing_files,
-    drawing_options,
-    read_frames,
-)
 from isa_nrsfm.cli._report import quality_report, table_report
 from isa_nrsfm.cli._sections import quality_section, table_section, text_of
 from isa_nrsfm.io._tables import table_suffix
@@ -33,18 +27,17 @@ def run(args: Namespace, warned: list[str]) -> str:
             f"--std: {args.model} was fitted with refinement={estimator.refinement!r}, "
             "which gives no standard deviations"
         )
-    if args.viewer is None and drawing_options(args):
+    if args.viewer is None and _reading.drawing_options(args):
         raise ValueError("--edges, --skeleton and --origin need --viewer")
-    frames = read_frames(args, estimator)
-    drawn = drawing(args, names_of_points(estimator), frames.skeleton)
+    frames = _reading.read_frames(args, estimator)
+    drawn = _reading.drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]
-    refuse_overwriting([args.table, args.model, *drawing_files(args)], outputs)
-    X, n_components = as_fitted(estimator, frames.X), len(estimator.basis_)
+    refuse_overwriting([args.table, args.model, *_reading.drawing_files(args)], outputs)
+    X, n_components = _reading.as_fitted(estimator, frames.X), len(estimator.basis_)
     alpha = std = np.empty((0, n_components))
     quality: Any = ["no frame was fitted"]
     if len(X):
-        fit = estimator.decompose(X, **frames.weighting)
-        motion, translation, alpha, std = fit
+        motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
         explained = estimator.inverse_transform(alpha, motion, translation)
         found = quality_report(estimator, X, explained, frames.weighting)
         quality = quality_section(found)
@@ -55,9 +48,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
-    table = table_report(args, frames)
     sections = {
-        "Table": table_section(table, unusable="without coefficients"),
+        "Table": table_section(table_report(args, frames), "without coefficients"),
         "Model": [args.model],
         "Quality": quality,
         "Output": [*map(str, outputs), f"{len(frames.points)} rows"],

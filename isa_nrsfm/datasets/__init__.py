@@ -1,10 +1,12 @@
 """Tables of landmarks: artificial ones with all truths known, and public ones."""
 
-from isa_nrsfm.datasets._body import make_body_tracks
-from isa_nrsfm.datasets._face import make_face_tracks
-from isa_nrsfm.datasets._hand import make_hand_tracks
 from isa_nrsfm.datasets._muct import fetch_muct
-from isa_nrsfm.datasets._nonrigid import make_nonrigid_tracks
+from isa_nrsfm.datasets._samples_generator import (
+    make_body_tracks,
+    make_face_tracks,
+    make_hand_tracks,
+    make_nonrigid_tracks,
+)
 from isa_nrsfm.datasets._shark import fetch_shark
 
 __all__ = [

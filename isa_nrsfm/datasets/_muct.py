@@ -18,7 +18,6 @@ S. Milborrow, J. Morkel, F. Nicolls: The MUCT Landmarked Face Database. Pattern
 Recognition Association of South Africa, 2010. http://www.milbo.org/muct
 """
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,19 +27,16 @@ from sklearn.utils import Bunch
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables.tracks import table_to_tracks
-from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, RemoteFile, fetch_file
+from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, fetch_file
 
-MUCT = RemoteFile(
-    name="muct76-opencv.csv",
-    url=(
-        "https://raw.githubusercontent.com/aviralgoyal1997/"
-        "Gender-Classification-On-Muct-database/"
-        "0c0e908dadec1d89533b522ac37e5227455fc6a1/muct76-opencv.csv"
-    ),
-    sha256="e5f393a52b6c8b1cdd945063d450476c0ca6be6ac07b3b2cd3cd5357f202c0eb",
+URL = (
+    "https://raw.githubusercontent.com/aviralgoyal1997/"
+    "Gender-Classification-On-Muct-database/"
+    "0c0e908dadec1d89533b522ac37e5227455fc6a1/muct76-opencv.csv"
 )
+SHA256 = "e5f393a52b6c8b1cdd945063d450476c0ca6be6ac07b3b2cd3cd5357f202c0eb"
 
-DESCR = f"{__doc__}\nSource: free for academic use, {MUCT.url}\n"
+DESCR = f"{__doc__}\nSource: free for academic use, {URL}\n"
 
 
 @checked_parameters(
@@ -144,17 +140,16 @@ def fetch_muct(
     >>> faces.data.shape  # doctest: +SKIP
     (3755, 136)
     """
-    path = fetch_file(MUCT, data_home, download_if_missing)
-    with path.open(encoding="ascii") as file:
-        names = file.readline().rstrip().split(",")[2:]
-    faces = _read(path, len(names))
+    path = fetch_file(URL, SHA256, data_home, download_if_missing)
+    cells = np.loadtxt(path, dtype=np.str_, delimiter=",")
+    faces = _labelled(cells[1:])
     if not mirrored:
         faces = {name: column[~faces["mirrored"]] for name, column in faces.items()}
     bunch = Bunch(
         **faces,
         target=faces["subjects"],
         tracks=table_to_tracks(faces["data"]),
-        feature_names=names,
+        feature_names=cells[0, 2:].tolist(),
         filename=str(path),
         DESCR=DESCR,
     )
@@ -163,13 +158,9 @@ def fetch_muct(
     return (bunch.data, bunch.target) if return_X_y else bunch
 
 
-def _read(path: Path, n_columns: int) -> dict[str, NDArray]:
+def _labelled(cells: NDArray) -> dict[str, NDArray]:
     """Return all rows of the file, NaN where a point is at (0, 0), and their labels."""
-    names, tags = np.loadtxt(
-        path, dtype=np.str_, delimiter=",", skiprows=1, usecols=(0, 1), unpack=True
-    )
-    columns = range(2, 2 + n_columns)
-    data = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns)
+    names, tags, data = *cells[:, :2].T.copy(), cells[:, 2:].astype(float)
     visible = table_to_tracks(data).any(axis=2)
     table_to_tracks(data)[~visible] = np.nan
 

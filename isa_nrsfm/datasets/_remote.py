@@ -3,7 +3,7 @@
 import hashlib
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sklearn.datasets import get_data_home
 
@@ -18,19 +18,12 @@ PARAMETERS: dict[str, list[Any]] = {
 }
 
 
-class RemoteFile(NamedTuple):
-    """A file of a public data set, with the hexadecimal checksum of its bytes."""
-
-    name: str
-    url: str
-    sha256: str
-
-
 def fetch_file(
-    remote: RemoteFile, data_home: DataHome = None, download_if_missing: bool = True
+    url: str, sha256: str, data_home: DataHome = None, download_if_missing: bool = True
 ) -> Path:
     """Return the path of a file of a public data set; download it if it is missing.
 
+    The file has the last part of its address as its name, and a hexadecimal checksum.
     An existing file with the right checksum is used, and never overwritten. A failed
     download leaves nothing in the folder.
     """
@@ -38,21 +31,15 @@ def fetch_file(
         folder = Path(get_data_home(), "isa_nrsfm")
     else:
         folder = Path(data_home).expanduser()
-    path = folder / remote.name
-    by_hand = (
-        f"To put it there by hand, take it from {remote.url}; its sha256 is "
-        f"{remote.sha256}"
-    )
-    absent = f"{remote.name} is not in the folder {folder}, and"
+    path = folder / url.rpartition("/")[2]
+    by_hand = f"To put it there by hand, take it from {url}; its sha256 is {sha256}"
+    absent = f"{path.name} is not in the folder {folder}, and"
     if not path.exists() and not download_if_missing:
         raise FileNotFoundError(f"{absent} download_if_missing is False. {by_hand}")
     if not path.exists():
         try:
             import_optional("pooch", extra="datasets").retrieve(
-                remote.url,
-                known_hash=f"sha256:{remote.sha256}",
-                fname=remote.name,
-                path=folder,
+                url, known_hash=f"sha256:{sha256}", fname=path.name, path=folder
             )
         except ImportError as error:
             raise ImportError(f"{absent} {error}. {by_hand}") from error
@@ -62,11 +49,11 @@ def fetch_file(
                 f"{absent} it could not be downloaded ({error}). {by_hand}"
             ) from error
     with path.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    if sha256 != remote.sha256:
+        stored = hashlib.file_digest(file, "sha256").hexdigest()
+    if stored != sha256:
         raise OSError(
             f"{path} is damaged, or it is another file of the same name: its sha256 is "
-            f"{sha256}. Remove it, and the next call downloads the right file. "
+            f"{stored}. Remove it, and the next call downloads the right file. "
             f"{by_hand}"
         )
     return path

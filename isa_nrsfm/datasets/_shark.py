@@ -17,18 +17,15 @@ from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables.tracks import tracks_to_table
-from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, RemoteFile, fetch_file
+from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, fetch_file
 
-JAWS = RemoteFile(
-    name="jaws.mat",
-    url=(
-        "https://raw.githubusercontent.com/scivision/em-sfm/"
-        "c0abf730b7148c35831b1fdf5ae02ae928471dbf/data/jaws.mat"
-    ),
-    sha256="e962fe60aaed847397d922889496519310d34374a098c6d6f9282232d0635fcc",
+URL = (
+    "https://raw.githubusercontent.com/scivision/em-sfm/"
+    "c0abf730b7148c35831b1fdf5ae02ae928471dbf/data/jaws.mat"
 )
+SHA256 = "e962fe60aaed847397d922889496519310d34374a098c6d6f9282232d0635fcc"
 
-DESCR = f"{__doc__}\nSource: free for non-commercial use, {JAWS.url}\n"
+DESCR = f"{__doc__}\nSource: free for non-commercial use, {URL}\n"
 
 
 @checked_parameters(PARAMETERS)
@@ -99,7 +96,7 @@ def fetch_shark(
     >>> shark.data.shape  # doctest: +SKIP
     (240, 182)
     """
-    path = fetch_file(JAWS, data_home, download_if_missing)
+    path = fetch_file(URL, SHA256, data_home, download_if_missing)
     # (3 n_frames, n_points): the x of all frames, then the y, then the z.
     coordinates = loadmat(path)["P3_gt"]
     n_points = coordinates.shape[1]

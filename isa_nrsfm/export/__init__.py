@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING
 from isa_nrsfm._compat.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from isa_nrsfm.export._gltf import write_glb as write_glb
-    from isa_nrsfm.export._point_distribution import (
-        PointDistributionModel as PointDistributionModel,
-        point_distribution_model as point_distribution_model,
-        read_pdm as read_pdm,
-        write_pdm as write_pdm,
-    )
     from isa_nrsfm.export._poses import (
         FramePoses as FramePoses,
         frame_poses as frame_poses,
         point_distances as point_distances,
         pose_function as pose_function,
     )
-    from isa_nrsfm.export._shape_arrays import (
+    from isa_nrsfm.export._shape_files import (
+        PointDistributionModel as PointDistributionModel,
         ShapeArrays as ShapeArrays,
+        point_distribution_model as point_distribution_model,
+        read_pdm as read_pdm,
         shape_arrays as shape_arrays,
+        write_pdm as write_pdm,
         write_shapes as write_shapes,
     )
-    from isa_nrsfm.export._viewer import write_viewer as write_viewer
+    from isa_nrsfm.export._viewer import (
+        write_glb as write_glb,
+        write_viewer as write_viewer,
+    )
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

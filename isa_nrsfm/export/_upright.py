@@ -21,7 +21,6 @@ from isa_nrsfm.calibration import (
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm.calibration._metric import unit_cameras
 from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,
@@ -85,7 +84,7 @@ def upright_space(
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
         transform = viewing_rotation(
-            unit_cameras(model.motion_ @ metric.Q),
+            model.motion_ @ metric.Q,
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )
@@ -121,27 +120,30 @@ def upright_frames(
     return EuclideanFrames(shapes @ space.transform.T, rotations, scales)
 
 
-def upright_basis(
+def viewed_shapes(
     space: UprightSpace, model: Any, block_numbers: int = 2**23
-) -> tuple[NDArray, NDArray]:
-    """Return the mean shape and the basis shapes in the upright space.
+) -> NDArray[np.float64]:
+    """Return the centred mean shape and the basis shapes (K + 1, J, 3) for a viewer.
 
-    Euclidean shapes of affine cameras are not exactly linear in the coefficients. For
-    these, the result is a least squares fit to the frames of the table, in blocks.
+    They are upright, but y points up and z to the viewer. Euclidean shapes of affine
+    cameras are not exactly linear in the coefficients. For these, the result is a least
+    squares fit to the frames of the table, in blocks.
     """
+    shapes = np.stack([model.mean_shape_, *model.basis_])
     if space.metric is None:
-        return model.mean_shape_ @ space.transform.T, model.basis_ @ space.transform.T
-    n_frames, n_components = model.alpha_.shape
-    size = model.mean_shape_.size
-    gram, product = (np.zeros((1 + n_components, n)) for n in (1 + n_components, size))
-    for block in gen_batches(n_frames, max(1, block_numbers // size)):
-        motion, alpha = model.motion_[block], model.alpha_[block]
-        shapes = upright_frames(space, model, motion, alpha).shapes
-        known = np.isfinite(shapes).all(axis=(1, 2))
-        weights = np.insert(np.asarray(alpha[known], dtype=np.float64), 0, 1.0, axis=1)
-        gram += weights.T @ weights
-        product += weights.T @ shapes[known].reshape(-1, size)
-    # Basis shapes of zeros have coefficients of zero.
-    fit = np.linalg.pinv(gram, hermitian=True) @ product
-    mean, *basis = fit.reshape(-1, *model.mean_shape_.shape)
-    return mean, np.array(basis)
+        shapes = shapes @ space.transform.T
+    else:
+        n_shapes, size = len(shapes), shapes[0].size
+        gram, product = (np.zeros((n_shapes, n)) for n in (n_shapes, size))
+        for block in gen_batches(len(model.alpha_), max(1, block_numbers // size)):
+            motion, alpha = model.motion_[block], model.alpha_[block]
+            frames = upright_frames(space, model, motion, alpha).shapes
+            known = np.isfinite(frames).all(axis=(1, 2))
+            weights = np.insert(alpha[known].astype(np.float64), 0, 1.0, axis=1)
+            gram += weights.T @ weights
+            product += weights.T @ frames[known].reshape(-1, size)
+        # Basis shapes of zeros have coefficients of zero.
+        fit = np.linalg.pinv(gram, hermitian=True) @ product
+        shapes = fit.reshape(shapes.shape)
+    shapes[0] -= shapes[0].mean(axis=0)
+    return shapes @ UPSIDE_DOWN

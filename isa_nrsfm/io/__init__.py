@@ -11,12 +11,12 @@ if TYPE_CHECKING:
         find_format as find_format,
         read_landmarks as read_landmarks,
     )
-    from isa_nrsfm.io._landmarks import Landmarks as Landmarks
-    from isa_nrsfm.io._models import load_model as load_model, save_model as save_model
-    from isa_nrsfm.io._results import (
+    from isa_nrsfm.io._landmarks import (
+        Landmarks as Landmarks,
         from_mediapipe as from_mediapipe,
         from_movement as from_movement,
     )
+    from isa_nrsfm.io._models import load_model as load_model, save_model as save_model
     from isa_nrsfm.io._stored_tables import open_table as open_table
     from isa_nrsfm.io._tables import (
         LandmarkTable as LandmarkTable,

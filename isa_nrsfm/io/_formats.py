@@ -80,10 +80,7 @@ class LandmarkFormat:
     def _function(self, kind: str) -> Callable[..., Any]:
         """Return the function of the reader that begins with "is" or "read"."""
         module, _, name = self.reader.partition(".")
-        found: Callable[..., Any] = getattr(
-            import_module(f"isa_nrsfm.io.{module}"), f"{kind}_{name}"
-        )
-        return found
+        return getattr(import_module(f"isa_nrsfm.io.{module}"), f"{kind}_{name}")
 
     def read(self, path: str | os.PathLike[str], **options: Any) -> "Landmarks":
         """
@@ -123,8 +120,7 @@ class LandmarkFormat:
                 f"{self.expected}, in {_listed(self.suffixes)}"
             )
         with reading(path, f"{self.name} ({self.title})", self.expected):
-            found: Landmarks = self._function("read")(path, **options)
-            return found
+            return self._function("read")(path, **options)
 
 
 def read_landmarks(
@@ -310,21 +306,21 @@ _ALL = (
         "iBUG, 300-W",
         "'version: 1', 'n_points: N' and N lines 'x y' between braces",
         (".pts", _FOLDER),
-        "_annotation_files.pts",
+        "_keypoints.pts",
     ),
     LandmarkFormat(
         "wflw",
         "WFLW lists",
         "lines of 196 coordinates, 4 of a box, 6 attributes and the image",
         (".txt",),
-        "_annotation_files.wflw",
+        "_keypoints.wflw",
     ),
     LandmarkFormat(
         "deeplabcut",
         "DeepLabCut, Lightning Pose",
         "columns of the levels scorer, (individuals,) bodyparts, coords",
         (".csv", ".tsv", ".h5", ".hdf5"),
-        "_deeplabcut.deeplabcut",
+        "_animals.deeplabcut",
     ),
     LandmarkFormat(
         "sleap",
@@ -332,7 +328,7 @@ _ALL = (
         "the datasets tracks, node_names and track_names, or the columns track, "
         "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
         (".h5", ".hdf5", *_TABLES),
-        "_sleap.sleap",
+        "_animals.sleap",
     ),
     LandmarkFormat(
         "coco",

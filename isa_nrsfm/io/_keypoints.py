@@ -1,8 +1,8 @@
-"""Read the json files of COCO, and those of OpenPose, one for each frame."""
+"""Read landmarks in images: COCO, OpenPose, iBUG's .pts files and the lists of WFLW."""
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,23 @@ from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm._parameters.choices import OPENPOSE_PARTS
 from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
+from isa_nrsfm.io._tables import first_lines
 
 # Entries of an instance beside its image and its points.
 _OF_INSTANCE = ("id", "score", "iscrowd", "area", "category")
 _OF_IMAGE = ("file_name", "width", "height")
 _NAME = re.compile(r"(?!\.).*?(\d*)_keypoints\.json", re.IGNORECASE)
 _OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
+_PTS = re.compile(
+    r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
+    r"\{(?P<points>[^{}]*)\}\s*"
+)
+_PTS_NAME = re.compile(r"(?is)(?!\.).*\.pts")
+_N_WFLW = 98
+_WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
+_WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
+# Fields of a line: points and image, without and with the box and the attributes.
+_WFLW_LENGTHS = (197, 207)
 
 
 def is_coco(path: Path) -> bool:
@@ -228,16 +239,8 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         raise ValueError(
             f"part must be one of {', '.join(OPENPOSE_PARTS)}; got {part!r}"
         )
-    files = [path]
-    if path.is_dir():
-        names = filter(lambda file: _NAME.fullmatch(file.name), path.iterdir())
-        files = sorted(names, key=by_number)
-        if not files:
-            raise ValueError("the folder has no files with names ..._keypoints.json")
-    people = []
-    for file in files:
-        with errors_of(file.name):
-            people.append(_people_in(_read_json(file)))
+    absent = "the folder has no files with names ..._keypoints.json"
+    names, people = _each_file(path, _NAME, absent, _people_in)
     known = {name for persons in people for person in persons for name in person}
     found = ", ".join(name for name in OPENPOSE_PARTS if name in known)
     if not known:
@@ -256,7 +259,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         {k: person[part] for k, person in enumerate(persons) if part in person}
         for persons in people
     ]
-    image, numbers, values = stacked(chosen, [file.name for file in files])
+    image, numbers, values = stacked(chosen, names)
     tracks, scores = np.split(values, [2], axis=2)
     tracks = np.where(scores == 0, np.nan, tracks)
     # Points that are cut off can be outside of the image.
@@ -265,20 +268,38 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             "the coordinates are shares of the image's size, which stretch the shapes. "
             "Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    matches = [_NAME.fullmatch(file.name) for file in files]
+    matches = map(_NAME.fullmatch, names)
     of_files = [int(match[1]) for match in matches if match and match[1]]
-    if len(set(of_files)) < len(files):
-        of_files = list(range(len(files)))
+    if len(set(of_files)) < len(names):
+        of_files = list(range(len(names)))
     frames = {
-        "file": [as_utf8(files[i].name) for i in image],
+        "file": [as_utf8(names[i]) for i in image],
         "frame": [of_files[i] for i in image],
         "person": numbers,
     }
     return assemble(tracks, None, frames, format="openpose", confidence=scores[..., 0])
 
 
-def _people_in(content: Any) -> list[dict[str, NDArray[np.float64]]]:
+def _each_file(
+    path: Path, pattern: re.Pattern[str], absent: str, read: Callable[[Path], Any]
+) -> tuple[list[str], list[Any]]:
+    """Read a file, or those of a folder whose names match, in the order of numbers."""
+    files = [path]
+    if path.is_dir():
+        matching = (file for file in path.iterdir() if pattern.fullmatch(file.name))
+        files = sorted(matching, key=by_number)
+        if not files:
+            raise ValueError(absent)
+    contents = []
+    for file in files:
+        with errors_of(file.name):
+            contents.append(read(file))
+    return [file.name for file in files], contents
+
+
+def _people_in(file: Path) -> list[dict[str, NDArray[np.float64]]]:
     """Return the visible parts of each person in a file, (n_points, 3) each."""
+    content = _read_json(file)
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list) or not all(isinstance(p, dict) for p in people):
         raise ValueError("expected an object with a list of objects called people")
@@ -288,3 +309,100 @@ def _people_in(content: Any) -> list[dict[str, NDArray[np.float64]]]:
         for person in people
     ]
     return [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
+
+
+def is_pts(path: Path) -> bool:
+    """Return whether a file begins as .pts files do, or a folder has such files."""
+    if path.is_dir():
+        return any(_PTS_NAME.fullmatch(file.name) for file in path.iterdir())
+    return "".join(first_lines(path, 1)).lstrip().startswith("version")
+
+
+def read_pts(path: Path) -> Landmarks:
+    """Read a .pts file, or all of a folder in the order of their names and numbers.
+
+    A file has the points of one image: ``version: 1``, ``n_points: 68`` and, between
+    braces, a line ``x y`` for each point. Other files of the folder are ignored.
+    Coordinates are as they are written; iBUG counts pixels from 1.
+    """
+    absent = "there are no .pts files in the folder"
+    names, points = _each_file(path, _PTS_NAME, absent, _points_of)
+    *_, tracks = stacked([{0: each} for each in points], names)
+    return assemble(tracks, None, {"file": [*map(as_utf8, names)]}, format="pts")
+
+
+def is_wflw(path: Path) -> bool:
+    """Return whether the first line has the fields of a WFLW list."""
+    fields = "".join(first_lines(path, 1)).split()
+    try:
+        _floats(fields[: 2 * _N_WFLW])
+    except ValueError:
+        return False
+    return len(fields) in _WFLW_LENGTHS
+
+
+def read_wflw(path: Path) -> Landmarks:
+    """Read a list of WFLW, with a line for each face.
+
+    A line has 196 coordinates, x and y in turn, the box of the face (``x_min y_min
+    x_max y_max``), six attributes 0 or 1 (pose, expression, illumination, make-up,
+    occlusion, blur) and the name of the image. Box and attributes may be missing.
+    """
+    rows: list[NDArray[np.float64]] = []
+    images: list[str] = []
+    n_fields = 0
+    with path.open(encoding="utf-8-sig") as file:
+        for number, line in enumerate(file, start=1):
+            fields = line.split()
+            if not fields:
+                continue
+            n_fields = n_fields or len(fields)
+            if len(fields) not in _WFLW_LENGTHS or len(fields) != n_fields:
+                raise ValueError(
+                    f"line {number} has {len(fields)} fields; all must have "
+                    f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
+                )
+            with errors_of(f"line {number}"):
+                rows.append(_floats(fields[:-1]))
+            images.append(fields[-1])
+    if not rows:
+        raise ValueError("there are no lines in it")
+    frames: dict[str, object] = {"image": images}
+    points, box, attributes = np.split(np.stack(rows), [196, 200], axis=1)
+    if n_fields == _WFLW_LENGTHS[1]:
+        if not np.isin(attributes, (0, 1)).all():
+            raise ValueError("the six attributes before the image must be 0 or 1")
+        frames |= zip(_WFLW_BOX, box.T, strict=True)
+        frames |= zip(_WFLW_ATTRIBUTES, attributes.T.astype(int), strict=True)
+    return assemble(points.reshape(-1, _N_WFLW, 2), None, frames, format="wflw")
+
+
+def _points_of(file: Path) -> NDArray[np.float64]:
+    """Return the points (n_points, 2) that a .pts file holds."""
+    text = file.read_bytes().decode("utf-8-sig")
+    match = _PTS.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
+            f"got {text[:40]!r}"
+        )
+    coordinates = _floats(match["points"].split())
+    n_points = int(match["n_points"])
+    if len(coordinates) != 2 * n_points or n_points == 0:
+        raise ValueError(
+            f"n_points is {n_points}, but there are {len(coordinates)} coordinates"
+        )
+    return coordinates.reshape(n_points, 2)
+
+
+def _floats(fields: list[str]) -> NDArray[np.float64]:
+    """Return the numbers that fields hold."""
+    # Python reads 1_0 as a number.
+    bad = next((field for field in fields if "_" in field), None)
+    if bad is not None:
+        raise ValueError(f"a coordinate should be a number; got {bad!r}")
+    numbers = np.array(fields, dtype=np.float64)
+    if np.isinf(numbers).any():
+        infinite = fields[int(np.isinf(numbers).argmax())]
+        raise ValueError(f"a coordinate should be finite; got {infinite!r}")
+    return numbers

@@ -134,10 +134,7 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
         "package_version": __version__,
         **packed_parts(estimator, "", arrays),
         "set_output": config.get("transform"),
-        "frames": {
-            name: packed(value, f"frames.{name}", arrays)
-            for name, value in _frame_entries(estimator).items()
-        },
+        "frames": packed_all(_frame_entries(estimator), "frames.", arrays),
         "arrays": sorted(arrays),
     }
     header["digest"] = _digest(header, arrays)
@@ -371,17 +368,15 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
 
 def packed_parts(held: Any, prefix: str, arrays: Arrays) -> dict[str, Any]:
     """Return parameters and fitted attributes of an object as JSON values."""
-    parts = {
-        "parameters": held.get_params(deep=False),
-        "attributes": fitted_attributes(held),
-    }
     return {
-        part: {
-            name: packed(value, f"{prefix}{name}", arrays)
-            for name, value in values.items()
-        }
-        for part, values in parts.items()
+        "parameters": packed_all(held.get_params(deep=False), prefix, arrays),
+        "attributes": packed_all(fitted_attributes(held), prefix, arrays),
     }
+
+
+def packed_all(values: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, Any]:
+    """Return the JSON values of parameters or attributes by their names."""
+    return {name: packed(values[name], prefix + name, arrays) for name in values}
 
 
 def unpacked(value: Any, arrays: Arrays) -> Any:

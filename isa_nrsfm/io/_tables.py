@@ -204,8 +204,7 @@ def landmark_table(
             f'missing must be None, "zeros" or a finite number; got {missing!r}'
         )
     codes = [] if code is None else [float(code)]
-    found = find_landmark_columns(frame.columns, columns)
-    names = found.interleaved
+    names = find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, codes).reshape(len(frame), len(names))
     return LandmarkTable(

@@ -1,7 +1,6 @@
 """Independent subspace analysis: estimators that can be used separately."""
 
 from isa_nrsfm.isa._base import SqrtDensity
-from isa_nrsfm.isa._fastisa import FastISA
-from isa_nrsfm.isa._pooled_fastica import PooledFastICA
+from isa_nrsfm.isa._strategies import FastISA, PooledFastICA
 
 __all__ = ["FastISA", "PooledFastICA", "SqrtDensity"]

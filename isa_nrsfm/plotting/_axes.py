@@ -143,31 +143,21 @@ def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
     return np.stack([centre - half, centre + half], axis=-1), reduction
 
 
-def choose_n_columns(n_shapes: int, aspect: float) -> int:
-    """Return the smallest number of columns of shapes of an aspect that fits a page."""
-    for n_columns in range(1, n_shapes):
-        height = PAGE_WIDTH / n_columns / aspect
-        n_rows = -(-n_shapes // n_columns)
-        whole = n_rows * (height + TITLE_HEIGHT) + LEGEND_HEIGHT
-        if whole <= 7.6 and height <= 2.8:  # inches
-            return n_columns
-    return n_shapes
-
-
 def new_page(n_shapes: int, extent: NDArray, n_columns: int | None) -> NDArray[Any]:
-    """Return new axes, two views side by side for each shape of an extent (3,)."""
+    """Return new axes, two views side by side for each shape of an extent (3,).
+
+    By default the smallest number of columns whose shapes fit a page.
+    """
     widths = [float(extent[horizontal]) for horizontal, _ in VIEWS]
     aspect = sum(widths) / extent[1]
-    if n_columns is None:
-        n_columns = choose_n_columns(n_shapes, aspect)
-    height = min(PAGE_WIDTH / n_columns / aspect, 2.8) + TITLE_HEIGHT
-    n_rows = -(-n_shapes // n_columns)
-    return grid(
-        2 * n_shapes,
-        2 * n_columns,
-        figsize=(PAGE_WIDTH, n_rows * height + LEGEND_HEIGHT),
-        width_ratios=widths * n_columns,
-    )
+    for columns in range(1, n_shapes + 1) if n_columns is None else [n_columns]:
+        height, n_rows = PAGE_WIDTH / columns / aspect, -(-n_shapes // columns)
+        whole = n_rows * (height + TITLE_HEIGHT) + LEGEND_HEIGHT
+        if whole <= 7.6 and height <= 2.8:  # inches
+            break
+    height = n_rows * (min(height, 2.8) + TITLE_HEIGHT) + LEGEND_HEIGHT
+    size, ratios = (PAGE_WIDTH, height), widths * columns
+    return grid(2 * n_shapes, 2 * columns, figsize=size, width_ratios=ratios)
 
 
 def show_view(axis: Any, view: list[int], limits: NDArray, origin: str) -> None:

@@ -9,33 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.plotting._axes import (
-    MEAN_COLOUR,
-    MINUS_COLOUR,
-    PLUS_COLOUR,
-    VIEWS,
-    add_legend,
-    block_limits,
-    chosen_numbers,
-    draw_points,
-    draw_segments,
-    flat_axes,
-    hide_frame,
-    is_dense,
-    new_page,
-    percent,
-    show_view,
-    side_colours,
-    wrap_title,
-)
-from isa_nrsfm.plotting._views import (
-    Edges,
-    Origin,
-    choose_lines,
-    depth_note,
-    upright_turn,
-    view_and_layout,
-)
+from isa_nrsfm.plotting import _axes, _views
+from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
 from isa_nrsfm.skeletons._column_names import checked_names
 
 # Arrows in the units of the points, with the same width in all axes.
@@ -237,7 +212,7 @@ class BasisShapeDisplay:
         check_is_fitted(estimator, "mean_shape_")
         view, layout, skeleton, origin = view_and_layout(estimator, edges, origin)
         shape = estimator.mean_shape_ @ view.T
-        view = upright_turn(shape, layout, origin) @ view
+        view = _views.upright_turn(shape, layout, origin) @ view
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
@@ -246,7 +221,7 @@ class BasisShapeDisplay:
             component_names=component_names,
             edges=skeleton,
             origin=origin,
-            depth_note=depth_note(estimator),
+            depth_note=_views.depth_note(estimator),
         )
         return display.plot(ax, **kw)
 
@@ -297,7 +272,7 @@ class BasisShapeDisplay:
             shape.
         """
         import_optional("matplotlib", extra="plot")
-        self.components_ = chosen_numbers(
+        self.components_ = _axes.chosen_numbers(
             components, "components", len(self.basis), "numbers of basis shapes"
         )
         n_drawn = len(self.components_)
@@ -309,40 +284,41 @@ class BasisShapeDisplay:
             )
         sizes = np.broadcast_to(amplitudes, n_drawn)[:, None, None]
         drift, mean = sizes * self.basis[self.components_], self.mean_shape
-        limits, reduction = block_limits(
+        limits, reduction = _axes.block_limits(
             [mean[None], *(np.stack([mean, mean + d, mean - d]) for d in drift)]
         )
-        axes = ax
+        page = ax
         if ax is None:
-            axes = new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
-        axes = flat_axes(axes, 2 + 2 * n_drawn, "two views for each shape")
+            page = _axes.new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
+        axes = _axes.flat_axes(page, 2 + 2 * n_drawn, "two views for each shape")
         self.axes_, self.figure_ = axes.reshape(-1, 2), axes[0].figure
 
         below, above = "negative end of the drift", "positive end of the drift"
         if not amplitudes.ndim:
             size = f"{amplitudes:g} standard deviations"
             below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
-        arrow_kw = ARROW_STYLE | (arrow_kw or {})
+        point_kw, edge_kw, arrow_kw = point_kw or {}, edge_kw or {}, arrow_kw or {}
         self.mean_: list[Any] = []
         self.minus_: list[Any] = []
         self.plus_: list[Any] = []
         self.arrows_: list[Any] = []
         for block, (pair, d) in enumerate(zip(self.axes_, [0, *drift], strict=True)):
-            shapes = [(self.mean_, mean, MEAN_COLOUR, "mean shape")]
+            shapes = [(self.mean_, mean, _axes.MEAN_COLOUR, "mean shape")]
             if block:
-                shapes.append((self.minus_, mean - d, MINUS_COLOUR, below))
-                shapes.append((self.plus_, mean + d, PLUS_COLOUR, above))
-            for view, axis in zip(VIEWS, pair, strict=True):
+                shapes.append((self.minus_, mean - d, _axes.MINUS_COLOUR, below))
+                shapes.append((self.plus_, mean + d, _axes.PLUS_COLOUR, above))
+            for view, axis in zip(_axes.VIEWS, pair, strict=True):
                 for artists, shape, colour, label in shapes:
-                    style = {"color": colour, "label": label} | (point_kw or {})
+                    style = {"color": colour, "label": label} | point_kw
                     drawn = self._draw(axis, shape[:, view], style, edge_kw, not block)
                     artists.append(drawn)
-                if block and not is_dense(mean):
+                if block and not _axes.is_dense(mean):
                     ends = (*mean[:, view].T, *d[:, view].T)
-                    self.arrows_.append(axis.quiver(*ends, **arrow_kw))
-                hide_frame(axis)
-                show_view(axis, view, limits[block], self.origin)
-            title = wrap_title(self._title(block, amplitudes, reduction[block]), pair)
+                    self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE | arrow_kw))
+                _axes.hide_frame(axis)
+                _axes.show_view(axis, view, limits[block], self.origin)
+            title = self._title(block, amplitudes, reduction[block])
+            title = _axes.wrap_title(title, pair)
             pair[0].set_title(title, loc="left", fontsize="small")
             pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
         if ax is None:
@@ -353,15 +329,16 @@ class BasisShapeDisplay:
         self, axis: Any, points: NDArray, style: Any, edge_kw: Any, sided: bool
     ) -> Any:
         """Draw one shape in one view, the mean shape with colours of the sides."""
-        if self.skeleton is not None:
+        layout = self.skeleton
+        if layout is not None:
             colours = colour = style["color"]
-            if sided and colour == MEAN_COLOUR:
-                colours = side_colours(self.skeleton.edge_sides, colour)
-                style = style | {"color": side_colours(self.skeleton.sides, colour)}
-            segments = points[self.skeleton.edges]
-            draw_segments(axis, segments, **({"colors": colours} | (edge_kw or {})))
+            if sided and colour == _axes.MEAN_COLOUR:
+                colours = _axes.side_colours(layout.edge_sides, colour)
+                style = style | {"color": _axes.side_colours(layout.sides, colour)}
+            edge_kw = {"colors": colours} | edge_kw
+            _axes.draw_segments(axis, points[layout.edges], **edge_kw)
             style = {"s": 2.0} | style
-        return draw_points(axis, points, **style)
+        return _axes.draw_points(axis, points, **style)
 
     def _title(self, block: int, amplitudes: NDArray, reduction: float) -> str:
         """Return the title of the mean shape (0) or of a basis shape."""
@@ -371,7 +348,7 @@ class BasisShapeDisplay:
         name = self.component_names[k]
         title, notes = f"Basis shape {name}" if name == str(k + 1) else name, []
         if self.energy_share is not None:
-            notes.append(f"{percent(self.energy_share[k])} of energy")
+            notes.append(f"{_axes.percent(self.energy_share[k])} of energy")
         if amplitudes.ndim:
             notes.append(f"±{amplitudes[block - 1]:g} s.d.")
         if reduction > 1:
@@ -390,4 +367,4 @@ class BasisShapeDisplay:
             Line2D([], [], color=p.get_facecolor()[0], label=p.get_label(), **style)
             for p in shown
         ]
-        add_legend(self.figure_, handles, self.skeleton)
+        _axes.add_legend(self.figure_, handles, self.skeleton)

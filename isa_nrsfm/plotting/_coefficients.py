@@ -10,12 +10,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.analysis._frame_columns import checked_column, kind_of
-from isa_nrsfm.plotting._axes import (
-    MINUS_COLOUR,
-    OBSERVED_COLOUR,
-    PAGE_WIDTH,
-    flat_axes,
-)
+from isa_nrsfm.plotting import _axes
 from isa_nrsfm.skeletons._column_names import checked_names
 
 Kind = Literal["classes", "number", "time"]
@@ -207,10 +202,14 @@ class CoefficientsDisplay:
             If `ax` has not one axes for each basis shape, or if `kind` needs `y`.
         """
         import_optional("matplotlib", extra="plot")
-        found = self._kind(kind)
+        found: Kind = "time"
+        if self.y is not None and kind != "time":
+            found = kind_of(self.y, kind)
+        elif kind not in ("auto", "time"):
+            raise ValueError(f"kind={kind!r} needs y, a label for each frame")
         n_components = self.alpha.shape[1]
-        size = (PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
-        self.axes_ = flat_axes(
+        size = (_axes.PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
+        self.axes_ = _axes.flat_axes(
             ax, n_components, "one for each basis shape", sharex=True, figsize=size
         )
         self.figure_ = self.axes_[0].figure
@@ -230,14 +229,6 @@ class CoefficientsDisplay:
             self.axes_[0].set_title(title, loc="left", fontsize="medium")
         return self
 
-    def _kind(self, kind: str) -> Kind:
-        """Return the kind of figure."""
-        if kind == "time" or (kind == "auto" and self.y is None):
-            return "time"
-        if self.y is None:
-            raise ValueError(f"kind={kind!r} needs y, a label for each frame")
-        return kind_of(self.y, kind)
-
     def _draw_classes(self, axes: Any, k: int) -> None:
         """Draw box plots and the frames of each class, scattered sideways."""
         assert self.y is not None
@@ -252,7 +243,7 @@ class CoefficientsDisplay:
             positions=range(len(classes)),
             widths=0.6,
             showfliers=False,
-            medianprops={"color": OBSERVED_COLOUR, "linewidth": 1.4},
+            medianprops={"color": _axes.OBSERVED_COLOUR, "linewidth": 1.4},
             **dict.fromkeys(("boxprops", "whiskerprops", "capprops"), THIN),
         )
         names = [str(each) for each in classes]
@@ -272,17 +263,17 @@ class CoefficientsDisplay:
         gaps = np.cumsum([len(piece) for piece in pieces])[:-1]
         times, alpha = np.insert(time[rows], gaps, time[rows][gaps - 1]), self.alpha
         curve = np.insert(alpha[rows, k], gaps, np.nan)
-        axes.plot(times, curve, color=MINUS_COLOUR, linewidth=0.9)
+        axes.plot(times, curve, color=_axes.MINUS_COLOUR, linewidth=0.9)
         single = [piece[0] for piece in pieces if len(piece) == 1]
         if single:
-            axes.plot(time[single], alpha[single, k], ".", color=MINUS_COLOUR)
+            axes.plot(time[single], alpha[single, k], ".", color=_axes.MINUS_COLOUR)
         if self.alpha_std is not None:
             # It is narrower than the curve in tables with little noise.
             median = np.nanmedian(self.alpha_std[rows, k])
             title = f"band: one standard deviation, {median:.2g} (median)"
             axes.set_title(title, loc="right", fontsize="x-small")
             deviation = np.insert(self.alpha_std[rows, k], gaps, np.nan)
-            style = {"color": MINUS_COLOUR, "alpha": 0.25, "linewidth": 0}
+            style = {"color": _axes.MINUS_COLOUR, "alpha": 0.25, "linewidth": 0}
             axes.fill_between(times, curve - deviation, curve + deviation, **style)
 
     def _pieces(self, time: NDArray) -> list[NDArray]:
@@ -308,5 +299,5 @@ def _rows_of_largest(groups: NDArray) -> tuple[NDArray, list[NDArray]]:
 
 def _scatter(axes: Any, x: NDArray, y: NDArray) -> None:
     """Draw frames as faint points."""
-    style = {"color": MINUS_COLOUR, "alpha": 0.5, "linewidths": 0}
+    style = {"color": _axes.MINUS_COLOUR, "alpha": 0.5, "linewidths": 0}
     axes.scatter(x, y, s=5, rasterized=True, **style)

@@ -206,17 +206,15 @@ class ModeCovarianceDisplay:
         if absolute:
             values, label = np.abs(values), f"absolute {label}"
         largest = np.abs(values).max() or 1.0
-        smallest = 0.0 if absolute else -largest
+        low = 0.0 if absolute else -largest
+        limits: dict[str, Any] = {"vmin": low, "vmax": largest}
         if scale is None:
             scale = "linear" if normalize else "asinh"
-        norm: Normalize
-        if scale == "asinh":
-            norm = AsinhNorm(LINEAR_SHARE * largest, vmin=smallest, vmax=largest)
-        elif scale == "linear":
-            norm = Normalize(vmin=smallest, vmax=largest)
-        else:
+        linear, asinh = Normalize(**limits), AsinhNorm(LINEAR_SHARE * largest, **limits)
+        norms = {"linear": linear, "asinh": asinh}
+        if scale not in norms:
             raise ValueError(f'scale must be "asinh" or "linear"; got {scale!r}')
-        style = {"cmap": "Greys" if absolute else "RdBu_r", "norm": norm}
+        style = {"cmap": "Greys" if absolute else "RdBu_r", "norm": norms[scale]}
         style |= {"interpolation": "nearest"} | (im_kw or {})
         self.im_ = self.ax_.imshow(values, **style)
 

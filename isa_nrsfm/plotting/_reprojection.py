@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
@@ -14,45 +14,9 @@ from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import FEWEST_POINTS, table_to_tracks, tracks_to_table
 from isa_nrsfm.metrics import inverse_snr
-from isa_nrsfm.plotting._axes import (
-    LEGEND_HEIGHT,
-    OBSERVED_COLOUR,
-    PLUS_COLOUR,
-    add_legend,
-    chosen_numbers,
-    draw_points,
-    draw_segments,
-    flat_axes,
-    hide_frame,
-    is_dense,
-    percent,
-    side_colours,
-)
+from isa_nrsfm.plotting import _axes
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
 from isa_nrsfm.skeletons._column_names import checked_names
-
-
-def choose_frames(
-    X: Any, n_frames: int | None, frames: ArrayLike | None, random_state: Any
-) -> NDArray[np.intp]:
-    """Return the rows to draw: the given ones, or random ones in ascending order.
-
-    Random rows have enough points for a fit.
-    """
-    if frames is not None:
-        return chosen_numbers(frames, "frames", len(X), "row numbers of X")
-    n_coordinates = np.isfinite(np.asarray(unmasked(X), dtype=float)).sum(axis=1)
-    rows = np.flatnonzero(n_coordinates >= 2 * FEWEST_POINTS)
-    if n_frames is None:
-        n_frames = min(6, len(rows))
-    if not 1 <= n_frames <= len(rows):
-        raise ValueError(
-            f"n_frames must be between 1 and the {len(rows)} rows of X with at least "
-            f"{FEWEST_POINTS} points; got {n_frames}"
-        )
-    rng = check_random_state(random_state)
-    return np.sort(rng.choice(rows, size=n_frames, replace=False))
-
 
 PANEL_WIDTH = 2.3  # inches
 
@@ -230,7 +194,18 @@ class ReprojectionDisplay:
             `origin` is not of the kind given above.
         """
         check_is_fitted(estimator, "mean_shape_")
-        rows = choose_frames(X, n_frames, frames, random_state)
+        if frames is None:
+            coordinates = np.isfinite(np.asarray(unmasked(X), dtype=float))
+            rows = np.flatnonzero(coordinates.sum(axis=1) >= 2 * FEWEST_POINTS)
+            n_frames = min(6, len(rows)) if n_frames is None else n_frames
+            if not 1 <= n_frames <= len(rows):
+                raise ValueError(
+                    f"n_frames must be between 1 and the {len(rows)} rows of X with at "
+                    f"least {FEWEST_POINTS} points; got {n_frames}"
+                )
+            rng = check_random_state(random_state)
+            frames = np.sort(rng.choice(rows, size=n_frames, replace=False))
+        rows = _axes.chosen_numbers(frames, "frames", len(X), "row numbers of X")
         table = taken_rows(X, rows)
         _, _, skeleton, origin = view_and_layout(estimator, edges, origin)
         observed, reprojected = (
@@ -287,8 +262,8 @@ class ReprojectionDisplay:
         n_frames = len(self.frames)
         n_columns = min(3, n_frames) if n_columns is None else n_columns
         height = (self._panel_height() + 0.4) * -(-n_frames // n_columns)
-        size = (PANEL_WIDTH * n_columns, height + LEGEND_HEIGHT)
-        self.axes_ = flat_axes(
+        size = (PANEL_WIDTH * n_columns, height + _axes.LEGEND_HEIGHT)
+        self.axes_ = _axes.flat_axes(
             ax, n_frames, "one for each frame", n_columns, figsize=size
         )
         self.figure_ = self.axes_[0].figure
@@ -301,8 +276,8 @@ class ReprojectionDisplay:
             self._plot_frame(axes, i, *styles)
         if ax is None:
             entries = [self.observed_[0], self.reprojected_[0]]
-            scale = 4.0 if is_dense(self.observed[0]) else 1.0
-            add_legend(self.figure_, entries, self.skeleton, markerscale=scale)
+            scale = 4.0 if _axes.is_dense(self.observed[0]) else 1.0
+            _axes.add_legend(self.figure_, entries, self.skeleton, markerscale=scale)
         return self
 
     def _panel_height(self) -> float:
@@ -312,29 +287,29 @@ class ReprojectionDisplay:
         aspect = np.divide(height, width, out=np.ones_like(width), where=width > 0)
         return PANEL_WIDTH * float(np.clip(np.median(aspect), 0.4, 1.3))
 
-    def _plot_frame(self, axes: Any, i: int, *styles: dict[str, Any]) -> None:
+    def _plot_frame(
+        self, axes: Any, i: int, observed_kw: Any, reprojected_kw: Any, edge_kw: Any
+    ) -> None:
         """Draw one frame."""
-        observed_kw, reprojected_kw, edge_kw = styles
         observed, reprojected = self.observed[i], self.reprojected[i]
         if self.skeleton is not None:
-            colours = side_colours(self.skeleton.edge_sides, PLUS_COLOUR)
+            colours = _axes.side_colours(self.skeleton.edge_sides, _axes.PLUS_COLOUR)
             style = {"colors": colours, "linewidths": 0.8, "alpha": 0.8}
             segments = reprojected[self.skeleton.edges]
-            self.edges_.append(draw_segments(axes, segments, **(style | edge_kw)))
-        style = {"color": OBSERVED_COLOUR}
-        if not is_dense(observed):
-            style = {"s": 14.0, "facecolors": "none", "edgecolors": OBSERVED_COLOUR}
-            style |= {"linewidths": 0.6}
+            self.edges_.append(_axes.draw_segments(axes, segments, **(style | edge_kw)))
+        colour, thin = _axes.OBSERVED_COLOUR, {"linewidths": 0.6}
+        style = {"color": colour}
+        if not _axes.is_dense(observed):
+            style = {"s": 14.0, "facecolors": "none", "edgecolors": colour} | thin
             error = np.stack([observed, reprojected], axis=1)
-            lines = {"colors": OBSERVED_COLOUR, "linewidths": 0.6}
-            self.errors_.append(draw_segments(axes, error, **lines))
+            self.errors_.append(_axes.draw_segments(axes, error, colors=colour, **thin))
         style |= {"label": "observed"} | observed_kw
-        self.observed_.append(draw_points(axes, observed, **style))
-        style = {"color": PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
+        self.observed_.append(_axes.draw_points(axes, observed, **style))
+        style = {"color": _axes.PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
         style |= reprojected_kw
-        self.reprojected_.append(draw_points(axes, reprojected, **style))
-        hide_frame(axes)
+        self.reprojected_.append(_axes.draw_points(axes, reprojected, **style))
+        _axes.hide_frame(axes)
         axes.set_aspect("equal", adjustable="datalim")
         axes.yaxis.set_inverted(self.origin == "upper")
-        share = f"inverse SNR {percent(self.inverse_snr[i])}"
+        share = f"inverse SNR {_axes.percent(self.inverse_snr[i])}"
         axes.set_title(f"frame {self.frame_names[i]}\n{share}", fontsize="small")

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._estimator import frames_of
-from isa_nrsfm.calibration import canonical_pose
-from isa_nrsfm.calibration._metric import (
-    mean_gram,
-    metric_quadric,
-    symmetric_power,
-    unit_cameras,
-)
+from isa_nrsfm.calibration import _metric, canonical_pose
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
@@ -33,11 +27,12 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 def viewing_rotation(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray:
     """Return the directions of space (3, 3) that are right, down and away in the view.
 
-    Right and down are nearest to the reference camera (2, 3). If unit cameras
+    Right and down are nearest to the reference camera (2, 3). If cameras
     (n_frames, 2, 3) go round the object, the direction of their axis in the images is
     kept. The view is then of the broadest side of the object, from the covariance
     `spread` of its points.
     """
+    cameras = _metric.unit_cameras(cameras)
     left, shared, right = np.linalg.svd(cameras.mean(axis=0), full_matrices=False)
     row = np.sqrt(np.mean(np.sum(cameras**2, axis=(1, 2))) / 2)
     if shared[1] < 0.2 * row <= shared[0]:  # as in `mean_view`
@@ -80,12 +75,9 @@ def depth_note(estimator: Any) -> str:
 
 def euclidean_axes(estimator: Any) -> NDArray:
     """Return the viewing axes (3, 3) of a model with calibrated cameras."""
-    shape = estimator.mean_shape_
-    return viewing_rotation(
-        unit_cameras(np.asarray(estimator.motion_)),
-        estimator.reference_motion_,
-        shape.T @ shape / len(shape),
-    )
+    motion, shape = np.asarray(estimator.motion_), estimator.mean_shape_
+    spread = shape.T @ shape / len(shape)
+    return viewing_rotation(motion, estimator.reference_motion_, spread)
 
 
 def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
@@ -96,18 +88,15 @@ def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
     nothing, the mean of ``M_i^T M_i`` over the unit cameras is made isotropic. The x
     and y axes are those of `viewing_rotation`; T has a non-negative determinant.
     """
-    G = metric_quadric(motion)
+    G = _metric.metric_quadric(motion)
     if G is None:
-        metric = symmetric_power(mean_gram(unit_cameras(motion)), 0.5)
+        gram = _metric.mean_gram(_metric.unit_cameras(motion))
+        metric = _metric.symmetric_power(gram, 0.5)
     else:
-        metric = symmetric_power(G, -0.5)
+        metric = _metric.symmetric_power(G, -0.5)
     from_metric = np.linalg.pinv(metric)
-    rotation = viewing_rotation(
-        unit_cameras(motion @ from_metric),
-        reference_motion @ from_metric,
-        metric @ metric.T,
-    )
-    transform = rotation @ metric
+    reference, spread = reference_motion @ from_metric, metric @ metric.T
+    transform = viewing_rotation(motion @ from_metric, reference, spread) @ metric
     size = np.linalg.norm(motion @ np.linalg.pinv(transform), axis=(1, 2)) / np.sqrt(2)
     return transform * np.median(size[np.isfinite(size) & (size > 0)])
 

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 from isa_nrsfm.skeletons._faces import IBUG_68
-from isa_nrsfm.skeletons._skeleton import Skeleton, run, sides_of_names
+from isa_nrsfm.skeletons._skeleton import named_skeleton, run, sides_of_names
 
 _BOTH = ("left", "right")
 _TOES = ("big_toe", "small_toe", "heel")
@@ -16,57 +16,41 @@ def _each(firsts: Iterable[str], seconds: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{first}_{second}" for first in firsts for second in seconds)
 
 
-def _of_both_sides(
-    parts: Iterable[str], sides: Sequence[str] = _BOTH
-) -> tuple[str, ...]:
-    """Return parts on two sides as names, one part after the other."""
+def _of_sides(parts: Iterable[str], sides: Sequence[str] = _BOTH) -> tuple[str, ...]:
+    """Return parts on the sides as names, one part after the other."""
     return tuple(f"{side}_{part}" for part in parts for side in sides)
 
 
-def _body(name: str, point_names: tuple[str, ...], **parts: Any) -> Skeleton:
-    """Return a layout of points whose names have the sides."""
-    left, right = sides_of_names(point_names)
-    return Skeleton(
-        name=name,
-        kind="body",
-        n_points=len(point_names),
-        point_names=point_names,
-        left=left,
-        right=right,
-        **parts,
-    )
+_body = partial(named_skeleton, kind="body")
 
-
-HAND_21 = Skeleton(
-    name="hand-21",
+_HAND_NAMES = (
+    "wrist",
+    *_each(["thumb"], ("cmc", "mcp", "ip", "tip")),
+    *_each(
+        ("index_finger", "middle_finger", "ring_finger", "pinky"),
+        ("mcp", "pip", "dip", "tip"),
+    ),
+)
+HAND_21 = named_skeleton(
+    "hand-21",
+    _HAND_NAMES,
     kind="hand",
-    n_points=21,
     curves=(
         run(0, 4),  # thumb
         *(run(first, first + 3) for first in (5, 9, 13, 17)),  # fingers
         (0, 5, 9, 13, 17, 0),  # palm
     ),
-    source=(
-        "T. Simon et al., Hand Keypoint Detection in Single Images using Multiview "
-        "Bootstrapping, CVPR 2017; F. Zhang et al., MediaPipe Hands, 2020; "
-        "https://github.com/google-ai-edge/mediapipe, "
-        "mediapipe/python/solutions/hands_connections.py"
-    ),
-    point_names=(
-        "wrist",
-        *_each(["thumb"], ("cmc", "mcp", "ip", "tip")),
-        *_each(
-            ("index_finger", "middle_finger", "ring_finger", "pinky"),
-            ("mcp", "pip", "dip", "tip"),
-        ),
-    ),
+    source="T. Simon et al., Hand Keypoint Detection in Single Images using Multiview "
+    "Bootstrapping, CVPR 2017; F. Zhang et al., MediaPipe Hands, 2020; "
+    "https://github.com/google-ai-edge/mediapipe, "
+    "mediapipe/python/solutions/hands_connections.py",
     # A table of one hand does not determine the side that is seen, nor which hand.
     up=((0, 9),),
 )
 
 
 _ARM, _LEG = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
-_COCO_NAMES = ("nose", *_of_both_sides(("eye", "ear", *_ARM, *_LEG)))
+_COCO_NAMES = ("nose", *_of_sides(("eye", "ear", *_ARM, *_LEG)))
 COCO_17 = _body(
     "coco-17",
     _COCO_NAMES,
@@ -77,11 +61,9 @@ COCO_17 = _body(
         *((5, 7, 9), (6, 8, 10)),  # arms
         *((11, 13, 15), (12, 14, 16)),  # legs
     ),
-    source=(
-        "T.-Y. Lin et al., Microsoft COCO: Common Objects in Context, ECCV 2014; "
-        "https://cocodataset.org/#format-data, "
-        "annotations/person_keypoints_val2017.json"
-    ),
+    source="T.-Y. Lin et al., Microsoft COCO: Common Objects in Context, ECCV 2014; "
+    "https://cocodataset.org/#format-data, "
+    "annotations/person_keypoints_val2017.json",
     up=((11, 5), (12, 6)),
     front=((3, 0), (4, 0)),
     across=((6, 5), (12, 11)),
@@ -100,12 +82,10 @@ H36M_17 = _body(
         *((0, 1, 2, 3), (0, 4, 5, 6)),  # legs
         *((8, 11, 12, 13), (8, 14, 15, 16)),  # arms
     ),
-    source=(
-        "C. Ionescu et al., Human3.6M, IEEE Transactions on Pattern Analysis and "
-        "Machine Intelligence 36, 2014; the 17 joints as of J. Martinez et al., A "
-        "Simple yet Effective Baseline for 3D Human Pose Estimation, ICCV 2017, and "
-        "https://github.com/facebookresearch/VideoPose3D"
-    ),
+    source="C. Ionescu et al., Human3.6M, IEEE Transactions on Pattern Analysis and "
+    "Machine Intelligence 36, 2014; the 17 joints as of J. Martinez et al., A "
+    "Simple yet Effective Baseline for 3D Human Pose Estimation, ICCV 2017, and "
+    "https://github.com/facebookresearch/VideoPose3D",
     up=((0, 8),),
     # The nose is in front of the line from the thorax to the top of the head.
     front=((8, 9), (10, 9)),
@@ -115,7 +95,7 @@ H36M_17 = _body(
 _BODY_25_NAMES = (
     *("nose", "neck", *_each(_RIGHT_FIRST, _ARM)),
     *("mid_hip", *_each(_RIGHT_FIRST, _LEG)),
-    *(*_of_both_sides(("eye", "ear"), _RIGHT_FIRST), *_each(_BOTH, _TOES)),
+    *(*_of_sides(("eye", "ear"), _RIGHT_FIRST), *_each(_BOTH, _TOES)),
 )
 BODY_25 = _body(
     "body-25",
@@ -127,11 +107,9 @@ BODY_25 = _body(
         *((8, 9, 10, 11, 22, 23), (11, 24)),  # right leg and foot
         *((8, 12, 13, 14, 19, 20), (14, 21)),  # left leg and foot
     ),
-    source=(
-        "Z. Cao et al., OpenPose, IEEE Transactions on Pattern Analysis and Machine "
-        "Intelligence 43, 2021; "
-        "https://github.com/CMU-Perceptual-Computing-Lab/openpose, doc/02_output.md"
-    ),
+    source="Z. Cao et al., OpenPose, IEEE Transactions on Pattern Analysis and Machine "
+    "Intelligence 43, 2021; "
+    "https://github.com/CMU-Perceptual-Computing-Lab/openpose, doc/02_output.md",
     up=((8, 1),),
     front=((17, 0), (18, 0), (21, 19), (24, 22)),
     across=((2, 5), (9, 12)),
@@ -141,7 +119,7 @@ _POSE_NAMES = (
     *("nose", "left_eye_inner", "left_eye", "left_eye_outer"),
     *("right_eye_inner", "right_eye", "right_eye_outer"),
     *("left_ear", "right_ear", "mouth_left", "mouth_right"),
-    *_of_both_sides((*_ARM, "pinky", "index", "thumb", *_LEG, "heel", "foot_index")),
+    *_of_sides((*_ARM, "pinky", "index", "thumb", *_LEG, "heel", "foot_index")),
 )
 POSE_33 = _body(
     "mediapipe-pose-33",
@@ -153,11 +131,9 @@ POSE_33 = _body(
         *((11, 13, 15, 17, 19, 15, 21), (12, 14, 16, 18, 20, 16, 22)),  # arms, hands
         *((23, 25, 27, 29, 31, 27), (24, 26, 28, 30, 32, 28)),  # legs and feet
     ),
-    source=(
-        "V. Bazarevsky et al., BlazePose: On-device Real-time Body Pose Tracking, "
-        "2020; https://github.com/google-ai-edge/mediapipe, "
-        "mediapipe/python/solutions/pose_connections.py"
-    ),
+    source="V. Bazarevsky et al., BlazePose: On-device Real-time Body Pose Tracking, "
+    "2020; https://github.com/google-ai-edge/mediapipe, "
+    "mediapipe/python/solutions/pose_connections.py",
     up=((23, 11), (24, 12)),
     front=((7, 0), (8, 0), (29, 31), (30, 32)),
     across=((12, 11), (24, 23)),
@@ -192,12 +168,10 @@ WHOLE_BODY_133 = replace(
         *(_shifted(curve, _RIGHT_HAND) for curve in HAND_21.curves),
         *((9, _LEFT_HAND), (10, _RIGHT_HAND)),  # wrists
     ),
-    source=(
-        "S. Jin et al., Whole-Body Human Pose Estimation in the Wild, ECCV 2020; "
-        "https://github.com/jin-s13/COCO-WholeBody; names: "
-        "https://github.com/open-mmlab/mmpose, "
-        "configs/_base_/datasets/coco_wholebody.py"
-    ),
+    source="S. Jin et al., Whole-Body Human Pose Estimation in the Wild, ECCV 2020; "
+    "https://github.com/jin-s13/COCO-WholeBody; names: "
+    "https://github.com/open-mmlab/mmpose, "
+    "configs/_base_/datasets/coco_wholebody.py",
     point_names=_WHOLE_NAMES,
     left=(*_LEFT, *_shifted(IBUG_68.left)),
     right=(*_RIGHT, *_shifted(IBUG_68.right)),

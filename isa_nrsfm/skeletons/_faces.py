@@ -23,10 +23,8 @@ IBUG_68 = Skeleton(
         *(run(36, 41, closed=True), run(42, 47, closed=True)),  # eyes
         *(run(48, 59, closed=True), run(60, 67, closed=True)),  # outer and inner lips
     ),
-    source=(
-        "C. Sagonas et al., 300 Faces in-the-Wild Challenge, ICCV Workshops 2013; "
-        "https://ibug.doc.ic.ac.uk/resources/facial-point-annotations/"
-    ),
+    source="C. Sagonas et al., 300 Faces in-the-Wild Challenge, ICCV Workshops 2013; "
+    "https://ibug.doc.ic.ac.uk/resources/facial-point-annotations/",
     right=listed(np.r_[0:8, 17:22, 31, 32, 36:42, 48:51, 58:62, 67]),
     left=listed(
         np.r_[16:8:-1, 26:21:-1, 35, 34, 45:41:-1, 47, 46, 54:51:-1, 56, 55, 64, 63, 65]
@@ -62,11 +60,9 @@ XM2VTS_68 = Skeleton(
         run(48, 59, closed=True),  # outer lips
         *((48, *run(60, 62), 54), (54, *run(63, 65), 48)),  # inner edges of the lips
     ),
-    source=(
-        "K. Messer et al., XM2VTSDB: The Extended M2VTS Database, AVBPA 1999; "
-        "S. Milborrow et al., The MUCT Landmarked Face Database, PRASA 2010, "
-        "http://www.milbo.org/muct"
-    ),
+    source="K. Messer et al., XM2VTSDB: The Extended M2VTS Database, AVBPA 1999; "
+    "S. Milborrow et al., The MUCT Landmarked Face Database, PRASA 2010, "
+    "http://www.milbo.org/muct",
     right=listed(np.r_[0:7, 21:32, 37:41, 46, 48:51, 59, 58, 60, 65]),
     left=listed(np.r_[14:7:-1, 15:21, 32:37, 45:41:-1, 47, 54:51:-1, 55, 56, 62, 63]),
     up=((7, 37), (7, 45)),
@@ -90,11 +86,9 @@ MUCT_76 = replace(
     name="muct-76",
     n_points=76,
     curves=(*(c for c in XM2VTS_68.curves if c not in _XM2VTS_EYES), *_MUCT_EYES),
-    source=(
-        "S. Milborrow, J. Morkel, F. Nicolls, The MUCT Landmarked Face Database, PRASA "
-        "2010, http://www.milbo.org/muct; the order round the eyes: "
-        "https://github.com/auduno/clmtrackr"
-    ),
+    source="S. Milborrow, J. Morkel, F. Nicolls, The MUCT Landmarked Face Database, "
+    "PRASA 2010, http://www.milbo.org/muct; the order round the eyes: "
+    "https://github.com/auduno/clmtrackr",
     right=(*XM2VTS_68.right, *range(68, 72)),
     left=(*XM2VTS_68.left, *range(72, 76)),
 )
@@ -112,11 +106,9 @@ WFLW_98 = Skeleton(
         *(run(60, 67, closed=True), run(68, 75, closed=True)),  # eyes
         *(run(76, 87, closed=True), run(88, 95, closed=True)),  # outer and inner lips
     ),
-    source=(
-        "W. Wu et al., Look at Boundary: A Boundary-Aware Face Alignment Algorithm, "
-        "CVPR 2018, https://wywu.github.io/projects/LAB/WFLW.html; mirror images: "
-        "https://github.com/open-mmlab/mmpose, configs/_base_/datasets/wflw.py"
-    ),
+    source="W. Wu et al., Look at Boundary: A Boundary-Aware Face Alignment Algorithm, "
+    "CVPR 2018, https://wywu.github.io/projects/LAB/WFLW.html; mirror images: "
+    "https://github.com/open-mmlab/mmpose, configs/_base_/datasets/wflw.py",
     right=listed(np.r_[0:16, 33:42, 55, 56, 60:68, 76:79, 87, 86, 88, 89, 95, 96]),
     left=(
         *listed(np.r_[32:16:-1, 46:41:-1, 50:46:-1, 59, 58, 72:67:-1, 75:72:-1]),
@@ -168,23 +160,16 @@ _LEFT_HALVES = (
     (2, 326, 327),
 )
 _BRIDGE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2)
-_MIRROR = {
-    right: left
-    for right, left in zip(
-        chain(*_RIGHT, *_RIGHT_HALVES), chain(*_LEFT, *_LEFT_HALVES), strict=True
-    )
-    if right != left
-}
+_SIDES = chain(*_RIGHT, *_RIGHT_HALVES), chain(*_LEFT, *_LEFT_HALVES)
+_MIRROR = {right: left for right, left in zip(*_SIDES, strict=True) if right != left}
 MESH_468 = Skeleton(
     name="mediapipe-face-468",
     kind="face",
     n_points=468,
     curves=(*_RIGHT, *_LEFT, *_RIGHT_HALVES, *_LEFT_HALVES, _BRIDGE),
-    source=(
-        "Y. Kartynnik et al., Real-time Facial Surface Geometry from Monocular Video "
-        "on Mobile GPUs, 2019; contours: https://github.com/google-ai-edge/mediapipe, "
-        "mediapipe/python/solutions/face_mesh_connections.py"
-    ),
+    source="Y. Kartynnik et al., Real-time Facial Surface Geometry from Monocular "
+    "Video on Mobile GPUs, 2019; contours: https://github.com/google-ai-edge/mediapipe"
+    ", mediapipe/python/solutions/face_mesh_connections.py",
     right=tuple(_MIRROR),
     left=tuple(_MIRROR.values()),
     up=((152, 168),),

@@ -7,9 +7,7 @@ from pathlib import Path
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.skeletons._skeleton import Skeleton, sides_of_names
-
-SUFFIXES = (".yaml", ".yml")
+from isa_nrsfm.skeletons._skeleton import Skeleton, named_skeleton
 
 
 def skeleton_of_names(
@@ -61,17 +59,8 @@ def skeleton_of_names(
                 f"{', '.join(names[:6])}{', ...' if len(names) > 6 else ''}; got "
                 f"{edge!r}"
             )
-    left, right = sides_of_names(names)
-    return Skeleton(
-        name=name,
-        kind="other",
-        n_points=len(names),
-        curves=tuple((place[a], place[b]) for a, b in edges),
-        source=source,
-        point_names=tuple(names),
-        left=left,
-        right=right,
-    )
+    curves = tuple((place[a], place[b]) for a, b in edges)
+    return named_skeleton(name, names, kind="other", curves=curves, source=source)
 
 
 def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> Skeleton:

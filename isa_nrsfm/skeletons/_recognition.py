@@ -18,20 +18,18 @@ SKELETONS: Mapping[str, Skeleton] = MappingProxyType(
 )
 
 # The layouts in which the readers of `isa_nrsfm.io` find points without names.
-LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "openface": ("ibug-68", "ibug-51"),
-        "pyfeat": ("ibug-68", "ibug-51", "mediapipe-face-478"),
-        "mediapipe": (
-            *("mediapipe-face-468", "mediapipe-face-478"),
-            *("hand-21", "mediapipe-pose-33"),
-        ),
-        "pts": ("ibug-68", "ibug-51"),
-        "wflw": ("wflw-98", "wflw-65"),
-        "coco": ("coco-17", "coco-wholebody-133"),
-        "openpose": ("body-25", "hand-21"),
-    }
-)
+LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = {
+    "openface": ("ibug-68", "ibug-51"),
+    "pyfeat": ("ibug-68", "ibug-51", "mediapipe-face-478"),
+    "mediapipe": (
+        *("mediapipe-face-468", "mediapipe-face-478"),
+        *("hand-21", "mediapipe-pose-33"),
+    ),
+    "pts": ("ibug-68", "ibug-51"),
+    "wflw": ("wflw-98", "wflw-65"),
+    "coco": ("coco-17", "coco-wholebody-133"),
+    "openpose": ("body-25", "hand-21"),
+}
 
 # Edges of a layout are short: so long at most is their mean, relative to the mean
 # distance of all points. Faces in their own order have 0.14 to 0.25 in single images

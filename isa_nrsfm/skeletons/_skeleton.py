@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -256,6 +256,19 @@ def sides_of_names(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ..
     mirror = [place.get(_LEFT_WORD.sub(_right_word, name)) for name in names]
     pairs = [(j, k) for j, k in enumerate(mirror) if k not in (j, None)]
     return tuple(j for j, _ in pairs), tuple(k for _, k in pairs)
+
+
+def named_skeleton(name: str, names: Sequence[str], **parts: Any) -> Skeleton:
+    """Return a layout of points whose names have the sides."""
+    left, right = sides_of_names(names)
+    return Skeleton(
+        name=name,
+        n_points=len(names),
+        point_names=tuple(names),
+        left=left,
+        right=right,
+        **parts,
+    )
 
 
 def _right_word(match: re.Match[str]) -> str:

@@ -1,4 +1,4 @@
-"""Point distribution models, and their files for OpenFace."""
+"""The arrays of a fitted model, and point distribution models, with their files."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -10,15 +10,138 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
-from sklearn.decomposition import PCA
+from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._compat.stored_arrays import array_in, write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm.export._names import suffix_of
+from isa_nrsfm._estimator import check_class
+from isa_nrsfm._linalg.small_matrices import procrustes
+from isa_nrsfm.export._names import names_of_components, suffix_of
 from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
 from isa_nrsfm.plotting._views import Origin
+from isa_nrsfm.skeletons._column_names import names_of_points
+
+
+class ShapeArrays(NamedTuple):
+    """
+    The arrays of a fitted model.
+
+    The image of frame i is ``(mean_shape + tensordot(alpha[i], basis, 1)) @
+    motion[i].T + translation[i]``.
+
+    Attributes
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape, in the space of the cameras; Euclidean if these are calibrated.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes, for one standard deviation of their coefficients.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients of the frames of the table; of no frames if none were kept.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras of the frames.
+    translation : ndarray of shape (n_frames, 2)
+        Images of the shapes' origin.
+    energy_share : ndarray of shape (n_components,)
+        Share of each basis shape in the energy of the deformations.
+    reference_motion : ndarray of shape (2, 3)
+        The mean view.
+    reference_translation : ndarray of shape (2,)
+        Its position.
+    point_names : ndarray of shape (n_points,)
+        Names of the points: those in the names of the columns, or their numbers.
+    component_names : ndarray of shape (n_components,)
+        Names of the coefficients.
+    """
+
+    mean_shape: NDArray
+    basis: NDArray
+    alpha: NDArray
+    motion: NDArray
+    translation: NDArray
+    energy_share: NDArray
+    reference_motion: NDArray
+    reference_translation: NDArray
+    point_names: NDArray
+    component_names: NDArray
+
+
+def shape_arrays(model: Any) -> ShapeArrays:
+    """
+    Return the arrays of a fitted model.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model.
+
+    Returns
+    -------
+    ShapeArrays
+        Named tuple of arrays: the attributes of the model and names.
+
+    Raises
+    ------
+    ValueError
+        If the model is no AffineNRSfM.
+
+    See Also
+    --------
+    write_shapes : Write these arrays to a file.
+    """
+    check_class(model, "model")
+    check_is_fitted(model)
+    n_components = len(model.basis_)
+    # Those that were not kept are of no frames.
+    kept = {"alpha": (0, n_components), "motion": (0, 2, 3), "translation": (0, 2)}
+    arrays = [
+        np.asarray(getattr(model, f"{name}_", np.empty(kept.get(name, 0))))
+        for name in ShapeArrays._fields[:-2]
+    ]
+    names = names_of_points(model), names_of_components(None, n_components)
+    return ShapeArrays(*arrays, *(np.array(each, dtype=str) for each in names))
+
+
+def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
+    """
+    Write the arrays of a fitted model for NumPy or for MATLAB.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model.
+    path : str or path-like
+        The file, with the suffix ``.npz`` or ``.mat``. An existing file is replaced.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is another one.
+    OSError
+        If the file cannot be written.
+
+    See Also
+    --------
+    shape_arrays : The arrays that are written, under the same names.
+    isa_nrsfm.io.save_model : Save the model itself.
+
+    Notes
+    -----
+    In MATLAB and Octave names are cell arrays of text, and alpha(i, k) is the
+    coefficient k of frame i, mean_shape(j, :) point j, squeeze(basis(k, j, :)) its
+    drift.
+    """
+    suffix = suffix_of(path, [".npz", ".mat"])
+    arrays = shape_arrays(model)._asdict()
+    with whole_file(path) as file:
+        if suffix == ".npz":
+            write_arrays(file, arrays)
+        else:
+            for name in ("point_names", "component_names"):
+                arrays[name] = arrays[name].astype(object)
+            savemat(file, arrays, oned_as="column")
+
 
 SUFFIXES = (".txt", ".mat", ".npz")
 NUMBER_OF_MODES = Interval(Integral, 1, None, closed="left")
@@ -338,13 +461,10 @@ def _aligned(shapes: NDArray) -> NDArray:
     shapes = aligned = shapes - shapes.mean(axis=1, keepdims=True)
     mean = shapes.mean(axis=0)
     for _ in range(100):
-        left, stretch, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ mean)
-        turned = np.linalg.det(left @ right)
-        left[:, :, 2] *= turned[:, None]
-        stretch[:, 2] *= turned
+        turned = shapes @ procrustes(shapes.mT @ mean)
         # <aligned shape, mean> = <mean, mean>
-        scales = np.sum(mean**2) / stretch.sum(axis=1)
-        aligned = scales[:, None, None] * (shapes @ (left @ right))
+        scales = np.sum(mean**2) / np.sum(turned * mean, axis=(1, 2), keepdims=True)
+        aligned = scales * turned
         previous, mean = mean, aligned.mean(axis=0)
         if np.linalg.norm(mean - previous) <= 1e-12 * np.linalg.norm(mean):
             break
@@ -353,6 +473,9 @@ def _aligned(shapes: NDArray) -> NDArray:
 
 def _principal_axes(rows: NDArray) -> tuple[NDArray, NDArray]:
     """Return orthonormal principal axes of centred rows and the variances on them."""
+    # This imports all linear models, which the other functions do not need.
+    from sklearn.decomposition import PCA
+
     wide = len(rows) < rows.shape[1]
     pca = PCA(svd_solver="full" if wide else "covariance_eigh").fit(rows)
     variances = pca.explained_variance_ * (1 - 1 / len(rows))

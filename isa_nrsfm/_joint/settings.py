@@ -1,0 +1,92 @@
+"""Settings of a fit: parameters of the estimator, and limits that steer it."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from numpy.typing import NDArray
+
+from isa_nrsfm._paper.pipeline import DENSE
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._tables.tracks import Layout
+
+# Default tolerances. JOINT_TOL: decrease of the objective of the joint refinement per
+# frame. PAPER_TOL: gain of the paper's refinement, as a share of the explained energy.
+JOINT_TOL, PAPER_TOL = 0.025, 1e-10
+
+
+class Limits(NamedTuple):
+    """Numbers that tests and benchmarks vary.
+
+    docs/benchmarks/README.md has the effects of those of the joint fit.
+    """
+
+    # A table with more points and rows of images is not factorised as a whole.
+    dense: int = DENSE
+    # Number of frames of the first sample of a large table
+    sample: int = 600
+    # Tables with fewer coordinates are fitted without a sample.
+    small_table: int = 150_000
+    # Most frames from which outliers and missing points are modelled
+    model_frames: int = 5_000
+    # Prior standard deviation of the coordinates of the image of a basis shape with
+    # coefficient one, as a share of the size of the frame
+    basis_std: float = 0.008
+    # Floor of the noise variance while K may be too small, as a share of the mean
+    # square. Unmodelled deformation must be absorbed by the noise; otherwise it
+    # distorts the depths.
+    least_noise: float = 5e-5
+    # K is sufficient if the noise variance does not exceed this multiple of the noise
+    # level of the spectrum. The ratio is 0.8 to 1.0 for artificial tables with the true
+    # K or more, 1.3 to 1.8 with fewer basis shapes, 1.9 and more for motion capture.
+    right: float = 1.4
+    # Floor of the noise variance for calibrated cameras and too few basis shapes: a
+    # multiple of the share of energy beyond K + 3 singular values, and its upper bound,
+    # because large motion adds to the spectrum
+    cut_off: float = 3.0
+    most_noise: float = 5e-4
+    # Largest number of frames of a small table, with several minima. In large tables
+    # all starts lead to the same minimum.
+    few_frames: int = 2000
+    # Columns of the mixtures from which cameras start, three for each shape
+    widths: tuple[int, ...] = (6, 9, 12, 18, 24, 36)
+    # Convergence tolerance of compared starts, for each frame. The objectives of
+    # different minima differ by tens per frame.
+    compared_tol: float = 0.5
+    # Frames with more points are represented by directions.
+    many_points: int = 200
+    # Threshold of a relevant basis shape, the share of its numbers that the table
+    # determines. On artificial tables with 2 % noise true shapes have 0.998 and more,
+    # others 0.83 and less.
+    determined: float = 0.95
+
+
+LIMITS = Limits()
+
+
+class FitSettings(NamedTuple):
+    """The parameters of `AffineNRSfM` of the same names, and limits.
+
+    scale_frames: False with orthographic cameras. names: those of the columns, if any.
+    silent_isa: whether a strategy that only starts the joint fit may end early.
+    on_step: called before each step of the joint fit.
+    """
+
+    refinement: str | None = "joint"
+    camera: str = "affine"
+    loss: str = "linear"
+    independence: str | None = "shapes"
+    block_recovery: str = "generalized_eigen"
+    layout: Layout = "interleaved"
+    scale_frames: bool = True
+    max_iter: int = 1000
+    tol: float = JOINT_TOL
+    n_jobs: int | None = None
+    names: NDArray | None = None
+    silent_isa: bool = True
+    limits: Limits = LIMITS
+    on_step: Callable[[], None] | None = None
+
+    @property
+    def joint(self) -> bool:
+        """Whether the refinement is the joint fit, or begins with it."""
+        return self.refinement in JOINT_REFINEMENTS

@@ -1,0 +1,442 @@
+"""Read the files of DeepLabCut, Lightning Pose and SLEAP, csv and HDF5.
+
+pandas itself reads tables in HDF5 files by PyTables, which unpickles whatever the file
+holds. Here only numbers, texts, tuples and lists are. The layouts are those of
+`DataFrame.to_hdf` with ``format="table"`` and ``format="fixed"``.
+"""
+
+import io
+import json
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm.io._landmark_columns import find_landmark_columns
+from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
+from isa_nrsfm.io._tables import (
+    SEPARATORS,
+    header_names,
+    header_rows,
+    read_columns,
+    tracks_in,
+)
+from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# zlib packs at most so many bytes into one (zlib.net, zlib technical details).
+LARGEST_RATIO = 1032
+# DeepLabCut: levels of the columns
+_LEVELS = ["scorer", "bodyparts", "coords"]
+_LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
+# Lightning Pose adds columns of other names, such as set.
+_COORDS = ("x", "y", "z", "likelihood")
+_VALUES = ("x", "y", "likelihood")
+_KEY = "df_with_missing"
+# The individual to which points belong that are not of an animal.
+_UNIQUE = "single"
+# SLEAP: axes of the points, also of older files
+_DIMS = ("frame", "track", "node", "xy")
+# Without the attribute: SLEAP's own order, and that of its older files
+# for Python. They differ where there are more than two points.
+_ORDERS = (("track", "xy", "node", "frame"), ("frame", "node", "xy", "track"))
+_CSV_COLUMNS = ["track", "frame_idx", "instance.score"]
+_NEEDED = frozenset({"tracks", "node_names", "track_names"})
+
+Columns = list[tuple[str, ...]]
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether a file begins as HDF5 files do."""
+    with path.open("rb") as file:
+        return file.read(len(_SIGNATURE)) == _SIGNATURE
+
+
+def root_groups(path: Path) -> set[str]:
+    """Return the names at the root of an HDF5 file, or raise where it is damaged."""
+    h5py = import_optional("h5py", extra="h5")
+    with reading(path, "HDF5"), h5py.File(path, "r") as file:
+        return set(file)
+
+
+def content_of(group: Any, name: str) -> Any:
+    """Return the content of a dataset: an array, a number or a text.
+
+    Raise if there is none, or if it claims to hold more than the file can: HDF5 has no
+    data of the parts of an array that nobody wrote.
+    """
+    dataset = group.get(name)
+    if dataset is None or not hasattr(dataset, "nbytes"):
+        raise ValueError(f"it has no dataset {name}")
+    stored = dataset.id.get_storage_size()
+    if dataset.nbytes > LARGEST_RATIO * stored:
+        raise ValueError(
+            f"the dataset {name} of shape {dataset.shape} would need {dataset.nbytes} "
+            f"bytes; the file has {stored}"
+        )
+    return dataset[()]
+
+
+def numbers_of(group: Any, name: str) -> NDArray[np.float64]:
+    """Return the real numbers that a dataset holds, or raise a ValueError."""
+    content = content_of(group, name)
+    if not isinstance(content, np.ndarray) or content.dtype.kind not in "fiu":
+        got = getattr(content, "dtype", type(content).__name__)
+        raise ValueError(f"the dataset {name} should have real numbers; got {got}")
+    return content.astype(np.float64, copy=False)
+
+
+def is_deeplabcut(path: Path) -> bool:
+    """Return whether the header, or the group of an h5 file, is DeepLabCut's."""
+    if path.suffix.lower() in SEPARATORS:
+        return _levels_of(header_rows(path, 4)) is not None
+    return is_hdf5(path) and _KEY in root_groups(path)
+
+
+def read_deeplabcut(path: Path) -> Landmarks:
+    """Read a csv, tsv or h5 file of DeepLabCut or Lightning Pose.
+
+    The columns have the levels ``scorer``, ``individuals`` (only with several animals),
+    ``bodyparts`` and ``coords``: ``x``, ``y`` and, but for labels made by hand,
+    ``likelihood``. The index has the number of the frame or the path of the image. The
+    individual "single", for points of no animal, is left out where there are others.
+    """
+    read = _read_text if path.suffix.lower() in SEPARATORS else _read_h5
+    table, columns, labels = read(path)
+    scorers = {column[0] for column in columns}
+    if len(scorers) > 1:
+        raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
+    places = _places(columns)
+    first = next(iter(places.values()))
+    points = [parts[name] for parts in places.values() for name in first]
+    where = np.array([[each.get(coord, -1) for coord in _VALUES] for each in points])
+    where = where.reshape(len(places), len(first), len(_VALUES))
+    # A column of NaN stands for likelihoods that are not there.
+    found = np.column_stack([table, np.full(len(table), np.nan)])[:, where]
+    try:
+        frames: dict[str, list[Any]] = {"frame": [int(label) for label in labels]}
+    except (TypeError, ValueError):
+        frames = {"image": [str(label) for label in labels]}
+    return assemble_individuals(
+        found[..., :2],
+        list(places) if len(columns[0]) == len(_LEVELS_OF_MANY) else None,
+        list(first),
+        frames,
+        format="deeplabcut",
+        confidence=found[..., 2] if (where[..., 2] >= 0).any() else None,
+    )
+
+
+def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
+    """Read a csv or tsv file, whose first lines are the levels of the columns."""
+    header = header_rows(path, 4)
+    levels = _levels_of(header)
+    if levels is None:
+        raise ValueError(
+            "its first lines do not begin with scorer, bodyparts, coords or with "
+            "scorer, individuals, bodyparts, coords"
+        )
+    header = header[: len(levels)]
+    if len({len(row) for row in header}) > 1:
+        raise ValueError("its first lines are not of the same length")
+    # Labels made by hand have the path of the image in up to three columns.
+    n_index = next(i for i, name in enumerate([*header[-1][1:], "x"], 1) if name)
+    columns = list(zip(*header, strict=True))
+    numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
+    names = [str(i) for i in range(len(columns))]
+    coordinates = [names[i] for i in numbers]
+    frame = read_columns(
+        path,
+        leave_out=set(names[n_index:]).difference(coordinates),
+        numbers=coordinates,
+        text=names[:n_index],
+        n_header=len(levels),
+        names=names,
+    )
+    cells = frame.iloc[:, :n_index].fillna("").to_numpy()
+    labels = ["/".join(row) for row in cells]
+    values = frame.iloc[:, n_index:].to_numpy(dtype=np.float64)
+    return values, [columns[i] for i in numbers], labels
+
+
+def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
+    """Return the levels that the first lines of a csv file name, or None."""
+    first = [row[0].strip().lower() if row else "" for row in header]
+    for levels in (_LEVELS, _LEVELS_OF_MANY):
+        if first[: len(levels)] == levels:
+            return levels
+    return None
+
+
+def _places(columns: Sequence[tuple[str, ...]]) -> dict[str, dict[str, dict[str, int]]]:
+    """Return the places of coordinates by individual, bodypart and name.
+
+    All individuals have the same bodyparts; one of others, for points of no animal, is
+    left out.
+    """
+    places: dict[str, dict[str, dict[str, int]]] = {}
+    for number, (_, *individual, bodypart, coord) in enumerate(columns):
+        parts = places.setdefault("".join(individual), {})
+        if coord == "z":
+            raise ValueError(
+                f"{bodypart!r} has a z: these are points in space, not in an image"
+            )
+        if coord in parts.setdefault(bodypart, {}):
+            raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
+        parts[bodypart][coord] = number
+    if not places:
+        raise ValueError("it has no columns x and y")
+    for parts in places.values():
+        for bodypart, of_point in parts.items():
+            if not {"x", "y"}.issubset(of_point):
+                raise ValueError(f"{bodypart!r} has no x or no y")
+    others = [name for name in places if name != _UNIQUE]
+    if others and _UNIQUE in places and {*places[_UNIQUE]} != {*places[others[0]]}:
+        warn_caller(
+            f"the points {', '.join(places.pop(_UNIQUE))} belong to no animal "
+            f"(individual {_UNIQUE!r}) and are left out"
+        )
+    first, *rest = places
+    for name in rest:
+        if {*places[name]} != {*places[first]}:
+            raise ValueError(
+                f"the individuals {first!r} and {name!r} have different bodyparts"
+            )
+    return places
+
+
+def _read_h5(path: Path) -> tuple[NDArray, Columns, list[Any]]:
+    """Read the table that pandas has stored in an h5 file.
+
+    Returns numbers (n_rows, n_columns), levels of the columns, and labels of the rows.
+    Damaged files lead to errors of h5py and pickle.
+    """
+    h5py = import_optional("h5py", extra="h5")
+    with h5py.File(path, "r") as file:
+        if _KEY not in file:
+            raise ValueError(f"it has no group {_KEY}")
+        group = file[_KEY]
+        kind = _text(group.attrs.get("pandas_type", ""))
+        if kind not in ("frame_table", "frame"):
+            raise ValueError(f"{_KEY} is no table of pandas")
+        read = _table_blocks if kind == "frame_table" else _fixed_blocks
+        blocks, labels = read(group)
+    for values, columns in blocks:
+        if values.shape != (len(labels), len(columns)):
+            raise ValueError(
+                f"a block of {len(labels)} rows and {len(columns)} columns has the "
+                f"shape {values.shape}"
+            )
+    arrays = [np.empty((len(labels), 0)), *(values for values, _ in blocks)]
+    table = np.concatenate(arrays, axis=1).astype(np.float64)
+    columns = [column for _, columns in blocks for column in columns]
+    numbers = [i for i, column in enumerate(columns) if column[-1] in _COORDS]
+    columns = [columns[i] for i in numbers]
+    for column in columns:
+        if len(column) not in (len(_LEVELS), len(_LEVELS_OF_MANY)):
+            raise ValueError(f"its columns have {len(column)} levels")
+    return table[:, numbers], columns, labels
+
+
+def _table_blocks(group: Any) -> tuple[list[tuple[NDArray, Columns]], list[Any]]:
+    """Return the blocks of format="table", one field of the rows each."""
+    rows, table = content_of(group, "table"), group["table"]
+    blocks = []
+    for name in rows.dtype.names or ():
+        is_number = rows.dtype[name].base.kind in "fiu"
+        if name.startswith("values_block_") and is_number:
+            labels = _plain(table.attrs[f"{name}_kind"])
+            columns = [tuple(map(str, label)) for label in labels]
+            blocks.append((rows[name].reshape(len(rows), -1), columns))
+    return blocks, [_label(label) for label in rows["index"]]
+
+
+def _fixed_blocks(group: Any) -> tuple[list[tuple[NDArray, Columns]], list[Any]]:
+    """Return the blocks of format="fixed", an array each."""
+    blocks = []
+    for i in range(int(group.attrs["nblocks"])):
+        name = f"block{i}_values"
+        values = content_of(group, name)
+        if values.dtype.kind in "fiu":
+            if not group[name].attrs.get("transposed", False):
+                values = values.T
+            blocks.append((values, _levels(group, f"block{i}_items")))
+    if _text(group.attrs["axis1_variety"]) == "multi":
+        return blocks, ["/".join(label) for label in _levels(group, "axis1")]
+    return blocks, [_label(label) for label in content_of(group, "axis1")]
+
+
+def _levels(group: Any, name: str) -> Columns:
+    """Return labels of several levels."""
+    if _text(group.attrs[f"{name}_variety"]) != "multi":
+        return [(_text(label),) for label in content_of(group, name)]
+    parts = []
+    for i in range(int(group.attrs[f"{name}_nlevels"])):
+        texts = [_text(text) for text in content_of(group, f"{name}_level{i}")]
+        codes = content_of(group, f"{name}_label{i}")
+        if np.any((codes < 0) | (codes >= len(texts))):
+            raise ValueError(f"{name} has labels that are not among its texts")
+        parts.append([texts[code] for code in codes])
+    return list(zip(*parts, strict=True))
+
+
+def _label(label: Any) -> Any:
+    """Return the label of a row, a number or a text."""
+    return _text(label) if isinstance(label, bytes) else label.item()
+
+
+def _text(value: Any) -> str:
+    """Return a text that HDF5 holds as bytes or as a text."""
+    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    """Unpickles numbers, texts, tuples, lists and dictionaries, and nothing else."""
+
+    def find_class(self, module_name: str, global_name: str, /) -> NoReturn:
+        """Refuse everything that has to be imported."""
+        raise pickle.UnpicklingError(f"{module_name}.{global_name} is not allowed")
+
+
+def _plain(pickled: Any) -> Any:
+    """Return the plain object that was pickled."""
+    return _PlainUnpickler(io.BytesIO(bytes(pickled)), encoding="utf-8").load()
+
+
+def is_sleap(path: Path) -> bool:
+    """Return whether a file has the datasets (h5) or the header of SLEAP."""
+    if is_hdf5(path):
+        return _NEEDED <= root_groups(path)
+    return header_names(path)[: len(_CSV_COLUMNS)] == _CSV_COLUMNS
+
+
+def read_sleap(path: Path) -> Landmarks:
+    """Read an analysis h5 file or table of SLEAP, or of sleap-io and movement.
+
+    In an h5 file, ``tracks`` has the points, in the order of axes of its attribute
+    ``dims``, by default (track, xy, node, frame). ``point_scores`` and
+    ``instance_scores`` have confidences, ``edge_names`` the pairs of nodes that the
+    skeleton joins. A table has a row for each instance, ``track, frame_idx,
+    instance.score`` and ``x``, ``y`` and ``score`` of each node. Frames are counted
+    from 0.
+    """
+    is_h5 = path.suffix.lower() in (".h5", ".hdf5")
+    return _read_analysis(path) if is_h5 else _read_table(path)
+
+
+def _read_table(path: Path) -> Landmarks:
+    """Read a table, which has no rows for frames without instances."""
+    if not is_sleap(path):
+        raise ValueError(f"its first columns are not {', '.join(_CSV_COLUMNS)}")
+    names = header_names(path)
+    found = find_landmark_columns(names, "*.x,*.y")
+    nodes = [name.removesuffix(".x") for name in found.x]
+    scores = [f"{node}.score" for node in nodes]
+    if not set(scores).issubset(names):
+        raise ValueError("not all of its points have a score")
+    table = read_columns(
+        path,
+        numbers=[*found.interleaved, *scores, "frame_idx", "instance.score"],
+        text=("track",),
+    )
+    return assemble(
+        tracks_in(table, found.interleaved),
+        nodes,
+        table[_CSV_COLUMNS].set_axis(["individual", "frame", "instance_score"], axis=1),
+        format="sleap",
+        confidence=table[scores].to_numpy(np.float64),
+    )
+
+
+def _read_analysis(path: Path) -> Landmarks:
+    """Read an h5 file."""
+    h5py = import_optional("h5py", extra="h5")
+    with h5py.File(path, "r") as file:
+        absent = _NEEDED.difference(file)
+        if absent:
+            raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
+        nodes = _texts(content_of(file, "node_names"))
+        names = _texts(content_of(file, "track_names"))
+        tracks, dims = _array(file, "tracks", {"xy": 2, "node": len(nodes)}, _ORDERS)
+        lengths = dict(zip(_DIMS, tracks.shape, strict=True))
+        scores = {}
+        for name, n_dims in (("point_scores", 3), ("instance_scores", 2)):
+            if name in file:
+                order = [dim for dim in dims if dim in _DIMS[:n_dims]]
+                scores[name], _ = _array(file, name, lengths, [order])
+        skeleton = _skeleton(file, nodes)
+    n_tracks = tracks.shape[1]
+    if names and len(names) != n_tracks:
+        raise ValueError(f"tracks holds {n_tracks} tracks, track_names {len(names)}")
+    of_instances = scores.pop("instance_scores", np.array(np.nan))
+    scored = {} if np.isnan(of_instances).all() else {"instance_score": of_instances}
+    return assemble_individuals(
+        tracks,
+        names or (range(n_tracks) if n_tracks > 1 else None),
+        nodes,
+        {"frame": range(len(tracks))},
+        of_instances=scored,
+        format="sleap",
+        confidence=scores.get("point_scores"),
+        skeleton=skeleton,
+    )
+
+
+def _array(
+    file: Any, name: str, lengths: dict[str, int], orders: Sequence[Sequence[str]]
+) -> tuple[NDArray[np.float64], Sequence[str]]:
+    """Return numbers with the axes in the order of `_DIMS`, and in the order stored.
+
+    Without the attribute ``dims`` this is one of `orders`.
+    """
+    stored, named = numbers_of(file, name), _named_dims(file[name])
+    wanted = [dim for dim in _DIMS if dim in orders[0]]
+    known = {dim: length for dim, length in lengths.items() if dim in wanted}
+    for dims in orders if named is None else [named]:
+        sizes = dict(zip(dims, stored.shape, strict=False))
+        fits = all(sizes.get(dim) == length for dim, length in known.items())
+        if sorted(dims) == sorted(wanted) and stored.ndim == len(dims) and fits:
+            return stored.transpose([dims.index(dim) for dim in wanted]), dims
+    raise ValueError(
+        f"{name} should have the axes {', '.join(named or orders[0])}, with "
+        f"{' and '.join(map(str, known.values()))} for {' and '.join(known)}; got the "
+        f"shape {stored.shape}"
+    )
+
+
+def _named_dims(dataset: Any) -> list[str] | None:
+    """Return the names of the axes in the attributes of a dataset, or None."""
+    if "dims" not in dataset.attrs:
+        return None
+    named = json.loads(dataset.attrs["dims"])
+    if not isinstance(named, list) or not all(isinstance(dim, str) for dim in named):
+        raise ValueError(f"its attribute dims should be a list of names; got {named}")
+    return named
+
+
+def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
+    """Return the skeleton of the dataset of edges; None if it is empty or absent."""
+    if "edge_names" not in file or not file["edge_names"].size:
+        return None
+    content = content_of(file, "edge_names")
+    size = np.shape(content)
+    if len(size) != 2 or 2 not in size:
+        raise ValueError(f"edge_names should hold pairs of names; got the shape {size}")
+    names = np.reshape(_texts(content), size)
+    # SLEAP writes a row for each edge; all other arrays of MATLAB's order are turned.
+    edges = (names if size[1] == 2 else names.T).tolist()
+    return skeleton_of_names(edges, nodes, name="SLEAP", source="its analysis file")
+
+
+def _texts(content: Any) -> list[str]:
+    """Return the texts that a dataset holds; an empty one may be of numbers."""
+    texts = np.ravel(content).tolist() if np.size(content) else []
+    if not all(isinstance(text, bytes | str) for text in texts):
+        raise ValueError(f"the names of nodes and tracks should be texts; got {texts}")
+    return [text.decode() if isinstance(text, bytes) else text for text in texts]

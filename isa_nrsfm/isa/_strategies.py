@@ -1,0 +1,433 @@
+"""The strategies: FastISA with many starts (ISA1), and FastICA with pooling (ISA2)."""
+
+import warnings
+from numbers import Integral
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from joblib import effective_n_jobs
+from numpy.typing import NDArray
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import check_array, check_random_state
+from sklearn.utils.parallel import Parallel, delayed
+
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import HasMethods, StrOptions, fit_context
+from isa_nrsfm.isa._base import (
+    BaseSubspaceAnalysis,
+    SqrtDensity,
+    SubspaceDensity,
+    Values,
+    energy_shares,
+    iterate,
+    likelihoods,
+    log_likelihood,
+    orthogonalise,
+    swap_until_best,
+)
+
+
+class FastISA(BaseSubspaceAnalysis):
+    """
+    Independent subspace analysis by fixed-point iteration from many starts.
+
+    Finds a linear transformation of the signals into sources. Consecutive groups of
+    `subspace_size` sources are as independent of each other as possible. Inside a
+    group, the energies of the sources depend on each other.
+
+    Each start takes a random orthogonal matrix, runs symmetric FastICA with the same
+    density (subspaces of size one), groups its rows by greedy swaps and runs FastISA.
+    The start with the largest likelihood is kept.
+
+    Parameters
+    ----------
+    subspace_size : int, default=3
+        Dimension of each subspace; the number of signals must be a multiple of it.
+    n_init : int, default=30
+        Number of starts.
+    density : object, default=None
+        Logarithm of the density of a subspace's energy, with the methods
+        ``log_density(energy)`` and ``derivatives(energy)``; None is
+        ``SqrtDensity(eps=0.1)``.
+    max_iter : int, default=500
+        Maximum number of steps of each of the two iterations of a start.
+    tol : float, default=1e-4
+        Tolerance of both iterations: the largest change of a subspace, as the mean
+        squared sine of the principal angles.
+    random_state : int, RandomState instance or None, default=None
+        Determines the random starts. Pass an int for reproducible results.
+    n_jobs : int or None, default=None
+        Number of joblib workers for the starts. The result does not depend on it.
+    verbose : int, default=0
+        If positive, print a line for each batch of starts.
+
+    Attributes
+    ----------
+    components_ : ndarray of shape (n_signals, n_signals)
+        Unmixing matrix, whitening included: ``(signals - mean_) @ components_.T`` are
+        the sources. Sources are uncorrelated and have unit variance. Consecutive rows
+        form a subspace. The matrix is orthogonal if the signals are white.
+    mean_ : ndarray of shape (n_signals,)
+        Mean of the signals.
+    log_likelihood_ : float
+        Mean log-likelihood per sample of the best start, up to a constant.
+    log_likelihoods_ : ndarray of shape (n_init,)
+        The same for every start.
+    n_iter_ : int
+        Number of steps of the best start, in both iterations together.
+    n_iters_ : ndarray of int, shape (n_init,)
+        The same for every start.
+    n_features_in_ : int
+        Number of signals.
+    feature_names_in_ : ndarray of shape (n_signals,)
+        Names of the signals. Defined only if all names are strings.
+
+    See Also
+    --------
+    PooledFastICA : Independent components that are grouped afterwards.
+
+    References
+    ----------
+    A. Hyvarinen, U. Koster, "FastISA: A fast fixed-point algorithm for independent
+    subspace analysis", ESANN 2006.
+
+    S. Brandt, H. Ackermann, S. Grasshof, "Uncalibrated Non-Rigid Factorisation by
+    Independent Subspace Analysis", 2018, section 3.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.isa import FastISA
+    >>> rng = np.random.default_rng(0)
+    >>> sources = rng.normal(size=(2000, 2, 3)) * rng.exponential(size=(2000, 2, 1))
+    >>> signals = sources.reshape(2000, 6) @ rng.normal(size=(6, 6))
+    >>> isa = FastISA(n_init=5, random_state=0).fit(signals)
+    >>> isa.components_.shape
+    (6, 6)
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **BaseSubspaceAnalysis._parameter_constraints,
+        "density": [None, HasMethods(["log_density", "derivatives"])],
+        "n_jobs": [None, Integral],
+        "verbose": ["verbose"],
+    }
+
+    def __init__(
+        self,
+        subspace_size: int = 3,
+        *,
+        n_init: int = 30,
+        density: SubspaceDensity | None = None,
+        max_iter: int = 500,
+        tol: float = 1e-4,
+        random_state: Any = None,
+        n_jobs: int | None = None,
+        verbose: int = 0,
+    ):
+        self.subspace_size = subspace_size
+        self.n_init = n_init
+        self.density = density
+        self.max_iter = max_iter
+        self.tol = tol
+        self.random_state = random_state
+        self.n_jobs = n_jobs
+        self.verbose = verbose
+
+    @fit_context(nested=False)
+    def fit(self, signals: Any, y: Any = None) -> Self:
+        """
+        Find the independent subspaces.
+
+        Parameters
+        ----------
+        signals : array-like of shape (n_samples, n_signals)
+            The signals, one per column.
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        FastISA
+            The fitted strategy.
+
+        Raises
+        ------
+        ValueError
+            If the number of signals is not a multiple of `subspace_size`, or the
+            signals are linearly dependent.
+        """
+        return self._fit_signals(signals)
+
+    def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
+        density = SqrtDensity() if self.density is None else self.density
+        random_state = check_random_state(self.random_state)
+        n_signals = len(Z)
+        starts = orthogonalise(
+            random_state.standard_normal((self.n_init, n_signals, n_signals))
+        )
+        # Batches that reduce the overhead of NumPy, with arrays that fit into the
+        # cache.
+        batches = [starts[first : first + 16] for first in range(0, self.n_init, 16)]
+        n_jobs = min(effective_n_jobs(self.n_jobs), len(batches))
+        runs = Parallel(n_jobs=n_jobs, return_as="generator")(
+            delayed(self._run)(batch, Z, density) for batch in batches
+        )
+        results = []
+        for run in runs:
+            results.append(run)
+            if self.verbose:
+                done = sum(len(W) for W, *_ in results)
+                best = max(values.max() for _, values, *_ in results)
+                print(f"[FastISA] {done}/{self.n_init} starts, best {best:.6g}")
+        W, log_likelihoods, n_iters, converged = map(
+            np.concatenate, zip(*results, strict=True)
+        )
+        best = int(np.argmax(log_likelihoods))
+        if not converged[best]:
+            warn_caller(
+                f"FastISA did not converge in max_iter={self.max_iter} steps: its "
+                "best start still changes. Increase max_iter or tol",
+                ConvergenceWarning,
+            )
+        self.log_likelihoods_ = log_likelihoods
+        self.log_likelihood_ = float(log_likelihoods[best])
+        self.n_iters_ = n_iters
+        self.n_iter_ = int(n_iters[best])
+        return W[best]
+
+    def _run(
+        self, starts: NDArray, Z: NDArray, density: SubspaceDensity
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return unmixing, likelihood, steps, convergence of starts (n_batch, n, n)."""
+        size, max_iter, tol = self.subspace_size, self.max_iter, self.tol
+        # FastICA: subspaces of size one. Inside a subspace the components may be
+        # undetermined, so a moderate convergence is enough.
+        W, n_iter_ica, _ = iterate(
+            starts, Z, 1, density, max_iter=max_iter, tol=max(tol, 1e-4)
+        )
+        # Group the components into subspaces.
+        in_order = np.arange(len(Z)) // size
+        for r in range(len(W)):
+            W[r] = W[r][swap_until_best([in_order], likelihoods(W[r] @ Z, density))[0]]
+        # FastISA.
+        W, n_iter, converged = iterate(W, Z, size, density, max_iter=max_iter, tol=tol)
+        return W, log_likelihood(W, Z, size, density), n_iter_ica + n_iter, converged
+
+
+class PooledFastICA(BaseSubspaceAnalysis):
+    """
+    Independent subspace analysis by FastICA and pooling of its components.
+
+    The independent components of scikit-learn's FastICA are pooled into groups of
+    `subspace_size` by greedy pairwise swaps. If a covariance matrix over other data is
+    given (for landmarks: over the images), the swaps make it as block-diagonal as
+    possible. Otherwise they maximise the likelihood of independent subspaces.
+
+    Parameters
+    ----------
+    subspace_size : int, default=3
+        Dimension of each subspace; the number of signals must be a multiple of it.
+    n_init : int, default=16
+        Number of runs of FastICA from different starts. With few samples the runs end
+        in different local optima. The best run by the criterion of `fit` is kept.
+    fun : {"exp", "logcosh", "cube"}, default="exp"
+        Contrast function of FastICA.
+    max_iter : int, default=200
+        Maximum number of steps of a run of FastICA.
+    tol : float, default=1e-4
+        Tolerance of FastICA.
+    random_state : int, RandomState instance or None, default=None
+        Determines the random starts. Pass an int for reproducible results.
+
+    Attributes
+    ----------
+    components_ : ndarray of shape (n_signals, n_signals)
+        Unmixing matrix, whitening included: ``(signals - mean_) @ components_.T`` are
+        the sources. Sources are uncorrelated and have unit variance. Consecutive rows
+        form a subspace. The matrix is orthogonal if the signals are white.
+    mean_ : ndarray of shape (n_signals,)
+        Mean of the signals.
+    criteria_ : ndarray of shape (n_init,)
+        Value of the criterion of `fit` for each run. The run with the largest value is
+        kept.
+    n_iter_ : int
+        Steps of FastICA in the run that is kept.
+    n_features_in_ : int
+        Number of signals.
+    feature_names_in_ : ndarray of shape (n_signals,)
+        Names of the signals. Defined only if all names are strings.
+
+    See Also
+    --------
+    FastISA : Independent subspaces by a fixed-point iteration.
+
+    References
+    ----------
+    S. Brandt, H. Ackermann, S. Grasshof, "Uncalibrated Non-Rigid Factorisation by
+    Independent Subspace Analysis", 2018, section 3.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.isa import PooledFastICA
+    >>> rng = np.random.default_rng(0)
+    >>> sources = rng.laplace(size=(1000, 6))
+    >>> isa = PooledFastICA(n_init=3, random_state=0)
+    >>> isa.fit(sources @ rng.normal(size=(6, 6))).components_.shape
+    (6, 6)
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **BaseSubspaceAnalysis._parameter_constraints,
+        "fun": [StrOptions({"exp", "logcosh", "cube"})],
+    }
+
+    def __init__(
+        self,
+        subspace_size: int = 3,
+        *,
+        n_init: int = 16,
+        fun: str = "exp",
+        max_iter: int = 200,
+        tol: float = 1e-4,
+        random_state: Any = None,
+    ):
+        self.subspace_size = subspace_size
+        self.n_init = n_init
+        self.fun = fun
+        self.max_iter = max_iter
+        self.tol = tol
+        self.random_state = random_state
+
+    @fit_context(nested=False)
+    def fit(
+        self,
+        signals: Any,
+        y: Any = None,
+        *,
+        covariance: Any = None,
+        criterion: Values | None = None,
+    ) -> Self:
+        """
+        Find the independent components and pool them.
+
+        Parameters
+        ----------
+        signals : array-like of shape (n_samples, n_signals)
+            The signals, one per column.
+        y : None
+            Ignored.
+        covariance : array-like of shape (n_signals, n_signals), default=None
+            Symmetric covariance in the coordinates of the signals. The pooling
+            minimises the energy of ``components_ @ covariance @ components_.T`` outside
+            its diagonal blocks. If None, it maximises the likelihood of independent
+            subspaces.
+        criterion : callable, default=None
+            Takes candidates for subspaces, ndarray of shape (n_candidates,
+            subspace_size, n_signals) with rows of `components_`, and returns the value
+            of each, ndarray of shape (n_candidates,). The run with the largest sum over
+            its subspaces is kept. Its components are then swapped between subspaces as
+            long as the sum rises. If None, the run with the best objective of the
+            pooling is kept, without further swaps.
+
+        Returns
+        -------
+        PooledFastICA
+            The fitted strategy.
+
+        Raises
+        ------
+        ValueError
+            If the number of signals is not a multiple of `subspace_size`, the signals
+            are linearly dependent, or `covariance` is not a symmetric matrix of shape
+            (n_signals, n_signals).
+        """
+        return self._fit_signals(signals, covariance=covariance, criterion=criterion)
+
+    def _unmix(
+        self,
+        Z: NDArray,
+        whitening: NDArray,
+        covariance: Any = None,
+        criterion: Values | None = None,
+    ) -> NDArray:
+        n_signals, size = len(Z), self.subspace_size
+        if covariance is not None:
+            covariance = _check_covariance(covariance, n_signals)
+            if covariance.any():
+                covariance = whitening @ covariance @ whitening.T
+            else:  # all groupings are as good
+                covariance = np.eye(n_signals)
+        random_state = check_random_state(self.random_state)
+        starts = random_state.standard_normal((self.n_init, n_signals, n_signals))
+        in_order = np.arange(n_signals) // size
+        # Greedy swaps start from the components in order, and from random groupings.
+        groupings = [in_order, *(random_state.permutation(in_order) for _ in range(7))]
+        runs: list[tuple[float, NDArray, int, bool]] = []
+        for start in starts:
+            W, n_iter, converged = self._components(Z, start)
+            if covariance is None:
+                value = likelihoods(W @ Z, SqrtDensity())
+            else:
+                value = energy_shares(W @ covariance @ W.T)
+            orders = swap_until_best(groupings, value)
+            sums = [float(np.sum(value(rows.reshape(-1, size)))) for rows in orders]
+            best = int(np.argmax(sums))
+            W = W[orders[best]]
+            if criterion is not None:
+                subspaces = (W @ whitening).reshape(-1, size, n_signals)
+                sums[best] = float(np.sum(criterion(subspaces)))
+            runs.append((sums[best], W, n_iter, converged))
+        self.criteria_ = np.array([run[0] for run in runs])
+        _, W, n_iter, converged = runs[int(np.argmax(self.criteria_))]
+        self.n_iter_ = n_iter
+        if criterion is not None:
+            # All swaps between subspaces that raise the criterion
+            components = W @ whitening
+            (rows,) = swap_until_best(
+                [in_order], lambda each: criterion(components[each])
+            )
+            W = W[rows]
+        if not converged:
+            other = "another fun or " if "fun" in self.get_params() else ""
+            warn_caller(
+                f"{type(self).__name__} did not converge in max_iter={self.max_iter} "
+                "steps in the run that is kept: its sources may be ill determined; try "
+                f"{other}larger n_init or max_iter",
+                ConvergenceWarning,
+            )
+        return W
+
+    def _components(self, Z: NDArray, start: NDArray) -> tuple[NDArray, int, bool]:
+        """Return unmixing, steps and convergence of one run on white signals.
+
+        Z is (n_signals, n_samples), start and unmixing (n_signals, n_signals).
+        """
+        # This imports all linear models, which `transform` does not need.
+        from sklearn.decomposition import FastICA
+
+        ica = FastICA(
+            whiten=False,
+            fun=self.fun,
+            max_iter=self.max_iter,
+            tol=self.tol,
+            w_init=start,
+        )
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            ica.fit(Z.T)
+        converged = not any(w.category is ConvergenceWarning for w in caught)
+        return orthogonalise(ica.components_[None])[0], ica.n_iter_, converged
+
+
+def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
+    """Return a covariance matrix as an array, or raise an error."""
+    covariance = check_array(covariance, dtype=np.float64, input_name="covariance")
+    if covariance.shape != (n_signals, n_signals):
+        raise ValueError(
+            f"covariance must have shape {(n_signals, n_signals)}; "
+            f"got {covariance.shape}"
+        )
+    if not np.allclose(covariance, covariance.T, atol=1e-8 * np.abs(covariance).max()):
+        raise ValueError("covariance must be symmetric; got a matrix that is not")
+    return covariance
