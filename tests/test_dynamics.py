@@ -2,7 +2,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from layers import start_may_not_converge
 from numpy.testing import assert_allclose
+from scenes import waving_scene
 from scipy.linalg import block_diag
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
@@ -126,9 +128,9 @@ class TestDynamics:
         assert_allclose((shown @ first @ shown.T)[:K, :K], np.eye(K))
 
 
+@pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
 class TestSmoother:
     @pytest.mark.parametrize("gaps", [False, True])
-    @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
     def test_is_the_posterior_of_the_joint_normal_distribution(
         self, gaps, n_walks, n_shares
     ):
@@ -147,7 +149,6 @@ class TestSmoother:
         assert_allclose(covariances, expected, atol=atol)
         assert_allclose(value, likelihood)
 
-    @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
     def test_gradient_is_that_of_the_likelihood(self, n_walks, n_shares):
         rng = np.random.default_rng(1)
         dynamics = some_dynamics(n_walks, n_shares=n_shares)
@@ -260,13 +261,7 @@ def test_likelihood_of_frames_is_linearised(name, loss):
 def waving():
     """Return a model of a thing that waves, its table in order of time."""
     rng = np.random.default_rng(0)
-    phase = 0.1 * np.arange(160)
-    alpha = np.stack([np.sin(phase), np.cos(0.7 * phase)], axis=1)
-    scene = make_nonrigid_tracks(
-        n_frames=160, n_points=20, n_components=2, noise=0.0, random_state=0
-    )
-    shapes = scene.mean_shape + np.einsum("ik,kjc->ijc", alpha, scene.basis)
-    tracks = shapes @ scene.motion.swapaxes(1, 2)
+    tracks = waving_scene(160, 20, [0.1, 0.07])[0].tracks
     tracks += 0.15 * tracks.std() * rng.normal(size=tracks.shape)
     tracks[rng.random(tracks.shape[:2]) < 0.4] = np.nan
     table = tracks.reshape(160, -1)
@@ -276,9 +271,7 @@ def waving():
 class TestSmooth:
     def test_cameras_are_smoothed(self):
         rng, t = np.random.default_rng(0), np.arange(150)
-        alpha = np.stack([np.sin(0.1 * t), np.cos(0.07 * t)], axis=1)
-        scene = make_nonrigid_tracks(150, 20, n_components=2, random_state=0)
-        shapes = scene.mean_shape + np.einsum("ik,kjc->ijc", alpha, scene.basis)
+        shapes = waving_scene(150, 20, [0.1, 0.07])[0].shapes
         turns = np.stack([0.3 * np.sin(0.1 * t), 0.05 * t, 0.2 * np.cos(0.05 * t)], 1)
         R = Rotation.from_rotvec(turns).as_matrix()
         truth = shapes @ R.transpose(0, 2, 1)
@@ -383,7 +376,7 @@ class TestSmooth:
             model.smooth(table, **options)
 
     # Whether FastICA converges on one basis shape depends on the version of SciPy.
-    @pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
+    @start_may_not_converge
     def test_needs_a_posterior(self, waving):
         _, table = waving
         model = AffineNRSfM(1, refinement=None, random_state=0).fit(table)

@@ -59,8 +59,7 @@ def test_score_is_minus_the_error_and_the_same_each_time(refinement):
         assert_allclose(model.score(few), by_plain_loops(model, few), rtol=1e-6)
     assert model.score(X) == score
     assert model.score(X, y=np.zeros(len(X))) == score
-    again = AffineNRSfM(2, **params, random_state=0).fit(X)
-    assert again.score(X) == score
+    assert AffineNRSfM(2, **params, random_state=0).fit(X).score(X) == score
 
 
 def test_score_weights_frames_as_the_fit_does():

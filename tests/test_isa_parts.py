@@ -89,16 +89,15 @@ class TestStep:
             assert subspace_change(W, new, 3).max() < 1e-13
 
 
-class TestChange:
-    def test_is_the_distance_of_projectors(self):
-        W, V = starts(0, 5, 6), starts(1, 5, 6)
-        for size in (1, 2, 3):
-            expected = []
-            for w, v in zip(W, V, strict=True):
-                a, b = w.reshape(-1, size, 6), v.reshape(-1, size, 6)
-                difference = a.swapaxes(1, 2) @ a - b.swapaxes(1, 2) @ b
-                expected.append(np.max(np.sum(difference**2, axis=(1, 2))) / 2 / size)
-            assert_allclose(subspace_change(W, V, size), expected)
+def test_change_is_the_distance_of_projectors():
+    W, V = starts(0, 5, 6), starts(1, 5, 6)
+    for size in (1, 2, 3):
+        expected = []
+        for w, v in zip(W, V, strict=True):
+            a, b = w.reshape(-1, size, 6), v.reshape(-1, size, 6)
+            difference = a.swapaxes(1, 2) @ a - b.swapaxes(1, 2) @ b
+            expected.append(np.max(np.sum(difference**2, axis=(1, 2))) / 2 / size)
+        assert_allclose(subspace_change(W, V, size), expected)
 
 
 def likelihood(signals, assignment):
@@ -116,6 +115,8 @@ def random_assignments(seed, n, n_signals=9, size=3):
     return [rng.permutation(np.arange(n_signals) // size) for _ in range(n)]
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
 class TestGains:
     """The gain of every swap, against the difference of the objective."""
 
@@ -132,16 +133,12 @@ class TestGains:
                     difference = objective(swapped) - now
                     assert_allclose(gain[a, b], difference, atol=1e-12 * size)
 
-    @pytest.mark.parametrize("seed", range(3))
-    @pytest.mark.parametrize("size", [1, 2, 3, 4])
     def test_covariance(self, seed, size):
         C = random_covariance(seed, 12)
         for assignment in random_assignments(seed, 3, 12, size):
             gains = covariance_gains(C)
             self.check(gains, lambda z: energy_inside(C, z) / 2, assignment)
 
-    @pytest.mark.parametrize("seed", range(3))
-    @pytest.mark.parametrize("size", [1, 2, 3, 4])
     def test_likelihood(self, seed, size):
         signals = spherical_sources(seed, 60, 4).T
         gains = likelihood_gains(signals, DENSITY)
@@ -281,19 +278,18 @@ class TestReturned:
     [["product"] * 4, ["student", "product", "gaussian", "uniform"], ["gaussian"] * 4],
     ids=["heavy", "mixed", "gaussian"],
 )
-class TestInvariance:
-    def test_to_basis_order_of_samples_and_common_rotations(self, kinds, size, seed):
-        signals = sources(kinds, seed, 200 if size == 1 else 68, size)
-        found = unmix(signals)
-        mixed = np.tensordot(random_mixing(seed + 7, len(kinds)), signals, 1)
-        order = np.random.default_rng(seed).permutation(signals.shape[1])
-        R = -random_rotation(seed, size)  # or reflections
-        for changed, expected in (
-            (1e-6 * mixed, found),
-            (signals[:, order], found[:, order]),
-            (signals @ R, found @ R),
-        ):
-            assert_allclose(matched(expected, unmix(changed)), expected, atol=1e-7)
+def test_invariance_to_basis_order_of_samples_and_rotations(kinds, size, seed):
+    signals = sources(kinds, seed, 200 if size == 1 else 68, size)
+    found = unmix(signals)
+    mixed = np.tensordot(random_mixing(seed + 7, len(kinds)), signals, 1)
+    order = np.random.default_rng(seed).permutation(signals.shape[1])
+    R = -random_rotation(seed, size)  # or reflections
+    for changed, expected in (
+        (1e-6 * mixed, found),
+        (signals[:, order], found[:, order]),
+        (signals @ R, found @ R),
+    ):
+        assert_allclose(matched(expected, unmix(changed)), expected, atol=1e-7)
 
 
 class TestOptimality:
