@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
-from layers import may_not_converge, slow_after
+from layers import may_not_converge, one_start, slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from sklearn.base import BaseEstimator, clone
@@ -23,6 +23,8 @@ from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
+
+pytestmark = one_start
 
 N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
@@ -693,7 +695,7 @@ def test_refinement_that_is_cut_short_says_so():
 
 def test_layout_warning_points_to_the_caller():
     with pytest.warns(UserWarning, match="layout='planar' explains") as caught:
-        estimator().fit(planar(TABLE))
+        estimator(refinement=None).fit(planar(TABLE))
     assert [warning.filename for warning in caught] == [__file__]
 
 
@@ -770,7 +772,7 @@ def test_strategies_with_other_subspaces_or_too_few_are_refused(isa, message):
 
 
 def test_verbose_prints_a_line_for_each_stage(capsys):
-    estimator().fit(TABLE)
+    estimator(refinement=None).fit(TABLE)
     assert capsys.readouterr().out == ""
     estimator(verbose=1).fit(TABLE)
     lines = capsys.readouterr().out.splitlines()
