@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import one_start, slow_after
 from numpy.testing import assert_allclose
 from refusals import warned
 from scipy.linalg import eigvals
@@ -26,6 +26,8 @@ from isa_nrsfm.analysis._diagnostics import (
 )
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.skeletons import get_skeleton
+
+pytestmark = one_start
 
 TABLE = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
 
