@@ -837,7 +837,7 @@ class TestReconstruct:
         with pytest.warns(UserWarning, match="hardly determine the metric"):
             model.reconstruct(table, camera="weak_perspective")
 
-    @pytest.mark.parametrize("seed", [11, 17])
+    @pytest.mark.parametrize("seed", slow_after(1, [11, 17]))
     def test_noisy_cameras_that_hardly_turn(self, seed):
         # The deeper space is, the better it fits the noise of such cameras.
         rng = np.random.default_rng(seed)

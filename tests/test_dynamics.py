@@ -2,7 +2,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from layers import one_start, start_may_not_converge
+from layers import one_start, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
 from scenes import waving_scene
 from scipy.linalg import block_diag
@@ -174,7 +174,7 @@ class TestEstimation:
         assert_allclose(found.rates, true.rates, atol=0.5)
         assert_allclose(found.walks, true.walks, atol=0.5)
 
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", slow_after(1, range(3)))
     def test_independent_frames_have_none(self, seed):
         rng = np.random.default_rng(seed)
         data = observed(rng.normal(size=(100, K)), rng, 1.0)
@@ -182,7 +182,9 @@ class TestEstimation:
 
 
 class TestPeople:
-    @pytest.mark.parametrize(("n_people", "n_frames"), [(30, 3), (4, 30)])
+    @pytest.mark.parametrize(
+        ("n_people", "n_frames"), slow_after(1, [(4, 30), (30, 3)], together=True)
+    )
     def test_photos_in_any_order_have_no_dynamics(self, n_people, n_frames):
         rng = np.random.default_rng(0)
         person = np.repeat(np.arange(n_people), n_frames)

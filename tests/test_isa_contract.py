@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from groupings import GROUPINGS, energy_inside
 from joblib import parallel_config
-from layers import may_not_converge, start_may_not_converge
+from layers import may_not_converge, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from scenes import random_rotation, spherical_sources
@@ -355,7 +355,7 @@ class TestCovariance:
         share = energy_inside(pooled, IN_ORDER) / np.sum(pooled**2)
         assert_allclose(isa.criteria_.max(), share)
 
-    @pytest.mark.parametrize("seed", range(8))
+    @pytest.mark.parametrize("seed", slow_after(3, range(8)))
     def test_best_of_all_groupings(self, seed):
         signals, _ = independent(seed, 500)
         A = np.random.default_rng(seed).normal(size=(9, 12))
@@ -402,7 +402,7 @@ class TestLikelihood:
         assert_allclose(isa.criteria_.max(), expected)
 
     @start_may_not_converge
-    @pytest.mark.parametrize("seed", range(8))
+    @pytest.mark.parametrize("seed", slow_after(3, range(8)))
     def test_best_of_all_groupings(self, seed):
         # So few samples that no grouping stands out.
         signals = np.random.default_rng(seed).laplace(size=(40, 9))

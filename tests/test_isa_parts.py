@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from groupings import energy_inside
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, spherical_sources
 from scipy.integrate import quad
@@ -208,7 +209,7 @@ def white(signals):
 
 
 class TestRecovery:
-    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("seed", slow_after(2, range(5)))
     @pytest.mark.parametrize(
         ("n_components", "n_points", "least"),
         [(2, 68, 0.97), (5, 68, 0.95), (9, 500, 0.99)],

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import sklearn
-from layers import one_start, start_may_not_converge
+from layers import one_start, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from refusals import refused, warned
@@ -155,7 +155,7 @@ class TestMeaning:
 
 class TestAccuracy:
     @CAMERAS
-    @pytest.mark.parametrize("seed", range(2))
+    @pytest.mark.parametrize("seed", slow_after(1, range(2)))
     def test_weighted_fits_have_less_error(self, camera, seed):
         X, weights, shapes = noisy(seed)
         plain = estimator(camera=camera).fit(X)
