@@ -8,10 +8,10 @@ def rotations(rng, n_frames, spread=0.6):
     return Rotation.from_rotvec(spread * rng.standard_normal((n_frames, 3))).as_matrix()
 
 
-def affinity(rng):
-    """A stretch between 1/2 and 2 with any axes and handedness."""
+def affinity(rng, *stretch):
+    """A stretch, between 1/2 and 2 if not given, with any axes and handedness."""
     left, right = (np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in "ab")
-    return left @ np.diag([0.5, 1.0, 2.0]) @ right
+    return left @ np.diag(stretch or [0.5, 1.0, 2.0]) @ right
 
 
 def weak_perspective(rng, n_frames=30, scales=None):

@@ -20,6 +20,8 @@ from estimator_contract import widen
 from hypothesis import settings
 from sklearn.utils import estimator_checks
 
+from isa_nrsfm import AffineNRSfM
+
 matplotlib.use("Agg")
 
 # The same examples each time; HYPOTHESIS_PROFILE=ci tries many more.
@@ -85,6 +87,16 @@ def load_data(data_path):
         return arrays | {name: arrays[name].astype(float) for name in floats}
 
     return load
+
+
+@pytest.fixture(scope="module")
+def one_start():
+    """Let joint fits of small tables have one start, as those of large ones do."""
+    limits = AffineNRSfM._limits
+    quick = limits._replace(few_frames=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(AffineNRSfM, "_limits", quick)
+        yield
 
 
 @pytest.fixture

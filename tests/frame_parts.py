@@ -16,11 +16,7 @@ def camera_and_alpha(fits):
 
 def numbers_of(fits):
     """Return all that is a number for each frame."""
-    return (
-        *camera_and_alpha(fits),
-        fits.covariance,
-        fits.objective,
-    )
+    return (*camera_and_alpha(fits), fits.covariance, fits.objective)
 
 
 def fit_posterior(tracks, shapes, noise, camera="affine", **given):

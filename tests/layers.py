@@ -1,6 +1,17 @@
-"""Parameters of tests that belong to the quick layer, and others that do not."""
+"""Parameters of tests of which some are slow, and a mark of tests."""
 
 import pytest
+
+# The run of FastICA or FastISA that is kept may go round in a cycle; it says so.
+may_not_converge = pytest.mark.filterwarnings(
+    "ignore::sklearn.exceptions.ConvergenceWarning"
+)
+# The joint refinement does not say so of its start.
+start_may_not_converge = pytest.mark.filterwarnings(
+    "ignore:PooledFastICA did not converge"
+)
+# For tests of what is done with a fit, which is then three times as quick.
+one_start = pytest.mark.usefixtures("one_start")
 
 
 def slow_after(n_quick, values, together=False):

@@ -1,17 +1,15 @@
-"""Small problems with a known solution, and tables, for the tests of all parts."""
+"""Small problems with a known solution, for the tests of all parts."""
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.point_sums import frame_tracks
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import make_nonrigid_tracks
 
 
 class Scene(NamedTuple):
@@ -76,6 +74,16 @@ def random_scene(
     return Scene(tracks, shapes, motion, translation, alpha, weights)
 
 
+def waving_scene(n_frames, n_points, rates, seed=0):
+    """Return a table of two basis shapes whose coefficients wave, and these."""
+    rates = np.outer(np.arange(n_frames), rates)
+    alpha = np.stack([np.sin(rates[:, 0]), np.cos(rates[:, 1])], axis=1)
+    scene = make_nonrigid_tracks(n_frames, n_points, 2, random_state=seed)
+    scene.shapes = scene.mean_shape + np.tensordot(alpha, scene.basis, 1)
+    scene.tracks = scene.shapes @ scene.motion.swapaxes(1, 2)
+    return scene, alpha
+
+
 def with_gaps(tracks, share=0.3, seed=0):
     """Return a copy of tracks (I, J, 2) or a table (I, 2J), NaN at random points."""
     pairs = np.array(tracks).reshape(len(tracks), -1, 2)
@@ -83,30 +91,9 @@ def with_gaps(tracks, share=0.3, seed=0):
     return pairs.reshape(tracks.shape)
 
 
-def with_missing(tracks, missing, seed=0):
-    """Return tracks with points missing at random, and the mask of those seen."""
-    seen = np.random.default_rng(seed).random(tracks.shape[:2]) >= missing
-    return np.where(seen[..., None], tracks, tracks.dtype.type(np.nan)), seen
-
-
 def random_cameras(rng, n_frames):
     """Return cameras with orthonormal rows, (I, 2, 3), in all orientations."""
     return Rotation.random(n_frames, rng).as_matrix()[:, :2]
-
-
-@cache
-def faces(n_frames=60, n_components=2, **options):
-    """Return generated faces, to be left as they are."""
-    options = {"n_components": n_components, "random_state": 0} | options
-    return make_face_tracks(n_frames, **options)
-
-
-@cache
-def face_model(n_frames=60, n_components=2, camera="weak_perspective", **options):
-    """Return a model of `faces`, to be left as it is."""
-    table = faces(n_frames, n_components, **options).data
-    model = AffineNRSfM(n_components, camera=camera, random_state=0)
-    return model.fit(table)
 
 
 class StructuredMotion(NamedTuple):
@@ -128,15 +115,6 @@ def structured_motion(seed, n_frames=25, n_blocks=3, noise=0.0):
     motion = blocks.reshape(2 * n_frames, -1)
     motion = motion + noise * rng.normal(size=motion.shape)
     return StructuredMotion(M_0.reshape(-1, 3), motion, alpha, E)
-
-
-def rotate_frames(W, seed):
-    """Rotate each image: the two rows of each frame of any matrix."""
-    rng = np.random.default_rng(seed)
-    angle = rng.uniform(0, 2 * np.pi, len(W) // 2)
-    c, s = np.cos(angle), np.sin(angle)
-    R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
-    return (R @ W.reshape(len(R), 2, -1)).reshape(W.shape)
 
 
 def permute_frames(W, seed):

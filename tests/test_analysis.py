@@ -305,8 +305,7 @@ class TestWithinGroups:
 
 class TestBetweenShare:
     def test_of_a_random_effects_model(self, rng):
-        sizes = rng.integers(2, 12, 400)
-        person = np.repeat(np.arange(400), sizes)
+        person = np.repeat(np.arange(400), rng.integers(2, 12, 400))
         share = np.array([0.0, 0.3, 0.9, 1.0])
         alpha = np.sqrt(share) * rng.normal(size=(400, 4))[person]
         alpha += np.sqrt(1 - share) * rng.normal(size=(len(person), 4))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from layers import slow_after
+from layers import may_not_converge, one_start, slow_after
 from refusals import refused
 from scenes import random_rotation
 
@@ -22,7 +22,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
 # Tables of few points: that FastICA does not converge makes no difference here.
-pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+pytestmark = [may_not_converge, one_start]
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = [
@@ -133,8 +133,7 @@ def test_command_measures_writes_and_rewrites(tmp_path, capsys):
     chosen = ["truth", "--sets", "synthetic", "--methods", "rigid", "floor"]
     output = ["--output", str(tmp_path)]
     command.main([*chosen, "--repeats", "1", "--jobs", "2", *output])
-    printed = capsys.readouterr().out
-    assert "[2/2] truth synthetic" in printed
+    assert "[2/2] truth synthetic" in capsys.readouterr().out
     page = (tmp_path / "truth.md").read_text(encoding="utf-8")
     assert "| rigid mean shape | " in page
     assert "time_limit 600" in page

@@ -69,16 +69,14 @@ def published_irls(scene, k, n_frames, n_iter=50):
     return d.reshape(3, 3)
 
 
-class TestProducts:
-    def test_definitions(self):
-        scene = structured_motion(0, noise=0.3)
-        cross, rigid, gram = motion_products(scene.rigid, scene.motion)
-        M_0 = scene.rigid.reshape(-1, 2, 3)
-        for i, M_i in enumerate(scene.motion.reshape(len(M_0), 2, -1)):
-            assert_allclose(cross[i], M_0[i].T @ M_i, atol=1e-13)
-            square = rigid[i].reshape(3, 3)
-            assert_allclose(square, M_0[i].T @ M_0[i], atol=1e-13)
-        assert_allclose(gram, scene.motion.T @ scene.motion, atol=1e-12)
+def test_products_by_definition():
+    scene = structured_motion(0, noise=0.3)
+    cross, rigid, gram = motion_products(scene.rigid, scene.motion)
+    M_0 = scene.rigid.reshape(-1, 2, 3)
+    for i, M_i in enumerate(scene.motion.reshape(len(M_0), 2, -1)):
+        assert_allclose(cross[i], M_0[i].T @ M_i, atol=1e-13)
+        assert_allclose(rigid[i].reshape(3, 3), M_0[i].T @ M_0[i], atol=1e-13)
+    assert_allclose(gram, scene.motion.T @ scene.motion, atol=1e-12)
 
 
 @ALL_METHODS
@@ -258,8 +256,7 @@ class TestRefinement:
         assert np.all(together >= np.median(single, axis=0) * (1 - 1e-9))
 
     def test_energies_rise_with_every_step(self, scene):
-        starts = random_starts(3, 3, 1)
-        fits = [refined(scene, starts, n) for n in range(1, 15)]
+        fits = [refined(scene, random_starts(3, 3, 1), n) for n in range(1, 15)]
         energies = np.array([explained(scene, E) for E, *_ in fits])
         assert np.all(np.diff(energies, axis=0) >= -1e-13 * energies[-1])
         assert np.all(energies[-1] > energies[0])

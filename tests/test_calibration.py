@@ -1,16 +1,20 @@
-"""From affine to Euclidean space: metric upgrades, cameras, upright poses, angles."""
+"""From affine to Euclidean space: metrics, cameras, poses, shapes of estimators."""
+
+from copy import deepcopy
 
 import numpy as np
 import pytest
-from cameras import affinity, lorentz_cameras, weak_perspective
+from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
-from scenes import face_model, faces, measurements
+from scenes import measurements
 from scipy.linalg import expm
 from scipy.optimize import approx_fprime, minimize
 from scipy.spatial.transform import Rotation
+from sklearn.exceptions import NotFittedError
 
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.calibration import (
     angle_deviations,
     canonical_pose,
@@ -30,28 +34,22 @@ few_cameras = pytest.mark.filterwarnings("ignore:the cameras hardly determine")
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
-def affinity_of(rng, *stretch):
-    left, right = (np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in "ab")
-    return left @ np.diag(stretch) @ right
-
-
 def scene(seed, camera, n_frames=20, spread=None, stretch=(0.2, 1.0, 3.0)):
     """Return affine cameras, their rotations and scales, and the affinity of space."""
     rng = np.random.default_rng(seed)
     turns = Rotation.random(n_frames, random_state=seed).as_matrix()
     if spread is not None:
-        vectors = spread * rng.standard_normal((n_frames, 3))
-        turns = Rotation.from_rotvec(vectors).as_matrix()
+        turns = rotations(rng, n_frames, spread)
     scales = np.full(n_frames, 1.7)
     if camera == "weak_perspective":
         scales = rng.uniform(0.2, 5, n_frames)
-    affinity = affinity_of(rng, *stretch)
-    motion = scales[:, None, None] * turns[:, :2] @ affinity
-    return motion, turns, scales, affinity
+    space = affinity(rng, *stretch)
+    motion = scales[:, None, None] * turns[:, :2] @ space
+    return motion, turns, scales, space
 
 
+@both_cameras
 class TestMetricUpgrade:
-    @both_cameras
     @pytest.mark.parametrize("seed", range(5))
     @pytest.mark.parametrize("stretch", [(1, 1, 1), (0.2, 1, 3), (1, 1, 300)])
     def test_exact_cameras(self, camera, seed, stretch):
@@ -68,7 +66,6 @@ class TestMetricUpgrade:
         seen = upgrade.scales[:, None, None] * upgrade.rotations[:, :2]
         assert_allclose(motion @ upgrade.Q, seen, atol=1e-8 * np.abs(seen).max())
 
-    @both_cameras
     def test_which_of_the_equivalent_matrices(self, camera):
         motion, *_ = scene(1, camera)
         motion += 0.1 * np.random.default_rng(1).standard_normal(motion.shape)
@@ -85,7 +82,6 @@ class TestMetricUpgrade:
         if camera == "orthographic":
             assert (upgrade.scales == 1).all()
 
-    @both_cameras
     def test_mirror_image_fits_as_well(self, camera):
         motion, *_ = scene(2, camera)
         motion += 0.1 * np.random.default_rng(2).standard_normal(motion.shape)
@@ -108,7 +104,6 @@ class TestMetricUpgrade:
         assert_allclose(again.Q, upgrade.Q)
         assert_allclose(again.rotations, upgrade.rotations)
 
-    @both_cameras
     def test_leaves_out_frames_without_camera(self, camera):
         motion, *_ = scene(7, camera)
         whole = np.full((23, 2, 3), np.nan)
@@ -170,8 +165,7 @@ class TestLeastResidual:
 
     @both_cameras
     def test_many_frames_are_worked_on_in_blocks(self, camera):
-        rng = np.random.default_rng(3)
-        motion = noisy_cameras(rng)
+        motion = noisy_cameras(np.random.default_rng(3))
         many = np.tile(motion, (70, 1, 1))
         few, whole = metric_upgrade(motion, camera), metric_upgrade(many, camera)
         assert_allclose(whole.Q, few.Q, atol=1e-8)
@@ -221,16 +215,15 @@ class TestDegenerateCameras:
         assert np.isfinite(upgrade.rotations).all()
 
 
-class TestEuclideanShapes:
-    def test_images_stay_what_they_are(self, rng):
-        motion, *_ = scene(0, "weak_perspective")
-        mean, basis = rng.standard_normal((9, 3)), rng.standard_normal((2, 9, 3))
-        Q = metric_upgrade(motion).Q
-        for shapes in (mean, basis):
-            upgraded = euclidean_shapes(shapes, Q)
-            assert upgraded.shape == shapes.shape
-            images = [shapes @ M.T for M in motion]
-            assert_allclose([upgraded @ (M @ Q).T for M in motion], images, atol=1e-9)
+def test_images_of_euclidean_shapes_stay_what_they_are(rng):
+    motion, *_ = scene(0, "weak_perspective")
+    mean, basis = rng.standard_normal((9, 3)), rng.standard_normal((2, 9, 3))
+    Q = metric_upgrade(motion).Q
+    for shapes in (mean, basis):
+        upgraded = euclidean_shapes(shapes, Q)
+        assert upgraded.shape == shapes.shape
+        images = [shapes @ M.T for M in motion]
+        assert_allclose([upgraded @ (M @ Q).T for M in motion], images, atol=1e-9)
 
 
 def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
@@ -242,7 +235,7 @@ def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
     root = size * rng.standard_normal((n_components, 3, 3))
     strain = root + root.transpose(0, 2, 1)
     strain -= np.trace(strain, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
-    Q = affinity_of(rng, 0.5, 1, 2)
+    Q = affinity(rng)
     Q = Q @ Q.T
     Q_i = np.array([Q @ expm(np.tensordot(a, strain, 1) / 2) for a in alpha])
     motion = scales[:, None, None] * turns[:, :2] @ np.linalg.inv(Q_i)
@@ -381,7 +374,8 @@ class TestEuclideanFrames:
 
 @pytest.mark.parametrize("camera", slow_after(1, CAMERAS[::-1]))
 def test_models_with_calibrated_cameras_have_a_metric(camera, recwarn):
-    model = face_model(camera=camera)
+    table = make_face_tracks(60, n_components=2, random_state=0).data
+    model = AffineNRSfM(2, camera=camera, random_state=0).fit(table)
     metric = deformation_metric(model.motion_, model.alpha_)
     scale = np.trace(metric.Q) / 3
     assert_allclose(metric.Q, scale * np.eye(3), atol=1e-6 * scale)
@@ -390,7 +384,7 @@ def test_models_with_calibrated_cameras_have_a_metric(camera, recwarn):
     assert len(recwarn) == 0
     fit = model.motion_, model.alpha_, model.mean_shape_, model.basis_
     frames = euclidean_frames(metric, *fit)
-    shapes = model.reconstruct(faces().data)
+    shapes = model.reconstruct(table)
     assert mean_shape_error_3d(shapes, frames.shapes, convention="frame") < 1e-6
 
 
@@ -658,14 +652,13 @@ def test_frames_without_a_rotation_have_no_angles():
     assert np.isnan(found[1]).all()
 
 
-class TestAngleDeviations:
-    def test_of_random_small_turns(self, rng):
-        R = Rotation.from_euler("ZXY", [20, -35, 50], degrees=True)
-        root = 0.003 * rng.normal(size=(3, 3))
-        turns = Rotation.from_rotvec(rng.normal(size=(20000, 3)) @ root.T)
-        expected = np.std(np.array(view_angles((R * turns).as_matrix())), axis=1)
-        found = angle_deviations(view_angles([R.as_matrix()]), [root @ root.T])
-        assert_allclose(np.ravel(found), expected, rtol=0.03)
+def test_deviations_of_angles_are_those_of_random_small_turns(rng):
+    R = Rotation.from_euler("ZXY", [20, -35, 50], degrees=True)
+    root = 0.003 * rng.normal(size=(3, 3))
+    turns = Rotation.from_rotvec(rng.normal(size=(20000, 3)) @ root.T)
+    expected = np.std(np.array(view_angles((R * turns).as_matrix())), axis=1)
+    found = angle_deviations(view_angles([R.as_matrix()]), [root @ root.T])
+    assert_allclose(np.ravel(found), expected, rtol=0.03)
 
 
 @pytest.mark.parametrize(
@@ -702,3 +695,166 @@ class TestAngleDeviations:
 )
 def test_refused_arrays(call, arguments, message):
     refused(message, call, *arguments)
+
+
+# --- shapes of estimators: what is known of the cameras is used ----------------------
+
+
+@pytest.fixture(scope="module")
+def photos():
+    return make_face_tracks(n_frames=300, camera="orthographic", random_state=0)
+
+
+@pytest.fixture(scope="module")
+def model(photos):
+    return AffineNRSfM(n_components=4, random_state=0).fit(photos.data)
+
+
+def frame_error(truth, shapes, scale=None):
+    return mean_shape_error_3d(truth, shapes, convention="frame", scale=scale)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """Shapes without noise in cameras of one scale."""
+    options = {"camera": "orthographic", "amplitude": 0.2, "noise": 0}
+    tracks = make_nonrigid_tracks(80, 40, 2, **options, random_state=0)
+    return tracks, AffineNRSfM(n_components=2, random_state=0).fit(tracks.data)
+
+
+class TestTruth:
+    def test_exact_tables_give_exact_shapes(self, exact):
+        tracks, model = exact
+        weak = model.reconstruct(tracks.data, camera="weak_perspective")
+        assert frame_error(tracks.shapes, weak) < 1e-4
+        # Images with the unit of the shapes say how large they are, too.
+        size = np.linalg.svd(tracks.motion, compute_uv=False)[0, 0]
+        shapes = model.reconstruct(tracks.data, camera="orthographic") / size
+        assert frame_error(tracks.shapes, shapes, scale=False) < 1e-4
+        assert frame_error(tracks.shapes, model.reconstruct(tracks.data)) > 0.05
+
+    def test_noisy_faces(self, photos, model):
+        weak = model.reconstruct(photos.data, camera="weak_perspective")
+        assert frame_error(photos.shapes, weak) < 0.012
+        ortho = model.reconstruct(photos.data, camera="orthographic")
+        # Two pixels a millimetre.
+        assert frame_error(photos.shapes, ortho / 2, scale=False) < 0.012
+        assert mean_shape_error_3d(photos.shapes, ortho / 2) < 0.05
+
+    def test_photos_of_different_resolution(self):
+        photos = make_face_tracks(n_frames=300, random_state=1)
+        model = AffineNRSfM(n_components=4, random_state=0).fit(photos.data)
+        shapes = model.reconstruct(photos.data, camera="weak_perspective")
+        assert frame_error(photos.shapes, shapes) < 0.012
+
+    @pytest.mark.parametrize(
+        ("name", "n_components", "errors"),
+        [
+            # With one metric for all frames: 0.044, 0.090; 0.061, 0.185; 0.101, 0.222;
+            # 0.111, 0.376.
+            ("ict_bu3dfe_like_68", 9, (0.032, 0.073)),
+            *slow_after(
+                0,
+                [
+                    ("akhter_drink", 3, (0.019, 0.097)),
+                    ("akhter_pickup", 3, (0.040, 0.125)),
+                    ("akhter_yoga", 4, (0.068, 0.245)),
+                ],
+                together=True,
+            ),
+        ],
+    )
+    def test_true_shapes(self, load_data, name, n_components, errors):
+        data = load_data(name)
+        table = data["W2d"].reshape(len(data["W2d"]), -1)
+        model = AffineNRSfM(n_components=n_components, random_state=0).fit(table)
+        shapes = model.reconstruct(table, camera="orthographic")
+        upgrade = metric_upgrade(model.motion_)
+        plain = euclidean_shapes(model.reconstruct(table), upgrade.Q)
+        plain *= upgrade.scales[:, None, None]
+        for convention, bound in zip(("frame", "sequence"), errors, strict=True):
+            found, before = (
+                mean_shape_error_3d(data["S3d"], X, convention=convention)
+                for X in (shapes, plain)
+            )
+            assert found < bound
+            assert found < 0.85 * before
+
+
+class TestReconstruct:
+    def test_affine_shapes_by_default(self, photos, model):
+        expected = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
+        assert_allclose(model.reconstruct(photos.data), expected, atol=1e-8)
+        shapes = model.reconstruct(photos.data)
+        assert_array_equal(model.reconstruct(photos.data, camera=None), shapes)
+
+    def test_shapes_are_those_of_the_calibration(self, photos, model):
+        motion, translation, alpha, _ = model.decompose(photos.data)
+        metric = deformation_metric(model.motion_, model.alpha_)
+        shapes = model.mean_shape_, model.basis_
+        frames = euclidean_frames(metric, motion, alpha, *shapes)
+        weak = model.reconstruct(photos.data, camera="weak_perspective")
+        assert_allclose(weak, frames.shapes)
+        ortho = model.reconstruct(photos.data, camera="orthographic")
+        assert_allclose(ortho, frames.scales[:, None, None] * frames.shapes)
+        # Cameras without scale see the orthographic shapes as the model does.
+        images = ortho @ frames.rotations[:, :2].transpose(0, 2, 1)
+        images += translation[:, None]
+        expected = model.reproject(photos.data)
+        assert_allclose(images.reshape(expected.shape), expected, atol=1e-8)
+
+    @both_cameras
+    def test_new_frames_do_not_depend_on_each_other(self, model, camera):
+        new = make_face_tracks(n_frames=20, camera="orthographic", random_state=5)
+        shapes = model.reconstruct(new.data, camera=camera)
+        assert frame_error(new.shapes, shapes) < 0.03
+        some = model.reconstruct(new.data[7:9], camera=camera)
+        assert_allclose(some, shapes[7:9], rtol=1e-6)
+
+    @pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+    def test_every_refinement(self, photos, refinement):
+        model = AffineNRSfM(n_components=2, refinement=refinement, random_state=0)
+        model.fit(photos.data)
+        for camera in CAMERAS:
+            shapes = model.reconstruct(photos.data, camera=camera)
+            assert frame_error(photos.shapes, shapes) < 0.08
+
+    def test_refuses_other_cameras(self, photos, model):
+        message = r"camera must be None or one of .*'weak_perspective'.* got 'affine'"
+        refused(message, model.reconstruct, photos.data, camera="affine")
+        with pytest.raises(NotFittedError):
+            AffineNRSfM().reconstruct(photos.data, camera="orthographic")
+
+    def test_warns_where_cameras_hardly_turn(self, rng):
+        options = {"camera": "orthographic", "amplitude": 0.1, "noise": 0}
+        tracks = make_nonrigid_tracks(100, 40, 1, **options, random_state=0)
+        motion = np.eye(2, 3) + np.zeros((100, 1, 1))
+        motion[:, :, 2] = 0.02 * rng.standard_normal((100, 2))
+        table = (tracks.shapes @ motion.transpose(0, 2, 1)).reshape(100, -1)
+        # The joint refinement takes long where cameras hardly turn.
+        model = AffineNRSfM(n_components=1, refinement="alternating", random_state=0)
+        model.fit(table)
+        with pytest.warns(UserWarning, match="hardly determine the metric"):
+            model.reconstruct(table, camera="weak_perspective")
+
+    @pytest.mark.parametrize("seed", slow_after(1, [11, 17]))
+    def test_noisy_cameras_that_hardly_turn(self, seed):
+        # The deeper space is, the better it fits the noise of such cameras.
+        rng = np.random.default_rng(seed)
+        angles = rng.uniform(-3, 3, (60, 3))
+        cameras = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()[:, :2]
+        cameras = cameras + rng.normal(0, 0.02, cameras.shape)
+        alpha = rng.normal(size=(60, 3))
+        with pytest.warns(UserWarning, match="hardly determine the metric"):
+            metric = deformation_metric(cameras, alpha)
+        # The cameras themselves see the depth with 0.04 of the other directions.
+        assert np.linalg.cond(metric.Q) < 1e5 / 0.04
+        mean, basis = rng.normal(size=(9, 3)), rng.normal(size=(3, 9, 3))
+        frames = euclidean_frames(metric, cameras, alpha, mean, basis)
+        assert np.isfinite(frames.shapes).all()
+
+    def test_refuses_cameras_that_see_two_directions(self, photos, model):
+        flat = deepcopy(model)
+        flat.motion_[:, :, 2] = 0
+        with pytest.raises(ValueError, match=r"three directions of space; .* see 2"):
+            flat.reconstruct(photos.data, camera="weak_perspective")

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import FIGURES, FILES as FIT_FILES, MODEL, Results
-from layers import slow_after
+from layers import one_start, slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 
@@ -24,6 +24,8 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import ModeCovarianceDisplay
+
+pytestmark = one_start
 
 N_FRAMES, N_COMPONENTS = 60, 2
 QUICK = ["--n-components", str(N_COMPONENTS), "--isa", "fast", "--n-init", "2"]

@@ -6,11 +6,13 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from layers import slow_after
+from layers import one_start, slow_after
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import find_format, read_landmarks
+
+pytestmark = one_start
 
 N_FRAMES = 40
 LOST, EMPTY = 3, 7

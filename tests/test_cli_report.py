@@ -10,7 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import Results
+from layers import one_start
 from matplotlib.figure import Figure
+from scenes import waving_scene
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
@@ -23,6 +25,8 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses
 from isa_nrsfm.plotting import ComponentChoiceDisplay
 
+pytestmark = one_start
+
 N = 120
 HOSTILE = '<script>alert("x")</script>&"{{content}}'
 EXPECTED = Path(__file__).with_name("expected") / "report.txt"
@@ -30,13 +34,8 @@ EXPECTED = Path(__file__).with_name("expected") / "report.txt"
 
 def table_of(seed=0):
     """Return a table of a thing that waves, with other columns."""
-    phase = 0.12 * np.arange(N)
-    alpha = np.stack([np.sin(phase), np.cos(0.6 * phase)], axis=1)
-    made = {"n_frames": N, "n_points": 14, "n_components": 2}
-    scene = make_nonrigid_tracks(**made, noise=0.0, random_state=seed)
-    shapes = scene.mean_shape + np.einsum("ik,kjc->ijc", alpha, scene.basis)
-    tracks = shapes @ scene.motion.swapaxes(1, 2)
-    rng = np.random.default_rng(seed)
+    scene, alpha = waving_scene(N, 14, [0.12, 0.072], seed)
+    tracks, rng = scene.tracks, np.random.default_rng(seed)
     tracks += 0.05 * tracks.std() * rng.normal(size=tracks.shape)
     names = [f"{c}{j}" for j in range(14) for c in "xy"]
     table = pd.DataFrame(tracks.reshape(N, -1), columns=names)
@@ -85,8 +84,7 @@ def test_the_text_is_as_expected(answers):
     found, *_ = answers
     text = found.out.replace(str(found.folder.parent), "")
     text = re.sub(r"\n {11}", " ", re.sub(r"[+-]?\d+(\.\d+)?(e-\d+)?", "#", text))
-    expected = EXPECTED.read_text(encoding="utf-8")
-    assert re.sub(" +", " ", text) == expected
+    assert re.sub(" +", " ", text) == EXPECTED.read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -245,8 +243,7 @@ def test_times_of_change(answers, scales, expected):
     ],
 )
 def test_the_unit_of_times_is_that_of_the_column(name, cells, unit):
-    column = pd.Series(cells, name=name)
-    assert read_times(column, None)[1] == unit
+    assert read_times(pd.Series(cells, name=name), None)[1] == unit
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,14 @@ import pandas as pd
 import pytest
 from exported_files import Read, content_of
 from fit_runs import Results
+from layers import one_start
 
 from isa_nrsfm import datasets
 from isa_nrsfm.cli import main
 from isa_nrsfm.export import frame_poses
 from isa_nrsfm.skeletons import get_skeleton
+
+pytestmark = one_start
 
 QUICK = [*"--n-components 1 --refinement none --isa fast --n-init 2".split()]
 

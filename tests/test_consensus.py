@@ -85,8 +85,7 @@ class TestNeighbours:
 
     def test_one_group_of_few_points(self):
         """Fewer points than the size are one group, as often as there are points."""
-        distances = np.ones((6, 6)) - np.eye(6)
-        ((points, count),) = neighbourhoods(distances, 12)
+        ((points, count),) = neighbourhoods(np.ones((6, 6)) - np.eye(6), 12)
         assert_array_equal(points, np.arange(6))
         assert count == 2  # COVER * 6 / 12
 
@@ -277,48 +276,49 @@ def perturbed(Y, size=0.1):
     return first
 
 
+@pytest.fixture(scope="module")
+def corrected():
+    """Return coordinates and groups, the first coordinates, and the common ones."""
+    Y, groups = jointed()
+    first = perturbed(Y)
+    return Y, groups, first, common_coordinates(Y[:, :2], first, groups, FLOOR, FLOOR)
+
+
 def error(found, Y):
     """Return the relative error of the depths."""
     z = found[:, 2] - found[:, 2].mean(axis=1, keepdims=True)
     return np.linalg.norm(z - Y[:, 2]) / np.linalg.norm(Y[:, 2])
 
 
-def test_depths_become_truer_and_true_ones_stay():
-    Y, groups = jointed()
-    first = perturbed(Y)
-    found = common_coordinates(Y[:, :2], first, groups, FLOOR, FLOOR)
+def test_depths_become_truer_and_true_ones_stay(corrected):
+    Y, groups, first, found = corrected
     assert error(found, Y) < 0.5 * error(first, Y)
     assert_array_equal(found[:, :2], Y[:, :2])
     found = common_coordinates(Y[:, :2], Y, groups, FLOOR, FLOOR)
     assert error(found, Y) < 2 * np.sqrt(FLOOR)
 
 
-def test_missing_points_are_filled_in():
-    Y, groups = jointed()
+def test_missing_points_are_filled_in(corrected):
+    Y, groups, first, _ = corrected
     hidden = np.random.default_rng(2).random(Y[:, 0].shape) < 0.2
     images = np.where(hidden[:, None], np.nan, Y[:, :2])
-    first = perturbed(Y)
-    first[:, :2] += 0.1 * hidden[:, None]
+    first = first + 0.1 * hidden[:, None] * [[1.0], [1.0], [0.0]]
     found = common_coordinates(images, first, groups, FLOOR, FLOOR)
     seen = np.broadcast_to(~hidden[:, None], images.shape)
     assert_array_equal(found[:, :2][seen], Y[:, :2][seen])
-    off = np.sqrt(np.mean((found[:, :2] - Y[:, :2])[~seen] ** 2))
-    assert off < 0.05
+    assert np.sqrt(np.mean((found[:, :2] - Y[:, :2])[~seen] ** 2)) < 0.05
     assert error(found, Y) < 0.5 * error(first, Y)
 
 
-def test_order_of_groups_and_frames_does_not_matter():
-    Y, groups = jointed()
-    first = perturbed(Y)
-    found = common_coordinates(Y[:, :2], first, groups, FLOOR, FLOOR)
+def test_order_of_groups_and_frames_does_not_matter(corrected):
+    Y, groups, first, found = corrected
     order = np.random.default_rng(3).permutation(len(Y))
     again = common_coordinates(Y[order, :2], first[order], groups[::-1], FLOOR, FLOOR)
     assert_allclose(again, found[order], atol=1e-6)
 
 
-def test_points_and_frames_of_no_group_stay():
-    Y, (group, _) = jointed()
-    first = perturbed(Y)
+def test_points_and_frames_of_no_group_stay(corrected):
+    Y, (group, _), first, _ = corrected
     some = group[0][:-5], group[1]
     found = common_coordinates(Y[:, :2], first, [some], FLOOR, FLOOR)
     assert_allclose(found[:, :, 10:], first[:, :, 10:], atol=1e-12)
@@ -416,8 +416,7 @@ def consensus_fit(table=X, n_components=14, **parameters):
 
 def in_camera(model, table):
     """Return shapes in the axes of the cameras, in the units of the images."""
-    fit = model.decompose(table)
-    rotations, scales = full_rotations(fit.motion)
+    rotations, scales = full_rotations(model.decompose(table).motion)
     turned = model.reconstruct(table) @ rotations.transpose(0, 2, 1)
     return scales[:, None, None] * turned
 
@@ -448,8 +447,7 @@ class TestEstimator:
     @pytest.mark.slow
     def test_automatic_number_of_components(self):
         """Automatic numbers of components exceed the twelve of the joint fit."""
-        model = consensus_fit(n_components="auto")
-        assert 12 < len(model.basis_) <= 60
+        assert 12 < len(consensus_fit(n_components="auto").basis_) <= 60
 
     def test_deviations_have_the_size_of_errors(self, body):
         """Errors of depths are half to twice their standard deviations."""
@@ -477,11 +475,9 @@ class TestEstimator:
     @pytest.mark.slow
     def test_order_of_frames_does_not_matter(self, body):
         """Permuted rows have permuted shapes."""
-        order = np.random.default_rng(0).permutation(len(X))
-        other = consensus_fit(X[order])
+        other = consensus_fit(X[np.random.default_rng(0).permutation(len(X))])
         before, after = (in_camera(model, X) for model in (body, other))
-        error = mean_shape_error_3d(before, after, convention="camera")
-        assert error < 0.01
+        assert mean_shape_error_3d(before, after, convention="camera") < 0.01
 
     @pytest.mark.slow
     def test_missing_points(self, body):
@@ -563,8 +559,7 @@ class TestEstimator:
     def test_progress(self, capsys):
         """The groups are a stage of the fit."""
         consensus_fit(verbose=1)
-        printed = capsys.readouterr().out
-        assert "consensus of groups of points: " in printed
+        assert "consensus of groups of points: " in capsys.readouterr().out
 
     @pytest.mark.slow
     def test_search_compares_joint_fits(self):

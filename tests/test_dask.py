@@ -102,13 +102,12 @@ def size_of(found):
 
 
 @pytest.mark.cluster
-class TestJoblib:
-    def test_grid_search_and_restarts(self, cluster):
-        X = table()
-        isa = FastISA(n_init=4, n_jobs=2)
-        model = SampledNRSfM(isa=isa, refinement="alternating", random_state=0)
-        search = GridSearchCV(model, {"n_components": [1, 2]}, cv=2, n_jobs=2)
-        plain = search.fit(X).cv_results_["mean_test_score"]
-        with joblib.parallel_config("dask"):
-            on_cluster = search.fit(X).cv_results_["mean_test_score"]
-        assert_allclose(on_cluster, plain, rtol=1e-8)
+def test_grid_search_and_restarts(cluster):
+    X = table()
+    isa = FastISA(n_init=4, n_jobs=2)
+    model = SampledNRSfM(isa=isa, refinement="alternating", random_state=0)
+    search = GridSearchCV(model, {"n_components": [1, 2]}, cv=2, n_jobs=2)
+    plain = search.fit(X).cv_results_["mean_test_score"]
+    with joblib.parallel_config("dask"):
+        on_cluster = search.fit(X).cv_results_["mean_test_score"]
+    assert_allclose(on_cluster, plain, rtol=1e-8)

@@ -277,8 +277,7 @@ class TestMuct:
         # One name lacks the letter for glasses; four photos of that moment have it.
         differ = faces.names[faces.glasses != known["glasses"]]
         assert differ.tolist() == ["i201ve-m1"]
-        others = np.strings.startswith(faces.names, "i201v")
-        assert faces.glasses[others].all()
+        assert faces.glasses[np.strings.startswith(faces.names, "i201v")].all()
         # What the description says.
         assert len(set(faces.subjects)) == 276
         assert (~faces.visible).sum() == 2544

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import one_start, slow_after
 from numpy.testing import assert_allclose
 from refusals import warned
 from scipy.linalg import eigvals
@@ -26,6 +26,8 @@ from isa_nrsfm.analysis._diagnostics import (
 )
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.skeletons import get_skeleton
+
+pytestmark = one_start
 
 TABLE = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
 
@@ -256,8 +258,7 @@ class TestOutliers:
     def test_are_named_and_stand_for_what_they_cause(self):
         faces = make_face_tracks(100, n_components=2, noise=0.01, random_state=0)
         table, wrong = with_outliers(faces, 0.05)
-        model = AffineNRSfM(2, random_state=0).fit(table)
-        found = model.diagnostics(table)
+        found = AffineNRSfM(2, random_state=0).fit(table).diagnostics(table)
         (message,) = found.messages
         assert message.startswith(f"the table has outliers: {len(found.outliers)} ")
         assert message.count("cauchy") == 1
@@ -273,8 +274,7 @@ class TestOutliers:
     def test_tables_without_have_none(self, camera):
         faces = make_face_tracks(100, noise=0.02, random_state=0)
         model = AffineNRSfM(3, camera=camera, random_state=0).fit(faces.data)
-        found = model.diagnostics(faces.data)
-        assert found.outlier_share == 0
+        assert model.diagnostics(faces.data).outlier_share == 0
         assert np.isnan(model.diagnostics().outlier_share)
 
     def test_rows_and_points_have_their_names(self):

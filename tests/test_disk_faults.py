@@ -10,7 +10,7 @@ import pytest
 from disk_faults import STRIKES, disk_faults, interrupt, leftovers, readable
 from export_models import face_model
 from fit_runs import FIGURES, FILES, fit, whole_run, write_landmarks
-from layers import slow_after
+from layers import one_start, slow_after
 from numpy.testing import assert_array_equal
 from refusals import refused
 from sklearn.exceptions import NotFittedError
@@ -18,6 +18,8 @@ from sklearn.exceptions import NotFittedError
 from isa_nrsfm import AffineNRSfM, FastISA, export
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import read_table, save_model, write_table
+
+pytestmark = one_start
 
 OLD = b"what was there before"
 TABLE = pd.DataFrame({"x0": np.linspace(0, 1, 9) / 3, "y0": np.arange(9.0)})

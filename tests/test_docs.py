@@ -171,8 +171,7 @@ def test_the_readme_runs():
 @pytest.mark.usefixtures("tables")
 def test_getting_started_runs():
     names = run("docs/getting_started.md")
-    table = pd.read_csv("alpha.csv")
-    assert list(table)[:2] == ["person", "alpha_1"]
+    assert list(pd.read_csv("alpha.csv"))[:2] == ["person", "alpha_1"]
     seen = names["points"].to_numpy()[0].reshape(-1, 2)
     np.testing.assert_allclose(names["row"], seen, atol=10)
     assert Path("shapes.png").stat().st_size

@@ -2,7 +2,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from layers import one_start, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
+from scenes import waving_scene
 from scipy.linalg import block_diag
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
@@ -21,6 +23,8 @@ from isa_nrsfm.analysis._smoothing import (
 )
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
+
+pytestmark = one_start
 
 K = 3
 
@@ -126,9 +130,9 @@ class TestDynamics:
         assert_allclose((shown @ first @ shown.T)[:K, :K], np.eye(K))
 
 
+@pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
 class TestSmoother:
     @pytest.mark.parametrize("gaps", [False, True])
-    @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
     def test_is_the_posterior_of_the_joint_normal_distribution(
         self, gaps, n_walks, n_shares
     ):
@@ -147,7 +151,6 @@ class TestSmoother:
         assert_allclose(covariances, expected, atol=atol)
         assert_allclose(value, likelihood)
 
-    @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
     def test_gradient_is_that_of_the_likelihood(self, n_walks, n_shares):
         rng = np.random.default_rng(1)
         dynamics = some_dynamics(n_walks, n_shares=n_shares)
@@ -171,7 +174,7 @@ class TestEstimation:
         assert_allclose(found.rates, true.rates, atol=0.5)
         assert_allclose(found.walks, true.walks, atol=0.5)
 
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", slow_after(1, range(3)))
     def test_independent_frames_have_none(self, seed):
         rng = np.random.default_rng(seed)
         data = observed(rng.normal(size=(100, K)), rng, 1.0)
@@ -179,7 +182,9 @@ class TestEstimation:
 
 
 class TestPeople:
-    @pytest.mark.parametrize(("n_people", "n_frames"), [(30, 3), (4, 30)])
+    @pytest.mark.parametrize(
+        ("n_people", "n_frames"), slow_after(1, [(4, 30), (30, 3)], together=True)
+    )
     def test_photos_in_any_order_have_no_dynamics(self, n_people, n_frames):
         rng = np.random.default_rng(0)
         person = np.repeat(np.arange(n_people), n_frames)
@@ -260,13 +265,7 @@ def test_likelihood_of_frames_is_linearised(name, loss):
 def waving():
     """Return a model of a thing that waves, its table in order of time."""
     rng = np.random.default_rng(0)
-    phase = 0.1 * np.arange(160)
-    alpha = np.stack([np.sin(phase), np.cos(0.7 * phase)], axis=1)
-    scene = make_nonrigid_tracks(
-        n_frames=160, n_points=20, n_components=2, noise=0.0, random_state=0
-    )
-    shapes = scene.mean_shape + np.einsum("ik,kjc->ijc", alpha, scene.basis)
-    tracks = shapes @ scene.motion.swapaxes(1, 2)
+    tracks = waving_scene(160, 20, [0.1, 0.07])[0].tracks
     tracks += 0.15 * tracks.std() * rng.normal(size=tracks.shape)
     tracks[rng.random(tracks.shape[:2]) < 0.4] = np.nan
     table = tracks.reshape(160, -1)
@@ -276,9 +275,7 @@ def waving():
 class TestSmooth:
     def test_cameras_are_smoothed(self):
         rng, t = np.random.default_rng(0), np.arange(150)
-        alpha = np.stack([np.sin(0.1 * t), np.cos(0.07 * t)], axis=1)
-        scene = make_nonrigid_tracks(150, 20, n_components=2, random_state=0)
-        shapes = scene.mean_shape + np.einsum("ik,kjc->ijc", alpha, scene.basis)
+        shapes = waving_scene(150, 20, [0.1, 0.07])[0].shapes
         turns = np.stack([0.3 * np.sin(0.1 * t), 0.05 * t, 0.2 * np.cos(0.05 * t)], 1)
         R = Rotation.from_rotvec(turns).as_matrix()
         truth = shapes @ R.transpose(0, 2, 1)
@@ -383,7 +380,7 @@ class TestSmooth:
             model.smooth(table, **options)
 
     # Whether FastICA converges on one basis shape depends on the version of SciPy.
-    @pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
+    @start_may_not_converge
     def test_needs_a_posterior(self, waving):
         _, table = waving
         model = AffineNRSfM(1, refinement=None, random_state=0).fit(table)

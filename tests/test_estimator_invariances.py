@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import may_not_converge, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
 from sklearn.base import clone
 
@@ -13,7 +13,7 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 pytestmark = [
     pytest.mark.filterwarnings("ignore:layout=:UserWarning"),
     # Of the paper's pipeline: the joint refinement does not say so.
-    pytest.mark.filterwarnings("ignore:PooledFastICA did not converge"),
+    start_may_not_converge,
 ]
 
 VARIANTS = {
@@ -153,7 +153,7 @@ def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, variant):
     assert_models_agree(fitted, unscaled)
 
 
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@may_not_converge
 @pytest.mark.parametrize("refinement", ["joint", "alternating"])
 @pytest.mark.parametrize(
     ("name", "n_components"),

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from frame_parts import ATTRIBUTES_OF_FRAMES
-from layers import slow_after
+from layers import one_start, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused, warned
 from sklearn.base import clone
@@ -20,7 +20,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
 # Of the paper's pipeline: the joint refinement does not say so.
-pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
+pytestmark = [one_start, start_may_not_converge]
 
 K = 2
 REFINEMENTS = ["joint", "alternating", None]

@@ -26,6 +26,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from layers import one_start
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from sklearn.base import clone
@@ -36,6 +37,8 @@ import isa_nrsfm
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
+
+pytestmark = one_start
 
 PACKAGE = str(Path(isa_nrsfm.__file__).parent)
 ESTIMATOR = inspect.getsourcefile(AffineNRSfM)
@@ -173,8 +176,7 @@ def assert_not_fitted(model, X, folder):
         refused(None, getattr(model, name), *given, error=NotFittedError)
     refused(None, save_model, model, folder / "none.npz", error=NotFittedError)
     assert not any(folder.iterdir())
-    left = [name for name in vars(model) if name.endswith("_")]
-    assert left == []
+    assert [name for name in vars(model) if name.endswith("_")] == []
 
 
 class Estimator(RuleBasedStateMachine):

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import may_not_converge, slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
@@ -175,8 +175,7 @@ FLAT = pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=st
 @pytest.mark.parametrize("n_components", [1, 2, 5])
 @FLAT
 def test_rigid_objects_have_no_basis_shapes(flat, n_components):
-    tracks = rigid_tracks(flat)
-    model = fitted(tracks, n_components)
+    model = fitted(rigid_tracks(flat), n_components)
     assert model.inverse_snr_ < 1e-25
     assert_zero_from(model, 0)
     rank = sum(flat)
@@ -316,8 +315,7 @@ def test_joint_refinement_of_the_shark(load_data, n_components):
     # The refinement has hardly an end where the table determines so little.
     tracks = real_tracks(load_data, "shark_torresani")[::8]
     model = jointly(tracks, n_components, repeat=n_components == 1, max_iter=100)
-    paper = fitted(tracks, n_components)
-    assert model.inverse_snr_ < paper.inverse_snr_
+    assert model.inverse_snr_ < fitted(tracks, n_components).inverse_snr_
 
 
 @pytest.mark.slow
@@ -334,8 +332,7 @@ def test_robust_fit_of_the_shark(load_data, loss):
     slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)], together=True),
 )
 def test_joint_refinement_of_flat_objects(n_components, noise):
-    tracks = bending_tracks(flat=(1, 1, 0), noise=noise)
-    model = jointly(tracks, n_components)
+    model = jointly(bending_tracks(flat=(1, 1, 0), noise=noise), n_components)
     assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 
 
@@ -388,8 +385,7 @@ def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, n
     # All frames from one place, or from two: depth is seen in part or not at all.
     motion = cameras(np.random.default_rng(1), n_cameras)
     tracks = bending_tracks(np.repeat(motion, 40 // n_cameras, axis=0), noise=noise)
-    model = jointly(tracks, n_components)
-    assert model.inverse_snr_ < 1e-9 + 2 * noise**2
+    assert jointly(tracks, n_components).inverse_snr_ < 1e-9 + 2 * noise**2
 
 
 @pytest.mark.parametrize(
@@ -437,7 +433,7 @@ def test_any_unit_is_fitted(scale, refinement):
 # --- accuracy -----------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@may_not_converge
 @pytest.mark.parametrize("seed", slow_after(1, [0, 1]))
 @pytest.mark.parametrize(
     ("name", "n_components", "params", "percent"),
@@ -457,7 +453,7 @@ def test_inverse_snr_of_tables(load_data, name, n_components, params, percent, s
     assert round(100 * model.inverse_snr_, 3) <= percent
 
 
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@may_not_converge
 @pytest.mark.parametrize("name", ["akhter_yoga", "ict_bu3dfe_like_68", "muct_68"])
 def test_one_basis_shape_needs_no_independence(load_data, name):
     # There is one subspace only: neither strategy nor seed have a say.

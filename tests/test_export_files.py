@@ -1,7 +1,12 @@
-"""Exported files: glTF, arrays of shapes, and what is refused before any is written."""
+"""Exported files and poses: glTF, shapes and their distribution, pages, angles."""
 
+import base64
 import copy
+import hashlib
+import io
+import re
 from functools import partial
+from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -9,33 +14,40 @@ import pytest
 from export_models import (
     N_COMPONENTS,
     N_FRAMES,
+    aligned,
     blob_model,
     calibrated_model,
     face_model,
     faces,
 )
 from exported_files import TYPES, Read, content_of, numbers
-from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
-from scipy.io import loadmat
+from layers import may_not_converge, one_start
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
+from refusals import refused, warned
+from scipy.io import loadmat, savemat
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 from sklearn.decomposition import PCA
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import (
+    PointDistributionModel,
     ShapeArrays,
     frame_poses,
     point_distances,
     point_distribution_model,
+    read_pdm,
     shape_arrays,
     write_glb,
     write_pdm,
     write_shapes,
     write_viewer,
 )
+from isa_nrsfm.skeletons import get_skeleton
 
-pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+pytestmark = [may_not_converge, one_start]
 
 
 @pytest.fixture
@@ -305,3 +317,545 @@ def test_models_that_have_no_frames_of_their_own():
     table = faces().data[:40]
     without = AffineNRSfM(1, refinement=None, random_state=0, keep_frames=False)
     refused("exporting shapes needs the cameras", frame_poses, without.fit(table))
+
+
+# --- pages ---------------------------------------------------------------------------
+
+
+def shapes_of(data):
+    """Return the mean shape and the basis shapes of a page."""
+    return numbers(data["shapes"]).reshape(1 + len(data["components"]), -1, 3)
+
+
+@pytest.fixture
+def page(tmp_path):
+    """Return a function that writes a page and returns its data."""
+
+    def write(model, **options):
+        path = tmp_path / "viewer.html"
+        write_viewer(model, path, **options)
+        return content_of(path)
+
+    return write
+
+
+def test_a_page_is_one_file_that_asks_for_nothing(tmp_path):
+    path = tmp_path / "viewer.html"
+    write_viewer(face_model(), path)
+    text = path.read_text(encoding="utf-8")
+    assert "http" not in text.replace('http-equiv="Content-Security-Policy"', "")
+    assert not re.search(r"\b(src|srcset|action)=|@import|url\(", text)
+    script = re.search(r"<script>(.*?)</script>", text, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}';" in text
+    assert "default-src 'none';" in text
+    assert "{{" not in text.replace(script, "")
+
+
+def test_shapes_have_y_up_and_size_one(page):
+    data = page(face_model())
+    shapes = shapes_of(data)
+    assert np.linalg.norm(shapes[0], axis=1).max() == pytest.approx(1)
+    assert_allclose(shapes[0].mean(axis=0), 0, atol=1e-6)
+    assert shapes[0, 8, 1] < shapes[0, 27, 1]
+    assert shapes[0, 30, 2] > shapes[0, 0, 2]
+    assert len(numbers(data["edges"], "<u4")) > 100
+    assert data["points"] == [str(j) for j in range(68)]
+
+
+def test_frames_are_those_of_the_fit(page):
+    model = face_model()
+    data = page(model)
+    alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
+    assert_array_equal(alpha, model.alpha_.astype("f4"))
+    assert data["rows"] == [str(i) for i in range(N_FRAMES)]
+    assert data["count"] == f"{N_FRAMES} rows."
+    assert data["labels"] == data["categories"] == []
+
+
+@pytest.mark.parametrize(
+    ("camera", "options"),
+    [
+        *((camera, {}) for camera in ("weak_perspective", "orthographic")),
+        ("affine", {}),
+        ("affine", {"mirrored": True}),
+        ("affine", {"origin": "lower"}),
+        ("orthographic", {"origin": "lower", "mirrored": True}),
+    ],
+)
+def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
+    truth, model = faces(noise=0.0), face_model(noise=0.0)
+    if camera != "affine":
+        truth, model = faces(camera=camera), calibrated_model(camera)
+    data = page(model, **options)
+    told = "weak_perspective" if camera == "affine" else camera
+    assert f"{told.replace('_', '-')} cameras" in data["about"]
+    shapes = shapes_of(data).astype(float)
+    alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
+    rotations = numbers(data["rotations"]).reshape(-1, 3, 3)
+    assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-5)
+    frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+    seen = (frames @ rotations.transpose(0, 2, 1))[:, :, :2] * [1, -1]
+    # The page turns the images of y that points up.
+    images = truth.clean * [1, -1 if "origin" in options else 1]
+    images = images - images.mean(axis=1, keepdims=True)
+    seen = seen - seen.mean(axis=1, keepdims=True)
+    scale = np.sum(seen * images, axis=(1, 2)) / np.sum(seen**2, axis=(1, 2))
+    error = images - scale[:, None, None] * seen
+    assert np.sum(error**2) < 1e-3 * np.sum(images**2)
+
+
+@pytest.mark.parametrize(
+    ("options", "signs"),
+    [({"mirrored": True}, [1, 1, -1]), ({"origin": "lower"}, [1, -1, -1])],
+)
+def test_mirror_images_and_origins_change_signs(page, options, signs):
+    shapes, other = shapes_of(page(blob_model())), page(blob_model(), **options)
+    assert_allclose(shapes_of(other), shapes * signs, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
+def test_basis_shapes_are_those_of_the_frames(page, camera):
+    # The model's, or the least squares fit to Euclidean shapes of affine cameras.
+    model = face_model() if camera == "affine" else calibrated_model(camera)
+    shapes = model.mean_shape_[None], model.basis_
+    if camera == "affine":
+        frames = model.reconstruct(faces().data, camera="weak_perspective")
+        weights = np.insert(model.alpha_, 0, 1.0, axis=1)
+        best = np.linalg.lstsq(weights, frames.reshape(len(frames), -1))[0]
+        shapes = np.split(best.reshape(-1, 68, 3), [1])
+    rows = np.concatenate([shapes[0] - shapes[0].mean(axis=1), shapes[1]])
+    drawn = shapes_of(page(model))
+    inner, expected = (np.tensordot(each, each, [2, 2]) for each in (drawn, rows))
+    unit = np.linalg.norm(expected) / np.linalg.norm(inner)
+    assert_allclose(unit * inner, expected, atol=1e-4 * expected.max())
+
+
+def test_deviations_have_the_size_of_the_shapes(page):
+    model, X = calibrated_model("orthographic"), faces(camera="orthographic").data
+    shapes, std = model.reconstruct(X, return_std=True)
+    data = page(model, X=X, depth_std=std, n_frames=4)
+    found = numbers(data["deviations"]).reshape(4, 68)
+    size = np.linalg.norm(shapes[0, 0] - shapes[0, 16])
+    alpha = numbers(data["alpha"]).reshape(4, -1)[0]
+    mean, *basis = shapes_of(data)
+    drawn = mean + np.tensordot(alpha, basis, 1)
+    unit = np.linalg.norm(drawn[0] - drawn[16]) / size
+    assert_allclose(found, unit * std[[0, 49, 99, 149]], rtol=1e-4)
+    assert page(model)["deviations"] == ""
+
+
+def test_deviations_of_points_are_those_of_all_frames(page):
+    model, deviations = calibrated_model(), np.linspace(0.0, 1.0, 68)
+    deviations[3] = np.nan
+    data = page(model, depth_std=deviations)
+    found = numbers(data["deviations"]).reshape(N_FRAMES, 68)
+    assert_allclose(found, np.tile(deviations * found[0, -1], (N_FRAMES, 1)), rtol=1e-5)
+    assert np.isnan(found[:, 3]).all()
+
+
+def test_few_frames_are_spread_over_the_rows(page):
+    data = page(face_model(), n_frames=4)
+    assert data["rows"] == ["0", "49", "99", "149"]
+    assert data["count"] == f"4 of {N_FRAMES} rows, evenly spread."
+    assert page(face_model(), n_frames=0)["rows"] == []
+
+
+def test_other_tables_are_shown_by_their_index(page):
+    model = face_model()
+    table = pd.DataFrame(faces().data[:6].copy(), index=list("abcdef"))
+    table.iloc[2] = np.nan
+    data = page(model, X=table.to_numpy(), n_frames=5)
+    assert data["rows"] == ["0", "1", "3", "5"]
+    count = "5 of 6 rows, evenly spread; 1 of them show too few points."
+    assert data["count"] == count
+    alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
+    assert_allclose(alpha, model.alpha_[[0, 1, 3, 5]], atol=1e-5)
+    data = page(model, X=table, labels=list("uvwxyz"))
+    assert data["rows"] == list("abdef")
+    assert data["labels"] == [0, 1, 3, 4, 5]
+    assert page(model, X=table, n_frames=0)["rows"] == []
+
+
+def test_labels_are_sorted_numbers_first_and_none_last(page):
+    model = blob_model()
+    labels = np.array([10, 9.5, "b", None, "a", np.nan, 9.5, 10] * 5, dtype=object)
+    data = page(model, labels=labels)
+    assert data["categories"] == ["9.5", "10", "a", "b", "(no label)"]
+    assert data["labels"][:8] == [1, 0, 3, 4, 2, 4, 0, 1]
+    labels = pd.array(["b", None, "a", "b"] * 10, dtype="string")
+    data = page(model, labels=labels)
+    assert data["categories"] == ["a", "b", "(no label)"]
+    assert data["labels"][:4] == [1, 2, 0, 1]
+
+
+def test_affine_shapes_have_no_poses_and_say_so(page):
+    data = page(face_model(), camera=None)
+    assert data["rotations"] == ""
+    assert data["about"].startswith("Affine shapes: angles and depth are not")
+
+
+def test_the_sides_of_a_known_layout_are_told(page):
+    data = page(face_model())
+    assert data["sides"] == get_skeleton("ibug-68").sides.tolist()
+    assert page(face_model(), edges=None)["sides"] == []
+    data = page(blob_model(), edges=[[0, 1, 2], [2, 1, 3]])
+    assert data["sides"] == []
+    # The sides of triangles, once
+    edges = numbers(data["edges"], "<u4").reshape(-1, 2).tolist()
+    assert edges == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
+
+
+def test_times_are_seconds_that_rise(page):
+    model = face_model()
+    n_frames = len(model.alpha_)
+    seconds = np.arange(n_frames) / 25 + 100
+    seconds[n_frames // 2 :] -= seconds[n_frames // 2] - 3  # another video
+    content = page(model, times=seconds, n_frames=n_frames)
+    found = numbers(content["times"], "<f8")
+    assert_allclose(found, np.arange(n_frames) / 25, atol=1e-9)
+    assert not len(numbers(page(model)["times"], "<f8"))
+    few = numbers(page(model, times=seconds, n_frames=3)["times"], "<f8")
+    assert_allclose(few, found[[0, (n_frames - 1) // 2, -1]], atol=1e-9)
+
+
+# --- angles and distances ------------------------------------------------------------
+
+EYES, MOUTH = (36, 45), (48, 54)
+
+
+@pytest.fixture(scope="module", params=["weak_perspective", "affine"])
+def fitted(request):
+    """Return faces with their true rotations, and a model of them."""
+    return faces(), face_model() if request.param == "affine" else calibrated_model()
+
+
+def rotations_of(poses):
+    """Return rotations from angles, by their definition."""
+    angles = np.stack([poses.roll, -poses.pitch, -poses.yaw], axis=1)
+    return Rotation.from_euler("ZXY", angles, degrees=True)
+
+
+class TestFramePoses:
+    def test_true_up_to_a_common_rotation(self, fitted):
+        truth, model = fitted
+        found = rotations_of(frame_poses(model, truth.data))
+        true = Rotation.from_euler("yxz", truth.angles, degrees=True)
+        common = (found.inv() * true).mean()
+        off = np.degrees((found * common * true.inv()).magnitude())
+        assert np.median(off) < 2
+        # Upright and frontal, as the makers of the faces have it
+        assert np.degrees(common.magnitude()) < 5
+
+    def test_deviations_are_those_of_the_errors(self, fitted):
+        truth, model = fitted
+        if model.camera == "affine":
+            assert np.isnan(frame_poses(model, truth.data).yaw_std).all()
+            return
+        # Frames of the model itself, with its noise
+        clean = model.inverse_transform(model.alpha_, model.motion_, model.translation_)
+        clean = clean.reshape(N_FRAMES, 68, 2)
+        sizes = (clean - clean.mean(axis=1, keepdims=True)).std(axis=(1, 2))
+        noise = np.sqrt(model.noise_variance_) * sizes[:, None, None]
+        noisy = clean + noise * np.random.default_rng(0).normal(size=clean.shape)
+        wanted = frame_poses(model)
+        found = frame_poses(model, noisy.reshape(N_FRAMES, -1))
+        for name in ("yaw", "pitch", "roll"):
+            off = getattr(found, name) - getattr(wanted, name)
+            ratio = np.sqrt(np.mean((off / getattr(found, f"{name}_std")) ** 2))
+            # Deviations contain the uncertainty of the shapes, which is none here.
+            assert ratio < 1.25
+
+    def test_of_the_fitted_table(self, fitted):
+        truth, model = fitted
+        expected = frame_poses(model, truth.data)[:4]
+        assert_allclose(frame_poses(model)[:4], expected, atol=1e-4)
+        assert np.isnan(frame_poses(model).yaw_std).all()
+
+    def test_of_fitted_frames(self, fitted):
+        truth, model = fitted
+        X = truth.data[:20]
+        frames = model.decompose(X)
+        assert_array_equal(frame_poses(model, frames)[:4], frame_poses(model, X)[:4])
+        assert np.isnan(frame_poses(model, frames).yaw_std).all()
+        found, pair = point_distances(model, [MOUTH], frames, unit=EYES), [MOUTH]
+        assert_array_equal(found, point_distances(model, pair, X, unit=EYES))
+
+
+class TestPointDistances:
+    def test_true_in_units_of_the_eyes(self, fitted):
+        truth, model = fitted
+        found = point_distances(model, [MOUTH, EYES])
+        true = np.linalg.norm(truth.shapes[:, 48] - truth.shapes[:, 54], axis=1)
+        mean = truth.shapes.mean(axis=0)
+        true /= np.linalg.norm(mean[36] - mean[45])
+        assert np.corrcoef(found[:, 0], true)[0, 1] > 0.98
+        assert_allclose(found[:, 0].mean(), true.mean(), rtol=0.03)
+        assert found[:, 1].mean() == pytest.approx(1.0, abs=0.01)
+
+    def test_units(self, fitted):
+        truth, model = fitted
+        eyes = point_distances(model, [MOUTH])
+        mouth = point_distances(model, [MOUTH], unit=MOUTH, length=50.0)
+        ratio = mouth / eyes
+        assert_allclose(ratio, ratio[0, 0])
+        assert mouth.mean() == pytest.approx(50.0, rel=0.01)
+        again = point_distances(model, [MOUTH], truth.data)
+        assert_allclose(again, eyes, atol=2e-3)
+
+    def test_a_pair_alone_is_no_list_of_pairs(self, fitted):
+        refused(r"\[\(62, 66\)\].* got 48 instead", point_distances, fitted[1], MOUTH)
+
+
+def test_uncertainty_needs_calibrated_cameras(fitted):
+    truth, model = fitted
+    if model.camera == "affine":
+        message = "needs a model with calibrated cameras; .* Fit with camera='weak_"
+        refused(message, model.rotation_covariance, truth.data)
+    else:
+        covariance = model.rotation_covariance(truth.data)
+        assert covariance.shape == (N_FRAMES, 3, 3)
+        assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+# --- point distribution models -------------------------------------------------------
+
+
+def scores_of(pdm, shapes):
+    """Return the scores of shapes that are aligned to the mean."""
+    flat = (shapes - pdm.mean).reshape(len(shapes), -1)
+    return flat @ pdm.modes.reshape(len(pdm.modes), -1).T
+
+
+def on_tangent_space(shapes, mean):
+    """Return shapes aligned to a mean, their differences from it orthogonal to it."""
+    shapes = aligned(shapes, mean)
+    scales = np.sum(mean**2) / np.sum(shapes * mean, axis=(1, 2))
+    return scales[:, None, None] * shapes
+
+
+def read_as_openface_does(path):
+    """Read a text as PDM::Read of OpenFace: after comments, sizes, type and numbers."""
+    lines = path.read_text().splitlines()
+    words = iter(" ".join(line for line in lines if not line.startswith("#")).split())
+    matrices = []
+    for _ in range(3):
+        n_rows, n_columns, kind = (int(next(words)) for _ in range(3))
+        assert kind == 6  # CV_64FC1, doubles
+        numbers = [float(next(words)) for _ in range(n_rows * n_columns)]
+        matrices.append(np.reshape(numbers, (n_rows, n_columns)))
+    assert not [*words]
+    return matrices
+
+
+@pytest.fixture(scope="module")
+def pdm():
+    return point_distribution_model(face_model())
+
+
+def test_modes_are_orthonormal_and_sorted(pdm):
+    flat = pdm.modes.reshape(len(pdm.modes), -1)
+    assert len(flat) == N_COMPONENTS
+    assert_allclose(flat @ flat.T, np.eye(N_COMPONENTS), atol=1e-12)
+    assert np.all(np.diff(pdm.eigenvalues) < 0)
+    assert_allclose(pdm.mean.mean(axis=0), 0, atol=1e-9)
+    largest = np.abs(flat).argmax(axis=1)
+    assert np.all(flat[np.arange(N_COMPONENTS), largest] > 0)
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+@pytest.mark.parametrize("camera", ["weak_perspective", None])
+@pytest.mark.parametrize("make", [face_model, calibrated_model])
+def test_faces_stand_upright_and_look_at_the_viewer(make, camera, y_up):
+    model = face_model(y_up=y_up) if make is face_model else make()
+    mean = point_distribution_model(model, camera=camera).mean
+    ear, nose, other_ear, brow, chin = mean[[0, 30, 16, 19, 8]]
+    assert brow[1] < nose[1] < chin[1]  # y points down
+    assert ear[0] < nose[0] < other_ear[0]
+    assert nose[2] < min(ear[2], other_ear[2])  # z points away
+
+
+def test_more_frames_than_coordinates(rng):
+    X = make_nonrigid_tracks(60, 12, 2, noise=0.02, random_state=0).data
+    model = AffineNRSfM(2, isa=FastISA(n_init=1), refinement=None, random_state=0)
+    found = point_distribution_model(model.fit(X), n_modes=0.999)
+    shapes = on_tangent_space(model.reconstruct(X, camera="weak_perspective"), found[0])
+    flat = (shapes - found.mean).reshape(60, -1)
+    values = np.linalg.svd(flat, compute_uv=False)[: len(found.modes)]
+    assert_allclose(found.eigenvalues, values**2 / 60, rtol=1e-6)
+
+
+def test_euclidean_shapes_of_the_frames_are_reproduced(pdm):
+    assert_true_mean(pdm, faces())
+    shapes = face_model().reconstruct(faces().data, camera="weak_perspective")
+    shapes = on_tangent_space(shapes, pdm.mean)
+    spread = np.sum((shapes - pdm.mean) ** 2)
+    errors = []
+    for model in (pdm, point_distribution_model(face_model(), n_modes=0.9999)):
+        scores = scores_of(model, shapes)
+        rebuilt = model.mean + np.tensordot(scores, model.modes, 1)
+        errors.append(np.sum((shapes - rebuilt) ** 2) / spread)
+        assert_allclose(np.mean(scores**2, axis=0), model.eigenvalues, rtol=1e-6)
+        assert_allclose(np.mean(scores, axis=0), 0, atol=1e-6)
+    assert errors[0] < 0.03
+    assert errors[1] < 1.01e-4
+
+
+def assert_true_mean(pdm, truth):
+    """Check the proportions, and the pose but for a few degrees of pitch."""
+    error = aligned(pdm.mean, truth.mean_shape) - truth.mean_shape
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth.mean_shape)
+    cosines = np.sum(pdm.mean * truth.mean_shape, axis=0)
+    sizes = (np.linalg.norm(shape, axis=0) for shape in (pdm.mean, truth.mean_shape))
+    assert (cosines / np.prod([*sizes], axis=0)).min() > 0.99
+
+
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
+    truth, model = faces(camera=camera), calibrated_model(camera)
+    pdm = point_distribution_model(model)
+    again = point_distribution_model(model, camera=None)
+    assert_equal(pdm, again)
+    assert_true_mean(pdm, truth)
+    shapes = on_tangent_space(model.reconstruct(truth.data), pdm.mean)
+    scores = scores_of(pdm, shapes)
+    assert_allclose(np.mean(scores**2, axis=0), pdm.eigenvalues, rtol=1e-6)
+    rest = shapes - pdm.mean - np.tensordot(scores, pdm.modes, 1)
+    assert np.sum(rest**2) < 0.02 * np.sum((shapes - pdm.mean) ** 2)
+    if camera == "orthographic":
+        unit = np.linalg.norm(truth.motion[0, 0])  # pixels a millimetre
+        size = unit * np.linalg.norm(truth.mean_shape)
+        assert np.linalg.norm(pdm.mean) == pytest.approx(size, rel=0.01)
+    assert len(recwarn) == 0
+
+
+def test_affine_shapes_have_as_many_modes_as_basis_shapes():
+    model = face_model()
+    pdm = point_distribution_model(model, camera=None, n_modes=0.999999)
+    assert len(pdm.modes) == N_COMPONENTS
+    message, options = "at most 3, the number of principal", {"camera": None}
+    refused(message, point_distribution_model, model, n_modes=4, **options)
+
+
+def test_rows_without_points_are_left_out():
+    table = faces().data[:60].copy()
+    options = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
+    model = AffineNRSfM(1, **options).fit(table[:40])
+    table[40:] = np.nan
+    with_empty = warned("no point is visible", AffineNRSfM(1, **options).fit, table)
+    found, expected = map(point_distribution_model, (with_empty, model))
+    for one, other in zip(found, expected, strict=True):
+        assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):
+    model = face_model()
+    everything = point_distribution_model(model, n_modes=0.999999).eigenvalues
+    share = np.cumsum(everything) / everything.sum()
+    for n_modes in (1, 2, 3):
+        between = share[n_modes - 1] - 1e-6
+        found = point_distribution_model(model, n_modes=float(between))
+        assert len(found.modes) == n_modes
+        exact = point_distribution_model(model, n_modes=n_modes)
+        assert_equal(found, exact)
+
+
+def test_another_unit_of_length(pdm):
+    scaled = pdm.scaled(2.5)
+    assert_allclose(scaled.mean, 2.5 * pdm.mean)
+    assert_allclose(scaled.eigenvalues, 6.25 * pdm.eigenvalues)
+    assert scaled.modes is pdm.modes
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".mat", ".npz"])
+def test_files_give_the_same_numbers_again(pdm, tmp_path, suffix):
+    path = tmp_path / f"pdm{suffix}"
+    write_pdm(pdm, path)
+    assert_equal(read_pdm(str(path)), pdm)
+    if suffix == ".mat":  # as MATLAB code of OpenFace has them
+        shapes = {name: loadmat(path)[name].shape for name in "MVE"}
+        m = N_COMPONENTS
+        assert shapes == {"M": (204, 1), "V": (204, m), "E": (m, 1)}
+        assert_array_equal(loadmat(path)["M"][68:136, 0], pdm.mean[:, 1])
+
+
+def test_openface_reads_the_text(pdm, tmp_path):
+    path = tmp_path / "pdm.txt"
+    write_pdm(pdm, path)
+    mean, components, variances = read_as_openface_does(path)
+    assert mean.shape == (204, 1)
+    assert components.shape == (204, N_COMPONENTS)
+    assert variances.shape == (1, N_COMPONENTS)
+    # All x, then all y, then all z; a shape is mean + components * scores.
+    scores = np.array([1.0, -2.0, 0.5])
+    shape = (mean[:, 0] + components @ scores).reshape(3, 68).T
+    assert_allclose(shape, pdm.mean + np.tensordot(scores, pdm.modes, 1))
+    assert_array_equal(variances[0], pdm.eigenvalues)
+
+
+def test_texts_as_others_write_them_are_read(tmp_path):
+    # Rows that end in blanks, carriage returns, more matrices at the end.
+    text = (
+        "# mean\r\n6\r\n1\r\n6\r\n1 \r\n2 \r\n3 \r\n4 \r\n5 \r\n6 \r\n"
+        "# modes\r\n6\r\n1\r\n6\r\n" + "0.5 \r\n" * 6 + "# variances\r\n1\r\n1\r\n6\r\n"
+        "7 \r\n# of expressions\r\n1\r\n1\r\n6\r\n9\r\n"
+    )
+    path = tmp_path / "other.txt"
+    path.write_bytes(text.encode())
+    pdm = read_pdm(path)
+    assert_array_equal(pdm.mean, [[1, 3, 5], [2, 4, 6]])
+    assert_array_equal(pdm.modes, np.full((1, 2, 3), 0.5))
+    assert_array_equal(pdm.eigenvalues, [7])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "as a point distribution model: where there should be the mean"),
+        ("# mean\n3 1 6 1 2\n", "where there should be the mean"),
+        ("3 1 6 1 2 3 3 1 6 1 one 1 1 1 6 1", "there should be the principal comp"),
+        ("3 1 6 1 2 3 3 1 6 1 1 1 1 2 6 1 1", r"should have a mean of 3n numbers"),
+    ],
+    ids=["empty", "short", "no number", "misfit"],
+)
+def test_other_texts_are_refused(tmp_path, text, message):
+    path = tmp_path / "other.txt"
+    path.write_text(text)
+    refused(message, read_pdm, path)
+
+
+def test_other_files_are_refused(pdm, tmp_path):
+    refused(r"\.txt or \.mat or \.npz; got", read_pdm, tmp_path / "pdm.csv")
+    np.savez(tmp_path / "a.npz", mean=pdm.mean)
+    refused("has no modes, eigenvalues", read_pdm, tmp_path / "a.npz")
+    savemat(tmp_path / "a.mat", {"M": pdm.mean})
+    refused("has no V, E", read_pdm, tmp_path / "a.mat")
+    misfit = PointDistributionModel(pdm.mean, pdm.modes, pdm.eigenvalues[1:])
+    refused("eigenvalues", write_pdm, misfit, tmp_path / "a.txt")
+    assert not (tmp_path / "a.txt").exists()
+
+
+def bytes_of(array, version=None):
+    """Return the bytes of an array in NumPy's format."""
+    content = io.BytesIO()
+    np.lib.format.write_array(content, array, version, allow_pickle=True)
+    return content.getvalue()
+
+
+def test_arrays_have_the_size_of_their_file(tmp_path):
+    path, mean = tmp_path / "a.npz", bytes_of(np.arange(6.0).reshape(2, 3), (2, 0))
+    objects = bytes_of(np.array([None, None]))
+    head = objects[: objects.index(b"\n") + 1]
+
+    def read(mean):
+        with ZipFile(path, "w") as file:
+            file.writestr("mean.npy", mean)
+            file.writestr("modes.npy", bytes_of(np.ones((1, 2, 3)), (1, 0)))
+            file.writestr("eigenvalues.npy", bytes_of(np.ones(1)))
+        return read_pdm(path).mean
+
+    assert_array_equal(read(mean), [[0, 1, 2], [3, 4, 5]])
+    for changed, n_bytes in ((mean[:-1], 47), (mean + b"0", 49)):
+        refused(f"48 bytes; got {n_bytes}", read, changed)
+    for size in (0, 8, 16, 24):
+        refused("type object should have 16 bytes", read, head + bytes(size))

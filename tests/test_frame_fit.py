@@ -437,8 +437,7 @@ def fitted(X, n_components=3, camera="weak_perspective", **options):
 
 def depths_of(model, X):
     """Return depths of the points (n_frames, n_points) in the units of the table."""
-    shapes = model.reconstruct(X)
-    z = np.einsum("ijc,ic->ij", shapes, model.rotations_[:, 2])
+    z = np.einsum("ijc,ic->ij", model.reconstruct(X), model.rotations_[:, 2])
     z = model.scales_[:, None] * z
     return z - z.mean(axis=1, keepdims=True)
 

@@ -77,8 +77,7 @@ class TestSpace:
         assert np.sum(gauge.mean_shape[:, 2] ** 3) > 0
 
     def test_scattered_views_have_their_principal_axes(self):
-        scene = Scene(n_frames=300).scattered()
-        gauge, motion = scene.canonical()
+        gauge, motion = Scene(n_frames=300).scattered().canonical()
         assert mean_view(motion) is None
         B = gauge.mean_shape
         assert_allclose(B.T @ B / len(B), np.eye(3), atol=1e-13)
@@ -183,16 +182,15 @@ class TestBasis:
         assert gauge.basis[2].any() == (size == 1e-6)
 
 
-class TestReorderBlocks:
-    def test_by_hand(self):
-        matrix = np.arange(81.0).reshape(9, 9)
-        order = np.array([2, 0, 1])
-        got = reorder_blocks(matrix, order)
-        for a in range(3):
-            for b in range(3):
-                rows, columns = (np.arange(3) + 3 * order[each] for each in (a, b))
-                expected = matrix[np.ix_(rows, columns)]
-                assert_array_equal(got[3 * a : 3 * a + 3, 3 * b : 3 * b + 3], expected)
+def test_blocks_are_reordered():
+    matrix = np.arange(81.0).reshape(9, 9)
+    order = np.array([2, 0, 1])
+    got = reorder_blocks(matrix, order)
+    for a in range(3):
+        for b in range(3):
+            rows, columns = (np.arange(3) + 3 * order[each] for each in (a, b))
+            expected = matrix[np.ix_(rows, columns)]
+            assert_array_equal(got[3 * a : 3 * a + 3, 3 * b : 3 * b + 3], expected)
 
 
 ALL = [*INDEPENDENCE, None]
@@ -272,17 +270,16 @@ def assert_same(got, expected, atol=1e-7):
         assert_allclose(one, other, atol=atol, err_msg=name)
 
 
+@EACH
 class TestSameFit:
     """What a fit says of the table and of the shapes is not changed."""
 
-    @EACH
     @pytest.mark.parametrize("n_components", [1, 3])
     def test_images(self, independence, n_components):
         fit = random_fit(n_components=n_components)
         result, _ = canonical(fit, independence)
         assert_allclose(result.images(), fit.images(), atol=1e-11)
 
-    @EACH
     def test_shapes_but_for_one_affinity_and_the_scales_of_frames(self, independence):
         fit = random_fit()
         result, _ = canonical(fit, independence)
@@ -350,17 +347,16 @@ def whitened(fit):
     return (white[1:] - along[:, None, None] * white[0]).transpose(0, 2, 1)
 
 
-class TestInvariance:
-    @EACH
-    @pytest.mark.parametrize("n_components", [1, 3, 5])
-    def test_gauge_of_the_fit(self, independence, n_components):
-        fit = random_fit(n_components=n_components, n_points=150)
-        expected, _ = canonical(fit, independence)
-        for seed in (1, 2, 3):
-            other = regauged(fit, seed, shift=0.01)
-            assert_allclose(other.images(), fit.images(), atol=1e-10)
-            got, _ = canonical(other, independence)
-            assert_same(got, expected)
+@EACH
+@pytest.mark.parametrize("n_components", [1, 3, 5])
+def test_gauge_of_the_fit_makes_no_difference(independence, n_components):
+    fit = random_fit(n_components=n_components, n_points=150)
+    expected, _ = canonical(fit, independence)
+    for seed in (1, 2, 3):
+        other = regauged(fit, seed, shift=0.01)
+        assert_allclose(other.images(), fit.images(), atol=1e-10)
+        got, _ = canonical(other, independence)
+        assert_same(got, expected)
 
 
 def calibrated(fit, camera):
@@ -375,11 +371,11 @@ def calibrated(fit, camera):
 BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 
 
+@BOTH
+@EACH
 class TestCalibratedCameras:
     """Space may only be turned, and orthographic cameras absorb no scales."""
 
-    @BOTH
-    @EACH
     @pytest.mark.parametrize("unit", [None, 3.0])
     def test_images_stay_and_cameras_stay_calibrated(self, camera, independence, unit):
         fit = calibrated(random_fit(), camera)
@@ -400,8 +396,6 @@ class TestCalibratedCameras:
         else:
             assert size[0] == pytest.approx(unit)
 
-    @BOTH
-    @EACH
     def test_conditions(self, camera, independence):
         fit = calibrated(random_fit(), camera)
         result, _ = canonical(fit, independence, camera)
@@ -412,8 +406,6 @@ class TestCalibratedCameras:
             along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
             assert_allclose(along, 0, atol=1e-10)
 
-    @BOTH
-    @EACH
     def test_another_fit_that_is_as_good_leads_to_the_same(self, camera, independence):
         fit = calibrated(random_fit(), camera)
         mixing = random_mixing(1, 4, shift=0.01)

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import one_start, slow_after
 from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
+
+pytestmark = one_start
 
 NOISE = 0.02
 N_FOLDS, FOLD_SEED = 5, 0
@@ -59,8 +61,7 @@ def test_score_is_minus_the_error_and_the_same_each_time(refinement):
         assert_allclose(model.score(few), by_plain_loops(model, few), rtol=1e-6)
     assert model.score(X) == score
     assert model.score(X, y=np.zeros(len(X))) == score
-    again = AffineNRSfM(2, **params, random_state=0).fit(X)
-    assert again.score(X) == score
+    assert AffineNRSfM(2, **params, random_state=0).fit(X).score(X) == score
 
 
 def test_score_weights_frames_as_the_fit_does():

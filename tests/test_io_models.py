@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from damage import as_json, damaged_array, damaged_tree, pick
-from layers import slow_after
+from layers import may_not_converge, one_start, slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from sklearn.base import clone
@@ -83,7 +83,8 @@ TABLES = {
     "missing points": HOLED,
 }
 pytestmark = [
-    pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning"),
+    one_start,
+    may_not_converge,
     pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined"),
 ]
 
@@ -237,8 +238,7 @@ def test_a_state_of_random_numbers_goes_on_where_it_was(path):
     assert_same(loaded, model)
     draws = random.standard_normal(9)
     assert_array_equal(loaded.random_state.standard_normal(9), draws)
-    other = np.random.RandomState(np.random.PCG64(0))
-    model.set_params(random_state=other)
+    model.set_params(random_state=np.random.RandomState(np.random.PCG64(0)))
     refused("random_state is of type .* cannot hold", save_model, model, path)
 
 

@@ -1,20 +1,27 @@
-"""Strategies of independent subspace analysis: what all have to do.
+"""Strategies of independent subspace analysis: what all have to do, then each of them.
 
 A new strategy in `isa_nrsfm.isa` is tested here without further changes.
 """
 
+import warnings
+
 import numpy as np
 import pytest
+from groupings import GROUPINGS, energy_inside
+from joblib import parallel_config
+from layers import may_not_converge, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refused, warned
 from scenes import random_rotation, spherical_sources
+from scipy.optimize import approx_fprime, check_grad
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from isa_nrsfm import AffineNRSfM, isa as strategies
+from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, isa as strategies
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
+from isa_nrsfm.isa import SqrtDensity
 from isa_nrsfm.metrics import subspace_distance
 
 KINDS = [getattr(strategies, name) for name in strategies.__all__]
@@ -82,7 +89,7 @@ class TestStrategies:
         covariance = np.cov(found.transform(sources).T, bias=True)
         assert_allclose(covariance, np.eye(3), atol=1e-12)
 
-    @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+    @may_not_converge
     def test_seeds(self, isa):
         few = spherical_sources(0, 68, 4)
         seeds = 0, 0, np.random.RandomState(0), 3
@@ -107,7 +114,7 @@ class TestStrategies:
         other = isa.fit(unit * (signals + 1.0)).components_
         assert_allclose(unit * other, first, atol=1e-8)
 
-    @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+    @may_not_converge
     def test_is_saved_with_a_model(self, isa, tmp_path):
         table = make_nonrigid_tracks(40, 20, 2, noise=0.01, random_state=0).data
         model = AffineNRSfM(2, isa=isa, refinement=None, random_state=0).fit(table)
@@ -120,26 +127,25 @@ class TestStrategies:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-class TestParameters:
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("subspace_size", 0),
-            ("subspace_size", 1.5),
-            ("n_init", 0),
-            ("max_iter", 0),
-            ("tol", 0.0),
-            ("random_state", "seed"),
-        ],
-    )
-    def test_bad_values(self, kind, signals, name, value):
-        refused(f"The '{name}' parameter of", kind(**{name: value}).fit, signals)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("subspace_size", 0),
+        ("subspace_size", 1.5),
+        ("n_init", 0),
+        ("max_iter", 0),
+        ("tol", 0.0),
+        ("random_state", "seed"),
+    ],
+)
+def test_bad_values_of_parameters(kind, signals, name, value):
+    refused(f"The '{name}' parameter of", kind(**{name: value}).fit, signals)
 
 
 # With subspaces of one signal any number of columns will do, so no check may fail that
 # feeds linearly independent signals. Many checks feed normal data, on which independent
 # components do not converge.
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@may_not_converge
 @parametrize_with_checks(
     [kind(subspace_size=1, n_init=2) for kind in KINDS],
     expected_failed_checks=lambda estimator: {
@@ -148,3 +154,358 @@ class TestParameters:
 )
 def test_scikit_learn_checks(estimator, check):
     check(estimator)
+
+
+# --- FastISA: recovery, optimality, what the result may not depend on ----------------
+
+
+def mixed(seed, n_samples=3000, n_subspaces=4, size=3):
+    """Return signals of independent spherical sources, and the true unmixing."""
+    sources = spherical_sources(seed, n_samples, n_subspaces, size)
+    A = random_rotation(seed, n_subspaces * size)
+    return sources @ A.T, A.T
+
+
+def few_samples(seed=0):
+    """Return signals of the size of landmark data: 68 points, 9 subspaces."""
+    return mixed(seed, 68, 9)[0]
+
+
+class CauchyDensity:
+    """Another density: ``F(u) = -log(1 + u)``."""
+
+    def log_density(self, energy):
+        return -np.log1p(energy)
+
+    def derivatives(self, energy):
+        root = 1.0 / (1.0 + energy)
+        return -root, root**2
+
+
+def test_subspaces_are_found_with_another_density():
+    signals, unmixing = mixed(0)
+    isa = FastISA(n_init=2, density=CauchyDensity(), random_state=0).fit(signals)
+    assert subspace_distance(isa.components_, unmixing) < 0.06
+
+
+class TestOptimality:
+    def test_relative_gradient_vanishes(self):
+        signals, _ = mixed(0, 3000, n_subspaces=3)
+        isa = FastISA(n_init=1, tol=1e-13, random_state=0).fit(signals)
+        Y = isa.transform(signals).T
+        u = np.repeat(np.sum(Y.reshape(3, 3, -1) ** 2, axis=1), 3, axis=0)
+        G = -0.5 / np.sqrt(u + 0.1) * Y @ Y.T / 3000
+        assert np.linalg.norm(G - G.T) < 1e-5 * np.linalg.norm(G)
+
+    def test_likelihood_is_that_of_the_sources(self):
+        signals = few_samples()
+        isa = FastISA(n_init=4, random_state=0).fit(signals)
+        u = np.sum(isa.transform(signals).reshape(68, 9, 3) ** 2, axis=2)
+        expected = -np.sqrt(u + 0.1).mean(axis=0).sum()
+        assert_allclose(isa.log_likelihood_, expected)
+
+    def test_largest_likelihood_is_kept(self):
+        isa = FastISA(n_init=12, random_state=0).fit(few_samples())
+        assert isa.log_likelihoods_.shape == isa.n_iters_.shape == (12,)
+        assert np.ptp(isa.log_likelihoods_) > 1e-3
+        best = isa.log_likelihoods_.argmax()
+        assert isa.log_likelihood_ == isa.log_likelihoods_[best]
+        assert isa.n_iter_ == isa.n_iters_[best]
+
+
+class TestInvariances:
+    @pytest.mark.slow
+    def test_n_jobs_change_no_bit(self):
+        signals = few_samples()
+        kwargs = {"n_init": 18, "random_state": 0}
+        one, two = (FastISA(**kwargs, n_jobs=n).fit(signals) for n in (1, 2))
+        assert_array_equal(two.components_, one.components_)
+        assert_array_equal(two.log_likelihoods_, one.log_likelihoods_)
+        assert_array_equal(two.n_iters_, one.n_iters_)
+
+    def test_threads_change_no_bit(self):
+        signals, _ = mixed(0, 500)
+        one = FastISA(n_init=17, random_state=0).fit(signals)
+        with parallel_config(backend="threading", n_jobs=3):
+            three = FastISA(n_init=17, random_state=0).fit(signals)
+        assert_array_equal(three.components_, one.components_)
+        assert_array_equal(three.log_likelihoods_, one.log_likelihoods_)
+
+    @may_not_converge
+    @pytest.mark.parametrize("n_init", [1, 8, 9])
+    def test_fewer_starts_are_the_first_of_more(self, n_init):
+        signals = few_samples()
+        more = FastISA(n_init=10, random_state=0).fit(signals)
+        fewer = FastISA(n_init=n_init, random_state=0).fit(signals)
+        assert_array_equal(fewer.log_likelihoods_, more.log_likelihoods_[:n_init])
+        assert_array_equal(fewer.n_iters_, more.n_iters_[:n_init])
+
+    def test_general_mixing_leaves_the_subspaces(self):
+        signals, _ = mixed(0, n_subspaces=3)
+        A = np.random.default_rng(1).normal(size=(9, 9))
+        first = FastISA(n_init=1, tol=1e-10, random_state=0).fit(signals)
+        other = FastISA(n_init=1, tol=1e-10, random_state=0).fit(signals @ A.T)
+        distance = subspace_distance(other.components_ @ A, first.components_)
+        assert distance < 1e-4
+        assert_allclose(other.log_likelihood_, first.log_likelihood_, atol=1e-8)
+
+
+class TestEdges:
+    def test_one_signal(self):
+        isa = FastISA(1, n_init=1, random_state=0).fit([[1.0], [2.0], [6.0]])
+        assert_allclose(np.abs(isa.transform([[3.0]])), 0, atol=1e-12)
+
+    @may_not_converge
+    def test_hardly_more_samples_than_signals(self):
+        signals = np.random.default_rng(0).normal(size=(14, 12))
+        isa = FastISA(n_init=2, random_state=0).fit(signals)
+        assert np.isfinite(isa.components_).all()
+
+    def test_not_converged(self):
+        message = "FastISA did not converge in max_iter=1 steps: its best start still "
+        message += "changes. Increase max_iter or tol"
+        isa = FastISA(n_init=2, max_iter=1, random_state=0)
+        warned(message, isa.fit, few_samples(), category=ConvergenceWarning)
+        assert_array_equal(isa.n_iters_, 2)  # one of either iteration
+
+    def test_verbose_prints_a_line_for_each_batch(self, capsys):
+        isa = FastISA(n_init=20, random_state=0, verbose=1).fit(few_samples())
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) == 2
+        assert lines[-1] == f"[FastISA] 20/20 starts, best {isa.log_likelihood_:.6g}"
+
+    @pytest.mark.parametrize("density", [3, "sqrt", object()])
+    def test_something_that_is_no_density(self, density):
+        with pytest.raises(ValueError, match="The 'density' parameter of FastISA"):
+            FastISA(density=density).fit(few_samples())
+
+
+ENERGIES = [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0, 1e4]
+
+
+@pytest.mark.parametrize("eps", [0.01, 0.1, 2.0])
+@pytest.mark.parametrize("energy", ENERGIES)
+class TestDerivatives:
+    def test_first(self, eps, energy):
+        density = SqrtDensity(eps=eps)
+        error = check_grad(
+            lambda u: density.log_density(u)[0],
+            lambda u: density.derivatives(u)[0],
+            np.array([energy]),
+            epsilon=1e-6 * (energy + eps),
+        )
+        assert error < 1e-5 * abs(density.derivatives(energy)[0])
+
+    def test_second(self, eps, energy):
+        density = SqrtDensity(eps=eps)
+        step = 1e-6 * (energy + eps)
+        numerical = approx_fprime(
+            np.array([energy]), lambda u: density.derivatives(u)[0][0], step
+        )
+        assert_allclose(density.derivatives(energy)[1], numerical[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("eps", [0.0, -0.5, np.nan])
+def test_eps_must_be_positive(eps):
+    density = SqrtDensity(eps=eps)
+    for method in (density.log_density, density.derivatives):
+        refused(f"eps must be above zero; got {eps}", method, np.ones(3))
+
+
+# --- PooledFastICA: pooling by covariance and likelihood, criteria, recovery ---------
+
+
+IN_ORDER = np.arange(9) // 3
+
+
+def independent(seed, n_samples=2000, n_signals=9):
+    """Return signals of independent sources, and the true unmixing."""
+    rng = np.random.default_rng(seed)
+    sources = rng.laplace(size=(n_samples, n_signals)) / np.sqrt(2)
+    A = random_rotation(seed, n_signals)
+    return sources @ A.T, A.T
+
+
+def pooled_covariance(isa, covariance):
+    return isa.components_ @ covariance @ isa.components_.T
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Signals, unmixing, and a covariance with three blocks of sources in it."""
+    signals, unmixing = independent(0)
+    rng = np.random.default_rng(0)
+    groups = rng.permutation(9).reshape(3, 3)
+    C = 0.01 * np.eye(9)
+    for group in groups:
+        A = rng.normal(size=(3, 3))
+        C[np.ix_(group, group)] += A @ A.T
+    return signals, unmixing[groups.ravel()], unmixing.T @ C @ unmixing
+
+
+class TestCovariance:
+    def test_general_coordinates(self, planted):
+        # Signals and covariance change together.
+        signals, unmixing, C = planted
+        A = np.random.default_rng(1).normal(size=(9, 9))
+        isa = PooledFastICA(n_init=2, random_state=0)
+        isa.fit(signals @ A.T, covariance=A @ C @ A.T)
+        assert subspace_distance(isa.components_ @ A, unmixing) < 0.1
+        pooled = pooled_covariance(isa, A @ C @ A.T)
+        share = energy_inside(pooled, IN_ORDER) / np.sum(pooled**2)
+        assert_allclose(isa.criteria_.max(), share)
+
+    @pytest.mark.parametrize("seed", slow_after(3, range(8)))
+    def test_best_of_all_groupings(self, seed):
+        signals, _ = independent(seed, 500)
+        A = np.random.default_rng(seed).normal(size=(9, 12))
+        C = A @ A.T
+        isa = PooledFastICA(n_init=1, random_state=seed).fit(signals, covariance=C)
+        pooled = pooled_covariance(isa, C)
+        best = max(energy_inside(pooled, z) for z in GROUPINGS)
+        assert_allclose(energy_inside(pooled, IN_ORDER), best)
+
+    @pytest.mark.parametrize("unit", [1e-18, 1e18])
+    def test_units_of_the_covariance(self, planted, unit):
+        signals, _, C = planted
+        first = PooledFastICA(n_init=2, random_state=0).fit(signals, covariance=C)
+        other = PooledFastICA(n_init=2, random_state=0)
+        other.fit(signals, covariance=unit * C)
+        assert_array_equal(other.components_, first.components_)
+        assert_allclose(other.criteria_, first.criteria_)
+
+    def test_covariance_of_zeros(self, planted):
+        isa = PooledFastICA(n_init=2, random_state=0)
+        isa.fit(planted[0], covariance=np.zeros((9, 9)))
+        assert_allclose(isa.criteria_, 1)
+
+    @pytest.mark.parametrize(
+        ("covariance", "message"),
+        [
+            (np.eye(6), r"covariance must have shape \(9, 9\); got \(6, 6\)"),
+            (np.ones(9), "Expected 2D array, got 1D array"),
+            (np.eye(9) + 0.1 * np.eye(9, k=1), "covariance must be symmetric"),
+            (np.diag([np.nan, *np.ones(8)]), "covariance contains NaN"),
+            (np.diag([np.inf, *np.ones(8)]), "covariance contains infinity"),
+        ],
+    )
+    def test_bad_covariances_are_refused(self, planted, covariance, message):
+        refused(message, PooledFastICA().fit, planted[0], covariance=covariance)
+
+
+class TestLikelihood:
+    def test_criteria_are_likelihoods(self):
+        signals = spherical_sources(0, 300, 3)
+        isa = PooledFastICA(n_init=4, random_state=0).fit(signals)
+        u = np.sum(isa.transform(signals).reshape(300, 3, 3) ** 2, axis=2)
+        expected = -np.sqrt(u + 0.1).mean(axis=0).sum()
+        assert_allclose(isa.criteria_.max(), expected)
+
+    @start_may_not_converge
+    @pytest.mark.parametrize("seed", slow_after(3, range(8)))
+    def test_best_of_all_groupings(self, seed):
+        # So few samples that no grouping stands out.
+        signals = np.random.default_rng(seed).laplace(size=(40, 9))
+        isa = PooledFastICA(n_init=1, random_state=seed).fit(signals)
+        square = isa.transform(signals) ** 2
+
+        def likelihood(z):
+            u = np.stack([square[:, z == k].sum(axis=1) for k in range(3)])
+            return -np.sqrt(u + 0.1).mean(axis=1).sum()
+
+        assert_allclose(likelihood(IN_ORDER), max(map(likelihood, GROUPINGS)))
+
+
+class TestComponents:
+    @pytest.mark.parametrize("fun", ["exp", "logcosh", "cube"])
+    def test_contrast_functions(self, fun):
+        signals, unmixing = independent(0, 5000)
+        isa = PooledFastICA(n_init=1, fun=fun, random_state=0).fit(signals)
+        assert subspace_distance(isa.components_, unmixing, 1) < 0.2
+
+    def test_unknown_contrast_function(self):
+        with pytest.raises(ValueError, match="The 'fun' parameter of PooledFastICA"):
+            PooledFastICA(fun="tanh").fit(independent(0)[0])
+
+    def test_not_converged(self):
+        message = "PooledFastICA did not converge in max_iter=1 steps in the run .*"
+        message += "try another fun or larger n_init or max_iter"
+        isa = PooledFastICA(n_init=2, max_iter=1, random_state=0)
+        signals = spherical_sources(0, 68, 9)
+        warned(message, isa.fit, signals, category=ConvergenceWarning)
+
+    def test_runs_that_are_not_kept_do_not_warn(self):
+        # Only the run that is kept has to converge.
+        signals = spherical_sources(3, 68, 3)
+        isa = PooledFastICA(n_init=10, max_iter=60, random_state=0)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            isa.fit(signals)
+        assert bool(caught) == (isa.n_iter_ == 60)
+
+
+class TestCriterion:
+    def test_candidates_are_subspaces_of_different_components(self, planted):
+        signals, _, C = planted
+        asked = []
+
+        def criterion(candidates):
+            asked.append(candidates)
+            return np.zeros(len(candidates))
+
+        isa = PooledFastICA(n_init=2, random_state=0)
+        isa.fit(signals, covariance=C, criterion=criterion)
+        assert {candidates.shape[1:] for candidates in asked} == {(3, 9)}
+        rows = np.vstack([candidates.reshape(-1, 9) for candidates in asked])
+        # All are rows of the components of the runs: 9 each.
+        assert len(np.unique(rows.round(9), axis=0)) == 18
+        # A row that comes twice makes no candidate for a subspace.
+        assert all((np.linalg.matrix_rank(each) == 3).all() for each in asked)
+
+    def test_no_opinion_leaves_the_first_run_as_pooled(self, planted):
+        signals, _, C = planted
+        isa = PooledFastICA(n_init=2, random_state=0)
+        isa.fit(signals, covariance=C, criterion=lambda c: np.zeros(len(c)))
+        alone = PooledFastICA(n_init=1, random_state=0).fit(signals, covariance=C)
+        assert_array_equal(isa.criteria_, 0)
+        pooled = pooled_covariance(isa, C)
+        share = energy_inside(pooled, IN_ORDER) / np.sum(pooled**2)
+        assert_allclose(share, alone.criteria_[0])
+
+    @may_not_converge
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_run_with_the_largest_sum_is_kept(self, sign):
+        signals = spherical_sources(0, 68, 3)
+        target = np.random.default_rng(1).normal(size=9)
+
+        def criterion(candidates):
+            return sign * np.max(np.abs(candidates @ target), axis=1)
+
+        def value(isa):
+            return criterion(isa.components_.reshape(3, 3, 9)).sum()
+
+        isa = PooledFastICA(n_init=6, random_state=0)
+        isa.fit(signals, criterion=criterion)
+        assert np.ptp(isa.criteria_) > 0
+        assert value(isa) >= isa.criteria_.max() * (1 - 1e-12 * sign)
+
+        # No two components of different subspaces gain by changing places.
+        for a in range(9):
+            for b in range(a // 3 * 3 + 3, 9):
+                order = np.arange(9)
+                order[[a, b]] = b, a
+                swapped = isa.components_[order].reshape(3, 3, 9)
+                assert criterion(swapped).sum() <= value(isa) + 1e-10
+
+    def test_the_criterion_decides_over_the_covariance(self, planted):
+        # The covariance pools one way, the criterion asks for another.
+        signals, unmixing, C = planted
+        wanted = unmixing[[0, 3, 6, 1, 4, 7, 2, 5, 8]].reshape(3, 3, 9)
+
+        def criterion(candidates):
+            inside = np.einsum("ncj,kdj->nkcd", candidates, wanted)
+            return np.max(np.sum(inside**2, axis=(2, 3)), axis=1)
+
+        isa = PooledFastICA(n_init=1, random_state=0)
+        isa.fit(signals, covariance=C, criterion=criterion)
+        assert subspace_distance(isa.components_, wanted.reshape(9, 9)) < 0.1

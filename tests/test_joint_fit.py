@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import may_not_converge, slow_after
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scenes import random_scene, with_gaps
@@ -98,7 +98,7 @@ class TestStarts:
         for model in models:
             assert error_of(model, tracks, truth) < 0.02
 
-    @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+    @may_not_converge
     def test_steps_that_end_before_further_directions(self):
         tracks, _ = random_table(n_frames=8, n_points=250)
         model = fitted(tracks, max_iter=5)
@@ -174,14 +174,13 @@ class TestCameras:
         assert euclidean_error(model, tracks, frames) < 0.02
 
 
-class TestNumberOfComponents:
-    @pytest.mark.slow
-    @pytest.mark.parametrize("n_components", [0, 2])
-    def test_of_many_points(self, n_components):
-        sizes = {"n_frames": 80, "n_points": 300, "n_components": n_components}
-        tracks, _ = random_table(deviation=0.02, **sizes)
-        model = fitted(tracks, "auto", camera="weak_perspective")
-        assert len(model.basis_) == max(n_components, 1)
+@pytest.mark.slow
+@pytest.mark.parametrize("n_components", [0, 2])
+def test_number_of_components_of_many_points(n_components):
+    sizes = {"n_frames": 80, "n_points": 300, "n_components": n_components}
+    tracks, _ = random_table(deviation=0.02, **sizes)
+    model = fitted(tracks, "auto", camera="weak_perspective")
+    assert len(model.basis_) == max(n_components, 1)
 
 
 class TestNoiseVariance:
@@ -245,8 +244,7 @@ class TestLargeTables:
     def test_points_that_the_sample_does_not_show(self):
         tracks, _ = random_table(n_frames=200)
         tracks[8:, 5] = np.nan
-        model = fitted(tracks, kind=SampledNRSfM)
-        assert np.isfinite(model.basis_).all()
+        assert np.isfinite(fitted(tracks, kind=SampledNRSfM).basis_).all()
 
 
 class TestRobustLoss:

@@ -16,13 +16,8 @@ from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.problem import (
-    NOISE_FLOOR,
-    JointState,
-    _line_search,
-    refine_joint,
-)
-from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
+from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, _line_search, refine_joint
+from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpack3
 
 DEVIATION = 0.03
 AFFINE = CAMERAS["affine"]
@@ -100,13 +95,12 @@ def counted(scene):
 KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
 
 
-class TestHistory:
-    @pytest.mark.parametrize("max_iter", [0, 1, 4])
-    def test_max_iter_cuts_it_short(self, max_iter):
-        scene = random_scene()
-        whole, part = refined(scene), refined(scene, max_iter=max_iter)
-        assert not part.converged
-        assert_array_equal(part.history, whole.history[: max_iter + 1])
+@pytest.mark.parametrize("max_iter", [0, 1, 4])
+def test_max_iter_cuts_the_history_short(max_iter):
+    scene = random_scene()
+    whole, part = refined(scene), refined(scene, max_iter=max_iter)
+    assert not part.converged
+    assert_array_equal(part.history, whole.history[: max_iter + 1])
 
 
 class TestOptimum:
@@ -142,33 +136,29 @@ class TestOptimum:
         )
 
 
-class TestFirstStep:
+@KINDS
+@pytest.mark.parametrize("penalty", [0.0, 10.0])
+def test_first_step_is_that_of_expectation_maximisation(kind, penalty):
     """The step without memory, from a state that is near enough to take it whole."""
-
-    @KINDS
-    @pytest.mark.parametrize("penalty", [0.0, 10.0])
-    def test_is_that_of_expectation_maximisation(self, kind, penalty):
-        scene = random_scene(kind=kind)
-        start = disturbed(scene.truth, size=0.01)
-        likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
-        state = refined(scene, start, penalty=penalty, max_iter=1).state
-        passed = likelihood(*start)
-        half = start.noise / 2
-        shapes = start.shapes.reshape(-1, scene.tracks.shape[1]).T.copy()
-        gradient = passed.shape_gradient.reshape(shapes.T.shape).T
-        for j, g in enumerate(gradient):
-            N = passed.shape_curvature[j if kind == "weighted" else 0]
-            shapes[j] -= half * np.linalg.solve(N, g)
-        assert_allclose(state.shapes, shapes.T.reshape(start.shapes.shape), atol=1e-9)
-        for i, packed in enumerate(passed.motion_curvature.T):
-            xx, xy, xz, yy, yz, zz = packed
-            A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            step = half * passed.motion_gradient[..., i] @ np.linalg.inv(A)
-            assert_allclose(state.motion[i], start.motion[i] - step)
-        # To first order the mean of the expected residual.
-        slope = passed.noise_gradient / likelihood.frames.totals[0]
-        assert abs(slope) < 1.5
-        assert state.noise == pytest.approx(start.noise * np.exp(-slope))
+    scene = random_scene(kind=kind)
+    start = disturbed(scene.truth, size=0.01)
+    likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
+    state = refined(scene, start, penalty=penalty, max_iter=1).state
+    passed = likelihood(*start)
+    half = start.noise / 2
+    shapes = start.shapes.reshape(-1, scene.tracks.shape[1]).T.copy()
+    gradient = passed.shape_gradient.reshape(shapes.T.shape).T
+    for j, g in enumerate(gradient):
+        N = passed.shape_curvature[j if kind == "weighted" else 0]
+        shapes[j] -= half * np.linalg.solve(N, g)
+    assert_allclose(state.shapes, shapes.T.reshape(start.shapes.shape), atol=1e-9)
+    for i, A in enumerate(np.moveaxis(unpack3(passed.motion_curvature), -1, 0)):
+        step = half * passed.motion_gradient[..., i] @ np.linalg.inv(A)
+        assert_allclose(state.motion[i], start.motion[i] - step)
+    # To first order the mean of the expected residual.
+    slope = passed.noise_gradient / likelihood.frames.totals[0]
+    assert abs(slope) < 1.5
+    assert state.noise == pytest.approx(start.noise * np.exp(-slope))
 
 
 class TestTolerance:
@@ -223,9 +213,9 @@ def problem_of(camera, penalty=0.0, **options):
 EACH = pytest.mark.parametrize("camera", CAMERAS)
 
 
+@EACH
+@KINDS
 class TestCameras:
-    @EACH
-    @KINDS
     def test_history_falls_and_cameras_stay_of_their_model(self, camera, kind):
         likelihood, start, result = optimum_of(camera, kind)
         assert result.converged
@@ -235,8 +225,6 @@ class TestCameras:
         if camera != "affine":
             assert_calibrated(result.state.motion, camera, 1e-11)
 
-    @EACH
-    @KINDS
     def test_objective_rises_in_every_direction(self, camera, kind):
         likelihood, _, result = optimum_of(camera, kind)
         cameras = CAMERAS[camera]
@@ -255,8 +243,6 @@ class TestCameras:
             assert min(rises) > 0
             assert_allclose(rises[0], rises[1], rtol=0.1)
 
-    @EACH
-    @KINDS
     def test_gradient_norm_by_its_definition(self, camera, kind):
         # The gradient in the metric of the curvature, in units of the coordinates.
         cameras, (_, likelihood, start) = CAMERAS[camera], problem_of(camera, kind=kind)
@@ -270,15 +256,12 @@ class TestCameras:
         D = cameras.tangents(frames_last(motion))
         slope = np.einsum("crai,rai->ci", D, passed.motion_gradient)
         for i, g in enumerate(slope.T):
-            xx, xy, xz, yy, yz, zz = passed.motion_curvature[:, i]
-            A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            A = unpack3(passed.motion_curvature)[..., i]
             curvature = np.einsum("cra,ab,drb->cd", D[..., i], A, D[..., i])
             square += noise / 2 * g @ np.linalg.solve(curvature, g)
         expected = np.sqrt(square / likelihood.frames.totals[0])
         assert result.gradient_norm == pytest.approx(expected, rel=1e-6)
 
-    @EACH
-    @KINDS
     def test_tables_without_noise_are_fitted_to_the_floor(self, camera, kind):
         cameras = CAMERAS[camera]
         _, likelihood, start = problem_of(camera, noise=0.0, kind=kind)
@@ -291,22 +274,21 @@ class TestCameras:
         assert likelihood(*result.state).residual < left * likelihood.frames.totals[1]
 
 
-class TestHeldCameras:
-    @KINDS
-    def test_shapes_and_noise_are_fitted(self, kind):
-        scene = random_scene(kind=kind)
-        likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
-        start = disturbed(scene.truth)._replace(motion=scene.truth.motion)
-        held = AffineCameras(held=True)
-        result = refine_joint(likelihood, start, held, max_iter=1000, tol=1e-10)
-        assert result.converged
-        assert_array_equal(result.state.motion, start.motion)
-        assert (np.diff(result.history) < 0).all()
-        first, last = likelihood(*start), likelihood(*result.state)
-        for name in ("shape_gradient", "noise_gradient"):
-            pair = (getattr(each, name) for each in (first, last))
-            before, after = (np.abs(gradient).max() for gradient in pair)
-            assert after < 1e-5 * before
+@KINDS
+def test_shapes_and_noise_are_fitted_to_held_cameras(kind):
+    scene = random_scene(kind=kind)
+    likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
+    start = disturbed(scene.truth)._replace(motion=scene.truth.motion)
+    held = AffineCameras(held=True)
+    result = refine_joint(likelihood, start, held, max_iter=1000, tol=1e-10)
+    assert result.converged
+    assert_array_equal(result.state.motion, start.motion)
+    assert (np.diff(result.history) < 0).all()
+    first, last = likelihood(*start), likelihood(*result.state)
+    for name in ("shape_gradient", "noise_gradient"):
+        pair = (getattr(each, name) for each in (first, last))
+        before, after = (np.abs(gradient).max() for gradient in pair)
+        assert after < 1e-5 * before
 
 
 class TestLeastNoise:
@@ -338,13 +320,11 @@ class TestLeastNoise:
         assert result.misfit == pytest.approx(largest)
 
 
-class TestWithoutNoise:
-    def test_starts_at_the_floor_where_the_start_has_no_noise(self):
-        scene, start = scene_and_start()
-        start = start._replace(noise=0.0)
-        state = refined(scene, start, max_iter=0).state
-        mean_square = np.mean(scene.tracks**2)
-        assert state.noise == pytest.approx(NOISE_FLOOR * mean_square)
+def test_search_starts_at_the_floor_where_the_start_has_no_noise():
+    scene, start = scene_and_start()
+    start = start._replace(noise=0.0)
+    state = refined(scene, start, max_iter=0).state
+    assert state.noise == pytest.approx(NOISE_FLOOR * np.mean(scene.tracks**2))
 
 
 @dataclass(frozen=True)

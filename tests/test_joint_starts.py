@@ -69,18 +69,17 @@ def camera_error(motion, truth):
     return np.abs(motion @ (U @ Vt) - truth).max()
 
 
-class TestRigidStart:
-    @BOTH
-    def test_of_a_rigid_object_is_the_truth(self, camera):
-        scene = random_scene(camera, n_components=0)
-        factors = scene.factors
-        paper = np.concatenate([factors.rigid_shape[None], np.zeros((2, 3, N_POINTS))])
-        scaled = camera == "weak_perspective"
-        motion, shapes = rigid_start(factors, paper, scaled)
-        assert_calibrated(motion, camera)
-        size = np.sqrt(np.mean(scene.scales**2)) if scaled else 1.0
-        assert camera_error(size * motion, scene.motion) < 1e-8
-        assert_allclose(motion @ shapes[0], scene.rows, atol=1e-8)
+@BOTH
+def test_rigid_start_of_a_rigid_object_is_the_truth(camera):
+    scene = random_scene(camera, n_components=0)
+    factors = scene.factors
+    paper = np.concatenate([factors.rigid_shape[None], np.zeros((2, 3, N_POINTS))])
+    scaled = camera == "weak_perspective"
+    motion, shapes = rigid_start(factors, paper, scaled)
+    assert_calibrated(motion, camera)
+    size = np.sqrt(np.mean(scene.scales**2)) if scaled else 1.0
+    assert camera_error(size * motion, scene.motion) < 1e-8
+    assert_allclose(motion @ shapes[0], scene.rows, atol=1e-8)
 
 
 class TestMixedCameras:
@@ -116,8 +115,7 @@ class TestLiftedShapes:
         scene = random_scene(camera)
         mean = lifted_shapes(scene.rows, scene.motion, 2)[0]
         stacked = scene.motion.reshape(-1, 3)
-        expected = np.linalg.lstsq(stacked, scene.W)[0]
-        assert_allclose(mean, expected, atol=1e-12)
+        assert_allclose(mean, np.linalg.lstsq(stacked, scene.W)[0], atol=1e-12)
 
     @BOTH
     @pytest.mark.parametrize("n_frames", [60, 200])
@@ -176,8 +174,7 @@ class TestBestStarts:
     def test_of_many_frames_has_cameras_of_all(self, thorough, n_starts):
         # The comparison is of some of them.
         scene = random_scene(n_frames=450, noise=0.01)
-        problem = problem_of(scene, thorough)
-        states = started(scene, "orthographic", problem)
+        states = started(scene, "orthographic", problem_of(scene, thorough))
         assert len(states) == n_starts
         for state in states:
             assert state.motion.shape == (450, 2, 3)
@@ -197,6 +194,12 @@ class TestAffineStart:
             assert_allclose(state.motion[i], M, atol=1e-12)
             left += np.sum((W - M @ paper[0]) ** 2)
         assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
+        # Basis shapes are one deviation of their coefficients.
+        for before, after in zip(paper[1:], state.shapes[1:], strict=True):
+            images = state.motion @ before
+            norms = np.sum(images**2, axis=(1, 2))
+            alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
+            assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
     def test_noise_is_not_below_the_floor(self):
         scene = random_scene(amplitude=0.0)
@@ -204,16 +207,6 @@ class TestAffineStart:
         state = affine_start(problem, scene.W, paper_shapes(scene.factors))
         floor = problem.settings.limits.least_noise * np.mean(scene.rows**2)
         assert state.noise == pytest.approx(floor)
-
-    def test_basis_shapes_are_one_deviation_of_their_coefficients(self):
-        scene = random_scene(noise=0.02)
-        paper = paper_shapes(scene.factors)
-        state = affine_start(problem_of(scene), scene.W, paper)
-        for before, after in zip(paper[1:], state.shapes[1:], strict=True):
-            images = state.motion @ before
-            norms = np.sum(images**2, axis=(1, 2))
-            alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
-            assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
 
 def random_frames(seed=0, n_frames=40, n_points=30, n_components=2):
@@ -225,28 +218,27 @@ def random_frames(seed=0, n_frames=40, n_points=30, n_components=2):
     return shapes, motion, rng.normal(size=(n_frames, n_components))
 
 
-class TestLikelyBasis:
-    @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
-    def test_no_other_basis_is_likelier(self, penalty):
-        truth, motion, true_alpha = random_frames()
-        shapes = likely_basis(truth, motion, true_alpha, penalty)
-        frames = truth[0] + np.tensordot(true_alpha, truth[1:], 1)
+@pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
+def test_no_other_basis_is_likelier(penalty):
+    truth, motion, true_alpha = random_frames()
+    shapes = likely_basis(truth, motion, true_alpha, penalty)
+    frames = truth[0] + np.tensordot(true_alpha, truth[1:], 1)
 
-        def objective(shift, mixing):
-            # alpha of these shapes from the true ones: S = B_0 + alpha B.
-            basis = np.tensordot(mixing, shapes[1:], 1).reshape(2, -1)
-            mean = shapes[0] + np.tensordot(shift, shapes[1:], 1)
-            alpha = (frames - mean).reshape(40, -1) @ np.linalg.pinv(basis)
-            seen = np.einsum("ira,kaj->ikrj", motion, basis.reshape(2, 3, -1))
-            gram = np.einsum("ikrj,ilrj->ikl", seen, seen)
-            value = np.linalg.slogdet(gram)[1].sum() + np.sum(alpha**2)
-            return value + penalty * np.trace(gram, axis1=1, axis2=2).sum()
+    def objective(shift, mixing):
+        # alpha of these shapes from the true ones: S = B_0 + alpha B.
+        basis = np.tensordot(mixing, shapes[1:], 1).reshape(2, -1)
+        mean = shapes[0] + np.tensordot(shift, shapes[1:], 1)
+        alpha = (frames - mean).reshape(40, -1) @ np.linalg.pinv(basis)
+        seen = np.einsum("ira,kaj->ikrj", motion, basis.reshape(2, 3, -1))
+        gram = np.einsum("ikrj,ilrj->ikl", seen, seen)
+        value = np.linalg.slogdet(gram)[1].sum() + np.sum(alpha**2)
+        return value + penalty * np.trace(gram, axis1=1, axis2=2).sum()
 
-        least = objective(np.zeros(2), np.eye(2))
-        rng = np.random.default_rng(6)
-        for _ in range(10):
-            step = 0.01 * rng.normal(size=2), np.eye(2) + 0.01 * rng.normal(size=(2, 2))
-            assert objective(*step) > least
+    least = objective(np.zeros(2), np.eye(2))
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        step = 0.01 * rng.normal(size=2), np.eye(2) + 0.01 * rng.normal(size=(2, 2))
+        assert objective(*step) > least
 
 
 def test_the_likeliest_fit_of_the_starts_counts():

@@ -126,8 +126,7 @@ def test_patterns_reach_names_of_any_form():
 def test_small_sets_do_not_compete_and_do_not_suffice():
     small = named("{p}_{a}", points=["gaze", *"abcde"])
     assert len(small) == 2 * (MIN_POINTS - 1)
-    found = find_landmark_columns(small + named("{a}{p}"))
-    assert found.pattern == "x#,y#"
+    assert find_landmark_columns(small + named("{a}{p}")).pattern == "x#,y#"
     refused(r"fewer than 7 points: '\*_x,\*_y' \(6\)", find_landmark_columns, small)
     assert len(find_landmark_columns(small, columns="*_x,*_y").x) == MIN_POINTS - 1
 

@@ -117,10 +117,9 @@ class TestAffineShapeError:
         # Axis-aligned pairs of points. The estimate misses the third pair in one
         # frame and is exact in the other.
         full = np.vstack([np.eye(3), -np.eye(3)])
-        part = full * (1, 1, 0)
         # The frames weigh alike, so A = diag(1, 1, c), and the error of the first
         # frame is sqrt(1/3) if the truth is full and the estimate is not.
-        error = affine_shape_error([full, full], [full, part])
+        error = affine_shape_error([full, full], [full, full * (1, 1, 0)])
         assert_allclose(error, np.sqrt(1 / 3) / 2)
 
     def test_one_affinity_for_all_frames(self, rng):

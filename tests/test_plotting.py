@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from cameras import lorentz_cameras
-from layers import slow_after
+from layers import may_not_converge, one_start, slow_after
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
@@ -31,7 +31,7 @@ from isa_nrsfm.plotting import (
 from isa_nrsfm.skeletons import get_skeleton
 
 # The figures do not depend on how far the iterations of the fit got.
-pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+pytestmark = [may_not_converge, one_start]
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
 SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
@@ -123,8 +123,7 @@ def test_displays_draw_on_a_new_figure_or_given_axes(kind):
 
 @EACH
 def test_displays_take_keywords_and_fitted_estimators(kind):
-    arguments = DISPLAYS[kind][0]
-    refused(None, kind, *list(arguments.values())[:2], error=TypeError)
+    refused(None, kind, *list(DISPLAYS[kind][0].values())[:2], error=TypeError)
     choice = kind is ComponentChoiceDisplay
     table = [np.zeros((3, 4))] if kind is ReprojectionDisplay else []
     with pytest.raises(NotFittedError):
@@ -659,8 +658,7 @@ def test_colours_of_the_matrix_are_symmetric(scale):
     assert_array_equal(display.im_.get_array(), np.abs(matrix))
     assert display.im_.get_clim() == (0, high)
     small = ModeCovarianceDisplay(mode_covariance=np.diag([1.0, 1, 1, 0.05, 1, 1]))
-    shade = small.plot(scale=scale).im_.norm(0.05)
-    assert (shade > 0.6) == (scale == "asinh")
+    assert (small.plot(scale=scale).im_.norm(0.05) > 0.6) == (scale == "asinh")
 
 
 def test_the_matrix_of_an_estimator_has_its_blocks(estimator):

@@ -60,15 +60,13 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
     assert_array_equal(later.subset(frames).whole(), array[frames])
     assert max(calls) == 10
     calls.clear()
-    kept = FrameBlocks.of_array(array, 10).derive(recorded)
-    kept.whole()
+    FrameBlocks.of_array(array, 10).derive(recorded).whole()
     assert calls == [10, 10, 3]
 
 
 @pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
 def test_small_blocks_are_regrouped(array, n_frames, lengths):
-    blocks = FrameBlocks.of_array(array, 3)
-    larger = blocks.regrouped(np.concatenate, n_frames)
+    larger = FrameBlocks.of_array(array, 3).regrouped(np.concatenate, n_frames)
     assert larger.lengths == lengths
     assert_array_equal(larger.whole(), array)
 

@@ -1,11 +1,10 @@
-"""AffineNRSfM on random small tables: invariances, finite numbers, errors."""
+"""AffineNRSfM on random small tables: the formula, finite numbers."""
 
 import warnings
 
 import numpy as np
-from hypothesis import assume, given, strategies as st
+from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
-from refusals import refused
 from sklearn.base import BaseEstimator
 from sklearn.exceptions import ConvergenceWarning
 
@@ -56,9 +55,6 @@ def tables(draw):
     return shapes @ motion.transpose(0, 2, 1) + position + noise, n_components
 
 
-# --- invariances --------------------------------------------------------------------
-
-
 # --- formula ------------------------------------------------------------------------
 
 
@@ -96,43 +92,3 @@ def test_tables_of_low_rank_give_finite_numbers(seed, rank, n_components):
     n_empty = max(n_components - -(-used // 3), 0)
     assert np.all(model.alpha_[:, n_components - n_empty :] == 0)
     assert np.all(model.basis_[n_components - n_empty :] == 0)
-
-
-# --- errors -------------------------------------------------------------------------
-
-
-@given(st.integers(2, 30), st.integers(1, 20), st.integers(1, 6), seeds)
-def test_tables_that_are_too_small_are_refused(n_frames, n_points, n_components, seed):
-    tracks = np.random.default_rng(seed).normal(size=(n_frames, n_points, 2))
-    largest = (n_points - 4) // 3
-    smallest = int(np.ceil(8 * (n_components + 2) / 5))
-    if n_components > largest:
-        message = "at least 7 points are needed for n_components=1$"
-        if largest > 0:
-            message = f"largest possible n_components is {largest}$"
-        refused(message, fit, tracks, n_components)
-    elif n_frames < smallest:
-        refused(f"at least {smallest} frames", fit, tracks, n_components)
-    else:
-        assert fit(tracks, n_components).basis_.shape == (n_components, n_points, 3)
-
-
-@given(
-    tables(),
-    st.sets(st.integers(0, 15), min_size=1),
-    st.floats(-1e6, 1e6).filter(lambda value: value == 0 or abs(value) > 1e-100),
-    st.sampled_from([np.float32, np.float64]),
-)
-def test_frames_of_equal_points_are_refused(table, rows, value, dtype):
-    tracks, n_components = table
-    assume(max(rows) < len(tracks))
-    broken = tracks.astype(dtype)
-    broken[sorted(rows)] = np.array([value, -3.0 * value], dtype)
-    message = rf"equal in {len(rows)} of \d+ frames \(first: row {min(rows)}\)"
-    refused(message, fit, broken, n_components)
-    # New frames of this kind have no camera.
-    frames = fit(tracks, n_components).decompose(broken.reshape(len(broken), -1))
-    unknown = np.isin(np.arange(len(broken)), list(rows))
-    for part in frames[:3]:
-        finite = np.isfinite(part.reshape(len(broken), -1))
-        assert np.all(finite == ~unknown[:, None])

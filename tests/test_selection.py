@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import sklearn
+from layers import may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
@@ -157,7 +158,7 @@ def test_the_path_may_begin_anywhere_and_leave_gaps():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@may_not_converge
 def test_the_pipeline_of_the_paper_is_searched_plainly():
     estimator = inner(refinement="alternating")
     search = AffineNRSfMCV((1, 2), estimator=estimator).fit(X)
@@ -298,7 +299,7 @@ def test_a_memory_map_is_a_table(tmp_path, fitted):
     assert_allclose(search.cv_results_[name], fitted.cv_results_[name], rtol=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@may_not_converge
 def test_a_table_of_noise_is_told():
     noise = np.random.default_rng(0).normal(size=(45, 24))
     estimator = inner(refinement=None)
@@ -316,7 +317,7 @@ def test_fits_that_do_not_converge_are_counted():
 
 
 # Whether FastICA converges for this table depends on the rounding of the BLAS.
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@may_not_converge
 def test_held_out_rows_are_not_fitted_without_joint_refinement():
     table, estimator = X[:, :20], inner(n_components=1, refinement=None)
     search = AffineNRSfMCV((1,), estimator=estimator, cv=2).fit(table)

@@ -64,8 +64,7 @@ def test_each_is_its_own_mirror_image(name):
 def test_each_has_a_source_and_joins_its_points(name):
     skeleton = SKELETONS[name]
     assert "20" in skeleton.source or "1999" in skeleton.source
-    joined = set(skeleton.edges.ravel().tolist())
-    alone = set(range(skeleton.n_points)) - joined
+    alone = set(range(skeleton.n_points)) - set(skeleton.edges.ravel().tolist())
     known = {
         **dict.fromkeys(("xm2vts-68", "muct-76"), (31, 36, 46, 47, 66, 67)),
         **dict.fromkeys(("xm2vts-53", "muct-61"), (16, 21, 31, 32, 51, 52)),
@@ -103,8 +102,7 @@ def test_bodies_are_turned_upright_and_mirrored_back(name, seed):
     upright = canonical_pose(body, scheme=name)
     assert not upright.mirrored
     # Bodies of the generator stand upright, but for how far they lean.
-    turn = Rotation.from_matrix(upright.rotation)
-    assert np.rad2deg(turn.magnitude()) < 15
+    assert np.rad2deg(Rotation.from_matrix(upright.rotation).magnitude()) < 15
     turned = Rotation.random(random_state=seed).apply(body)
     assert_allclose(canonical_pose(turned, scheme=name).shape, upright.shape, atol=1e-6)
     mirrored = canonical_pose(turned * [1, 1, -1], scheme=name)
@@ -347,6 +345,5 @@ def test_parts_of_curves_and_sides_are_kept():
     assert (part.left, part.right) == ((1,), (2,))
     assert part.up == ((1, 4),)
     assert part.contour == (4,)
-    names = list("gfedcba")
-    assert skeleton.reordered(names).contour == (4, 2)
+    assert skeleton.reordered(list("gfedcba")).contour == (4, 2)
     refused("0 to 6; got 7", dataclasses.replace, skeleton, contour=(7,))

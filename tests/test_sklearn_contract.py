@@ -11,11 +11,13 @@ from estimator_contract import (
     NARROW_TABLE_CHECKS,
     assert_only_narrow_tables_fail,
 )
-from layers import slow_after
+from layers import may_not_converge, one_start, slow_after
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
+
+pytestmark = one_start
 
 # Checks of what a fit leaves behind, whose outcome depends on the way of fitting.
 CHECKS_OF_RESULTS = (
@@ -46,12 +48,6 @@ def search(refinement):
     options = {"isa": FastISA(n_init=2), "max_iter": 3, "random_state": 0}
     estimator = AffineNRSfM(refinement=refinement, **options)
     return AffineNRSfMCV((1, 2), estimator=estimator, cv=2)
-
-
-# With 16 points few starts may end in a cycle, and they say so.
-may_not_converge = pytest.mark.filterwarnings(
-    "ignore::sklearn.exceptions.ConvergenceWarning"
-)
 
 
 @may_not_converge

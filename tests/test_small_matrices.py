@@ -1,17 +1,12 @@
-"""Small matrices, sums over points of frames, and the posterior of coefficients."""
-
-from typing import NamedTuple
+"""Small matrices, and sums over the points of frames."""
 
 import numpy as np
 import pytest
-import scenes
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.point_sums import (
     ShapeProducts,
-    coefficient_posterior,
     determines_camera,
     frame_sums,
     frame_tracks,
@@ -23,7 +18,6 @@ from isa_nrsfm._linalg.small_matrices import (
     LANES,
     ROWS,
     diagonal_of,
-    frames_last,
     inverse3,
     invert_positive,
     of_frames,
@@ -243,136 +237,6 @@ def test_procrustes_rotations_are_those_of_scipy(mirrored, rng):
     assert_allclose(procrustes(target[0].T @ shapes[0]), found[0], atol=1e-12)
 
 
-NOISE = 0.05
-
-
-class Scene(scenes.Scene):
-    """Tracks that the shapes do not explain, and cameras."""
-
-    @property
-    def M(self):
-        return frames_last(self.motion)
-
-    def posterior(self, noise=NOISE, **options):
-        products = frame_sums(
-            frame_tracks(self.tracks.transpose(0, 2, 1), self.weights),
-            ShapeProducts(self.shapes),
-        )
-        return coefficient_posterior(products, self.M, noise, **options)
-
-
-def random_scene(kind="complete", n_components=3):
-    return Scene(*scenes.random_scene(0, 6, 11, n_components, noise=1.0, kind=kind))
-
-
-class Frame(NamedTuple):
-    """A frame as a linear regression: ``y ~ x_0 + X a``, noise of variance one."""
-
-    y: NDArray
-    first: NDArray
-    X: NDArray
-
-
-def frames_of(scene):
-    """Yield the regressions, centred and weighted by the root of the weights."""
-    for i, points in enumerate(scene.tracks):
-        w = np.ones(len(points)) if scene.weights is None else scene.weights[i]
-        seen = w > 0
-        points, shapes, w = points[seen], scene.shapes[..., seen], w[seen]
-        points = points - w @ points / w.sum()
-        shapes = shapes - (shapes @ w / w.sum())[..., None]
-        images = np.sqrt(w) * (scene.M[..., i] @ shapes)
-        columns = images.reshape(len(shapes), -1)
-        yield Frame((np.sqrt(w) * points.T).ravel(), columns[0], columns[1:].T)
-
-
-KINDS = pytest.mark.parametrize("kind", ["complete", "missing"])
-
-
-class TestPosterior:
-    @KINDS
-    def test_mean_and_covariance_by_dense_algebra(self, kind):
-        scene = random_scene(kind)
-        got = scene.posterior()
-        covariance = -NOISE * unpacked(got.inverse)[1:, 1:]
-        for i, frame in enumerate(frames_of(scene)):
-            precision = frame.X.T @ frame.X / NOISE + np.eye(3)
-            right = frame.X.T @ (frame.y - frame.first) / NOISE
-            expected = np.linalg.solve(precision, right)
-            assert_allclose(got.alpha[:, i], expected, rtol=1e-10)
-            assert_allclose(covariance[..., i], np.linalg.inv(precision), rtol=1e-8)
-        assert_array_equal(got.c[0], 1.0)
-        assert_array_equal(got.c[1:], got.alpha)
-
-    @KINDS
-    def test_objective_and_determinant_are_the_marginal_likelihood(self, kind):
-        # Of y ~ N(x_0, X X^T + s2 I), by its definition.
-        scene = random_scene(kind)
-        got = scene.posterior()
-        for i, frame in enumerate(frames_of(scene)):
-            covariance = frame.X @ frame.X.T + NOISE * np.eye(len(frame.y))
-            rest = frame.y - frame.first
-            expected = rest @ np.linalg.solve(covariance, rest)
-            expected += np.linalg.slogdet(covariance)[1]
-            value = got.objective[i] / NOISE + got.log_determinant[i]
-            value += len(frame.y) * np.log(NOISE)
-            assert value == pytest.approx(expected, rel=1e-12)
-
-    @KINDS
-    def test_moments_and_energies_by_definition(self, kind):
-        scene = random_scene(kind)
-        got = scene.posterior()
-        moments = unpacked(got.second_moments(NOISE))
-        residual, spread = got.residual(NOISE), got.spread(NOISE)
-        for i, frame in enumerate(frames_of(scene)):
-            alpha, X = got.alpha[:, i], frame.X
-            covariance = np.linalg.inv(X.T @ X / NOISE + np.eye(3))
-            c = np.append(1.0, alpha)
-            second = np.outer(c, c)
-            second[1:, 1:] += covariance
-            assert_allclose(moments[..., i], second, rtol=1e-10)
-            assert_allclose(got.image_energy[:, i], np.sum(X**2, axis=0), rtol=1e-12)
-            rest = frame.y - frame.first - X @ alpha
-            assert_allclose(residual[i], rest @ rest, rtol=1e-12)
-            assert_allclose(spread[i], np.trace(X @ covariance @ X.T), rtol=1e-10)
-
-
-class TestNoise:
-    @KINDS
-    def test_refinement_solves_the_equations_of_a_tiny_noise(self, kind):
-        # Basis shapes that are hard to tell from each other, tracks without noise.
-        scene = random_scene(kind)
-        shapes = scene.shapes.copy()
-        shapes[2] = shapes[1] + 1e-4 * shapes[2]
-        alpha = np.random.default_rng(1).normal(size=(6, 3))
-        frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
-        tracks = (scene.motion @ frames).swapaxes(1, 2)
-        scene = scene._replace(tracks=tracks, shapes=shapes)
-        noise = 1e-14
-
-        def left(refined):
-            found = scene.posterior(noise, refined=refined).alpha
-            rests = [
-                frame.X.T @ (frame.y - frame.first - frame.X @ a) - noise * a
-                for frame, a in zip(frames_of(scene), found.T, strict=True)
-            ]
-            return np.linalg.norm(rests)
-
-        assert left(True) < 0.1 * left(False)
-        assert left(True) < 1e-12
-
-
-class TestDegenerate:
-    @pytest.mark.parametrize("refined", [False, True])
-    def test_basis_shapes_of_zeros_have_the_prior(self, refined):
-        scene = random_scene()
-        scene.shapes[2] = 0.0
-        got = scene.posterior(refined=refined)
-        assert_array_equal(got.alpha[1], 0.0)
-        moments = unpacked(got.second_moments(NOISE))
-        assert_allclose(moments[2, 2], 1.0)
-
-
 def random_problem(seed, n_frames=6, n_points=11, n_components=2):
     """Return tracks, shapes (n_components + 1, 3, n_points) and weights."""
     rng = np.random.default_rng(seed)
@@ -391,25 +255,24 @@ def plain_gram(shapes, weights):
     return np.einsum("kaj,j,lbj->klab", moved, weights, moved)
 
 
-class TestProducts:
-    def test_by_definition(self):
-        tracks, shapes, weights = random_problem(0)
-        products = frame_sums(
-            frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(shapes)
-        )
-        first, second = pair_indices(3)
-        for i, w in enumerate(weights):
-            mean = w @ tracks[i] / w.sum()
-            moved = tracks[i] - mean
-            G = plain_gram(shapes, w)
-            pairs = 0.5 * (G + G.swapaxes(2, 3))[first, second][:, ROWS, COLUMNS]
-            P = np.einsum("kaj,j,jr->kar", shapes, w, moved)
-            assert_allclose(products.centroid[:, i], mean)
-            assert_allclose(products.weight[i], w.sum())
-            assert_allclose(products.energy[i], np.sum(w[:, None] * moved**2))
-            assert_allclose(products.cross[..., i], P, atol=1e-13)
-            assert_allclose(products.shape_centroid[..., i], shapes @ w / w.sum())
-            assert_allclose(products.gram.pairs[..., i], pairs, atol=1e-13)
+def test_products_by_definition():
+    tracks, shapes, weights = random_problem(0)
+    products = frame_sums(
+        frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(shapes)
+    )
+    first, second = pair_indices(3)
+    for i, w in enumerate(weights):
+        mean = w @ tracks[i] / w.sum()
+        moved = tracks[i] - mean
+        G = plain_gram(shapes, w)
+        pairs = 0.5 * (G + G.swapaxes(2, 3))[first, second][:, ROWS, COLUMNS]
+        P = np.einsum("kaj,j,jr->kar", shapes, w, moved)
+        assert_allclose(products.centroid[:, i], mean)
+        assert_allclose(products.weight[i], w.sum())
+        assert_allclose(products.energy[i], np.sum(w[:, None] * moved**2))
+        assert_allclose(products.cross[..., i], P, atol=1e-13)
+        assert_allclose(products.shape_centroid[..., i], shapes @ w / w.sum())
+        assert_allclose(products.gram.pairs[..., i], pairs, atol=1e-13)
 
 
 class TestWhitened:

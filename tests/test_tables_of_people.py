@@ -412,8 +412,7 @@ def test_whole_tables_are_no_tables_of_points(estimator, further, number, first)
     columns = [tuple(f"DLC {name}".split()) for name in table]
     levels = table.set_axis(pd.MultiIndex.from_tuples(columns), axis=1)
     refused(message.replace(first, f"DLC_{first}"), estimator.fit, levels)
-    fitted = estimator.fit(landmarks().to_numpy())
-    refused(message, fitted.transform, table)
+    refused(message, estimator.fit(landmarks().to_numpy()).transform, table)
     unnamed = landmarks().set_axis([f"c{j}" for j in range(24)], axis=1)
     texts = unnamed.assign(c24="Ann", c25="Bob")
     refused("X has texts: .*'Ann'.*landmark_table", estimator.fit, texts)
@@ -491,8 +490,7 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
         lines.append(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}")
     path = tmp_path / "config.yaml"
     path.write_text("\n".join([*lines, "skeleton: [[NO, 1, x]]"]))
-    found = read_skeleton(path, ["NO", "1", "x"])
-    assert found.curves == ((0, 1), (1, 2))
+    assert read_skeleton(path, ["NO", "1", "x"]).curves == ((0, 1), (1, 2))
 
 
 WIDE = landmarks(2).round(1)

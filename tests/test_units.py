@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from sklearn.base import BaseEstimator, TransformerMixin, clone
@@ -111,7 +111,7 @@ def test_the_page_has_all_attributes():
 
 
 # The paper's pipeline says so of tables with as few points as this one.
-@pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
+@start_may_not_converge
 @pytest.mark.parametrize("refinement", slow_after(1, ["joint", "alternating", None]))
 @pytest.mark.parametrize("column", range(len(COLUMNS)))
 def test_attributes(column, refinement):

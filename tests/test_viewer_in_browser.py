@@ -12,11 +12,12 @@ from export_models import (
     face_model,
     faces,
 )
+from layers import one_start
 from numpy.testing import assert_allclose
 
 from isa_nrsfm.export import write_viewer
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, one_start]
 
 FRAME = "new Promise((done) => requestAnimationFrame("
 DRAWN = FRAME + "() => requestAnimationFrame(done)))"
@@ -117,8 +118,7 @@ def test_the_mouse_turns_and_zooms_the_shape(browser, page):
     browser.call("Input.dispatchMouseEvent", **wheel)
     browser.wait("viewer.state().zoom > 1.2")
     browser.click("front")
-    again = browser.array("viewer.projected()")
-    assert_allclose(again, before, atol=1e-3)
+    assert_allclose(browser.array("viewer.projected()"), before, atol=1e-3)
 
 
 def test_keys_turn_and_zoom_the_shape(browser, page):
