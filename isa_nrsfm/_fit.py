@@ -376,12 +376,11 @@ def _joint_frames(
     mean_shape, basis, frame_map = independent_gauge(
         model.shapes, motion, alpha, s.independence, s.camera, unit
     )
-    residual /= table.n_observations.sum()
-    certainty = model.certainty._replace(residual=residual)
+    weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
+    certainty = model.certainty._replace(residual=residual / weight.sum())
     if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     model = replace(model, gauge=frame_map, certainty=certainty)
-    weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)

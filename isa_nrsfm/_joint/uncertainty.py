@@ -96,8 +96,8 @@ def fitted_frames(
     parts = posteriors.map(
         lambda fit: (fit.motion, fit.alpha, fit.covariance.sum(0), fit.objective.sum())
     )
-    motion, alpha, covariance, objective = zip(*parts, strict=True)
-    motion, alpha = np.concatenate(motion), np.concatenate(alpha)
+    M, a, covariance, objective = zip(*parts, strict=True)
+    motion, alpha = np.concatenate(M), np.concatenate(a)
     total = np.sum(covariance, axis=0) / posteriors.n_frames
     residual = float(sum(objective) - model.noise_variance * np.sum(alpha**2))
     return posteriors, motion, alpha, total, residual
