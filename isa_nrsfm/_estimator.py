@@ -216,8 +216,9 @@ class AffineNRSfM(
         complete frames.
     depth_uncertainty_ : float
         Expected RMS error of the depths of the frames, relative to their RMS
-        (calibrated cameras with the joint refinement only). After a consensus it is
-        that of the joint fit, an upper bound.
+        (calibrated cameras with the joint refinement only). It contains what
+        deformation explains as well as turning. Above 0.55, depths and angles are
+        withheld.
     rotations_ : ndarray of shape (n_frames, 3, 3)
         Rotations of calibrated cameras, with determinant one. The rows are the axes of
         the image, x, y and z. Like `scales_`, only with such cameras.
