@@ -21,7 +21,7 @@ def _of_sides(parts: Iterable[str], sides: Sequence[str] = _BOTH) -> tuple[str, 
     return tuple(f"{side}_{part}" for part in parts for side in sides)
 
 
-_body = partial(named_skeleton, kind="body")
+_BODY = partial(named_skeleton, kind="body")
 
 _HAND_NAMES = (
     "wrist",
@@ -51,7 +51,7 @@ HAND_21 = named_skeleton(
 
 _ARM, _LEG = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
 _COCO_NAMES = ("nose", *_of_sides(("eye", "ear", *_ARM, *_LEG)))
-COCO_17 = _body(
+COCO_17 = _BODY(
     "coco-17",
     _COCO_NAMES,
     curves=(
@@ -74,7 +74,7 @@ _H36M_NAMES = (
     *("pelvis", *_each(_RIGHT_FIRST, ("hip", "knee", "foot"))),
     *("spine", "thorax", "nose", "head", *_each(_BOTH, _ARM)),
 )
-H36M_17 = _body(
+H36M_17 = _BODY(
     "h36m-17",
     _H36M_NAMES,
     curves=(
@@ -97,7 +97,7 @@ _BODY_25_NAMES = (
     *("mid_hip", *_each(_RIGHT_FIRST, _LEG)),
     *(*_of_sides(("eye", "ear"), _RIGHT_FIRST), *_each(_BOTH, _TOES)),
 )
-BODY_25 = _body(
+BODY_25 = _BODY(
     "body-25",
     _BODY_25_NAMES,
     curves=(
@@ -121,7 +121,7 @@ _POSE_NAMES = (
     *("left_ear", "right_ear", "mouth_left", "mouth_right"),
     *_of_sides((*_ARM, "pinky", "index", "thumb", *_LEG, "heel", "foot_index")),
 )
-POSE_33 = _body(
+POSE_33 = _BODY(
     "mediapipe-pose-33",
     _POSE_NAMES,
     curves=(
