@@ -11,8 +11,8 @@ Neighbouring points have a simpler model, with rotations of their own:
    (`common_depths`).
 5. The mean and the principal components of these shapes are the new model.
 
-The mean square change of the depth of a point by step 4 estimates its squared error:
-for motion capture errors are 0.8 to 1.7 times these standard deviations.
+The mean squared difference of the depths of a point in its groups from the result of
+step 4 estimates its squared error: docs/benchmarks/consensus.md.
 """
 
 from functools import partial
@@ -133,11 +133,13 @@ def consensus(
     if groups:
         noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
         share = 1.0 - scene.floor / noise
-        merged, moved = together(scene, groups, distances, scales, noise)
+        groups = weighted(scene, groups)
+        merged = together(scene, groups, distances, scales, noise)
         noise -= (1.0 - LAST_SHARE) * scene.floor
         weights = interpolation(model.shapes[0], chosen)
-        depths = moved @ weights, merged[:, 2] @ weights
-        squares = np.mean(centred(np.array(depths)) ** 2, axis=1)
+        depths = centred(merged[:, 2] @ weights)
+        errors = disagreements(groups, merged[:, 2]) @ weights
+        squares = np.array([errors, np.mean(depths**2, axis=0)])
         change = (merged - scene.first) @ weights
         others = np.setdiff1d(np.arange(n_points), chosen)
         off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
@@ -152,13 +154,12 @@ def consensus(
 
 def together(
     scene: Scene, groups: list[Group], distances: NDArray, scales: NDArray, noise: float
-) -> tuple[NDArray, NDArray]:
+) -> NDArray:
     """Return coordinates (I, 3, n) of all groups together, also of the smallest ones.
 
-    Also returns the changes of the depths (I, n) since the merge of the groups. Camera
-    scales are (I,); the noise variance includes its floor.
+    Camera scales are (I,); the noise variance includes its floor.
     """
-    merged = merge(scene, weighted(scene, groups), 1.0 - scene.floor / noise)
+    merged = merge(scene, groups, 1.0 - scene.floor / noise)
     pairs = [(group.frames, group.points) for group in groups]
     for points, _ in neighbourhoods(distances, SMALLEST):
         frames = frames_showing(scene.rows[:, :, points])
@@ -169,9 +170,22 @@ def together(
     common = unit * common_coordinates(
         scene.rows / unit, merged / unit, pairs, noise, scene.floor
     )
-    moved, free = common[:, 2] - merged[:, 2], np.isnan(scene.rows)
+    free = np.isnan(scene.rows)
     merged[:, :2][free], merged[:, 2] = common[:, :2][free], common[:, 2]
-    return merged, moved
+    return merged
+
+
+def disagreements(groups: list[Group], depths: NDArray) -> NDArray:
+    """Return mean squared differences (n,) of the groups from the depths (I, n)."""
+    squares, weight = np.zeros((2, depths.shape[1]))
+    for group in groups:
+        own = depths[np.ix_(group.frames, group.points)]
+        off = centred(group.coordinates[:, 2]) - centred(own)
+        squares[group.points] += group.weight * np.sum(off**2, axis=0)
+        weight[group.points] += group.weight * len(off)
+    # Points of no fitted group have the mean error of the others.
+    mean = squares.sum() / weight.sum()
+    return np.divide(squares, weight, out=np.full_like(weight, mean), where=weight > 0)
 
 
 def fitted_groups(
