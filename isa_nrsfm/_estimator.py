@@ -40,6 +40,7 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
+from isa_nrsfm._joint.consensus import MOST_FIRST
 from isa_nrsfm._joint.settings import (
     JOINT_TOL,
     LIMITS,
@@ -70,7 +71,13 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
+from isa_nrsfm.analysis._advice import depth_advice, facts_of
+from isa_nrsfm.analysis._diagnostics import (
+    Diagnostics,
+    diagnose,
+    gross_residuals,
+    summary_html,
+)
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa import PooledFastICA
@@ -102,10 +109,10 @@ class AffineNRSfM(
         ``ceil(8 (K + 2) / 5)`` frames. Calibrated cameras allow up to 2J - 7 basis
         shapes of J points, if there are enough frames (joint refinement only): for 17
         points 27 instead of 4. "auto" fits twelve basis shapes, or as many as the table
-        allows, and keeps the relevant ones (joint refinement only); their number is
-        ``len(basis_)``. With ``refinement="consensus"`` the joint fit has at most
-        twelve, and the result has K principal components of the merged shapes; "auto"
-        keeps those that exceed the noise, at most 60.
+        allows, and keeps the relevant and reliable ones (joint refinement only); their
+        number is ``len(basis_)``. With ``refinement="consensus"`` the joint fit has at
+        most twelve, and the result has K principal components of the merged shapes;
+        "auto" keeps those that exceed the noise, at most 60.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
@@ -507,44 +514,44 @@ class AffineNRSfM(
         if auto:
             with warnings.catch_warnings(action="ignore"):  # the fit warns again
                 table = ready_table(source, weights, 1, settings)
-            n_components, all_relevant = supported_components(table, isa, settings)
-            # A consensus has more components.
-            if all_relevant and self.refinement != "consensus":
-                warn_caller(
-                    f"all {n_components} basis shapes that were tried are relevant: "
-                    f"more than n_components={n_components} may be needed for this "
-                    "table"
-                )
+            n_components, most = supported_components(table, isa, settings)
         table = ready_table(source, weights, n_components, settings)
         model, frames, converged, fitted = fit_table(
             table, n_components, isa, settings, progress, start, auto, errors
         )
+        # A consensus has more components.
+        if auto and self.refinement == "joint" and len(model.basis) == most:
+            more = f"more than n_components={most} may be needed for this table"
+            if most < MOST_FIRST:
+                more = "the table allows no more with these cameras"
+            warn_caller(f"all {most} basis shapes that were tried are relevant: {more}")
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
-        attributes = {**vars(opened), **fitted}
+        attributes = opened.__dict__
+        attributes.update(fitted)
         if self.keep_frames:
             kept = keep(frames._asdict())
             frames = Decomposition(*map(source.as_collected, kept.values()))
-            attributes |= {
-                f"{name}_": value for name, value in frames._asdict().items()
-            }
+            attributes.update(
+                {f"{name}_": value for name, value in frames._asdict().items()}
+            )
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
                 R, scales = full_rotations(frames.motion)
-                attributes |= {"rotations_": R, "scales_": scales}
+                attributes.update({"rotations_": R, "scales_": scales})
         else:
             del attributes["_frame_sizes"]
-        certainty = model.frames.certainty
-        if errors and not certainty.determined:
-            warn_caller(certainty.advice)
+        opened._model, opened._n_features_out = model, len(model.basis)
+        opened.camera_, opened.frames_scaled_ = self.camera, settings.scale_frames
+        if errors and not model.frames.certainty.determined:
+            share, _ = gross_residuals(source.joined(model.distances))
+            warn_caller(depth_advice(facts_of(opened, outlier_share=share)))
         self.__dict__.update(attributes)
-        self._model, self._n_features_out = model, len(model.basis)
-        self.camera_, self.frames_scaled_ = self.camera, settings.scale_frames
 
     def _ready(
         self, X: Any, point_weight: Any = None

@@ -28,7 +28,8 @@ from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.skeletons import SKELETONS
 
 _CAMERAS = {
-    "affine": "affine: shapes are known up to an affine transformation of space",
+    "affine": "affine: shapes are known up to an affine transformation of space. "
+    "Angles and proportions need --camera weak_perspective.",
     "weak_perspective": "weak-perspective: shapes are known up to size and a mirror "
     "image in depth",
     "orthographic": "orthographic: shapes are known up to a mirror image in depth, in "
@@ -285,23 +286,22 @@ def _fit(report: dict[str, Any]) -> Section:
 
 
 def _cameras(model: dict[str, Any]) -> Section:
-    """Return the camera model, the certainty of the depth, and advice."""
+    """Return the camera model, the certainty of the depth, and what the noise means."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
-    meaning = model["camera_meaning"]
-    if model["depth_advice"]:
-        title = (
-            f"{title.partition(':')[0]}: {model['depth_advice']}. cameras.csv has no "
-            "angles, and proportions in viewer.html are not true."
-        )
-        meaning = ""  # the ratio of the noise means nothing
+    if model["camera"] != "affine" and not model["depth_determined"]:
+        return [
+            f"{title.partition(':')[0]}: the depth is not determined (expected error "
+            f"{100 * uncertainty:.2g} %). cameras.csv has no angles, and proportions "
+            "in viewer.html are not true."
+        ]  # the ratio of the noise means nothing
     parts = [title]
-    if model["depth_determined"] and uncertainty and math.isfinite(uncertainty):
+    if uncertainty and math.isfinite(uncertainty):
         parts.append(
             f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
             "square)"
         )
-    remarks = [each for each in (meaning, model["camera_advice"]) if each]
-    return [*parts, _sentence("; ".join(remarks))] if remarks else parts
+    meaning = model["camera_meaning"]
+    return [*parts, _sentence(meaning)] if meaning else parts
 
 
 def _alpha(coefficients: list[dict[str, Any]]) -> Section:
