@@ -40,7 +40,6 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
-from isa_nrsfm._joint.consensus import MOST_FIRST
 from isa_nrsfm._joint.settings import (
     JOINT_TOL,
     LIMITS,
@@ -71,13 +70,8 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._advice import depth_advice, facts_of
-from isa_nrsfm.analysis._diagnostics import (
-    Diagnostics,
-    diagnose,
-    gross_residuals,
-    summary_html,
-)
+from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
+from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa import PooledFastICA
@@ -521,29 +515,29 @@ class AffineNRSfM(
         )
         # A consensus has more components.
         if auto and self.refinement == "joint" and len(model.basis) == most:
-            more = f"more than n_components={most} may be needed for this table"
-            if most < MOST_FIRST:
-                more = "the table allows no more with these cameras"
-            warn_caller(f"all {most} basis shapes that were tried are relevant: {more}")
+            warn_caller(
+                f"all {most} basis shapes that were tried are relevant: try a larger "
+                "n_components, if the table allows it"
+            )
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
-        attributes = opened.__dict__
-        attributes.update(fitted)
+        attributes: dict[str, Any] = opened.__dict__
+        attributes |= fitted
         if self.keep_frames:
             kept = keep(frames._asdict())
             frames = Decomposition(*map(source.as_collected, kept.values()))
-            attributes.update(
-                {f"{name}_": value for name, value in frames._asdict().items()}
-            )
+            attributes |= {
+                f"{name}_": value for name, value in frames._asdict().items()
+            }
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
                 R, scales = full_rotations(frames.motion)
-                attributes.update({"rotations_": R, "scales_": scales})
+                attributes |= {"rotations_": R, "scales_": scales}
         else:
             del attributes["_frame_sizes"]
         opened._model, opened._n_features_out = model, len(model.basis)

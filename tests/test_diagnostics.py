@@ -19,9 +19,8 @@ from sklearn.pipeline import make_pipeline
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.models import DepthCertainty
 from isa_nrsfm._joint.uncertainty import reliabilities
-from isa_nrsfm.analysis._advice import Facts, advice
+from isa_nrsfm.analysis._advice import Facts, advice, gross_residuals
 from isa_nrsfm.analysis._diagnostics import (
-    gross_residuals,
     outlier_text,
     pose_share,
     weak_information,
@@ -374,8 +373,11 @@ class TestAdvice:
         ("known", "expected"),
         [
             ({"certainty": UNKNOWN["deformation"]}, "table in which the objects turn"),
-            ({"certainty": UNKNOWN["parts"]}, 'Use n_components="auto"'),
-            ({"certainty": UNKNOWN["parts"], "noise_ratio": 20.0}, "Make sure that x"),
+            ({"certainty": UNKNOWN["parts"]}, 'First use n_components="auto"'),
+            (
+                {"certainty": UNKNOWN["parts"], "noise_ratio": 20.0},
+                "First make sure that x",
+            ),
             ({"certainty": UNKNOWN["parts"], "auto": True}, 'refinement="consensus"'),
             ({"noise_ratio": 1.5}, 'n_components="auto" finds how many'),
             (

@@ -1,5 +1,7 @@
 """Advice on a fit: from measured facts to at most three messages that agree."""
 
+from collections.abc import Iterator
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,6 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import n_reliable
+from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
 
 # Entries of V_k with a larger standard deviation count as not determined.
 LARGEST_DEVIATION = 0.1
@@ -20,6 +23,8 @@ SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
 SAME_UNIT = (
     "x and y have the same unit, unlike shares of the width and height of an image"
 )
+# Least length of gross residuals, in robust standard deviations.
+GROSS = 8.0
 # Share of points with gross residuals above which a table has outliers. Without
 # outliers the share is at most 0.02 %: generated faces, bodies and hands, captured
 # motion, photos of faces, K = 3 and 9. With one wrong point in a thousand, at half the
@@ -83,117 +88,106 @@ class Facts(NamedTuple):
 
 def facts_of(model: Any, **found: Any) -> Facts:
     """Return what the attributes of a joint fit tell, and what else was found."""
-    frames = model._model.frames
-    return Facts(
-        model.camera_,
-        frames.loss,
-        model.refinement == "consensus",
-        model.n_components == "auto",
-        frames.certainty,
-        model.reliability_,
-        getattr(model, "camera_noise_ratio_", np.nan),
-        **found,
-    )
+    frames, ratio = model._model.frames, getattr(model, "camera_noise_ratio_", np.nan)
+    consensus, auto = model.refinement == "consensus", model.n_components == "auto"
+    known = frames.certainty, model.reliability_, ratio
+    return Facts(model.camera_, frames.loss, consensus, auto, *known, **found)
 
 
 def advice(facts: Facts) -> tuple[str, ...]:
-    """Return what happened, why, and what to do: the most important messages first."""
-    depth, n_components = depth_advice(facts), len(facts.reliability)
-    if facts.bent:  # outliers may cause all others
+    """Return what happened, why, and what to do: the most important messages."""
+    return tuple(islice(filter(None, _messages(facts)), MOST_MESSAGES))
+
+
+def _messages(facts: Facts) -> Iterator[str]:
+    """Yield messages that do not contradict each other, the most important first."""
+    if facts.bent:
         bent = 'they bend the shapes. Use loss="cauchy", or correct them'
-        messages = [f"{facts.outliers}: {bent}", depth]
-    elif not facts.n_supported:
-        messages = [depth, _of_rigid_objects(facts)]
-    elif facts.n_supported < n_components:
-        surplus = n_components - facts.n_supported
-        text = (
-            f"the table does not support n_components={n_components}: {surplus} "
-            "direction(s) of the coefficients are probably noise. Use at most "
-            f"n_components={facts.n_supported}"
+        yield f"{facts.outliers}: {bent}"
+    yield (depth := depth_advice(facts))
+    if facts.bent:  # outliers may cause all that follows
+        return
+    n_components, n_supported = len(facts.reliability), facts.n_supported
+    if not n_supported:
+        outliers = '. If some points are wrong, use loss="cauchy"'
+        yield (
+            "no deformation was found beyond the noise: the object may be rigid. Do "
+            f"not interpret the coefficients{outliers * (facts.loss == 'linear')}"
         )
-        messages = [depth, text, facts.pose]
-    else:
-        few = "Look for wrong landmarks in the frames with the largest coefficients"
-        few = f"{facts.few}. {few}" if facts.few else ""
-        cameras = "" if depth else _of_cameras(facts)
-        # Wrong cameras look like coefficients that depend on the pose.
-        pose = "" if cameras else facts.pose
-        messages = [depth or cameras, _of_weak_parts(facts), few, pose]
-    return tuple(filter(None, messages))[:MOST_MESSAGES]
+        return
+    if n_supported < n_components:
+        yield (
+            f"the table does not support n_components={n_components}: "
+            f"{n_components - n_supported} direction(s) of the coefficients are "
+            f"probably noise. Use at most n_components={n_supported}"
+        )
+    elif facts.camera != "affine" and not depth and facts.noise_ratio >= SAME_NOISE:
+        other_fit = 'affine cameras (camera="affine")'
+        if not facts.auto and facts.noise_ratio < OTHER_CAMERAS:
+            other_fit = 'more basis shapes (n_components="auto" finds how many)'
+        meaning = camera_meaning(facts.noise_ratio)
+        yield f"{meaning}. Make sure that {SAME_UNIT}, or use {other_fit}"
+        return  # wrong cameras look like coefficients that depend on the pose
+    elif facts.camera == "affine" and facts.deviation > LARGEST_DEVIATION:
+        yield (
+            f"the basis shapes are uncertain by up to {100 * facts.deviation:.2g} % of "
+            "the mean shape: affine cameras absorb such deformation. Use more frames, "
+            "best of objects that turn further"
+        )
+    if facts.few and n_supported == n_components:
+        what = "Look for wrong landmarks in the frames with the largest coefficients"
+        yield f"{facts.few}. {what}"
+    yield facts.pose
 
 
 def depth_advice(facts: Facts) -> str:
     """Return the message on depths that calibrated cameras do not determine."""
-    certainty = facts.certainty
+    certainty, most = facts.certainty, max(facts.n_supported, 1)
     if facts.camera == "affine" or certainty.determined:
         return ""
-    text = (
-        "the depth of the shapes is not determined: its expected error is "
-        f"{100 * certainty.total:.0f} % of the depth"
-    )
+    error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
+    text = f"the depth of the shapes is not determined: {error}"
     if facts.bent:
         return f"{text}. The outliers may be the reason"
-    most = max(facts.n_supported, 1)
+    why, remedy = "parts of the points lead to different depths", "fit more points"
     if certainty.deformation > LARGEST_SHARE**2:
         why = "deformation explains the images as well as rotations do"
-        remedy = (
-            "fit a table in which the objects turn further, and transform this one "
-            "with that model"
-        )
-    else:
-        why = "parts of the points lead to different depths"
-        if most < len(facts.reliability):
-            remedy = f"use at most n_components={most}"
-        elif not facts.auto:
-            remedy = (
-                'use n_components="auto" and, if that does not suffice, '
-                'refinement="consensus"'
-            )
-        elif not facts.consensus:
-            remedy = 'use refinement="consensus"'
-        else:
-            remedy = "fit more points or further views"
-        if facts.noise_ratio >= SAME_NOISE:
-            remedy = f"make sure that {SAME_UNIT}, then {remedy}"
+        remedy = "fit a table in which the objects turn further, and transform this one"
+    elif most < len(facts.reliability):
+        remedy = f"use at most n_components={most}"
+    elif not facts.auto:
+        remedy = 'use n_components="auto"'
+    elif not facts.consensus:
+        remedy = 'use refinement="consensus"'
+    if facts.noise_ratio >= SAME_NOISE:
+        remedy = f"make sure that {SAME_UNIT}, then {remedy}"
     return (
-        f"{text}, because {why}. {remedy[0].upper()}{remedy[1:]}. If coefficients "
-        'suffice, use affine cameras (camera="affine"). See "How reliable is the '
-        'depth?" in the documentation'
+        f"{text}, because {why}. First {remedy}. If coefficients suffice, use affine "
+        'cameras (camera="affine"). See "How reliable is the depth?" in the '
+        "documentation"
     )
 
 
-def _of_rigid_objects(facts: Facts) -> str:
-    """Return the message on coefficients that are all noise."""
-    text = (
-        "no deformation was found beyond the noise: the object may be rigid. Do not "
-        "interpret the coefficients"
-    )
-    if facts.loss == "linear" and np.isnan(facts.outlier_share):
-        text += '. If some points are wrong (outliers), use loss="cauchy"'
-    return text
+def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
+    """Return the share of points with gross residuals, and their rows and points.
 
-
-def _of_cameras(facts: Facts) -> str:
-    """Return the message on calibrated cameras that do not explain the images."""
-    ratio = facts.noise_ratio
-    if facts.camera == "affine" or not ratio >= SAME_NOISE:
-        return ""
-    if facts.auto or facts.consensus or ratio >= OTHER_CAMERAS:
-        remedy = 'affine cameras (camera="affine")'
-    else:
-        remedy = 'more basis shapes (n_components="auto" finds how many)'
-    return f"{camera_meaning(ratio)}. Make sure that {SAME_UNIT}, or use {remedy}"
-
-
-def _of_weak_parts(facts: Facts) -> str:
-    """Return the message on what affine cameras cannot separate from deformation."""
-    if facts.camera != "affine" or not facts.deviation > LARGEST_DEVIATION:
-        return ""
-    return (
-        "the basis shapes are uncertain by up to "
-        f"{100 * facts.deviation:.2g} % of the mean shape: affine cameras absorb such "
-        "deformation. Use more frames, best of objects that turn further"
-    )
+    The outliers (n_outliers, 2) are sorted, the largest first. The scale is the median
+    residual. It is larger for points and frames with a larger median of their own,
+    which the model fits badly as a whole.
+    """
+    none = np.empty((0, 2), dtype=np.intp)
+    if distance is None or not (shown := np.isfinite(distance)).any():
+        return np.nan, none
+    median = float(np.median(distance[shown]))
+    if not median > 0:
+        return 0.0, none
+    filled = np.ma.masked_invalid(distance)
+    of_rows = np.maximum(1.0, np.ma.median(filled, axis=1).filled(0) / median)
+    of_points = np.maximum(1.0, np.ma.median(filled, axis=0).filled(0) / median)
+    relative = np.where(shown, distance, 0.0) / of_rows[:, None] / of_points
+    found = np.argwhere(relative > GROSS * median / MEDIAN_DISTANCE)
+    order = np.argsort(-relative[tuple(found.T)], kind="stable")
+    return len(found) / np.count_nonzero(shown), found[order]
 
 
 def camera_meaning(ratio: float) -> str:

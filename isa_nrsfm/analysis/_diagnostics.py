@@ -11,19 +11,10 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
-from isa_nrsfm.analysis._advice import (
-    MOST_GROSS,
-    SAME_UNIT,
-    advice,
-    camera_meaning,
-    facts_of,
-)
+from isa_nrsfm.analysis import _advice
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
-# Least length of gross residuals, in robust standard deviations.
-GROSS = 8.0
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
 # to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
 MOST_POSE = 0.3
@@ -129,14 +120,14 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
         np.sqrt(frames.noise_variance / known),
         frames.certainty.total,
         ratio,
-        camera_meaning(ratio),
+        _advice.camera_meaning(ratio),
         share,
-        *gross_residuals(distance),
+        *_advice.gross_residuals(distance),
     )
     names = names_of_points(estimator)
     image = mean_shape @ estimator.reference_motion_.T
     layout = find_skeleton(len(names), names, shape=image)
-    facts = facts_of(
+    facts = _advice.facts_of(
         estimator,
         deviation=found.weak_deviations[-1],
         outlier_share=found.outlier_share,
@@ -144,7 +135,7 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
         few=_few_frames(found, coefficients, rows),
         pose=_of_pose(found, mean_shape, basis, layout),
     )
-    return found._replace(messages=advice(facts))
+    return found._replace(messages=_advice.advice(facts))
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
@@ -170,31 +161,9 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     return np.asarray(1 - np.sum(left_out**2, axis=0) / energy)
 
 
-def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
-    """Return the share of points with gross residuals, and their rows and points.
-
-    The outliers (n_outliers, 2) are sorted, the largest first. The scale is the median
-    residual. It is larger for points and frames with a larger median of their own,
-    which the model fits badly as a whole.
-    """
-    none = np.empty((0, 2), dtype=np.intp)
-    if distance is None or not (shown := np.isfinite(distance)).any():
-        return np.nan, none
-    median = float(np.median(distance[shown]))
-    if not median > 0:
-        return 0.0, none
-    filled = np.ma.masked_invalid(distance)
-    of_rows = np.maximum(1.0, np.ma.median(filled, axis=1).filled(0) / median)
-    of_points = np.maximum(1.0, np.ma.median(filled, axis=0).filled(0) / median)
-    relative = np.where(shown, distance, 0.0) / of_rows[:, None] / of_points
-    found = np.argwhere(relative > GROSS * median / MEDIAN_DISTANCE)
-    order = np.argsort(-relative[tuple(found.T)], kind="stable")
-    return len(found) / np.count_nonzero(shown), found[order]
-
-
 def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     """Describe the outliers; empty if they are few enough to ignore."""
-    if not found.outlier_share > MOST_GROSS:
+    if not found.outlier_share > _advice.MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
     points, counts = np.unique(found.outliers[:, 1], return_counts=True)
@@ -202,7 +171,7 @@ def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     return (
         f"the table has outliers: {len(found.outliers)} points "
         f"({100 * found.outlier_share:.2g} %) in {len(frames)} frames are more than "
-        f"{GROSS:g} standard deviations from the model, in the rows "
+        f"{_advice.GROSS:g} standard deviations from the model, in the rows "
         f"{first_items((rows[i] for i in frames), 5)}, most often the points "
         f"{first_items((names[j] for j in most), 5)}"
     )
@@ -237,7 +206,9 @@ def _of_pose(
     shape = basis[np.nanargmax(found.pose_share)]
     rest = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
     if 2 * np.sum(rest**2) < np.sum(shape**2):
-        return f"{text}: they stretch the whole shape. Make sure that {SAME_UNIT}"
+        return (
+            f"{text}: they stretch the whole shape. Make sure that {_advice.SAME_UNIT}"
+        )
     return (
         f"{text}: {len(layout.contour)} points "
         f"of {layout.name} follow the visible outline, which slides over the "
@@ -292,7 +263,7 @@ def _lines(model: Any) -> dict[str, str]:
         lines["Frames"] = f"{fitted.sum()}{without}"
     camera = model.camera_.replace("_", " ")
     ratio = getattr(model, "camera_noise_ratio_", None)
-    meaning = "" if ratio is None else f"; {camera_meaning(ratio)}"
+    meaning = "" if ratio is None else f"; {_advice.camera_meaning(ratio)}"
     lines["Cameras"] = f"{camera}{meaning}"
     floor = _percent(model.rank_floor_)
     lines["Inverse SNR"] = f"{_percent(model.inverse_snr_)}, rank floor {floor}"

@@ -131,9 +131,8 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
         f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
         "squares) of the residuals, relative to that of the centred points.",
         f"held-out error {_percent(quality['held_out_error'])}: the same for points "
-        f"predicted from the other points of their frame.{weighted} If it is much "
-        "larger, look first for wrong points (outliers, or missing points with "
-        "coordinates such as (0, 0)), then use fewer basis shapes.",
+        f"predicted from the other points of their frame.{weighted} Wrong points and "
+        "too many basis shapes make it much larger.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
         "square, in the units of the table)",
     ]
@@ -290,9 +289,8 @@ def _cameras(model: dict[str, Any]) -> Section:
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
     if model["camera"] != "affine" and not model["depth_determined"]:
         return [
-            f"{title.partition(':')[0]}: the depth is not determined (expected error "
-            f"{100 * uncertainty:.2g} %). cameras.csv has no angles, and proportions "
-            "in viewer.html are not true."
+            f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
+            "no angles, and proportions in viewer.html are not true."
         ]  # the ratio of the noise means nothing
     parts = [title]
     if uncertainty and math.isfinite(uncertainty):
