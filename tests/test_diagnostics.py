@@ -373,10 +373,10 @@ class TestAdvice:
         ("known", "expected"),
         [
             ({"certainty": UNKNOWN["deformation"]}, "table in which the objects turn"),
-            ({"certainty": UNKNOWN["parts"]}, 'First use n_components="auto"'),
+            ({"certainty": UNKNOWN["parts"]}, 'Use n_components="auto"'),
             (
                 {"certainty": UNKNOWN["parts"], "noise_ratio": 20.0},
-                "First make sure that x",
+                "Make sure that x",
             ),
             ({"certainty": UNKNOWN["parts"], "auto": True}, 'refinement="consensus"'),
             ({"noise_ratio": 1.5}, 'n_components="auto" finds how many'),

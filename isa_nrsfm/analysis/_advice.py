@@ -152,7 +152,10 @@ def depth_advice(facts: Facts) -> str:
     why, remedy = "parts of the points lead to different depths", "fit more points"
     if certainty.deformation > LARGEST_SHARE**2:
         why = "deformation explains the images as well as rotations do"
-        remedy = "fit a table in which the objects turn further, and transform this one"
+        remedy = (
+            "fit a table in which the objects turn further, and transform this one "
+            "with that model"
+        )
     elif most < len(facts.reliability):
         remedy = f"use at most n_components={most}"
     elif not facts.auto:
@@ -162,9 +165,9 @@ def depth_advice(facts: Facts) -> str:
     if facts.noise_ratio >= SAME_NOISE:
         remedy = f"make sure that {SAME_UNIT}, then {remedy}"
     return (
-        f"{text}, because {why}. First {remedy}. If coefficients suffice, use affine "
-        'cameras (camera="affine"). See "How reliable is the depth?" in the '
-        "documentation"
+        f"{text}, because {why}. {remedy[0].upper()}{remedy[1:]}. If coefficients "
+        'suffice, use affine cameras (camera="affine"). See "How reliable is the '
+        'depth?" in the documentation'
     )
 
 
