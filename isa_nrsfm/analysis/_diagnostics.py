@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm.analysis import _advice
+from isa_nrsfm.analysis._advice import (
+    GROSS,
+    MOST_GROSS,
+    SAME_UNIT,
+    advice,
+    camera_meaning,
+    facts_of,
+    gross_residuals,
+)
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -120,14 +128,14 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
         np.sqrt(frames.noise_variance / known),
         frames.certainty.total,
         ratio,
-        _advice.camera_meaning(ratio),
+        camera_meaning(ratio),
         share,
-        *_advice.gross_residuals(distance),
+        *gross_residuals(distance),
     )
     names = names_of_points(estimator)
     image = mean_shape @ estimator.reference_motion_.T
     layout = find_skeleton(len(names), names, shape=image)
-    facts = _advice.facts_of(
+    facts = facts_of(
         estimator,
         deviation=found.weak_deviations[-1],
         outlier_share=found.outlier_share,
@@ -135,7 +143,7 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
         few=_few_frames(found, coefficients, rows),
         pose=_of_pose(found, mean_shape, basis, layout),
     )
-    return found._replace(messages=_advice.advice(facts))
+    return found._replace(messages=advice(facts))
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
@@ -163,7 +171,7 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
 
 def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     """Describe the outliers; empty if they are few enough to ignore."""
-    if not found.outlier_share > _advice.MOST_GROSS:
+    if not found.outlier_share > MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
     points, counts = np.unique(found.outliers[:, 1], return_counts=True)
@@ -171,7 +179,7 @@ def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     return (
         f"the table has outliers: {len(found.outliers)} points "
         f"({100 * found.outlier_share:.2g} %) in {len(frames)} frames are more than "
-        f"{_advice.GROSS:g} standard deviations from the model, in the rows "
+        f"{GROSS:g} standard deviations from the model, in the rows "
         f"{first_items((rows[i] for i in frames), 5)}, most often the points "
         f"{first_items((names[j] for j in most), 5)}"
     )
@@ -206,9 +214,7 @@ def _of_pose(
     shape = basis[np.nanargmax(found.pose_share)]
     rest = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
     if 2 * np.sum(rest**2) < np.sum(shape**2):
-        return (
-            f"{text}: they stretch the whole shape. Make sure that {_advice.SAME_UNIT}"
-        )
+        return f"{text}: they stretch the whole shape. Make sure that {SAME_UNIT}"
     return (
         f"{text}: {len(layout.contour)} points "
         f"of {layout.name} follow the visible outline, which slides over the "
@@ -263,7 +269,7 @@ def _lines(model: Any) -> dict[str, str]:
         lines["Frames"] = f"{fitted.sum()}{without}"
     camera = model.camera_.replace("_", " ")
     ratio = getattr(model, "camera_noise_ratio_", None)
-    meaning = "" if ratio is None else f"; {_advice.camera_meaning(ratio)}"
+    meaning = "" if ratio is None else f"; {camera_meaning(ratio)}"
     lines["Cameras"] = f"{camera}{meaning}"
     floor = _percent(model.rank_floor_)
     lines["Inverse SNR"] = f"{_percent(model.inverse_snr_)}, rank floor {floor}"
