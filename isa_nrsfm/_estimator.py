@@ -70,6 +70,7 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
+from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
 from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
@@ -102,10 +103,10 @@ class AffineNRSfM(
         ``ceil(8 (K + 2) / 5)`` frames. Calibrated cameras allow up to 2J - 7 basis
         shapes of J points, if there are enough frames (joint refinement only): for 17
         points 27 instead of 4. "auto" fits twelve basis shapes, or as many as the table
-        allows, and keeps the relevant ones (joint refinement only); their number is
-        ``len(basis_)``. With ``refinement="consensus"`` the joint fit has at most
-        twelve, and the result has K principal components of the merged shapes; "auto"
-        keeps those that exceed the noise, at most 60.
+        allows, and keeps the relevant and reliable ones (joint refinement only); their
+        number is ``len(basis_)``. With ``refinement="consensus"`` the joint fit has at
+        most twelve, and the result has K principal components of the merged shapes;
+        "auto" keeps those that exceed the noise, at most 60.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
@@ -507,25 +508,25 @@ class AffineNRSfM(
         if auto:
             with warnings.catch_warnings(action="ignore"):  # the fit warns again
                 table = ready_table(source, weights, 1, settings)
-            n_components, all_relevant = supported_components(table, isa, settings)
-            # A consensus has more components.
-            if all_relevant and self.refinement != "consensus":
-                warn_caller(
-                    f"all {n_components} basis shapes that were tried are relevant: "
-                    f"more than n_components={n_components} may be needed for this "
-                    "table"
-                )
+            n_components, most = supported_components(table, isa, settings)
         table = ready_table(source, weights, n_components, settings)
         model, frames, converged, fitted = fit_table(
             table, n_components, isa, settings, progress, start, auto, errors
         )
+        # A consensus has more components.
+        if auto and self.refinement == "joint" and len(model.basis) == most:
+            warn_caller(
+                f"all {most} basis shapes that were tried are relevant: try a larger "
+                "n_components, if the table allows it"
+            )
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
-        attributes = {**vars(opened), **fitted}
+        attributes: dict[str, Any] = opened.__dict__
+        attributes |= fitted
         if self.keep_frames:
             kept = keep(frames._asdict())
             frames = Decomposition(*map(source.as_collected, kept.values()))
@@ -539,12 +540,12 @@ class AffineNRSfM(
                 attributes |= {"rotations_": R, "scales_": scales}
         else:
             del attributes["_frame_sizes"]
-        certainty = model.frames.certainty
-        if errors and not certainty.determined:
-            warn_caller(certainty.advice)
+        opened._model, opened._n_features_out = model, len(model.basis)
+        opened.camera_, opened.frames_scaled_ = self.camera, settings.scale_frames
+        if errors and not model.frames.certainty.determined:
+            share, _ = gross_residuals(source.joined(model.distances))
+            warn_caller(depth_advice(facts_of(opened, outlier_share=share)))
         self.__dict__.update(attributes)
-        self._model, self._n_features_out = model, len(model.basis)
-        self.camera_, self.frames_scaled_ = self.camera, settings.scale_frames
 
     def _ready(
         self, X: Any, point_weight: Any = None

@@ -60,9 +60,9 @@ from isa_nrsfm._joint.problem import (
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
-    LEAST_RELIABILITY,
     depth_certainty,
     fitted_frames,
+    n_reliable,
     reliabilities,
     shape_uncertainty,
     shown_frames,
@@ -130,8 +130,9 @@ def fit_table(
     """Fit a table with K basis shapes and a clone of the strategy `isa`.
 
     The joint fit starts from the model of a similar table, if `start` is given, instead
-    of the paper's result. `free`: the consensus keeps all components that exceed the
-    noise, instead of K. `errors`: estimate the errors of the depths.
+    of the paper's result. `free`: K falls until all directions of the coefficients
+    are reliable; the consensus keeps all components that exceed the noise, instead of
+    K. `errors`: estimate the errors of the depths.
 
     Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
     without visible points; convergence; and the other attributes of `AffineNRSfM`.
@@ -178,6 +179,13 @@ def fit_table(
             attributes["depth_uncertainty_"] = model.certainty.total
         fitted, frames, measures = _joint_frames(table, model, tracks, settings)
         converged = fit.converged
+        # Down-weighted outliers, for example, look like basis shapes at first.
+        supported = max(n_reliable(measures["reliability_"]), 1)
+        if free and settings.refinement == "joint" and supported < n_components:
+            quiet = NoProgress()
+            return fit_table(
+                table, supported, isa, settings, quiet, start, free, errors
+            )
     else:
         fitted, frames, measures = _paper_frames(
             table, factorised.factors, shapes, covariance, settings
@@ -195,11 +203,12 @@ def fit_table(
 @one_blas_thread
 def supported_components(
     table: ScaledTable, isa: Any, settings: FitSettings
-) -> tuple[int, bool]:
-    """Return the number of basis shapes that a table supports, of at most twelve.
+) -> tuple[int, int]:
+    """Return the number of relevant basis shapes of a table, and how many were tried.
 
-    Also returns whether all that were tried are relevant.
+    Those are at most twelve.
     """
+    consensus = settings.refinement == "consensus"
     settings = settings._replace(refinement="joint")
     possible = most_components(len(table.sizes), table.n_points, settings.camera)
     most = min(MOST_FIRST, possible)
@@ -208,15 +217,10 @@ def supported_components(
     factors = factorised.factors
     shapes, *_ = _paper_result(factors, most, clone(isa), settings, quiet)
     supported = count_components(factorised, shapes, settings)
-    # Down-weighted outliers look like basis shapes: fit again with the final weights.
-    while supported > 1 and settings.loss != "linear":
-        with warnings.catch_warnings(action="ignore"):
-            *_, fitted = fit_table(table, supported, isa, settings, quiet)
-        reliable = fitted["reliability_"] >= LEAST_RELIABILITY
-        before, supported = supported, max(int(reliable.sum()), 1)
-        if supported == before:
-            break
-    return supported, supported == most
+    if consensus:  # of a joint fit with as many as are reliable
+        model, *_ = fit_table(table, supported, isa, settings, quiet, free=True)
+        supported = len(model.basis)
+    return supported, most
 
 
 def _factorised(

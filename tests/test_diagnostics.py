@@ -3,6 +3,7 @@
 import re
 from copy import copy
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,11 +17,11 @@ from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frames.models import DepthCertainty
 from isa_nrsfm._joint.uncertainty import reliabilities
+from isa_nrsfm.analysis._advice import Facts, advice, gross_residuals
 from isa_nrsfm.analysis._diagnostics import (
-    camera_advice,
-    gross_residuals,
-    outlier_advice,
+    outlier_text,
     pose_share,
     weak_information,
 )
@@ -291,13 +292,13 @@ class TestOutliers:
 
 
 def test_outliers_are_named_by_rows_and_most_frequent_points():
-    def advice(share):
+    def described(share):
         points = np.array([[3, 1], [0, 2], [3, 2], [7, 0]])
         found = SimpleNamespace(outlier_share=share, outliers=points)
-        return outlier_advice(found, np.arange(10, 20), "abc")
+        return outlier_text(found, np.arange(10, 20), "abc")
 
-    assert advice(5e-4) == ""
-    assert advice(6e-4) == (
+    assert described(5e-4) == ""
+    assert described(6e-4) == (
         "the table has outliers: 4 points (0.06 %) in 3 frames are more than 8 "
         "standard deviations from the model, in the rows 10, 13, 17, most often the "
         "points c, a, b"
@@ -328,12 +329,79 @@ def test_messages_on_the_basis_come_first():
     assert second.startswith("a few of the 60 frames determine alpha_1")
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1.5, 100.0])
-def test_advice_on_cameras_does_not_lead_back(ratio):
-    found = camera_advice("weak_perspective", ratio, determined=False)
-    assert found.startswith("next: affine cameras for this table")
-    found = camera_advice("affine", ratio, determined=True)
-    assert re.search("^keep these cameras|with these cameras$", found)
+def facts(**known):
+    """Return the facts of a fit with three basis shapes."""
+    given = {"camera": "weak_perspective", "loss": "linear", "consensus": False}
+    given |= {"auto": False, "certainty": DepthCertainty(0.1, 0.0)}
+    return Facts(**given | {"reliability": np.ones(3), "noise_ratio": 1.0} | known)
+
+
+UNKNOWN = {
+    "deformation": DepthCertainty(1.4, 1.0),
+    "parts": DepthCertainty(0.9, 1e-6),
+    None: DepthCertainty(0.1, 1e-6),
+}
+
+
+BENT = 'they bend the shapes. Use loss="cauchy", or correct them'
+
+
+class TestAdvice:
+    def test_messages_agree(self):
+        cameras, ratios = ["affine", "weak_perspective"], [1.0, 1.5, 100.0, np.nan]
+        shares, flags = [np.nan, 0.0, 0.01], [False, True]
+        cases = product(cameras, UNKNOWN, ratios, range(4), flags, shares)
+        for camera, depth, ratio, supported, auto, share in cases:
+            known = {"noise_ratio": ratio, "auto": auto, "camera": camera}
+            known |= {"reliability": 1.0 * (np.arange(3) < supported)}
+            known |= {"certainty": UNKNOWN[depth], "deviation": 0.3, "few": "frames"}
+            known |= {"outliers": "wrong points", "outlier_share": share}
+            found = advice(facts(**known, pose="the outline"))
+            text = " | ".join(found)
+            assert len({*found}) == len(found) <= 3
+            missing = depth is not None and camera != "affine"
+            assert ("depth of the shapes is not" in text) == missing
+            # No message asks for more and another for fewer basis shapes.
+            more = 'n_components="auto"' in text or "consensus" in text
+            assert not (more and "at most n_components" in text)
+            assert not (auto and 'n_components="auto"' in text)
+            assert text.count('camera="affine"') <= (camera != "affine")
+            assert found[:1] == (f"wrong points: {BENT}",) or not share > 0
+            assert not (share > 0 and "n_components" in text)
+
+    @pytest.mark.parametrize(
+        ("known", "expected"),
+        [
+            ({"certainty": UNKNOWN["deformation"]}, "table in which the objects turn"),
+            ({"certainty": UNKNOWN["parts"]}, 'Use n_components="auto"'),
+            (
+                {"certainty": UNKNOWN["parts"], "noise_ratio": 20.0},
+                "Make sure that x",
+            ),
+            ({"certainty": UNKNOWN["parts"], "auto": True}, 'refinement="consensus"'),
+            ({"noise_ratio": 1.5}, 'n_components="auto" finds how many'),
+            (
+                {"noise_ratio": 1.5, "auto": True},
+                'use affine cameras (camera="affine")',
+            ),
+            ({"noise_ratio": 20.0}, 'use affine cameras (camera="affine")'),
+            ({"deviation": 0.3, "camera": "affine"}, "uncertain by up to 30 %"),
+        ],
+    )
+    def test_one_remedy(self, known, expected):
+        (message,) = advice(facts(**known))
+        assert expected in message
+
+    def test_a_consensus_has_components_that_are_noise(self):
+        known = {"consensus": True, "auto": True}
+        assert advice(facts(**known, reliability=np.array([0.9, 0.8, 0.0]))) == ()
+        (message,) = advice(facts(**known, reliability=np.zeros(3)))
+        assert "no deformation was found" in message
+
+    @pytest.mark.parametrize("ratio", [1.0, 1.5, 100.0])
+    def test_on_cameras_does_not_lead_back(self, ratio):
+        given = facts(camera="affine", noise_ratio=ratio, deviation=0.3)
+        assert not any("perspective" in message for message in advice(given))
 
 
 # --- what a notebook shows of a model ------------------------------------------------

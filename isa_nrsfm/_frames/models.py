@@ -84,29 +84,6 @@ class DepthCertainty(NamedTuple):
             return np.tile(points, (len(alpha), 1))
         return np.outer(leverages(alpha) / self.leverage, points)
 
-    @property
-    def advice(self) -> str:
-        """Reason and remedy for depths that are not determined."""
-        if self.deformation > self.total**2 / 2:
-            reason = "deformation explains the images as well as rotations do"
-            remedy = (
-                "fit a table in which the objects turn further, and transform this one "
-                "with that model"
-            )
-        else:
-            reason = "parts of the points lead to different depths"
-            remedy = (
-                'try more basis shapes or refinement="consensus", and make sure that x '
-                "and y have the same unit, unlike shares of the width and height of an "
-                "image"
-            )
-        return (
-            "the depth of the shapes is not determined: its expected error is "
-            f"{100 * self.total:.2g} % of the depth, because {reason}. Use affine "
-            f'cameras for this table (camera="affine"), or {remedy}. See "How reliable '
-            'is the depth?" in the documentation'
-        )
-
 
 def leverages(alpha: NDArray) -> NDArray:
     """Return 1 + |alpha|^2 of frames (n, K)."""

@@ -198,6 +198,11 @@ def reliabilities(
     return shares
 
 
+def n_reliable(reliability: NDArray) -> int:
+    """Return the number of directions of the coefficients that a table supports."""
+    return int(np.sum(reliability >= LEAST_RELIABILITY))
+
+
 def depth_certainty(
     frames: PosteriorFrames, rows: FrameBlocks, weights: NDArray | None = None
 ) -> DepthCertainty:

@@ -2,34 +2,27 @@
 
 import html
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._joint.uncertainty import LEAST_RELIABILITY
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
+from isa_nrsfm.analysis._advice import (
+    GROSS,
+    MOST_GROSS,
+    SAME_UNIT,
+    advice,
+    camera_meaning,
+    facts_of,
+    gross_residuals,
+)
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
-# Entries of V_k with a larger standard deviation count as not determined.
-LARGEST_DEVIATION = 0.1
-# Thresholds of the noise variance with calibrated cameras over that with affine ones.
-# Below the first, the table does not contradict calibrated cameras. Above the second,
-# the cameras are probably not calibrated. Measured on artificial tables: 1.02 for
-# weak-perspective cameras, up to 1.2 for perspective ones at 8 to 2.5 radii, 22 to 48
-# for cameras that stretch the image. Motion capture with too few basis shapes has 1.1
-# to 4 (``python -m benchmarks.accuracy cameras``).
-SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
-# Least length of gross residuals, in robust standard deviations, and the share of such
-# points above which a table has outliers. Without outliers the share is at most 0.02 %:
-# generated faces, bodies and hands, captured motion, photos of faces, K = 3 and 9. With
-# one wrong point in a thousand, at half the size of a face, it is 0.06 to 0.13 %.
-GROSS, MOST_GROSS = 8.0, 5e-4
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
 # to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
 MOST_POSE = 0.3
@@ -80,8 +73,9 @@ class Diagnostics(NamedTuple):
     outliers : ndarray of shape (n_outliers, 2)
         Row and point of each gross residual, the largest first.
     messages : tuple of str
-        Interpretation of the figures, a sentence or two each; empty if all is well.
-        If the table has outliers and the loss is linear, only the outliers are named.
+        What happened, why, and what to do: at most three, the most important first;
+        empty if all is well. If the table has outliers and the loss is linear, only
+        these and a depth that is not determined are named.
     """
 
     camera_singular_values: NDArray
@@ -139,18 +133,17 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
         *gross_residuals(distance),
     )
     names = names_of_points(estimator)
-    outliers = outlier_advice(found, rows, names)
-    if frames.loss == "linear" and outliers:
-        # Outliers may cause all the other messages.
-        advice = 'they bend the shapes. Use loss="cauchy", or correct them'
-        return found._replace(messages=(f"{outliers}: {advice}",))
-    image = estimator.mean_shape_ @ estimator.reference_motion_.T
+    image = mean_shape @ estimator.reference_motion_.T
     layout = find_skeleton(len(names), names, shape=image)
-    messages = (
-        *_of_support(found, frames.loss),
-        *_of_coefficients(found, coefficients, rows, layout),
+    facts = facts_of(
+        estimator,
+        deviation=found.weak_deviations[-1],
+        outlier_share=found.outlier_share,
+        outliers=outlier_text(found, rows, names),
+        few=_few_frames(found, coefficients, rows),
+        pose=_of_pose(found, mean_shape, basis, layout),
     )
-    return found._replace(messages=messages)
+    return found._replace(messages=advice(facts))
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
@@ -176,30 +169,8 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     return np.asarray(1 - np.sum(left_out**2, axis=0) / energy)
 
 
-def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
-    """Return the share of points with gross residuals, and their rows and points.
-
-    The outliers (n_outliers, 2) are sorted, the largest first. The scale is the median
-    residual. It is larger for points and frames with a larger median of their own,
-    which the model fits badly as a whole.
-    """
-    none = np.empty((0, 2), dtype=np.intp)
-    if distance is None or not (shown := np.isfinite(distance)).any():
-        return np.nan, none
-    median = float(np.median(distance[shown]))
-    if not median > 0:
-        return 0.0, none
-    filled = np.ma.masked_invalid(distance)
-    of_rows = np.maximum(1.0, np.ma.median(filled, axis=1).filled(0) / median)
-    of_points = np.maximum(1.0, np.ma.median(filled, axis=0).filled(0) / median)
-    relative = np.where(shown, distance, 0.0) / of_rows[:, None] / of_points
-    found = np.argwhere(relative > GROSS * median / MEDIAN_DISTANCE)
-    order = np.argsort(-relative[tuple(found.T)], kind="stable")
-    return len(found) / np.count_nonzero(shown), found[order]
-
-
-def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
-    """Return the message on outliers; empty if they are few enough to ignore."""
+def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
+    """Describe the outliers; empty if they are few enough to ignore."""
     if not found.outlier_share > MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
@@ -214,105 +185,42 @@ def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     )
 
 
-def _of_support(found: Diagnostics, loss: str) -> Iterator[str]:
-    """Yield the message on basis shapes that the table does not determine."""
-    n_components = len(found.reliability)
-    unsupported = int(np.sum(found.reliability < LEAST_RELIABILITY))
-    if not unsupported:
-        deviation = found.weak_deviations[-1]
-        if deviation > LARGEST_DEVIATION:
-            yield (
-                "the basis shapes are uncertain: deformation and camera motion cannot "
-                "be separated well in this table (uncertainty up to "
-                f"{100 * deviation:.2g} % of the mean shape). Use more frames or fewer "
-                "basis shapes"
-            )
-        return
-    if unsupported == n_components:
-        text = (
-            "no deformation was found beyond the noise: the object may be rigid, and "
-            "all coefficients may be noise"
-        )
-    else:
-        text = (
-            f"the table does not support n_components={n_components}: {unsupported} "
-            "direction(s) of the coefficients are probably noise. Use at most "
-            f"n_components={n_components - unsupported}"
-        )
-    if loss == "linear":
-        text += '. If some points are wrong (outliers), use loss="cauchy"'
-    yield text
-
-
-def _of_coefficients(
-    found: Diagnostics, alpha: NDArray, rows: Any, layout: Skeleton | None
-) -> Iterator[str]:
-    """Yield messages on coefficients that a handful of frames or the pose decide."""
+def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
+    """Describe coefficients that a few frames decide; empty if there are none."""
     n_frames = np.count_nonzero(~np.isnan(alpha[:, 0]))
     effective = found.effective_frames
-    # Smallest numbers without outliers, on the tables named at GROSS: 20 of 307 to 320
-    # of 1000 frames. With outliers: 1 to 20.
+    # Smallest numbers without outliers, on the tables named at MOST_GROSS: 20 of 307 to
+    # 320 of 1000 frames. With outliers: 1 to 20.
     few = (effective > 0) & (effective < min(10.0, 0.1 * n_frames))
-    if (found.reliability < LEAST_RELIABILITY).any():
-        few[:] = False  # noise
-    if few.any():
-        shown = [
-            f"alpha_{k + 1} ({effective[k]:.1f} effective frames, most row "
-            f"{rows[np.nanargmax(np.abs(alpha[:, k]))]})"
-            for k in np.flatnonzero(few)
-        ]
-        yield (
-            f"a few of the {n_frames} frames determine {first_items(shown, 5)}. Look "
-            "for wrong landmarks in the frames with the largest coefficients, or use "
-            "fewer basis shapes"
-        )
-    large = np.flatnonzero(~few & (found.pose_share > MOST_POSE))
-    if layout is not None and layout.contour and len(large):
-        shown = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
-        yield (
-            f"the pose predicts {first_items(shown, 5)}: {len(layout.contour)} points "
-            f"of {layout.name} follow the visible outline, which slides over the "
-            "surface as the head turns. Fit the other points alone (--points inner; in "
-            f"Python the columns get_skeleton({layout.name!r}).inner_columns)"
-        )
+    shown = [
+        f"alpha_{k + 1} ({effective[k]:.1f} effective frames, most row "
+        f"{rows[np.nanargmax(np.abs(alpha[:, k]))]})"
+        for k in np.flatnonzero(few)
+    ]
+    return f"a few of the {n_frames} frames determine {first_items(shown, 5)}" * any(
+        few
+    )
 
 
-def camera_meaning(ratio: float) -> str:
-    """Return the meaning of `camera_noise_ratio_`, in a sentence."""
-    if np.isnan(ratio):
-        return "not known: it was not measured"
-    if ratio < SAME_NOISE:
-        what = "calibrated cameras explain the table as well as affine ones"
-    elif ratio < OTHER_CAMERAS:
-        what = (
-            "affine cameras explain more than calibrated ones: possible reasons are "
-            "too few basis shapes, perspective, or slightly stretched images"
-        )
-    else:
-        what = (
-            "the cameras are probably not calibrated: the images were stretched, or "
-            "there are far too few basis shapes"
-        )
-    return f"{what} (noise variance {ratio:#.3g} times that of affine cameras)"
-
-
-def camera_advice(camera: str, ratio: float, determined: bool) -> str:
-    """Return the camera model to try next, in a sentence; empty if not measured."""
-    if np.isnan(ratio):
+def _of_pose(
+    found: Diagnostics, mean_shape: NDArray, basis: NDArray, layout: Skeleton | None
+) -> str:
+    """Describe coefficients of faces that the pose predicts; empty if none."""
+    large = np.flatnonzero(found.pose_share > MOST_POSE)
+    if layout is None or not layout.contour or not len(large):
         return ""
-    if camera != "affine" and not determined:
-        return "next: affine cameras for this table"
-    if ratio >= OTHER_CAMERAS:
-        return "keep these cameras" if camera == "affine" else "next: affine cameras"
-    if ratio >= SAME_NOISE:
-        return "next: more basis shapes, with these cameras"
-    if camera == "affine":
-        return (
-            "keep these cameras, unless angles and proportions are needed. For these, "
-            "try weak-perspective cameras, whose fit reports if the objects turn too "
-            "little for them"
-        )
-    return "keep these cameras"
+    shown = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
+    text = f"the pose predicts {first_items(shown, 5)}"
+    shape = basis[np.nanargmax(found.pose_share)]
+    rest = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
+    if 2 * np.sum(rest**2) < np.sum(shape**2):
+        return f"{text}: they stretch the whole shape. Make sure that {SAME_UNIT}"
+    return (
+        f"{text}: {len(layout.contour)} points "
+        f"of {layout.name} follow the visible outline, which slides over the "
+        "surface as the head turns. Fit the other points alone (--points inner; in "
+        f"Python the columns get_skeleton({layout.name!r}).inner_columns)"
+    )
 
 
 def weak_information(

@@ -15,7 +15,8 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis import _diagnostics
+from isa_nrsfm.analysis._advice import camera_meaning
+from isa_nrsfm.analysis._diagnostics import Diagnostics, outlier_text
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
@@ -79,14 +80,7 @@ def model_report(
     errors = np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2, axis=1))
     ratio = getattr(estimator, "camera_noise_ratio_", None)
     certainty = frames_of(estimator).certainty
-    advice = certainty.advice.replace('camera="affine"', "--camera affine")
     _, layout, lines, _ = view_and_layout(estimator, edges)
-    meaning, camera_advice = None, ""
-    if ratio is not None:
-        meaning = _diagnostics.camera_meaning(ratio)
-        camera_advice = _diagnostics.camera_advice(
-            estimator.camera_, ratio, certainty.determined
-        )
     is_joint = estimator.refinement in JOINT_REFINEMENTS
     found = estimator.diagnostics(X) if is_joint else None
     for message in () if found is None else found.messages:
@@ -117,11 +111,9 @@ def model_report(
         "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
-        "camera_meaning": meaning,
+        "camera_meaning": None if ratio is None else camera_meaning(ratio),
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
-        "depth_advice": "" if certainty.determined else advice,
-        "camera_advice": camera_advice,
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
         "n_edges": None if edges is None else 0 if lines is None else len(lines.edges),
@@ -132,7 +124,7 @@ def model_report(
     }
 
 
-def _outliers(found: _diagnostics.Diagnostics, model: Any, X: Any) -> dict[str, Any]:
+def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
     """Describe the gross residuals of a table, by its rows and names of points."""
     names = names_of_points(model)
     largest = found.outliers[:MOST_LISTED]
@@ -141,7 +133,7 @@ def _outliers(found: _diagnostics.Diagnostics, model: Any, X: Any) -> dict[str, 
         "n_points": len(found.outliers),
         "n_frames": len(np.unique(found.outliers[:, 0])),
         "largest": [{"row": X.index[i], "point": names[j]} for i, j in largest],
-        "message": _diagnostics.outlier_advice(found, X.index, names),
+        "message": outlier_text(found, X.index, names),
     }
 
 

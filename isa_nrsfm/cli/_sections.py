@@ -28,7 +28,8 @@ from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.skeletons import SKELETONS
 
 _CAMERAS = {
-    "affine": "affine: shapes are known up to an affine transformation of space",
+    "affine": "affine: shapes are known up to an affine transformation of space. "
+    "Angles and proportions need --camera weak_perspective.",
     "weak_perspective": "weak-perspective: shapes are known up to size and a mirror "
     "image in depth",
     "orthographic": "orthographic: shapes are known up to a mirror image in depth, in "
@@ -130,9 +131,8 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
         f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
         "squares) of the residuals, relative to that of the centred points.",
         f"held-out error {_percent(quality['held_out_error'])}: the same for points "
-        f"predicted from the other points of their frame.{weighted} If it is much "
-        "larger, look first for wrong points (outliers, or missing points with "
-        "coordinates such as (0, 0)), then use fewer basis shapes.",
+        f"predicted from the other points of their frame.{weighted} Wrong points and "
+        "too many basis shapes make it much larger.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
         "square, in the units of the table)",
     ]
@@ -285,23 +285,21 @@ def _fit(report: dict[str, Any]) -> Section:
 
 
 def _cameras(model: dict[str, Any]) -> Section:
-    """Return the camera model, the certainty of the depth, and advice."""
+    """Return the camera model, the certainty of the depth, and what the noise means."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
-    meaning = model["camera_meaning"]
-    if model["depth_advice"]:
-        title = (
-            f"{title.partition(':')[0]}: {model['depth_advice']}. cameras.csv has no "
-            "angles, and proportions in viewer.html are not true."
-        )
-        meaning = ""  # the ratio of the noise means nothing
+    if model["camera"] != "affine" and not model["depth_determined"]:
+        return [
+            f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
+            "no angles, and proportions in viewer.html are not true."
+        ]  # the ratio of the noise means nothing
     parts = [title]
-    if model["depth_determined"] and uncertainty and math.isfinite(uncertainty):
+    if uncertainty and math.isfinite(uncertainty):
         parts.append(
             f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
             "square)"
         )
-    remarks = [each for each in (meaning, model["camera_advice"]) if each]
-    return [*parts, _sentence("; ".join(remarks))] if remarks else parts
+    meaning = model["camera_meaning"]
+    return [*parts, _sentence(meaning)] if meaning else parts
 
 
 def _alpha(coefficients: list[dict[str, Any]]) -> Section:

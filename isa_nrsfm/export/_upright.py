@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class, check_frames_kept, frames_of
 from isa_nrsfm._frames.camera_models import compose, full_rotations
+from isa_nrsfm.analysis._advice import depth_advice, facts_of
 from isa_nrsfm.calibration import (
     DeformationMetric,
     EuclideanFrames,
@@ -72,9 +73,8 @@ def upright_space(
     check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
     known: str | None = camera if fitted == "affine" else fitted
-    certainty = frames_of(model).certainty
-    if camera is not None and not certainty.determined:
-        warn_caller(certainty.advice)
+    if camera is not None and not frames_of(model).certainty.determined:
+        warn_caller(depth_advice(facts_of(model)))
     to_metric = np.eye(3)
     if fitted != "affine":
         transform = euclidean_axes(model)

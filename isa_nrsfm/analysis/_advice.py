@@ -1,0 +1,212 @@
+"""Advice on a fit: from measured facts to at most three messages that agree."""
+
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
+from isa_nrsfm._joint.uncertainty import n_reliable
+from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
+
+# Entries of V_k with a larger standard deviation count as not determined.
+LARGEST_DEVIATION = 0.1
+# Thresholds of the noise variance with calibrated cameras over that with affine ones.
+# Below the first, the table does not contradict calibrated cameras. Above the second,
+# the cameras are probably not calibrated. Measured on artificial tables: 1.02 for
+# weak-perspective cameras, up to 1.2 for perspective ones at 8 to 2.5 radii, 22 to 48
+# for cameras that stretch the image. Motion capture with too few basis shapes has 1.1
+# to 4 (``python -m benchmarks.accuracy cameras``).
+SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
+SAME_UNIT = (
+    "x and y have the same unit, unlike shares of the width and height of an image"
+)
+# Least length of gross residuals, in robust standard deviations.
+GROSS = 8.0
+# Share of points with gross residuals above which a table has outliers. Without
+# outliers the share is at most 0.02 %: generated faces, bodies and hands, captured
+# motion, photos of faces, K = 3 and 9. With one wrong point in a thousand, at half the
+# size of a face, it is 0.06 to 0.13 %.
+MOST_GROSS = 5e-4
+MOST_MESSAGES = 3
+
+
+class Facts(NamedTuple):
+    """
+    What is known of a joint fit.
+
+    Attributes
+    ----------
+    camera, loss : str
+        Those of the fit.
+    consensus, auto : bool
+        Whether groups of points were fitted, and whether the fit has chosen the number
+        of basis shapes.
+    certainty : DepthCertainty
+        Errors of the depths.
+    reliability, noise_ratio : ndarray of shape (n_components,), float
+        `reliability_` and `camera_noise_ratio_`; NaN if it was not measured.
+    deviation : float
+        Largest standard deviation of the weakly determined parts of the basis shapes.
+    outlier_share : float
+        As in `Diagnostics`.
+    outliers, few, pose : str
+        Descriptions of outliers, of coefficients that a few frames determine, and of
+        those that the pose predicts; empty if there are none.
+    """
+
+    camera: str
+    loss: str
+    consensus: bool
+    auto: bool
+    certainty: DepthCertainty
+    reliability: NDArray
+    noise_ratio: float
+    deviation: float = 0.0
+    outlier_share: float = np.nan
+    outliers: str = ""
+    few: str = ""
+    pose: str = ""
+
+    @property
+    def bent(self) -> bool:
+        """Whether outliers have their full influence on the fit."""
+        return self.loss == "linear" and self.outlier_share > MOST_GROSS
+
+    @property
+    def n_supported(self) -> int:
+        """Number of basis shapes that the table supports.
+
+        A consensus has many small components. Without those that are noise, the next
+        smallest ones are.
+        """
+        supported = n_reliable(self.reliability)
+        return len(self.reliability) if supported and self.consensus else supported
+
+
+def facts_of(model: Any, **found: Any) -> Facts:
+    """Return what the attributes of a joint fit tell, and what else was found."""
+    frames, ratio = model._model.frames, getattr(model, "camera_noise_ratio_", np.nan)
+    consensus, auto = model.refinement == "consensus", model.n_components == "auto"
+    known = frames.certainty, model.reliability_, ratio
+    return Facts(model.camera_, frames.loss, consensus, auto, *known, **found)
+
+
+def advice(facts: Facts) -> tuple[str, ...]:
+    """Return what happened, why, and what to do: the most important messages."""
+    return tuple(islice(filter(None, _messages(facts)), MOST_MESSAGES))
+
+
+def _messages(facts: Facts) -> Iterator[str]:
+    """Yield messages that do not contradict each other, the most important first."""
+    if facts.bent:
+        bent = 'they bend the shapes. Use loss="cauchy", or correct them'
+        yield f"{facts.outliers}: {bent}"
+    yield (depth := depth_advice(facts))
+    if facts.bent:  # outliers may cause all that follows
+        return
+    n_components, n_supported = len(facts.reliability), facts.n_supported
+    if not n_supported:
+        outliers = '. If some points are wrong, use loss="cauchy"'
+        yield (
+            "no deformation was found beyond the noise: the object may be rigid. Do "
+            f"not interpret the coefficients{outliers * (facts.loss == 'linear')}"
+        )
+        return
+    if n_supported < n_components:
+        yield (
+            f"the table does not support n_components={n_components}: "
+            f"{n_components - n_supported} direction(s) of the coefficients are "
+            f"probably noise. Use at most n_components={n_supported}"
+        )
+    elif facts.camera != "affine" and not depth and facts.noise_ratio >= SAME_NOISE:
+        other_fit = 'affine cameras (camera="affine")'
+        if not facts.auto and facts.noise_ratio < OTHER_CAMERAS:
+            other_fit = 'more basis shapes (n_components="auto" finds how many)'
+        meaning = camera_meaning(facts.noise_ratio)
+        yield f"{meaning}. Make sure that {SAME_UNIT}, or use {other_fit}"
+        return  # wrong cameras look like coefficients that depend on the pose
+    elif facts.camera == "affine" and facts.deviation > LARGEST_DEVIATION:
+        yield (
+            f"the basis shapes are uncertain by up to {100 * facts.deviation:.2g} % of "
+            "the mean shape: affine cameras absorb such deformation. Use more frames, "
+            "best of objects that turn further"
+        )
+    if facts.few and n_supported == n_components:
+        what = "Look for wrong landmarks in the frames with the largest coefficients"
+        yield f"{facts.few}. {what}"
+    yield facts.pose
+
+
+def depth_advice(facts: Facts) -> str:
+    """Return the message on depths that calibrated cameras do not determine."""
+    certainty, most = facts.certainty, max(facts.n_supported, 1)
+    if facts.camera == "affine" or certainty.determined:
+        return ""
+    error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
+    text = f"the depth of the shapes is not determined: {error}"
+    if facts.bent:
+        return f"{text}. The outliers may be the reason"
+    why, remedy = "parts of the points lead to different depths", "fit more points"
+    if certainty.deformation > LARGEST_SHARE**2:
+        why = "deformation explains the images as well as rotations do"
+        remedy = (
+            "fit a table in which the objects turn further, and transform this one "
+            "with that model"
+        )
+    elif most < len(facts.reliability):
+        remedy = f"use at most n_components={most}"
+    elif not facts.auto:
+        remedy = 'use n_components="auto"'
+    elif not facts.consensus:
+        remedy = 'use refinement="consensus"'
+    if facts.noise_ratio >= SAME_NOISE:
+        remedy = f"make sure that {SAME_UNIT}, then {remedy}"
+    return (
+        f"{text}, because {why}. {remedy[0].upper()}{remedy[1:]}. If coefficients "
+        'suffice, use affine cameras (camera="affine"). See "How reliable is the '
+        'depth?" in the documentation'
+    )
+
+
+def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
+    """Return the share of points with gross residuals, and their rows and points.
+
+    The outliers (n_outliers, 2) are sorted, the largest first. The scale is the median
+    residual. It is larger for points and frames with a larger median of their own,
+    which the model fits badly as a whole.
+    """
+    none = np.empty((0, 2), dtype=np.intp)
+    if distance is None or not (shown := np.isfinite(distance)).any():
+        return np.nan, none
+    median = float(np.median(distance[shown]))
+    if not median > 0:
+        return 0.0, none
+    filled = np.ma.masked_invalid(distance)
+    of_rows = np.maximum(1.0, np.ma.median(filled, axis=1).filled(0) / median)
+    of_points = np.maximum(1.0, np.ma.median(filled, axis=0).filled(0) / median)
+    relative = np.where(shown, distance, 0.0) / of_rows[:, None] / of_points
+    found = np.argwhere(relative > GROSS * median / MEDIAN_DISTANCE)
+    order = np.argsort(-relative[tuple(found.T)], kind="stable")
+    return len(found) / np.count_nonzero(shown), found[order]
+
+
+def camera_meaning(ratio: float) -> str:
+    """Return the meaning of `camera_noise_ratio_`, in a sentence."""
+    if np.isnan(ratio):
+        return "not known: it was not measured"
+    if ratio < SAME_NOISE:
+        what = "calibrated cameras explain the table as well as affine ones"
+    elif ratio < OTHER_CAMERAS:
+        what = (
+            "affine cameras explain more than calibrated ones: possible reasons are "
+            "too few basis shapes, perspective, or slightly stretched images"
+        )
+    else:
+        what = (
+            "the cameras are probably not calibrated: the images were stretched, or "
+            "there are far too few basis shapes"
+        )
+    return f"{what} (noise variance {ratio:#.3g} times that of affine cameras)"
