@@ -119,6 +119,7 @@ def model_report(
         "camera_noise_ratio": ratio,
         "camera_meaning": meaning,
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
+        "mirror_certainty": estimator.mirror_certainty_,
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "depth_advice": "" if certainty.determined else advice,
         "camera_advice": camera_advice,
