@@ -159,6 +159,11 @@ class AffineNRSfM(
         fit, so that photos of any resolution have the same weight. `motion_` is in the
         units of the table in any case. If False, frames are weighted by their size.
         With orthographic cameras, which have one scale, frames are not scaled.
+    hidden_points : bool, default=True
+        Whether points may be missing because the object hides them. Such points are
+        farther away than visible ones, which decides between the two mirror images in
+        depth (`mirror_certainty_`). Set False if points are missing for other reasons
+        that depend on the view.
     max_iter : int, default=1000
         Largest number of steps of the refinement.
     tol : float or None, default=None
@@ -199,7 +204,8 @@ class AffineNRSfM(
         identity (of rank two for flat objects). With weak-perspective cameras only the
         mean square of its coordinates is one. With orthographic ones it is in the units
         of the table. x and y are the axes of the mean camera (so y points down for
-        image coordinates), z is depth. The mirror image in depth fits equally well.
+        image coordinates), z is depth, away from the viewer if `mirror_certainty_` is
+        known. The mirror image in depth fits equally well.
     basis_ : ndarray of shape (n_components, n_points, 3)
         Basis shapes B_k, centred, sorted by decreasing energy in the images, each for
         one standard deviation of `alpha_`. Basis shapes without motion in the table are
@@ -220,6 +226,10 @@ class AffineNRSfM(
         (calibrated cameras with the joint refinement only). It contains what
         deformation explains as well as turning. Above 0.55, depths and angles are
         withheld.
+    mirror_certainty_ : float
+        Probability that the depth has the right sign, if missing points decide it: a
+        test of whether they are farther away is significant at 1 %. Otherwise NaN, and
+        the sign is a convention; see `hidden_points` and `mirrored`.
     rotations_ : ndarray of shape (n_frames, 3, 3)
         Rotations of calibrated cameras, with determinant one. The rows are the axes of
         the image, x, y and z. Like `scales_`, only with such cameras.
@@ -329,6 +339,7 @@ class AffineNRSfM(
     noise_variance_: float
     camera_noise_ratio_: float
     depth_uncertainty_: float
+    mirror_certainty_: float
     reliability_: NDArray
     objective_history_: NDArray
     gradient_norm_: float
@@ -360,6 +371,7 @@ class AffineNRSfM(
         "loss": [StrOptions(set(LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],
         "scale_frames": ["boolean"],
+        "hidden_points": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "tol": [None, Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
@@ -382,6 +394,7 @@ class AffineNRSfM(
         loss: str = "linear",
         layout: Layout = "interleaved",
         scale_frames: bool = True,
+        hidden_points: bool = True,
         max_iter: int = 1000,
         tol: float | None = None,
         random_state: Any = None,
@@ -400,6 +413,7 @@ class AffineNRSfM(
         self.loss = loss
         self.layout = layout
         self.scale_frames = scale_frames
+        self.hidden_points = hidden_points
         self.max_iter = max_iter
         self.tol = tol
         self.random_state = random_state
@@ -904,9 +918,10 @@ class AffineNRSfM(
         Return the mirror image of the model in depth, which fits equally well.
 
         Neither affine nor calibrated cameras distinguish an object from its mirror
-        image. The fit chooses the one whose mean shape has depths of positive skewness.
-        Use this method if that is the wrong one, for example a face whose nose points
-        away. Coefficients, reprojection and score stay the same.
+        image. If missing points do not decide (`mirror_certainty_`), the fit chooses
+        the one whose mean shape has depths of positive skewness. Use this method if
+        that is the wrong one, for example a face whose nose points away. Coefficients,
+        reprojection and score stay the same.
 
         Returns
         -------
@@ -925,7 +940,11 @@ class AffineNRSfM(
         """
         check_is_fitted(self)
         mirror, dtype = copy.copy(self), self.mean_shape_.dtype
-        for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
+        mirror._model = model = self._model.mirrored()
+        mirror.mean_shape_, mirror.basis_ = model.mean_shape, model.basis
+        # Not in files of older versions
+        mirror.mirror_certainty_ = 1.0 - getattr(self, "mirror_certainty_", np.nan)
+        for name in ("reference_motion_", "motion_"):
             if hasattr(self, name):
                 setattr(mirror, name, getattr(self, name) * MIRROR.astype(dtype))
         if hasattr(self, "rotations_"):
@@ -933,11 +952,6 @@ class AffineNRSfM(
             mirror.rotations_ = turned.astype(dtype, copy=False)
         signs = np.tile(MIRROR, len(self.basis_))
         mirror.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
-        mirror._model = self._model._replace(
-            frames=self._model.frames.mirrored(),
-            mean_shape=mirror.mean_shape_,
-            basis=mirror.basis_,
-        )
         return mirror
 
     def reproject(self, X: Any) -> NDArray:

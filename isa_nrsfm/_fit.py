@@ -36,6 +36,7 @@ from isa_nrsfm._frames.camera_models import (
     reprojection_error,
 )
 from isa_nrsfm._frames.models import (
+    MIRROR,
     Decomposition,
     FrameMap,
     PosteriorFrames,
@@ -191,6 +192,16 @@ def fit_table(
             table, factorised.factors, shapes, covariance, settings
         )
         attributes = {"n_iter_": n_iter}
+    # The mirror image in depth
+    probability = np.nan
+    if settings.hidden_points and not table.complete:
+        probability = fitted.mirror_certainty(table.rows, frames)
+    if probability < 0.5:
+        probability, fitted = 1.0 - probability, fitted.mirrored()
+        frames = frames._replace(motion=frames.motion * MIRROR)
+        signs = np.tile(MIRROR, len(fitted.basis))
+        measures["mode_covariance_"] *= np.outer(signs, signs)
+    attributes["mirror_certainty_"] = probability
     # 6. Measures of the fit
     attributes |= measures | _measures(table, factorised, fitted, frames, settings)
     progress("gauge and coefficients")

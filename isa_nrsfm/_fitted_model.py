@@ -1,12 +1,15 @@
 """The fitted model, applied to a table block by block."""
 
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from isa_nrsfm._frames.camera_models import compose, full_rotations, project
 from isa_nrsfm._frames.models import (
+    MIRROR,
     Decomposition,
     LinearisedFrames,
     PosteriorFrames,
@@ -14,6 +17,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import (
     Layout,
     centred_frames,
@@ -23,6 +27,9 @@ from isa_nrsfm._tables.tracks import (
     weighted_sizes,
 )
 from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
+
+# Level of the two-sided test by which missing points decide on the mirror image.
+MIRROR_LEVEL = 0.01
 
 
 class TableModel(NamedTuple):
@@ -55,6 +62,51 @@ class TableModel(NamedTuple):
         fit = fit._replace(translation=fit.translation + translation)
         dtype = rows.dtype if dtype is None else dtype
         return Decomposition(*(of_all_rows(part, usable).astype(dtype) for part in fit))
+
+    def mirrored(self) -> "TableModel":
+        """Return the model with shapes mirrored in depth."""
+        mirror = MIRROR.astype(self.mean_shape.dtype)
+        mean_shape, basis = self.mean_shape * mirror, self.basis * mirror
+        frames = self.frames.mirrored()
+        return self._replace(frames=frames, mean_shape=mean_shape, basis=basis)
+
+    def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
+        """
+        Return the probability that the depth of fitted frames has the right sign.
+
+        Points that the object hides are farther away. The probability that point j of
+        frame i is missing is modelled as ``a_i + b_j + c_i d_j + beta z_ij``, with the
+        depth z_ij along the line of sight, and its mean d_j over the frames. a, b and c
+        are effects of frames and points that have nothing to do with hiding: frames in
+        profile may lose more points, and more of those of one depth (c). The sign of
+        beta is that of ``sum_i T_i``, ``T_i = sum_j (y_ij - mean_i y_ij) r_ij``, with
+        y_ij one for missing points, and r_i the part of z_i without d. r is orthogonal
+        to a, b and c. To first order in the rotations out of the image plane it does
+        not depend on the affinity of space. If masks are independent of the view, T_i
+        has mean zero, even if points are missing together. Its variance is ``sum_i
+        T_i^2``, and in videos twice the covariances at the lags before the first one
+        that is not positive. Both signs have equal odds beforehand.
+
+        NaN if a test of ``beta = 0`` is not significant.
+        """
+        sight, n_frames = full_rotations(frames.motion)[0][:, 2], len(frames.motion)
+        bent = np.einsum("kja,ka->j", self.basis, frames.alpha.T @ sight)
+        depth = self.mean_shape @ sight.mean(axis=0) + bent / n_frames
+        visible = sum(rows.map(lambda part: seen_points(part).sum(axis=0))) / n_frames
+
+        def scores(part: NDArray, sight: NDArray, alpha: NDArray) -> Any:
+            shapes = compose(self.mean_shape, self.basis, alpha)
+            z = np.vecdot(shapes, sight[:, None])
+            r = z - np.outer(z @ depth, depth) / (depth @ depth or 1.0)
+            return np.vecdot(visible - seen_points(part), r)
+
+        T = np.concatenate([*rows.map(scores, sight, frames.alpha)])
+        off, square = T - T.mean(), T @ T
+        covariances = (off[lag:] @ off[:-lag] for lag in range(1, n_frames))
+        variance = square + 2.0 * sum(takewhile(lambda value: value > 0, covariances))
+        probability = float(ndtr(T.sum() / np.sqrt(variance or 1.0)))
+        decided = min(probability, 1.0 - probability) < MIRROR_LEVEL / 2
+        return probability if decided else np.nan
 
     def posterior(
         self, rows: NDArray, weights: NDArray | None = None

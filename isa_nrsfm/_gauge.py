@@ -1,8 +1,9 @@
 """The canonical choice among shapes and cameras that fit a table equally well.
 
 An affinity of space (with calibrated cameras a rotation) and the order, scale and sign
-of the basis shapes are free. Here they are fixed. The sign of depth is a convention: a
-table does not distinguish an object from its mirror image.
+of the basis shapes are free. Here they are fixed. The sign of depth is a convention:
+images do not distinguish an object from its mirror image, but hidden points may
+(`TableModel.mirror_certainty`).
 
 A fit determines the shapes of the frames, up to one affinity of space and one scale a
 frame. It does not determine their basis. Three replacements fit equally well. In the

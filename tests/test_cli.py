@@ -157,10 +157,11 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
     [
         (
             "--isa fast --n-init 3 --block-recovery eigen --refinement none -k 1 "
-            "--independence none --no-scale-frames --random-state 7 --n-jobs 1",
+            "--independence none --no-scale-frames --no-hidden-points "
+            "--random-state 7 --n-jobs 1",
             {"isa__n_init": 3, "block_recovery": "eigen", "refinement": None}
             | {"n_components": 1, "independence": None, "scale_frames": False}
-            | {"random_state": 7, "n_jobs": 1},
+            | {"random_state": 7, "n_jobs": 1, "hidden_points": False},
         ),
         (
             "--independence coefficients --loss huber -k 1 --isa fast --n-init 1",

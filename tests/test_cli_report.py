@@ -350,6 +350,16 @@ def test_the_choice_in_words(answers, errors, chosen, expected):
     assert ". %" not in text
 
 
+@pytest.mark.parametrize(("certainty", "shown"), [(0.9979, "99.7 %"), (1.0, "99.9 %")])
+def test_the_mirror_image_in_words(answers, certainty, shown):
+    report = answers[0].report
+    assert "mirror image in depth:" not in " ".join(fit_sections(report)["Cameras"])
+    model = report["model"] | {"mirror_certainty": certainty}
+    text = fit_sections(report | {"model": model})["Cameras"][-2]
+    assert f"probability of at least {shown}" in text
+    assert "--no-hidden-points" in text
+
+
 def test_seconds_are_extrapolated_along_a_line():
     tried = np.array([1, 2, 3, 4])
     # The first one, which searches for starts, does not count.

@@ -302,7 +302,8 @@ def test_the_fitted_table_has_its_coefficients_to_the_bit(variant, scale_frames)
     assert_array_equal(frames.translation, fitted.translation_)
     for name, value in vars(fitted).items():
         if name.endswith("_") and isinstance(value, np.ndarray | float):
-            assert np.isfinite(value).all(), name
+            known = name != "mirror_certainty_"  # points are missing at random
+            assert np.isfinite(value).all() == known, name
 
 
 def test_rows_do_not_depend_on_each_other(variant):

@@ -127,6 +127,9 @@ def test_attributes(column, refinement):
             assert not hasattr(first, name)
             continue
         values = [getattr(model, name) for model in (second, first)]
+        if np.isnan(values[0]).all():  # no point is missing
+            assert name == "mirror_certainty_"
+            continue
         if refinement != "joint" and name == "mode_covariance_":  # in other axes
             values, name = [np.linalg.eigvalsh(value) for value in values], "energies"
         assert_changed(*values, name.removesuffix("_"), word)

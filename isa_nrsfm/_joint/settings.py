@@ -78,6 +78,7 @@ class FitSettings(NamedTuple):
     block_recovery: str = "generalized_eigen"
     layout: Layout = "interleaved"
     scale_frames: bool = True
+    hidden_points: bool = True
     max_iter: int = 1000
     tol: float = JOINT_TOL
     n_jobs: int | None = None

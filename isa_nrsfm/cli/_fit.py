@@ -176,6 +176,7 @@ def _fitted(
         args.n_components[0],
         isa=isa,
         scale_frames=not args.no_scale_frames,
+        hidden_points=not args.no_hidden_points,
         **given,
     )
     search, X, groups = None, frames.X, frames.groups

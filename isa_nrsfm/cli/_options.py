@@ -234,6 +234,8 @@ HELP = {
     "loss": "joint refinement: all but linear limit the influence of outliers",
     "no_scale_frames": "weight frames by their size in the image, as orthographic "
     "cameras always do",
+    "no_hidden_points": "missing points are not hidden by the object: they do not "
+    "decide between the mirror images in depth",
     "random_state SEED": "seed of the random starts (default: 0)",
     "n_jobs N": "processes for the random starts, -1 for all processors (default: 1)",
     # Export.
@@ -323,7 +325,7 @@ coefficients. The results replace those of an earlier run in the output folder."
             "method": (
                 *("n_components", "camera", "isa", "n_init", "block_recovery"),
                 *("refinement", "independence", "loss", "no_scale_frames"),
-                *("random_state", "n_jobs"),
+                *("no_hidden_points", "random_state", "n_jobs"),
             ),
         },
     ),

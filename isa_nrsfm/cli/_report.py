@@ -113,6 +113,7 @@ def model_report(
         "camera_noise_ratio": ratio,
         "camera_meaning": None if ratio is None else camera_meaning(ratio),
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
+        "mirror_certainty": estimator.mirror_certainty_,
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.

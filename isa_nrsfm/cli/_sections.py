@@ -298,6 +298,14 @@ def _cameras(model: dict[str, Any]) -> Section:
             f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
             "square)"
         )
+    mirror = model["mirror_certainty"]
+    if mirror and math.isfinite(mirror):
+        least = min(math.floor(1000 * mirror) / 10, 99.9)
+        parts.append(
+            "mirror image in depth: the one in which missing points are farther away, "
+            f"right with a probability of at least {least:g} % if the object hides "
+            "them. If it does not, use --no-hidden-points."
+        )
     meaning = model["camera_meaning"]
     return [*parts, _sentence(meaning)] if meaning else parts
 

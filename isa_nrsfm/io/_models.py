@@ -269,7 +269,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((N, K), ["alpha_", "alpha_std_"]),
         ((N, 3, 3), ["rotations_"]),
         ((N,), ["scales_", "sizes"]),
-        ((), [*single, "deformation", "residual"]),
+        ((), [*single, "deformation", "residual", "mirror_certainty_"]),
     )
     for shape, name in ((shape, name) for shape, names in shapes for name in names):
         if (value := values.get(name)) is None:
