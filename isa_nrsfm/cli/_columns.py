@@ -97,9 +97,9 @@ def column_results(
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
     if asked.labels:
-        aligned = _aligned_pca(estimator, X)
+        features = {"alpha": alpha} | _aligned_pca(estimator, X)
         report["labels"] = [
-            _label_report(label, alpha, aligned, asked, args.random_state)
+            _label_report(label, features, asked, args.random_state)
             for label in asked.labels
         ]
     if asked.groups is not None:
@@ -199,18 +199,24 @@ def _names(known: "pd.Series") -> "pd.Series":
     return numbers if numbers.astype(str).equals(known.astype(str)) else known
 
 
-def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:
-    """Return principal components of the aligned table, missing points filled in."""
+def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray]:
+    """Return K and 3K + 3 principal components of the aligned table, points filled in.
+
+    Of as many components as coefficients, and of the rank of the model.
+    """
     table = np.where(X.isna(), fitted_table(estimator), X)
     aligned = analysis.AlignedFrames().fit_transform(table)
-    most = min(len(estimator.basis_), *aligned.shape)
-    return np.asarray(PCA(most, random_state=0).fit_transform(aligned))
+    n_shapes = len(estimator.basis_)
+    most = min(3 * n_shapes + 3, *aligned.shape)
+    scores = PCA(most, random_state=0).fit_transform(aligned)
+    return {"pca": scores[:, :n_shapes], "pca_of_rank": scores}
 
 
 def _label_report(
-    label: Label, alpha: NDArray, aligned: NDArray, asked: Columns, random_state: int
+    label: Label, features: dict[str, NDArray], asked: Columns, random_state: int
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
+    alpha = features["alpha"]
     known, classes = label.known, label.kind == "classes"
     options: dict[str, Any] = {
         "y": label.values,
@@ -229,6 +235,7 @@ def _label_report(
         "values": found.statistic,
         "p_values": found.p_value,
         "permuted": found.permuted,
+        "untested": found.untested,
         "score": "accuracy" if classes else "r_squared",
     }
     if classes:
@@ -237,12 +244,12 @@ def _label_report(
         report["largest_class"] = counts.max() / len(label.values)
         report["class_means"] = class_means(label, alpha)
     try:
-        report["cross_validated"] = analysis.predictability(
-            alpha[known], **options
-        ).mean()
-        report["cross_validated_pca"] = analysis.predictability(
-            aligned[known], **options
-        ).mean()
+        for name, values in features.items():
+            scores = analysis.predictability(values[known], **options)
+            key = "cross_validated" + f"_{name}" * (name != "alpha")
+            report[key], n = scores.mean(), len(scores)
+            report[f"{key}_standard_error"] = scores.std(ddof=1) / np.sqrt(n)
+            report[f"{key}_n_features"] = values.shape[1]
     except ValueError as error:  # too few frames of a class, or groups, for two folds
         report["not_cross_validated"] = str(error)
     return report
