@@ -30,10 +30,9 @@ from isa_nrsfm.analysis._frame_columns import (
 )
 from isa_nrsfm.analysis._permutations import (
     FrameOrder,
-    are_independent,
+    independent_length,
     indicators,
     permuted_energies,
-    powers,
     unexplained,
 )
 
@@ -57,9 +56,9 @@ class Association(NamedTuple):
     n_frames : int
         Number of frames with coefficients; copies of a frame count once.
     permuted : str
-        The units that were permuted: "groups", "frames", or "frequencies" if
-        neighbouring frames depend on each other; with "within groups" if they were
-        permuted within groups.
+        The units that were permuted: "groups", "frames", or, if neighbouring frames
+        depend on each other, "frequencies" or "blocks of 40 frames"; with "within
+        groups" if they were permuted within groups.
     untested : str
         Why there are no p-values; empty if there are.
     """
@@ -116,7 +115,7 @@ def association(
         groups are permuted among the groups, differences from them within each group.
     time : array-like of shape (n_frames,), default=None
         Times of the frames; None for the order of the rows. If neighbours in time
-        depend on each other, frequencies are permuted instead of frames.
+        depend on each other, frequencies or blocks are permuted instead of frames.
     kind : {"auto", "classes", "number"}, default="auto"
         Kind of the labels. "auto" treats names, booleans and whole numbers as classes,
         as scikit-learn does.
@@ -148,9 +147,10 @@ def association(
     Neighbouring frames are compared after removal of the part of the coefficients that
     labels explain. Frames sorted by their label can thus be independent. If they are
     not, the frequencies of the coefficients (cosine transform) get random signs and
-    sizes. Coefficients and labels with less than two frequencies in common, in effect,
-    cannot be tested: a drift and a label that changes once, or regular rhythms. Neither
-    can joined clips, which are recognised by jumps, without `groups`.
+    sizes; if they are sorted, blocks are permuted. There are no p-values for less than
+    eight blocks, or two frequencies that coefficients and labels share, in effect: a
+    drift and a label that changes once, or regular rhythms. Neither are there any for
+    joined clips, which are recognised by jumps, without `groups`.
 
     Examples
     --------
@@ -206,8 +206,7 @@ def predictability(
     groups : array-like of shape (n_frames,), default=None
         People, videos or other groups. Frames of a group are in one fold.
     time : array-like of shape (n_frames,), default=None
-        See `association`. Without groups, blocks of dependent frames are in one fold,
-        five times as long as the integrated autocorrelation time.
+        See `association`. Without groups, blocks of dependent frames are in one fold.
     kind : {"auto", "classes", "number"}, default="auto"
         See `association`.
     n_folds : int, default=5
@@ -316,10 +315,9 @@ def _dependent_frames(
     """Return the block of each frame (n_frames,), None for independent frames."""
     columns = _label_columns(labels, kind)[order.rows]
     rest = unexplained(_unit_columns(features)[order.rows], columns, order)
-    if are_independent(rest):
+    length = independent_length(rest)
+    if length == 1:
         return None
-    times = len(rest) * np.sum(powers(rest, columns, order), axis=0)
-    length = int(np.ceil(5 * max(1.0, times.max())))
     blocks = np.empty(len(labels), dtype=int)
     blocks[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
     return blocks

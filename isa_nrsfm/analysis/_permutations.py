@@ -23,6 +23,16 @@ from isa_nrsfm.analysis._within_groups import between_share
 
 # Sum of squares, relative to that of the labels, that is due to rounding errors.
 ROUNDING = 1e-12
+# Why a label cannot be tested.
+ONE_EVENT = (
+    "the coefficients and the label change slowly or with one period: they have one "
+    "event in common, which may be chance. Record more events, or give several people "
+    "or videos as groups"
+)
+JUMPS = (
+    "the coefficients jump {} times, first after {} frames, as where clips are joined. "
+    "Give the clips as groups"
+)
 
 
 class FrameOrder(NamedTuple):
@@ -69,21 +79,25 @@ def unexplained(alpha: NDArray, labels: csr_array, order: FrameOrder) -> NDArray
     return np.stack([a - design @ lsmr(design, a)[0] for a in alpha.T], axis=1)
 
 
-def are_independent(rest: NDArray) -> bool:
-    """Return whether neighbours are uncorrelated: frames, and means of 2, 4, 8, ...
+def independent_length(rest: NDArray) -> int:
+    """Return the length of blocks of ordered frames that are independent.
 
-    Means of many frames show slow drifts, which single frames hide.
+    One if neighbours are uncorrelated: frames, and means of 2, 4, 8, ..., which show
+    slow drifts that single frames hide. Otherwise five times the length of the shortest
+    means that are.
     """
     n_scales = max(1, int(np.log2(len(rest) / 8)) + 1)
     least = norm.isf(0.05 / (rest.shape[1] * n_scales))
+    length, scale = 1, 1
     while len(rest) >= 8:
         energy = np.sum(rest**2, axis=0)
         r = np.sum(rest[1:] * rest[:-1], axis=0) * np.sqrt(len(rest))
+        scale *= 2
         if np.any(r > least * energy):
-            return False
+            length = 5 * scale
         rest = rest[: len(rest) // 2 * 2].reshape(-1, 2, rest.shape[1]).mean(axis=1)
         rest = rest - rest.mean(axis=0)
-    return True
+    return length
 
 
 def powers(values: NDArray, labels: csr_array, order: FrameOrder) -> NDArray:
@@ -152,12 +166,19 @@ def permuted_energies(
         permuted.append("groups")
     if square - np.sum(sizes * of_labels**2) > ROUNDING * total:
         rest = unexplained(alpha, labels, order)
-        if are_independent(rest):
-            units, shuffled = "frames", _shuffled(alpha, order, n_permutations, rng)
-        else:
+        length, in_runs = independent_length(rest), _are_sorted(labels, order)
+        units = "frames" if length == 1 else f"blocks of {length} frames"
+        shuffled = _shuffled(alpha, order, length, n_permutations, rng)
+        if length > 1 and not in_runs:
             units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
-            if not permuted:
-                untested = _untested(values[order.rows], alpha, rest, labels, order)
+        if length > 1 and not permuted:
+            few = (
+                8 * length > len(alpha) if in_runs else _one_event(alpha, labels, order)
+            )
+            untested = few * ONE_EVENT
+            cuts = np.intersect1d(seams(values[order.rows]), seams(rest))
+            if len(means) == 1 and len(cuts):
+                untested = JUMPS.format(len(cuts), cuts[0])
         energies += _energies(alpha, labels, shuffled)
         permuted.append(f"{units} within groups" if len(means) > 1 else units)
     return energies, ", and ".join(permuted), untested
@@ -169,35 +190,34 @@ def indicators(numbers: NDArray) -> csr_array:
     return csr_array((np.ones(len(numbers)), (rows, numbers)))
 
 
-def _untested(
-    values: NDArray, alpha: NDArray, rest: NDArray, labels: csr_array, order: FrameOrder
-) -> str:
-    """Return why dependent frames cannot be tested; nothing if they can."""
-    if len(order.sizes) == 1:
-        cuts = np.intersect1d(seams(values), seams(rest))
-        if len(cuts):
-            return (
-                f"the coefficients jump {len(cuts)} times, first after {cuts[0]} "
-                "frames, as where clips are joined. Give the clips as groups"
-            )
+def _are_sorted(labels: csr_array, order: FrameOrder) -> bool:
+    """Return whether each class is one run of a single group, or numbers only rise."""
+    if len(order.sizes) > 1:
+        return False
+    if labels.shape[1] > 1:
+        return bool(np.count_nonzero(np.diff(labels.indices)) < labels.shape[1])
+    steps = np.diff(labels.toarray(), axis=0)
+    return bool((steps >= 0).all() or (steps <= 0).all())
+
+
+def _one_event(alpha: NDArray, labels: csr_array, order: FrameOrder) -> bool:
+    """Return whether labels share less than two frequencies with alpha, in effect."""
     products = powers(alpha, labels, order)
     shared = np.sum(products / np.maximum(products.sum(axis=0), 1e-300), axis=1)
-    # The number of frequencies that coefficients and label share, in effect
-    if np.sum(shared) ** 2 >= 2 * np.sum(shared**2):
-        return ""
-    return (
-        "the coefficients and the label change slowly or with one period, so that they "
-        "have one event in common, which may be chance. Record more events, or give "
-        "several people or videos as groups"
-    )
+    return bool(np.sum(shared) ** 2 < 2 * np.sum(shared**2))
 
 
 def _shuffled(
-    alpha: NDArray, order: FrameOrder, n_permutations: int, rng: np.random.RandomState
+    alpha: NDArray,
+    order: FrameOrder,
+    length: int,
+    n_permutations: int,
+    rng: np.random.RandomState,
 ) -> Iterator[NDArray]:
-    """Yield ordered coefficients whose frames are permuted within groups."""
+    """Yield ordered coefficients whose blocks of frames are permuted within groups."""
+    block = order.blocks(length)
     for _ in range(n_permutations):
-        yield alpha[np.lexsort((rng.random_sample(len(alpha)), order.groups))]
+        yield alpha[np.lexsort((rng.random_sample(block[-1] + 1)[block], order.groups))]
 
 
 def _waves(
