@@ -1,11 +1,12 @@
 """
-Print what fits say of labels, people, time and head pose.
+Print what fits say of labels, people, time and head pose, and levels of p-values.
 
-Run ``python -m benchmarks.questions [section ...] [--seeds N]``: about two minutes. The
-figures of docs/questions.md are those of the first seed.
+Run ``python -m benchmarks.questions [section ...] [--seeds N]``: about two minutes, and
+ten for ``chance``. The figures of docs/questions.md are those of the first seed.
 """
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from sklearn.decomposition import PCA
 
@@ -46,15 +47,15 @@ Y_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 def told(features, labels, groups, seed):
-    """Return the cross-validated accuracy with which features tell labels, percent."""
-    scores = predictability(features, labels, groups, random_state=seed)
-    return 100 * scores.mean()
+    """Return with which accuracy features tell labels, with its standard error."""
+    scores = 100 * predictability(features, labels, groups, random_state=seed)
+    return f"{scores.mean():.1f} +- {scores.std(ddof=1) / np.sqrt(len(scores)):.1f} %"
 
 
 def labels(options):
     """Expressions: eta squared, p-values, and accuracy, of PCA of aligned frames, too.
 
-    Folds hold different people where these are known.
+    PCA has K and 3 K + 3 components. Folds hold different people where these are known.
     """
     for case, K in ((ICT, 9), (EXPRESSIONS, 8)):
         arrays = load_arrays(case)
@@ -64,21 +65,141 @@ def labels(options):
         for seed in range(options.seeds):
             alpha = AffineNRSfM(K, random_state=seed).fit_transform(X)
             found = association(alpha, names, people, random_state=seed)
-            aligned = PCA(K, random_state=seed).fit_transform(
+            aligned = PCA(3 * K + 3, random_state=seed).fit_transform(
                 AlignedFrames().fit_transform(X)
             )
             print(f"{case.file}, K={K}")
             print(f"  eta squared {found.statistic.round(2)}")
             print(f"  p-values    {found.p_value.round(3)}")
-            print(
-                f"  accuracy {told(alpha, names, people, seed):.1f} %, "
-                f"PCA of aligned frames {told(aligned, names, people, seed):.1f} %",
-                flush=True,
-            )
+            features = {"coefficients": alpha, "PCA, K": aligned[:, :K]}
+            features["PCA, 3 K + 3"] = aligned
             if people is not None:
                 own = WithinGroups().fit_transform(alpha, groups=people)
-                accuracy = told(own, names, people, seed)
-                print(f"  relative to the person's mean {accuracy:.1f} %", flush=True)
+                features["coefficients relative to the person"] = own
+            for name, values in features.items():
+                accuracy = told(values, names, people, seed)
+                print(f"  {name:36}{accuracy}", flush=True)
+
+
+def rhythm(rng, k, period=30, damping=0.99, n=900):
+    """Return k oscillations (n, k) that forget their phase."""
+    noise = rng.normal(size=(n + 1000, k))
+    recursion = [1, -2 * damping * np.cos(2 * np.pi / period), damping**2]
+    return lfilter([1], recursion, noise, axis=0)[1000:]
+
+
+def slow(rng, k, memory, n=500):
+    """Return k autoregressions (n, k) of the first order."""
+    noise = rng.normal(size=(n + 1000, k))
+    return lfilter([1], [1, -memory], noise, axis=0)[1000:]
+
+
+def periodic(rng, k, noise=0.2, n=900):
+    """Return k waves (n, k) with one period and some noise."""
+    phases = 2 * np.pi * (np.arange(n)[:, None] / 37.3 + rng.random(k))
+    return np.sin(phases) + noise * rng.normal(size=(n, k))
+
+
+def drift(rng, k, n=400):
+    """Return k linear drifts (n, k) with noise."""
+    slopes = 2 * rng.normal(size=k)
+    return np.linspace(-2, 2, n)[:, None] * slopes + rng.normal(size=(n, k))
+
+
+def classes(rng, n, length):
+    """Return two classes (n,) that change after `length` frames on average."""
+    return np.repeat(rng.integers(2, size=n), rng.geometric(1 / length, n))[:n]
+
+
+def clips(rng, k, n_clips, size, memory=0.9):
+    """Return coefficients (n, k) of clips with own means, and the clips (n,)."""
+    clip = np.repeat(np.arange(n_clips), size)
+    within = np.concatenate([slow(rng, k, memory, size) for _ in range(n_clips)])
+    return within + 3 * rng.normal(size=(n_clips, k))[clip], clip
+
+
+def of_groups(rng, values, group, constant):
+    """Return coefficients, classes of groups or frames, and the groups."""
+    labels = rng.integers(2, size=group.max() + 1)[group]
+    return values, labels if constant else classes(rng, len(group), 20), group
+
+
+# Series and a label that has nothing to do with them, from a generator of numbers.
+UNRELATED = {
+    "photos, classes": lambda r: (r.normal(size=(200, 3)), r.integers(2, size=200)),
+    "photos, numbers": lambda r: (r.normal(size=(200, 3)), r.normal(size=200)),
+    "photos sorted by class": lambda r: (
+        r.normal(size=(200, 3)),
+        np.sort(r.integers(2, size=200)),
+    ),
+    "photos of 20 people, label of the person": lambda r: of_groups(
+        r, *clips(r, 3, 20, 10, 0.0), True
+    ),
+    "videos of 8 people, classes": lambda r: of_groups(r, *clips(r, 3, 8, 60), False),
+    **{
+        f"AR(1) of {memory}, {kind}": lambda r, memory=memory, kind=kind: (
+            slow(r, 3, memory),
+            slow(r, 1, memory)[:, 0] if kind == "numbers" else classes(r, 500, 20),
+        )
+        for memory, kind in ((0.3, "numbers"), (0.9, "classes"), (0.98, "numbers"))
+    },
+    **{
+        f"rhythm of {period}, damping {damping}": lambda r, p=period, d=damping: (
+            rhythm(r, 3, p, d),
+            rhythm(r, 1, p, d)[:, 0],
+        )
+        for period, damping in ((30, 0.97), (30, 0.99), (12, 0.99), (60, 0.99))
+    },
+    "waves of one period": lambda r: (periodic(r, 3), periodic(r, 1)[:, 0]),
+    "random walks": lambda r: (slow(r, 3, 1.0), slow(r, 1, 1.0)[:, 0]),
+    "drift, a label that changes once": lambda r: (
+        drift(r, 3),
+        np.arange(400) >= r.integers(100, 300),
+    ),
+    "eight clips, not told": lambda r: of_groups(r, *clips(r, 3, 8, 100), True)[:2],
+}
+# The same with an effect of half a standard deviation on the second coefficient.
+RELATED = {
+    name: UNRELATED[name] for name in ("photos, classes", "rhythm of 30, damping 0.97")
+} | {
+    "rhythm of 30, damping 0.99": UNRELATED["rhythm of 30, damping 0.99"],
+    "rhythm of 30, damping 0.99, classes": lambda r: (
+        rhythm(r, 3),
+        classes(r, 900, 20),
+    ),
+    "AR(1) of 0.9, 900 frames, classes": lambda r: (
+        slow(r, 3, 0.9, 900),
+        classes(r, 900, 20),
+    ),
+}
+
+
+def chance(options):
+    """Generated series: how often a label is significant at .05, or is not tested.
+
+    Of 500 labels that are unrelated, and 200 that are related.
+    """
+    print(f"{'':52}{'significant, %':>16}{'not tested, %':>16}")
+    for title, cases, n in (("unrelated", UNRELATED, 500), ("related", RELATED, 200)):
+        for name, case in cases.items():
+            least = []
+            for seed in range(n):
+                alpha, y, *groups = case(np.random.default_rng(seed))
+                if len(np.unique(y)) == 1:
+                    continue
+                if title == "related":
+                    effect = y if y.dtype.kind in "bi" else y / y.std()
+                    alpha[:, 1] += 0.5 * alpha[:, 1].std() * effect
+                found = association(
+                    alpha, y, *groups, n_permutations=199, random_state=seed
+                )
+                p = found.p_value
+                least.append(p[1] if title == "related" else p.min())
+            share = [100 * np.mean(np.array(least) <= 0.05)]
+            share.append(100 * np.mean(np.isnan(least)))
+            print(
+                f"{title + ': ' + name:46}{share[0]:16.1f}{share[1]:16.1f}", flush=True
+            )
 
 
 def people(options):
@@ -188,7 +309,7 @@ def poses(options):
             )
 
 
-SECTIONS = {each.__name__: each for each in (labels, people, smoothing, poses)}
+SECTIONS = {each.__name__: each for each in (labels, chance, people, smoothing, poses)}
 
 if __name__ == "__main__":
     run_sections(__doc__, SECTIONS)

@@ -144,6 +144,8 @@ def test_labels_groups_and_times_are_those_of_python(answers):
     assert "class_means" not in age
     assert max(np.abs(age["values"])) > 0.9
     assert age["cross_validated"] > 0.8 > age["cross_validated_pca"]
+    assert 0 < age["cross_validated_standard_error"] < 0.2
+    assert age["cross_validated_pca_of_rank_n_features"] == 9
 
     alpha, person = found.alpha, table["person"]
     within = WithinGroups().fit_transform(model.alpha_, groups=person)
@@ -171,6 +173,10 @@ def test_means_of_classes_are_of_significant_coefficients(answers):
     assert line in fit_sections(report)["Labels"]
     mood["p_values"][k] = 0.2
     assert line not in fit_sections(report)["Labels"]
+    mood |= {"untested": "one event", "p_values": [None] * len(mood["p_values"])}
+    assert any(
+        "no p-values: one event" in str(each) for each in fit_sections(report)["Labels"]
+    )
 
 
 @pytest.mark.parametrize("n_classes", [12, 13])

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.stats import rankdata
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import RidgeCV
@@ -29,8 +30,10 @@ from isa_nrsfm.analysis._frame_columns import (
 )
 from isa_nrsfm.analysis._permutations import (
     FrameOrder,
-    dependent_blocks,
+    independent_length,
+    indicators,
     permuted_energies,
+    unexplained,
 )
 
 
@@ -49,13 +52,15 @@ class Association(NamedTuple):
     p_value : ndarray of shape (n_components,)
         Permutation p-values, corrected for the number of coefficients. Each is the
         share of permutations in which this coefficient, or any weaker one, has at least
-        the observed statistic.
+        the observed statistic. NaN if they cannot be tested.
     n_frames : int
-        Number of frames with coefficients.
+        Number of frames with coefficients; copies of a frame count once.
     permuted : str
-        The units that were permuted: "frames", "groups", "blocks of 37 frames" or
-        "sequences shifted in time"; with "within groups" if frames were permuted within
-        groups.
+        The units that were permuted: "groups", "frames", or, if neighbouring frames
+        depend on each other, "frequencies" or "blocks of 40 frames"; with "within
+        groups" if they were permuted within groups.
+    untested : str
+        Why there are no p-values; empty if there are.
     """
 
     kind: str
@@ -63,6 +68,7 @@ class Association(NamedTuple):
     p_value: NDArray
     n_frames: int
     permuted: str
+    untested: str = ""
 
     def to_frame(self) -> "pd.DataFrame":
         """
@@ -109,7 +115,7 @@ def association(
         groups are permuted among the groups, differences from them within each group.
     time : array-like of shape (n_frames,), default=None
         Times of the frames; None for the order of the rows. If neighbours in time
-        depend on each other, blocks of frames are permuted.
+        depend on each other, frequencies or blocks are permuted instead of frames.
     kind : {"auto", "classes", "number"}, default="auto"
         Kind of the labels. "auto" treats names, booleans and whole numbers as classes,
         as scikit-learn does.
@@ -121,7 +127,8 @@ def association(
     Returns
     -------
     Association
-        Named tuple of kind, statistic, p_value (n_components,), n_frames and permuted.
+        Named tuple of kind, statistic, p_value (n_components,), n_frames, permuted and
+        untested.
 
     Raises
     ------
@@ -137,9 +144,13 @@ def association(
     If labels differ both between and within groups, both parts are tested together.
     Each part is divided by its mean over the permutations, and the parts are summed.
 
-    The length of a block is five times the integrated autocorrelation time of labels
-    and coefficients together. This time is estimated from the part of the coefficients
-    that labels do not explain. Frames sorted by their label can thus be independent.
+    Neighbouring frames are compared after removal of the part of the coefficients that
+    labels explain. Frames sorted by their label can thus be independent. If they are
+    not, the frequencies of the coefficients (cosine transform) get random signs and
+    sizes; if they are sorted, blocks are permuted. There are no p-values for less than
+    eight blocks, or two frequencies that coefficients and labels share, in effect: a
+    drift and a label that changes once, or regular rhythms. Neither are there any for
+    joined clips, which are recognised by jumps, without `groups`.
 
     Examples
     --------
@@ -156,6 +167,7 @@ def association(
     alpha, labels, _, order = _known_frames(alpha, y, groups, time)
     found = kind_of(labels, kind)
     columns = _label_columns(labels, found)
+    values = alpha
     if found == "number":
         alpha = rankdata(alpha, axis=0)
     alpha = _unit_columns(alpha)
@@ -163,9 +175,13 @@ def association(
     classes = found == "classes"
     statistic = np.sum(covariances**2, axis=0) if classes else covariances[0]
     rng = check_random_state(random_state)
-    energies, permuted = permuted_energies(alpha, columns, order, n_permutations, rng)
+    energies, permuted, untested = permuted_energies(
+        values, alpha, columns, order, n_permutations, rng
+    )
     p_value = _step_down_p_values(energies)
-    return Association(found, statistic, p_value, len(alpha), permuted)
+    if untested:
+        p_value[:] = np.nan
+    return Association(found, statistic, p_value, len(alpha), permuted, untested)
 
 
 def predictability(
@@ -244,18 +260,22 @@ def predictability(
 def _known_frames(
     features: Any, y: Any, groups: Any, time: Any
 ) -> tuple[NDArray, NDArray, NDArray | None, FrameOrder]:
-    """Return features, labels, groups and order of the frames without NaN."""
+    """Return features, labels, groups and order of different frames without NaN."""
     features = check_array(
         features, dtype=np.float64, ensure_all_finite="allow-nan", input_name="alpha"
     )
-    known = np.isfinite(features).all(axis=1)
-    if not known.any():
+    known = np.flatnonzero(np.isfinite(features).all(axis=1))
+    if not len(known):
         raise ValueError("no frame has coefficients: all rows of alpha have NaN")
-    labels = checked_column("y", y, len(known))
-    refuse_infinite("y", labels, np.arange(len(known)))
-    numbers = group_numbers(groups, len(known))[known]
-    order = FrameOrder.of(numbers, checked_times(time, len(known))[known])
-    return features[known], labels[known], numbers, order
+    labels = checked_column("y", y, len(features))
+    refuse_infinite("y", labels, np.arange(len(features)))
+    numbers = group_numbers(groups, len(features))
+    seconds = checked_times(time, len(features))
+    classes = np.unique(labels, return_inverse=True)[1]
+    rows = np.column_stack([features, classes, numbers])[known]
+    known = known[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
+    order = FrameOrder.of(numbers[known], seconds[known])
+    return features[known], labels[known], numbers[known], order
 
 
 def _step_down_p_values(energies: NDArray) -> NDArray:
@@ -270,16 +290,16 @@ def _step_down_p_values(energies: NDArray) -> NDArray:
     return p_value
 
 
-def _label_columns(labels: NDArray, kind: str) -> NDArray:
+def _label_columns(labels: NDArray, kind: str) -> csr_array:
     """Return ranks, or indicators of classes, as columns (n_frames, n_columns).
 
     The sum of their squared covariances with a column of norm one is eta squared, or
     the square of Spearman's rank correlation.
     """
     if kind == "number":
-        return _unit_columns(rankdata(labels)[:, None])
-    indicators = labels[:, None] == np.unique(labels)
-    return indicators / np.sqrt(indicators.sum(axis=0))
+        return csr_array(_unit_columns(rankdata(labels)[:, None]))
+    columns = indicators(np.unique(labels, return_inverse=True)[1])
+    return csr_array(columns / np.sqrt(columns.sum(axis=0)))
 
 
 def _unit_columns(values: NDArray) -> NDArray:
@@ -293,10 +313,9 @@ def _dependent_frames(
     features: NDArray, labels: NDArray, kind: str, order: FrameOrder, n_folds: int
 ) -> NDArray | None:
     """Return the block of each frame (n_frames,), None for independent frames."""
-    columns = _label_columns(labels, kind)
-    columns = columns - columns.mean(axis=0)
-    features = _unit_columns(features)
-    length, _ = dependent_blocks(features[order.rows], columns[order.rows], order)
+    columns = _label_columns(labels, kind)[order.rows]
+    rest = unexplained(_unit_columns(features)[order.rows], columns, order)
+    length = independent_length(rest)
     if length == 1:
         return None
     blocks = np.empty(len(labels), dtype=int)

@@ -1,10 +1,12 @@
-"""Permutations of labels among people, and among blocks of dependent frames.
+"""Permutations of labels among people and frames, and of the frequencies of videos.
 
 Labels may be permuted only between units that are exchangeable under the null
 hypothesis of no association (Winkler, Webster, Vidaurre, Nichols, Smith, "Multi-level
 block permutation", 2015). The means of labels over groups are permuted among the
-groups. The differences from these means are permuted within each group: frame by frame,
-or in blocks if neighbouring frames of a video depend on each other.
+groups, and independent frames within each group. If neighbouring frames of a video
+depend on each other, the frequencies of the coefficients are independent instead: the
+cosine transform nearly diagonalises the covariance of any stationary series, and of
+random walks.
 """
 
 from collections.abc import Iterable, Iterator
@@ -12,12 +14,25 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct, idct
+from scipy.sparse import csr_array, hstack
+from scipy.sparse.linalg import lsmr
 from scipy.stats import norm
 
 from isa_nrsfm.analysis._within_groups import between_share
 
 # Sum of squares, relative to that of the labels, that is due to rounding errors.
-ROUNDING = 1e-20
+ROUNDING = 1e-12
+# Why a label cannot be tested.
+ONE_EVENT = (
+    "the coefficients and the label change slowly or with one period: they have one "
+    "event in common, which may be chance. Record more events, or give several people "
+    "or videos as groups"
+)
+JUMPS = (
+    "the coefficients jump {} times, first after {} frames, as where clips are joined. "
+    "Give the clips as groups"
+)
 
 
 class FrameOrder(NamedTuple):
@@ -43,6 +58,12 @@ class FrameOrder(NamedTuple):
         """Average ordered values (n_frames, k) over each group (n_groups, k)."""
         return np.asarray(np.add.reduceat(values, self.first) / self.sizes[:, None])
 
+    def spectrum(self, values: NDArray, inverse: bool = False) -> NDArray:
+        """Transform ordered values (n_frames, k) of each group to cosines, or back."""
+        transform = idct if inverse else dct
+        parts = np.split(values, self.first[1:])
+        return np.concatenate([transform(a, axis=0, norm="ortho") for a in parts])
+
     def blocks(self, length: int) -> NDArray:
         """Number the blocks of `length` ordered frames within groups (n_frames,)."""
         place = np.arange(len(self.rows)) - self.first[self.groups]
@@ -51,115 +72,177 @@ class FrameOrder(NamedTuple):
         return np.asarray(place // length + first[self.groups])
 
 
-def dependent_blocks(
-    alpha: NDArray, labels: NDArray, order: FrameOrder
-) -> tuple[int, NDArray]:
-    """Return the length of blocks much longer than the autocorrelation of frames.
-
-    Also returns the share of the variance of a covariance (n_components,) that is lost
-    at the cuts. Coefficients and labels are ordered, and relative to the mean of their
-    group.
-
-    The covariance of two unrelated series has ``1 + 2 sum_h r_h s_h`` times the
-    variance for independent frames, with the autocorrelations r and s of the series
-    (Bartlett, "Some aspects of the time-correlation problem", 1935). So frames count as
-    independent, with length one, if the labels or the coefficients are.
-    """
-    n_frames, n_components = alpha.shape
-    # With 5 and with 10 autocorrelation times a block, 3 to 7 % of random labels in
-    # blocks have p <= .05 (autoregressions of .3 to .98, 150 to 570 frames); the power
-    # is larger with 5.
-    n_times = 5
+def unexplained(alpha: NDArray, labels: csr_array, order: FrameOrder) -> NDArray:
+    """Return the part of ordered alpha that neither labels nor groups explain."""
     # Neighbours of one class are alike because of the class: measure the residuals.
-    rest = alpha - labels @ np.linalg.lstsq(labels, alpha)[0]
-    energy, of_labels = np.sum(rest**2, axis=0), np.sum(labels**2)
-    energy[energy <= ROUNDING * np.sum(alpha**2, axis=0)] = np.inf
-    least = norm.isf(0.05 / n_components) / np.sqrt(n_frames)
-    time, straddling = np.ones(n_components), np.zeros(n_components)
-    growing = np.ones(n_components, dtype=bool)
-    for lag in range(1, int(order.sizes.max())):
-        pairs = order.groups[lag:] == order.groups[:-lag]
-        share = np.count_nonzero(pairs) / n_frames
-        r = np.sum((rest[lag:] * rest[:-lag])[pairs], axis=0) / (share * energy)
-        s = np.sum((labels[lag:] * labels[:-lag])[pairs]) / (share * of_labels)
-        if lag == 1:
-            growing = (r > least) & (s > least)
-        growing &= (r > 0) & (s > 0)
-        if not growing.any() or n_times * time.max() > order.sizes.max():
-            break
-        time[growing] += 2 * share * (r * s)[growing]
-        straddling[growing] += 2 * lag * (r * s)[growing]
-    if time.max() == 1:
-        return 1, np.zeros(n_components)
-    length = int(np.ceil(n_times * time.max()))
-    # Each cut separates `lag` pairs of frames for each lag.
-    n_cuts = np.sum(np.where(order.sizes > 1, -(-order.sizes // length), 0))
-    return length, np.minimum(n_cuts * straddling / (n_frames * time), 0.5)
+    design = hstack([labels, indicators(order.groups)], format="csr")
+    return np.stack([a - design @ lsmr(design, a)[0] for a in alpha.T], axis=1)
 
 
-def permutations_within(
-    order: FrameOrder, length: int, n_permutations: int, rng: np.random.RandomState
-) -> Iterator[NDArray]:
-    """Yield permutations (n_frames,) of ordered frames within their groups.
+def independent_length(rest: NDArray) -> int:
+    """Return the length of blocks of ordered frames that are independent.
 
-    Groups are shifted circularly, cut into blocks (if longer), and these are shuffled.
+    One if neighbours are uncorrelated: frames, and means of 2, 4, 8, ..., which show
+    slow drifts that single frames hide. Otherwise five times the length of the shortest
+    means that are.
     """
-    block = order.blocks(length)
-    starts, lengths = np.flatnonzero(np.diff(block, prepend=-1)), np.bincount(block)
-    first, sizes = order.first[order.groups], order.sizes[order.groups]
-    for _ in range(n_permutations):
-        keys = rng.random_sample(len(starts))
-        shuffled = np.lexsort((keys, order.groups[starts]))
-        moved = lengths[shuffled]
-        by = starts[shuffled] - (np.cumsum(moved) - moved)
-        place = np.arange(len(block)) + np.repeat(by, moved)
-        shift = np.floor(rng.random_sample(len(order.sizes)) * order.sizes).astype(int)
-        yield first + (place - first + shift[order.groups]) % sizes
+    n_scales = max(1, int(np.log2(len(rest) / 8)) + 1)
+    least = norm.isf(0.05 / (rest.shape[1] * n_scales))
+    length, scale = 1, 1
+    while len(rest) >= 8:
+        energy = np.sum(rest**2, axis=0)
+        r = np.sum(rest[1:] * rest[:-1], axis=0) * np.sqrt(len(rest))
+        scale *= 2
+        if np.any(r > least * energy):
+            length = 5 * scale
+        rest = rest[: len(rest) // 2 * 2].reshape(-1, 2, rest.shape[1]).mean(axis=1)
+        rest = rest - rest.mean(axis=0)
+    return length
+
+
+def powers(values: NDArray, labels: csr_array, order: FrameOrder) -> NDArray:
+    """Return products (n_frames, k) of the powers of values and labels of norm one.
+
+    Times the number of frames, their sum is the integrated autocorrelation time of
+    both: ``1 + 2 sum_h r_h s_h`` with the autocorrelations r and s of the series
+    (Bartlett, "Some aspects of the time-correlation problem", 1935).
+    """
+    power = np.zeros((len(values), 1))
+    for c in range(labels.shape[1]):
+        power += order.spectrum(labels[:, [c]].toarray()) ** 2
+    power[order.first] = 0.0
+    products = power / power.sum() * order.spectrum(values) ** 2
+    energy = np.sum(values**2, axis=0)
+    return np.asarray(products / np.where(energy > 0, energy, 1.0))
+
+
+def seams(alpha: NDArray) -> NDArray:
+    """Return the frames (n,) before which coefficients jump, as where clips are joined.
+
+    A jump is larger than any of so many normally distributed steps, and, unlike a
+    movement, twice as large as the steps before and after it.
+    """
+    steps = np.abs(np.diff(alpha, axis=0))
+    scale = np.median(steps, axis=0) / norm.isf(0.25)
+    steps = steps / np.where(scale > 0, scale, np.inf)
+    size = np.pad(np.linalg.norm(steps, axis=1), 1)
+    apart = size[1:-1] > 2 * np.maximum(size[:-2], size[2:])
+    large = np.any(steps > norm.isf(0.025 / steps.size), axis=1)
+    return np.flatnonzero(apart & large) + 1
 
 
 def permuted_energies(
+    values: NDArray,
     alpha: NDArray,
-    labels: NDArray,
+    labels: csr_array,
     order: FrameOrder,
     n_permutations: int,
     rng: np.random.RandomState,
-) -> tuple[NDArray, str]:
+) -> tuple[NDArray, str, str]:
     """
     Compute squared covariances of coefficients with labels, and with permuted labels.
 
-    Returns them (n_permutations + 1, n_components), the given labels first, and the
-    permuted units. The parts between and within groups are summed, each divided by its
-    mean over the permutations.
+    Coefficients are given as values, and as ranks or values of norm one (alpha).
+    Returns them (n_permutations + 1, n_components), the given labels first; the
+    permuted units; and why they are no test, or nothing. The parts between and within
+    groups are summed, each divided by its mean over the permutations.
     """
     alpha, labels = alpha[order.rows], labels[order.rows]
-    total = np.sum((labels - labels.mean(axis=0)) ** 2)
-    means, of_labels = order.means(alpha), order.means(labels)
+    n_components = alpha.shape[1]
+    sizes = order.sizes[:, None]
+    means = order.means(alpha)
+    of_labels = (indicators(order.groups).T @ labels).toarray() / sizes
+    alpha = alpha - means[order.groups]
+    square = np.sum(labels.data**2)
+    total = square - len(alpha) * np.sum((sizes.T @ of_labels / len(alpha)) ** 2)
+    energies, permuted = np.zeros((n_permutations + 1, n_components)), []
+    untested = ""
     weights = _weights(labels, order)
-    alpha, labels = alpha - means[order.groups], labels - of_labels[order.groups]
-    energies, permuted = np.zeros((n_permutations + 1, alpha.shape[1])), []
     between = _standard(of_labels, weights)
     if np.sum(between**2) > ROUNDING * total:
+        centres = _standard(means, weights)
         orders = (rng.permutation(len(means)) for _ in range(n_permutations))
-        energies += _energies(_standard(means, weights), between, orders, 1.0)
+        energies += _energies(centres, between, (centres[i] for i in orders))
         permuted.append("groups")
-    if np.sum(labels**2) > ROUNDING * total:
-        length, loss = dependent_blocks(alpha, labels, order)
-        permutations = permutations_within(order, length, n_permutations, rng)
-        energies += _energies(alpha, labels, permutations, 1.0 / (1.0 - loss))
+    if square - np.sum(sizes * of_labels**2) > ROUNDING * total:
+        rest = unexplained(alpha, labels, order)
+        length, in_runs = independent_length(rest), _are_sorted(labels, order)
         units = "frames" if length == 1 else f"blocks of {length} frames"
-        if 1 < order.sizes.max() <= length:
-            units = "sequences shifted in time"
+        shuffled = _shuffled(alpha, order, length, n_permutations, rng)
+        if length > 1 and not in_runs:
+            units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
+        if length > 1 and not permuted:
+            few = (
+                8 * length > len(alpha) if in_runs else _one_event(alpha, labels, order)
+            )
+            untested = few * ONE_EVENT
+            cuts = np.intersect1d(seams(values[order.rows]), seams(rest))
+            if len(means) == 1 and len(cuts):
+                untested = JUMPS.format(len(cuts), cuts[0])
+        energies += _energies(alpha, labels, shuffled)
         permuted.append(f"{units} within groups" if len(means) > 1 else units)
-    return energies, ", and ".join(permuted)
+    return energies, ", and ".join(permuted), untested
 
 
-def _weights(labels: NDArray, order: FrameOrder) -> NDArray:
+def indicators(numbers: NDArray) -> csr_array:
+    """Return columns (n, n_numbers) with one where a row has the number."""
+    rows = np.arange(len(numbers))
+    return csr_array((np.ones(len(numbers)), (rows, numbers)))
+
+
+def _are_sorted(labels: csr_array, order: FrameOrder) -> bool:
+    """Return whether each class is one run of a single group, or numbers only rise."""
+    if len(order.sizes) > 1:
+        return False
+    if labels.shape[1] > 1:
+        return bool(np.count_nonzero(np.diff(labels.indices)) < labels.shape[1])
+    steps = np.diff(labels.toarray(), axis=0)
+    return bool((steps >= 0).all() or (steps <= 0).all())
+
+
+def _one_event(alpha: NDArray, labels: csr_array, order: FrameOrder) -> bool:
+    """Return whether labels share less than two frequencies with alpha, in effect."""
+    products = powers(alpha, labels, order)
+    shared = np.sum(products / np.maximum(products.sum(axis=0), 1e-300), axis=1)
+    return bool(np.sum(shared) ** 2 < 2 * np.sum(shared**2))
+
+
+def _shuffled(
+    alpha: NDArray,
+    order: FrameOrder,
+    length: int,
+    n_permutations: int,
+    rng: np.random.RandomState,
+) -> Iterator[NDArray]:
+    """Yield ordered coefficients whose blocks of frames are permuted within groups."""
+    block = order.blocks(length)
+    for _ in range(n_permutations):
+        yield alpha[np.lexsort((rng.random_sample(block[-1] + 1)[block], order.groups))]
+
+
+def _waves(
+    alpha: NDArray, order: FrameOrder, n_permutations: int, rng: np.random.RandomState
+) -> Iterator[NDArray]:
+    """Yield ordered coefficients whose frequencies have random signs and sizes.
+
+    Random signs alone keep the power of each frequency. But neighbouring frequencies of
+    a regular rhythm have signs that depend on each other; with random sizes, too, they
+    do not appear as independent (docs/questions.md).
+    """
+    spectrum = order.spectrum(alpha)
+    for _ in range(n_permutations):
+        factors = rng.uniform(-np.sqrt(3.0), np.sqrt(3.0), (len(alpha), 1))
+        yield order.spectrum(factors * spectrum, inverse=True)
+
+
+def _weights(labels: csr_array, order: FrameOrder) -> NDArray:
     """Return weights (n_groups, 1) with which means of labels have equal variances."""
     sizes = order.sizes[:, None]
     if (sizes == sizes[0]).all():
         return np.ones(sizes.shape)
-    share = between_share(labels, order.groups).between
-    share = np.average(share, weights=np.var(labels, axis=0))
+    values = labels.toarray()
+    share = between_share(values, order.groups).between
+    share = np.average(share, weights=np.var(values, axis=0))
     return np.asarray(1.0 / np.sqrt(share + (1.0 - share) / sizes))
 
 
@@ -171,15 +254,12 @@ def _standard(means: NDArray, weights: NDArray) -> NDArray:
 
 
 def _energies(
-    alpha: NDArray,
-    labels: NDArray,
-    permutations: Iterable[NDArray],
-    inflation: NDArray | float,
+    alpha: NDArray, labels: NDArray | csr_array, permuted: Iterable[NDArray]
 ) -> NDArray:
     """Return squared covariances (n_permutations + 1, n_components) of mean one."""
     energy = np.sum(alpha**2, axis=0)
-    alpha = alpha / np.sqrt(np.where(energy > 0, energy, 1.0))
-    orders = [np.arange(len(labels)), *permutations]
-    energies = np.array([np.sum((labels[i].T @ alpha) ** 2, axis=0) for i in orders])
-    energies[1:] *= inflation
+    energies = np.array(
+        [np.sum((labels.T @ a) ** 2, axis=0) for a in (alpha, *permuted)]
+    )
+    energies /= np.where(energy > 0, energy, 1.0)
     return np.asarray(energies / (energies.mean() or 1.0))

@@ -71,9 +71,9 @@ def column_results(
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
     if frames.labels:
-        aligned = _aligned_pca(estimator, X)
+        features = {"alpha": alpha} | _aligned_pca(estimator, X)
         report["labels"] = [
-            _label_report(label, alpha, aligned, frames, args.random_state)
+            _label_report(label, features, frames, args.random_state)
             for label in frames.labels
         ]
     if frames.groups is not None:
@@ -186,18 +186,24 @@ def _names(known: "pd.Series") -> "pd.Series":
     return numbers if numbers.astype(str).equals(known.astype(str)) else known
 
 
-def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:
-    """Return principal components of the aligned table, missing points filled in."""
+def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray]:
+    """Return K and 3K + 3 principal components of the aligned table, points filled in.
+
+    Of as many components as coefficients, and of the rank of the model.
+    """
     table = np.where(X.isna(), fitted_table(estimator), X)
     aligned = analysis.AlignedFrames().fit_transform(table)
-    most = min(len(estimator.basis_), *aligned.shape)
-    return np.asarray(PCA(most, random_state=0).fit_transform(aligned))
+    n_shapes = len(estimator.basis_)
+    most = min(3 * n_shapes + 3, *aligned.shape)
+    scores = PCA(most, random_state=0).fit_transform(aligned)
+    return {"pca": scores[:, :n_shapes], "pca_of_rank": scores}
 
 
 def _label_report(
-    label: "pd.Series", alpha: NDArray, aligned: NDArray, frames: Frames, seed: int
+    label: "pd.Series", features: dict[str, NDArray], frames: Frames, seed: int
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
+    alpha = features["alpha"]
     known, classes = label.notna().to_numpy(), has_classes(label)
     options: dict[str, Any] = {
         "y": label.dropna().to_numpy(),
@@ -216,6 +222,7 @@ def _label_report(
         "values": found.statistic,
         "p_values": found.p_value,
         "permuted": found.permuted,
+        "untested": found.untested,
         "score": "accuracy" if classes else "r_squared",
     }
     if classes:
@@ -223,10 +230,13 @@ def _label_report(
         report["classes"] = counts.rename(str).to_dict()
         report["largest_class"] = counts.max() / counts.sum()
         report["class_means"] = class_means(label, alpha)
-    features = {"cross_validated": alpha, "cross_validated_pca": aligned}
     try:
         for name, values in features.items():
-            report[name] = analysis.predictability(values[known], **options).mean()
+            scores = analysis.predictability(values[known], **options)
+            key = "cross_validated" + f"_{name}" * (name != "alpha")
+            report[key], n = scores.mean(), len(scores)
+            report[f"{key}_standard_error"] = scores.std(ddof=1) / np.sqrt(n)
+            report[f"{key}_n_features"] = values.shape[1]
     except ValueError as error:  # too few frames of a class, or groups, for two folds
         report["not_cross_validated"] = str(error)
     return report

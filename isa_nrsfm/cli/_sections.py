@@ -374,30 +374,47 @@ def _label(label: dict[str, Any]) -> Section:
     statistic, meaning = "Spearman", "rank correlation, from -1 to 1"
     if label["statistic"] == "eta_squared":
         statistic, meaning = "eta squared", "share of the variance between classes"
-    tests = [*zip(names, label["values"], label["p_values"], strict=True)]
-    rows = [[name, f"{value:z.2f}", f"{p:.3f}"] for name, value, p in tests]
+    rows = [
+        [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
+        for name, value, p in zip(
+            names, label["values"], label["p_values"], strict=True
+        )
+    ]
     means = _class_means(label, names) if "class_means" in label else []
     if means:
         means.insert(0, "mean of each class if p < 0.05, in standard deviations:")
-    if "not_cross_validated" in label:
-        score = f"not cross-validated: {label['not_cross_validated']}"
-    elif label["score"] == "accuracy":
-        score = (
-            f"cross-validated accuracy {100 * label['cross_validated']:.1f} %; PCA of "
-            f"the aligned frames {100 * label['cross_validated_pca']:.1f} %, largest "
-            f"class {100 * label['largest_class']:.1f} %"
-        )
-    else:
-        score = (
-            f"cross-validated R^2 {label['cross_validated']:.2f}; PCA of the aligned "
-            f"frames {label['cross_validated_pca']:.2f}"
-        )
+    test = f"p-values: permutations of {label['permuted']}"
+    if label["untested"]:
+        test = f"no p-values: {label['untested']}"
     return [
         Cells(["", statistic, "p"], rows, title),
-        f"{statistic}: {meaning}; p-values: permutations of {label['permuted']}",
+        f"{statistic}: {meaning}; {test}",
         *means,
-        score,
+        _score(label),
     ]
+
+
+def _score(label: dict[str, Any]) -> str:
+    """Return how well coefficients predict a label, compared with PCA."""
+    if "not_cross_validated" in label:
+        return f"not cross-validated: {label['not_cross_validated']}"
+    classes = label["score"] == "accuracy"
+
+    def shown(name: str) -> str:
+        score, error = (label[name + each] for each in ("", "_standard_error"))
+        if classes:
+            return f"{100 * score:.1f} +- {100 * error:.1f} %"
+        return f"{score:.2f} +- {error:.2f}"
+
+    parts = [
+        f"{'accuracy' if classes else 'R^2'} {shown('cross_validated')} (standard error"
+        "); PCA of the aligned frames"
+    ]
+    for name in ("cross_validated_pca", "cross_validated_pca_of_rank"):
+        parts.append(f"{shown(name)} ({label[f'{name}_n_features']} components)")
+    if classes:
+        parts.append(f"largest class {100 * label['largest_class']:.1f} %")
+    return f"cross-validated {parts[0]} {', '.join(parts[1:])}"
 
 
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:

@@ -37,14 +37,17 @@ for axis, i in zip(display.axes_, shown, strict=True):
 
 # %%
 # The complete pipeline is cross-validated: the shapes are fitted within each fold, so
-# the accuracy applies to new rows.
+# the accuracy applies to new rows. These rows are independent. Where people repeat, use
+# ``cv=GroupKFold(3)`` and ``search.fit(X, labels, groups=people)``.
 
 pipeline = make_pipeline(
     AffineNRSfM(random_state=0), StandardScaler(), LinearDiscriminantAnalysis()
 )
 search = GridSearchCV(pipeline, {"affinenrsfm__n_components": [3, 5, 9]}, cv=3)
 search.fit(X, labels)
-print(search.best_params_, f"accuracy {search.best_score_:.1%}")
+# Standard error of the share of frames whose label is predicted
+error = np.sqrt(search.best_score_ * (1 - search.best_score_) / len(X))
+print(search.best_params_, f"accuracy {search.best_score_:.1%} +- {error:.1%}")
 
 # %%
 # For comparison, PCA of aligned frames, with the same number of components, and with
@@ -54,7 +57,8 @@ K = search.best_params_["affinenrsfm__n_components"]
 for n_components in (K, 3 * K + 3):
     steps = AlignedFrames(), PCA(n_components), LinearDiscriminantAnalysis()
     accuracy = cross_val_score(make_pipeline(*steps), X, labels, cv=3).mean()
-    print(f"PCA with {n_components} components: accuracy {accuracy:.1%}")
+    error = np.sqrt(accuracy * (1 - accuracy) / len(X))
+    print(f"PCA with {n_components} components: accuracy {accuracy:.1%} +- {error:.1%}")
 
 # %%
 # With many components of PCA, the classifier can separate pose and expression within

@@ -36,9 +36,9 @@ for label, y, column in (("gesture", hands.labels, 0), ("person", people, 1)):
 # ----------
 #
 # Eta squared is the share of the variance of a coefficient that lies between the
-# gestures. For the p-values, labels are permuted between people, and in blocks of
-# frames within people, because the frames of a video are similar. `between_share` is
-# the share of the variance between people.
+# gestures. For the p-values, labels are permuted between people; within people the
+# frequencies of the coefficients are tested, because the frames of a video are similar.
+# `between_share` is the share of the variance between people.
 
 found = association(model.alpha_, hands.labels, people, random_state=0)
 share = between_share(model.alpha_, people)
@@ -58,21 +58,23 @@ BasisShapeDisplay.from_estimator(model, n_columns=3)
 # All coefficients together
 # -------------------------
 #
-# How well do all coefficients predict the gestures of new people? The baseline is PCA
-# of the aligned frames with the same number of components. `WithinGroups` subtracts the
-# mean coefficients of each person. Three gestures are easy to predict with any of these
-# features. For seven expressions of faces, both kinds of coefficients are better than
-# PCA (:doc:`/questions`).
+# How well do all coefficients predict the gestures of new people? The baselines are PCA
+# of the aligned frames with the same number of components, and with 3 K + 3, the rank
+# of the model. `WithinGroups` subtracts the mean coefficients of each person. Three
+# gestures are easy to predict with any of these features. For seven expressions of
+# faces, coefficients are better than PCA with as many components, and those relative to
+# the person are better than PCA with 3 K + 3, too (:doc:`/questions`).
 
+aligned = PCA(18).fit_transform(AlignedFrames().fit_transform(hands.data))
 features = {
     "alpha": model.alpha_,
     "alpha, relative to the person": WithinGroups().fit_transform(
         model.alpha_, groups=people
     ),
-    "PCA of aligned frames": PCA(5).fit_transform(
-        AlignedFrames().fit_transform(hands.data)
-    ),
+    "PCA, 5 components": aligned[:, :5],
+    "PCA, 18 components": aligned,
 }
 for name, values in features.items():
     scores = predictability(values, hands.labels, people, random_state=0)
-    print(f"{name:30} accuracy {scores.mean():.1%}")
+    error = scores.std(ddof=1) / np.sqrt(len(scores))
+    print(f"{name:30} accuracy {scores.mean():.1%} +- {error:.1%}")
