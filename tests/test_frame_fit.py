@@ -328,10 +328,13 @@ class TestSamplePosterior:
             directions = np.linalg.svd(model.shapes.reshape(9, -1))[2][:9]
             frames = JointFrames.from_directions(blocks, directions)
         expected = model.posterior(rows)
-        _, motion, alpha, covariance = fitted_frames(model, frames, blocks)
+        _, motion, alpha, covariance, residual = fitted_frames(model, frames, blocks)
         assert_allclose(motion, expected.motion, atol=1e-7)
         assert_allclose(alpha, expected.alpha, atol=1e-7)
         assert_allclose(covariance, expected.covariance.mean(axis=0), rtol=1e-6)
+        if loss == "linear":
+            squares = distances(rows, model.shapes, *expected[:3]) ** 2
+            assert_allclose(residual, squares.sum(), rtol=1e-6)
 
     def test_outliers_are_points_beyond_four_deviations(self):
         model, tracks = posterior_frames(0, "huber")
@@ -648,7 +651,8 @@ def test_uncertainty_of_depths_does_not_depend_on_the_order_of_rows():
 def test_deviations_of_frames_grow_with_their_residual(turned):
     X, *_, model = turned
     noise = np.random.default_rng(0).normal(size=X.shape)
-    spoilt = X + 3 * np.sqrt(model.noise_variance_) * X.std() * noise
+    residual = (X - model.reproject(X)).std(axis=1, keepdims=True)
+    spoilt = X + 3 * residual * noise
     before, after = (model.reconstruct(x, return_std=True)[1] for x in (X, spoilt))
     assert 2 < np.median(after / before) < 4
 

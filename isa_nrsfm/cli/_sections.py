@@ -380,7 +380,8 @@ def _label(label: dict[str, Any]) -> Section:
             names, label["values"], label["p_values"], strict=True
         )
     ]
-    means = _class_means(label, names) if "class_means" in label else []
+    tested = "class_means" in label and not label["untested"]
+    means = _class_means(label, names) if tested else []
     if means:
         means.insert(0, "mean of each class if p < 0.05, in standard deviations:")
     test = f"p-values: permutations of {label['permuted']}"
