@@ -6,10 +6,10 @@ import warnings
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks._sets import ICT, load_arrays
+from benchmarks._sets import ICT, Case, load_arrays
 from benchmarks.accuracy import common_rotation
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
 from isa_nrsfm.export import frame_poses
 
 # Spread of pitch, yaw and roll, relative to that of yaw; of the scales of cameras.
@@ -64,9 +64,64 @@ def rotation_ratio(model, X, rotations):
     return min(found)[::-1]
 
 
+def animal(n_frames, rng):
+    """Return shapes (n_frames, 18, 3) of a walking animal: x ahead, y down, z aside."""
+    body = [(x, y, z) for x in (-60, 0, 60) for y in (-15, 15) for z in (-12, 12)]
+    points = np.tile(np.array(body[:10], dtype=float), (n_frames, 1, 1))
+    phase = 2 * np.pi * np.cumsum(rng.uniform(0.6, 1.4, n_frames)) / 30
+    for leg, (x, z) in enumerate((x, z) for x in (-55, 55) for z in (-15, 15)):
+        swing = 0.5 * np.sin(phase + np.pi * (leg in (0, 3)))
+        for length in (30.0, 60.0):
+            foot = x + length * np.sin(swing), 15 + length * np.cos(swing)
+            foot = np.stack([*foot, np.full(n_frames, z)], axis=1)
+            points = np.append(points, foot[:, None], axis=1)
+    return points
+
+
+def sheet(n_frames, rng):
+    """Return shapes (n_frames, 49, 3) of a sheet with two waves, across and along."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-1, 1, 7)]))
+    a, b = 0.3 * rng.normal(size=(2, n_frames, 1))
+    z = a * np.sin(2 * x) + b * np.cos(2 * y)
+    flat = np.broadcast_to(np.stack([x, y], axis=1), (n_frames, 49, 2))
+    return np.concatenate([flat, z[:, :, None]], axis=2)
+
+
+def flat_hand(n_frames, rng):
+    """Return shapes (n_frames, 21, 3) of hands whose fingers move in one plane."""
+    shapes = make_hand_tracks(n_frames, random_state=rng.integers(2**31)).shapes
+    axes = np.linalg.svd((shapes - shapes.mean(axis=(0, 1))).reshape(-1, 3))[2]
+    return (shapes @ axes.T) * (1.0, 1.0, 0.02)
+
+
+def captured(file):
+    """Return a function of the shapes of a file, None where it is absent."""
+    arrays = load_arrays(Case(file, file, 8))
+    if arrays is None:
+        return None
+    shapes = arrays.get("S3d_world", arrays["S3d"]).astype(float)
+    return lambda n, rng: shapes[np.linspace(0, len(shapes) - 1, n).astype(int)]
+
+
+# Objects whose depth is invented easily if they hardly turn, and numbers of shapes
+OBJECTS = {
+    "animals from the side": (animal, 4),
+    "flat hands": (flat_hand, 4),
+    "sheets": (sheet, 2),
+    **{file: (file, 8) for file in ("cmu_body", "rat_23", "fly_legs_30")},
+}
+
+
 def measured(kind, n_components, degrees, noise, seed, n_frames, ict):
     """Return the figures of one table, None if its shapes are not there."""
-    shapes = shapes_of(kind, n_frames, seed, ict)
+    if kind in OBJECTS:
+        make = OBJECTS[kind][0]
+        make = captured(make) if isinstance(make, str) else make
+        shapes = None
+        if make is not None:
+            shapes = make(n_frames, np.random.default_rng(seed))
+    else:
+        shapes = shapes_of(kind, n_frames, seed, ict)
     if shapes is None:
         return None
     X, points, rotations = seen(shapes, degrees, noise, seed)
@@ -91,6 +146,7 @@ def main(argv=None):
     parser.add_argument(
         "--degrees", type=float, nargs="+", default=[2, 4, 6, 10, 20, 40]
     )
+    parser.add_argument("--kinds", nargs="+", default=[])
     options = parser.parse_args(argv)
     ict = load_arrays(ICT)
     cases = [("ICT-68 faces", 3), ("ICT-68 faces", 9)]
@@ -99,7 +155,9 @@ def main(argv=None):
         ("generated faces", 9),
         ("bodies", 3),
         ("bodies", 12),
+        *((kind, K) for kind, (_, K) in OBJECTS.items()),
     ]
+    cases = [case for case in cases if not options.kinds or case[0] in options.kinds]
     print(
         "| shapes | K | noise | turned by | error of depths, relative to the true "
         "depths | relative to the fitted depths | estimated (`depth_uncertainty_`) | "
