@@ -228,7 +228,8 @@ def supported_components(
     factors = factorised.factors
     shapes, *_ = _paper_result(factors, most, clone(isa), settings, quiet)
     supported = count_components(factorised, shapes, settings)
-    if consensus:  # of a joint fit with as many as are reliable
+    # Down-weighted outliers look like basis shapes of the joint fit of a consensus.
+    if consensus and settings.loss != "linear":
         model, *_ = fit_table(table, supported, isa, settings, quiet, free=True)
         supported = len(model.basis)
     return supported, most
