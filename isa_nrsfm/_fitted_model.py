@@ -1,6 +1,5 @@
 """The fitted model, applied to a table block by block."""
 
-from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +27,8 @@ from isa_nrsfm._tables.tracks import (
 )
 from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 
-# Level of the two-sided test by which missing points decide on the mirror image.
+# Level of the two-sided test by which missing points decide on the mirror image: false
+# decisions are in docs/depth.md, "The mirror image".
 MIRROR_LEVEL = 0.01
 
 
@@ -101,9 +101,10 @@ class TableModel(NamedTuple):
             return np.vecdot(visible - seen_points(part), r)
 
         T = np.concatenate([*rows.map(scores, sight, frames.alpha)])
-        off, square = T - T.mean(), T @ T
-        covariances = (off[lag:] @ off[:-lag] for lag in range(1, n_frames))
-        variance = square + 2.0 * sum(takewhile(lambda value: value > 0, covariances))
+        power = np.abs(np.fft.rfft(T - T.mean(), 2 * n_frames)) ** 2
+        covariances = np.fft.irfft(power, 2 * n_frames)[1 : n_frames + 1]
+        positive = np.logical_and.accumulate(covariances > 0)
+        variance = T @ T + 2.0 * covariances[positive].sum()
         probability = float(ndtr(T.sum() / np.sqrt(variance or 1.0)))
         decided = min(probability, 1.0 - probability) < MIRROR_LEVEL / 2
         return probability if decided else np.nan
