@@ -176,10 +176,12 @@ def permuted_energies(
                 8 * length > len(alpha) if in_runs else _one_event(alpha, labels, order)
             )
             untested = few * ONE_EVENT
-            cuts = np.intersect1d(seams(values[order.rows]), seams(rest))
-            if len(means) == 1 and len(cuts):
-                untested = JUMPS.format(len(cuts), cuts[0])
-        energies += _energies(alpha, labels, shuffled)
+            if len(means) == 1:
+                cuts = np.intersect1d(seams(values[order.rows]), seams(rest))
+                if len(cuts):
+                    untested = JUMPS.format(len(cuts), cuts[0])
+        if not untested:
+            energies += _energies(alpha, labels, shuffled)
         permuted.append(f"{units} within groups" if len(means) > 1 else units)
     return energies, ", and ".join(permuted), untested
 
