@@ -539,8 +539,12 @@ class AffineNRSfM(
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
-        attributes: dict[str, Any] = opened.__dict__
-        attributes |= fitted
+        attributes: dict[str, Any] = fitted | {
+            "_model": model,
+            "_n_features_out": len(model.basis),
+            "camera_": self.camera,
+            "frames_scaled_": settings.scale_frames,
+        }
         if self.keep_frames:
             kept = keep(frames._asdict())
             frames = Decomposition(*map(source.as_collected, kept.values()))
@@ -554,12 +558,11 @@ class AffineNRSfM(
                 attributes |= {"rotations_": R, "scales_": scales}
         else:
             del attributes["_frame_sizes"]
-        opened._model, opened._n_features_out = model, len(model.basis)
-        opened.camera_, opened.frames_scaled_ = self.camera, settings.scale_frames
+        opened.__dict__.update(attributes)
         if errors and not model.frames.certainty.determined:
             share, _ = gross_residuals(source.joined(model.distances))
             warn_caller(depth_advice(facts_of(opened, outlier_share=share)))
-        self.__dict__.update(attributes)
+        self.__dict__.update(vars(opened))
 
     def _ready(
         self, X: Any, point_weight: Any = None
