@@ -2,6 +2,7 @@
 
 import argparse
 import warnings
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -90,17 +91,18 @@ def sheet(n_frames, rng):
 def flat_hand(n_frames, rng):
     """Return shapes (n_frames, 21, 3) of hands whose fingers move in one plane."""
     shapes = make_hand_tracks(n_frames, random_state=rng.integers(2**31)).shapes
-    axes = np.linalg.svd((shapes - shapes.mean(axis=(0, 1))).reshape(-1, 3))[2]
+    flat = (shapes - shapes.mean(axis=(0, 1))).reshape(-1, 3)
+    axes = np.linalg.svd(flat, full_matrices=False)[2]
     return (shapes @ axes.T) * (1.0, 1.0, 0.02)
 
 
-def captured(file):
-    """Return a function of the shapes of a file, None where it is absent."""
+def captured(n_frames, rng, file):
+    """Return shapes of a file at equal distances, or None where it is absent."""
     arrays = load_arrays(Case(file, file, 8))
     if arrays is None:
         return None
     shapes = arrays.get("S3d_world", arrays["S3d"]).astype(float)
-    return lambda n, rng: shapes[np.linspace(0, len(shapes) - 1, n).astype(int)]
+    return shapes[np.linspace(0, len(shapes) - 1, n_frames).astype(int)]
 
 
 # Objects whose depth is invented easily if they hardly turn, and numbers of shapes
@@ -108,18 +110,17 @@ OBJECTS = {
     "animals from the side": (animal, 4),
     "flat hands": (flat_hand, 4),
     "sheets": (sheet, 2),
-    **{file: (file, 8) for file in ("cmu_body", "rat_23", "fly_legs_30")},
+    **{
+        file: (partial(captured, file=file), 8)
+        for file in ("cmu_body", "rat_23", "fly_legs_30")
+    },
 }
 
 
 def measured(kind, n_components, degrees, noise, seed, n_frames, ict):
     """Return the figures of one table, None if its shapes are not there."""
     if kind in OBJECTS:
-        make = OBJECTS[kind][0]
-        make = captured(make) if isinstance(make, str) else make
-        shapes = None
-        if make is not None:
-            shapes = make(n_frames, np.random.default_rng(seed))
+        shapes = OBJECTS[kind][0](n_frames, np.random.default_rng(seed))
     else:
         shapes = shapes_of(kind, n_frames, seed, ict)
     if shapes is None:

@@ -11,6 +11,7 @@ from refusals import warned
 from scenes import random_rotation, with_gaps
 from scipy.spatial.transform import Rotation
 
+from benchmarks.depth import animal
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
@@ -411,22 +412,10 @@ def faces_turned_by(degrees, seed=0, n_frames=150, noise=0.01, missing=0.0):
 
 def animal_seen_from_the_side(n_frames=150, noise=1.0):
     """Return a table of a walking animal of 18 points, and points in camera axes."""
-    rng, t = np.random.default_rng(0), np.arange(n_frames)
-    body = np.array(
-        [[x, y, z] for x in (-60, 0, 60) for y in (-15, 15) for z in (-12, 12)]
-    )
-    points = np.tile(body[:10].astype(float), (n_frames, 1, 1))
-    for leg, (x, z) in enumerate((x, z) for x in (-55, 55) for z in (-15, 15)):
-        swing = 0.5 * np.sin(2 * np.pi * t / 30 + np.pi * (leg in (0, 3)))
-        for length in (30.0, 60.0):
-            foot = x + length * np.sin(swing), 15 + length * np.cos(swing)
-            points = np.append(
-                points, np.stack([*foot, np.full(n_frames, z)], 1)[:, None], axis=1
-            )
-    yaw = Rotation.from_rotvec(
-        np.radians(3) * rng.normal(size=(n_frames, 1)) * [0, 1, 0]
-    )
-    points = points @ yaw.as_matrix().transpose(0, 2, 1)
+    rng = np.random.default_rng(0)
+    vectors = np.radians(3) * rng.normal(size=(n_frames, 1)) * [0, 1, 0]
+    yaw = Rotation.from_rotvec(vectors).as_matrix()
+    points = animal(n_frames, rng) @ yaw.transpose(0, 2, 1)
     tracks = points[:, :, :2] + noise * rng.normal(size=(*points.shape[:2], 2))
     return tracks.reshape(n_frames, -1), points
 
