@@ -64,7 +64,7 @@ MOST_FRAMES, MOST_POINTS = 200, 200
 # Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
 # %, the floor changes no deviation by more than a third.
 LEAST_NOISE = 1e-6
-# Factor of the depths of a fit that hardly turns. 100 and 10,000 give the same.
+# Factor of the depths of a fit that hardly turns: docs/depth.md, "How it is estimated".
 FAR = 1000.0
 
 
