@@ -166,7 +166,9 @@ def fit_table(
             "n_iter_": len(fit.history) - 1,
         }
         if errors and camera != "affine":
-            certainty = depth_certainty(model, table.rows, table.weights)
+            certainty = depth_certainty(
+                model, table.rows, table.weights, settings.limits
+            )
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             # A residual below the noise of the spectrum leaves nothing for groups.

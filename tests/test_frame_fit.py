@@ -341,7 +341,8 @@ class TestSamplePosterior:
         model, tracks = posterior_frames(0, "huber")
         tracks[np.arange(12), np.arange(12), 0] += NOISE * np.linspace(1.0, 8.0, 12)
         rows, _ = rows_of(tracks)
-        cleaned, found = inlying_rows(model, rows)
+        blocks, linear = FrameBlocks.of_array(rows, 8), replace(model, loss="linear")
+        cleaned, found, _ = inlying_rows(model, blocks, 12)
         expected = model.posterior(rows)
         assert_array_equal(found.alpha, expected.alpha)
         far = distances(rows, model.shapes, *expected[:3])
@@ -350,7 +351,7 @@ class TestSamplePosterior:
         for row in range(2):
             assert_array_equal(np.isnan(cleaned[:, row]), outlying)
         assert_array_equal(cleaned[~np.isnan(cleaned)], rows[~np.isnan(cleaned)])
-        assert_array_equal(inlying_rows(replace(model, loss="linear"), rows)[0], rows)
+        assert_array_equal(inlying_rows(linear, blocks, 12)[0], rows)
 
     def test_uncertainty_of_the_shapes_is_the_inverse_of_their_information(self):
         rng = np.random.default_rng(0)

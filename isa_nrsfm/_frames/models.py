@@ -23,7 +23,7 @@ from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._frames.single_frame import SingleSearch
-from isa_nrsfm._linalg.small_matrices import frames_last, padded
+from isa_nrsfm._linalg.small_matrices import centred, frames_last, padded
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.tracks import seen_points
 
@@ -316,8 +316,7 @@ class PosteriorFrames:
 
     def of_points(self, kept: NDArray) -> "PosteriorFrames":
         """Return the model of frames that have only some of the points (n_points,)."""
-        shapes = self.shapes[:, :, kept]
-        return replace(self, shapes=shapes - shapes.mean(axis=2, keepdims=True))
+        return replace(self, shapes=centred(self.shapes[:, :, kept]))
 
     def fit(
         self,

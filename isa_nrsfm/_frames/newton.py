@@ -60,7 +60,7 @@ from isa_nrsfm._frames.point_sums import (
     whitened,
     with_one,
 )
-from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State
+from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State, scale_of
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     ROWS,
@@ -88,7 +88,7 @@ class AffineSearch(FrameSearch):
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
         """Return coefficients (K, n) after a step with the cameras held."""
-        T, _, M, _ = affine_cameras(problem.products, with_one(alpha))
+        T, _, M, _ = affine_cameras(problem[0], with_one(alpha))
         return alpha + solve_positive(*_held(problem, alpha, T, M))[0]
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
@@ -116,8 +116,8 @@ class AffineSearch(FrameSearch):
         self, problem: FrameProblem, M: NDArray, alpha: NDArray
     ) -> tuple[NDArray, NDArray]:
         """Return the covariances of coefficients (K, K, n), and NaN for rotations."""
-        inverse = self.evaluate(problem, alpha).inverse()
-        return problem.noise * inverse, np.full((3, 3, len(problem.noise)), np.nan)
+        noise, inverse = problem[1], self.evaluate(problem, alpha).inverse()
+        return noise * inverse, np.full((3, 3, len(noise)), np.nan)
 
 
 def _held(
@@ -127,13 +127,13 @@ def _held(
 
     T and the cameras M come from `affine_cameras` for alpha (K, n).
     """
-    Q = camera_gram(M)
-    held = problem.products.gram.energies(Q)[len(T) :]
-    held[diagonal_of(held)] += problem.noise
+    (products, noise), Q = problem, camera_gram(M)
+    held = products.gram.energies(Q)[len(T) :]
+    held[diagonal_of(held)] += noise
     # sum_l H_kl c_l = <B_k S^T + S B_k^T, M^T M> / 2
-    slope = np.einsum("kari,rai->ki", problem.products.cross[1:], M)
+    slope = np.einsum("kari,rai->ki", products.cross[1:], M)
     slope -= np.einsum("kpi,pi->ki", T[1:], 0.5 * TWICE[:, None] * Q)
-    slope -= problem.noise * alpha
+    slope -= noise * alpha
     return held, slope
 
 
@@ -186,7 +186,7 @@ class CalibratedSearch(FrameSearch):
 
         The better of the nearest and the `_completed` camera is taken.
         """
-        M = affine_cameras(problem.products, with_one(alpha))[2]
+        M = affine_cameras(problem[0], with_one(alpha))[2]
         starts = calibrated_starts(self.model, M)
         values = [_value(problem, _posterior(problem, start)) for start in starts]
         return np.where(values[1] < values[0], *starts[::-1])
@@ -212,7 +212,7 @@ class CalibratedSearch(FrameSearch):
         second[:3, :3] -= np.einsum("aai->i", mixed) * np.eye(3)[:, :, None]
         second[3:], second[:, 3:] = gradient, gradient[:, None]
         # The coefficients follow: - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
-        F = _changes(problem, M, posterior)
+        F = _changes(products, M, posterior)
         coupling = np.einsum("crai,krai->kci", self.model.tangents(M), F)
         through = posterior.covaried(coupling)
         hessian = definite + second[pair_indices(len(gradient))]
@@ -248,7 +248,7 @@ class CalibratedSearch(FrameSearch):
         They come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``. C is the
         coupling, Y the Hessian by the camera with the coefficients eliminated.
         """
-        noise, posterior = problem.noise, _posterior(problem, M)
+        noise, posterior = problem[1], _posterior(problem, M)
         state, through = self._derivatives(problem, M, posterior)
         inverse = state.inverse()
         widened = np.einsum("kci,cdi->kdi", through, inverse)
@@ -271,7 +271,7 @@ class CalibratedSearch(FrameSearch):
         `tried`. Also returns masks (n,) of replaced cameras and of searches that
         converged.
         """
-        limit = value - 1e-10 * problem.energy
+        limit = value - 1e-10 * scale_of(problem)
         cameras, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
         tried = padded(tried)
         if len(tried):
@@ -326,9 +326,9 @@ def _rise(
     ``e = (0, 0, z) / |z|``, in the quadratic approximation with half the Hessian Y.
     This neglects the gradient at M, and Y bounds the log determinant from above.
     """
-    K, n = len(posterior.alpha), M.shape[2]
-    F = _changes(problem, M, posterior).reshape(K, 6, n)
-    A = problem.products.gram.moments(posterior.second_moments(problem.noise))
+    (products, noise), K, n = problem, len(posterior.alpha), M.shape[2]
+    F = _changes(products, M, posterior).reshape(K, 6, n)
+    A = products.gram.moments(posterior.second_moments(noise))
     Y = -packed_products(posterior.covaried(F).swapaxes(0, 1), F.swapaxes(0, 1))
     # A for each row of the camera: the diagonal 3x3 blocks of the packed 6x6 matrix
     places = unpacked(np.arange(len(Y)))
@@ -344,18 +344,18 @@ def _rise(
 
 
 def _changes(
-    problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
+    products: FrameSums, M: NDArray, posterior: CoefficientPosterior
 ) -> NDArray:
     """Return ``F_k`` (K, 2, 3, n) for cameras M (2, 3, n)."""
-    products = problem.products
     return seen_changes(products.cross, products.gram.products(posterior.c), M)
 
 
 def _value(problem: FrameProblem, posterior: CoefficientPosterior) -> NDArray:
     """Return ``s2 F`` (n,)."""
-    return posterior.objective + problem.noise * posterior.log_determinant
+    return posterior.objective + problem[1] * posterior.log_determinant
 
 
 def _posterior(problem: FrameProblem, M: NDArray) -> CoefficientPosterior:
     """Return the posterior of the coefficients for cameras (2, 3, n)."""
-    return coefficient_posterior(problem.products, M, problem.noise)
+    products, noise = problem
+    return coefficient_posterior(products, M, noise)

@@ -92,16 +92,14 @@ def largest_objective(n_points: Any, noise: Any) -> Any:
     return 3.0 * noise * np.maximum(2.0 * n_points - 8.0, 1.0)
 
 
-class FrameProblem(NamedTuple):
-    """Frames, given by their sums for the shapes, and their noise variances (n,)."""
+# Frames, given by their sums for the shapes, and their noise variances (n,)
+FrameProblem = tuple[FrameSums, NDArray]
 
-    products: FrameSums
-    noise: NDArray
 
-    @property
-    def energy(self) -> NDArray:
-        """``||W||^2 + s2`` (n,), the scale of gains and rounding errors."""
-        return self.products.energy + self.noise
+def scale_of(problem: FrameProblem) -> NDArray:
+    """Return ``||W||^2 + s2`` (n,), the scale of gains and rounding errors."""
+    products, noise = problem
+    return products.energy + noise
 
 
 class State(NamedTuple):
@@ -283,7 +281,7 @@ class FrameSearch:
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
         """Return frames with noise variances (n,) that are not zero."""
         noise = np.maximum(variance, 1e-13 * products.energy)
-        return FrameProblem(products, np.where(noise > 0, noise, 1.0))
+        return products, np.where(noise > 0, noise, 1.0)
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
         """Return the start of the search for coefficients (K, n)."""
@@ -328,7 +326,7 @@ class FrameSearch:
             # quadratic: the step after it would gain far less.
             step, damping = self.step(state, damping)
             gain = np.einsum("pi,pi->i", state.slope, step)
-            small = (damping == 0) & (gain <= 1e-12 * problem.energy)
+            small = (damping == 0) & (gain <= 1e-12 * scale_of(problem))
             leaving = small | (damping >= LARGEST_DAMPING)
             if known is not None:
                 leaving |= _hopeless(state, gain, *known)
@@ -348,7 +346,7 @@ class FrameSearch:
             # Trial step, refused where the objective rises. Less damping after a good
             # step, more after a refused one.
             trial = self.evaluate(problem, self.model.moved(state.position, step))
-            highest = state.value + OF_STEPS * problem.energy
+            highest = state.value + OF_STEPS * scale_of(problem)
             worse = np.flatnonzero(~(trial.value <= highest))
             eased = np.where(damping > 0.01, 0.1 * damping, 0.0)
             if len(worse):

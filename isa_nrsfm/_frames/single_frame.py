@@ -5,8 +5,6 @@ frames takes as long for one frame as for sixteen: 4 to 7 times as long as this 
 Frames that are not regular are left to it.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,14 +26,26 @@ from isa_nrsfm._frames.search import (
 UNKNOWN = np.full((3, 3), np.nan)
 
 
-class _Camera(NamedTuple):
+class _Camera:
     """A calibrated camera M (2, 3), its objective, and the coefficients' posterior."""
 
-    M: NDArray
-    value: float
-    alpha: NDArray
-    Q: NDArray
-    log_determinant: float
+    def __init__(
+        self,
+        search: "SingleSearch",
+        M: NDArray,
+        P: NDArray,
+        energy: float,
+        noise: float,
+    ):
+        H = (search.pairs @ (M.T @ M).ravel()).reshape(search.K + 1, -1)
+        seen = P.reshape(-1, 6) @ M.ravel()
+        damped = H[1:, 1:].copy()
+        damped.flat[:: search.K + 1] += noise
+        self.M, self.Q, right = M, np.linalg.inv(damped), seen[1:] - H[1:, 0]
+        self.alpha = self.Q @ right
+        self.log_determinant = np.linalg.slogdet(damped)[1] - search.K * np.log(noise)
+        square = energy - 2.0 * seen[0] + H[0, 0] - right @ self.alpha
+        self.value = square + noise * self.log_determinant
 
 
 _Moments = tuple[NDArray, NDArray, NDArray]
@@ -119,7 +129,7 @@ class SingleSearch:
         """Minimise over cameras, with the coefficients integrated out."""
         affine = P[0] @ np.linalg.inv(0.5 * self.sums[:9, 0].reshape(3, 3))
         starts = calibrated_starts(self.model, affine[..., None])
-        cameras = [self._camera(M[..., 0], P, energy, noise) for M in starts]
+        cameras = [_Camera(self, M[..., 0], P, energy, noise) for M in starts]
         start = min(cameras, key=lambda camera: camera.value)
         minimum = self._minimum(start, P, energy, noise)
         if minimum is None:
@@ -127,7 +137,7 @@ class SingleSearch:
         moments = self._moments(minimum, P, noise)
         if not self._rise(minimum, moments) > LARGE_RISE * minimum.value:
             # A lower minimum from the reversed camera is left to the other search.
-            other = self._camera(minimum.M * REVERSED.T, P, energy, noise)
+            other = _Camera(self, minimum.M * REVERSED.T, P, energy, noise)
             limit = minimum.value - 1e-10 * (energy + noise)
             if self._minimum(other, P, energy, noise, minimum, limit) is not None:
                 return None
@@ -137,19 +147,6 @@ class SingleSearch:
         objective = max(minimum.value - noise * minimum.log_determinant, 0.0)
         turns = noise * turns[:3, :3]
         return minimum.M, minimum.alpha, covariance, turns, objective
-
-    def _camera(self, M: NDArray, P: NDArray, energy: float, noise: float) -> _Camera:
-        """Return a camera with the posterior of the coefficients."""
-        H = (self.pairs @ (M.T @ M).ravel()).reshape(self.K + 1, -1)
-        seen = P.reshape(-1, 6) @ M.ravel()
-        damped = H[1:, 1:].copy()
-        damped.flat[:: self.K + 1] += noise
-        Q, right = np.linalg.inv(damped), seen[1:] - H[1:, 0]
-        alpha = Q @ right
-        log_determinant = np.linalg.slogdet(damped)[1] - self.K * np.log(noise)
-        square = energy - 2.0 * seen[0] + H[0, 0] - right @ alpha
-        value = square + noise * log_determinant
-        return _Camera(M, value, alpha, Q, log_determinant)
 
     def _derivatives(
         self, camera: _Camera, P: NDArray, moments: _Moments
@@ -216,7 +213,7 @@ class SingleSearch:
             ):
                 return None
             M = self.model.moved(camera.M, self.model.limited(step))
-            moved = self._camera(M, P, energy, noise)
+            moved = _Camera(self, M, P, energy, noise)
             if damping == 0 and gain <= tol:
                 return moved if moved.value < limit else None
             if moved.value <= camera.value + tol:

@@ -38,7 +38,8 @@ from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._joint.uncertainty import inlying_rows
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
+from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # docs/benchmarks/consensus.md has the errors with other values of these constants.
@@ -109,10 +110,7 @@ def consensus(
     variance of a coordinate, the coefficients (n, K) of some frames, and the mean
     squares (2, J) of errors and of depths, None without groups.
     """
-    few = representative_frames(rows, MOST_FRAMES)
-    part, fit = inlying_rows(model, np.asarray(rows.take(few), dtype=np.float64))
-    known = np.isfinite(fit.motion).all(axis=(1, 2))
-    part, fit = part[known], fit.take(known)
+    part, fit, _ = inlying_rows(model, rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
     shapes = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
     rotations, scales = full_rotations(fit.motion)
@@ -343,11 +341,6 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     depths = np.linalg.solve(A, b[:, :, None])
     images = images + share * (fitted - images)
     return np.concatenate([images, depths.mT], axis=1)
-
-
-def centred(depths: NDArray) -> NDArray:
-    """Return depths (..., n) without their mean."""
-    return depths - depths.mean(axis=-1, keepdims=True)
 
 
 def interpolation(mean_shape: NDArray, chosen: NDArray) -> NDArray:

@@ -48,7 +48,7 @@ from isa_nrsfm._joint.starts import (
     with_prior,
 )
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import frames_last
+from isa_nrsfm._linalg.small_matrices import centred, frames_last
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import representative_frames
 
@@ -104,8 +104,7 @@ def fit_jointly(
     if sampled:
         state = state._replace(motion=state.motion[table.parts[0]])
     noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose)
-    centred = shapes - shapes.mean(axis=2, keepdims=True)
-    end = JointState(centred, fit.state.motion, max(noise, OF_DISTANCES**2))
+    end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
     fit = fit._replace(state=end, camera_noise_ratio=ratio)
     return fit, problem.frames, first.likelihood(*state).alpha
 

@@ -23,7 +23,7 @@ from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
-from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
+from isa_nrsfm._linalg.small_matrices import centred, frames_first, frames_last
 from isa_nrsfm._paper.pipeline import Factorisation
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
@@ -153,7 +153,7 @@ class JointProblem:
         """Return a state with nearly optimal cameras for its centred shapes."""
         shapes, _, noise = state
         if self.frames.directions is None:
-            shapes = shapes - shapes.mean(axis=2, keepdims=True)
+            shapes = centred(shapes)
         search = frame_search(cameras.name, shapes)
         motion = self.frames.blocks.joined(
             lambda block: search.fit(block, noise, covariances=False, rough=True).motion

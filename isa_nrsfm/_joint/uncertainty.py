@@ -16,7 +16,7 @@ These fits do not have the prior of the extents, which would hide uncertain dept
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,8 @@ from isa_nrsfm._frames.models import (
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JointState, refine_joint
-from isa_nrsfm._joint.settings import LIMITS
+from isa_nrsfm._joint.settings import LIMITS, Limits
+from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
@@ -69,15 +70,22 @@ FAR = 1000.0
 
 
 def inlying_rows(
-    model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
-) -> tuple[NDArray, FramePosterior]:
-    """Return frames (n, 2, J) of size one with outliers as NaN, and their fit."""
-    fit = model.posterior(rows, covariances=False, weights=weights)
+    model: PosteriorFrames, rows: FrameBlocks, most: int, weights: NDArray | None = None
+) -> tuple[NDArray, FramePosterior, NDArray | None]:
+    """Return about `most` frames (n, 2, J) of size one with a camera, and their fit.
+
+    Outliers are NaN. Also returns the weights of the points of these frames, if any.
+    """
+    chosen = representative_frames(rows, most)
+    part = np.asarray(rows.take(chosen), dtype=np.float64)
+    weights = None if weights is None else weights[chosen]
+    fit = model.posterior(part, covariances=False, weights=weights)
     if model.loss != "linear":
-        off = distances(rows, model.shapes, *fit[:3])
+        off = distances(part, model.shapes, *fit[:3])
         outlying = off > OUTLYING * np.sqrt(model.noise_variance)
-        rows = np.where(outlying[:, None], np.nan, rows)
-    return rows, fit
+        part = np.where(outlying[:, None], np.nan, part)
+    known = np.isfinite(fit.motion).all(axis=(1, 2))
+    return part[known], fit.take(known), None if weights is None else weights[known]
 
 
 def fitted_frames(
@@ -204,69 +212,98 @@ def n_reliable(reliability: NDArray) -> int:
 
 
 def depth_certainty(
-    frames: PosteriorFrames, rows: FrameBlocks, weights: NDArray | None = None
+    frames: PosteriorFrames,
+    rows: FrameBlocks,
+    weights: NDArray | None = None,
+    limits: Limits = LIMITS,
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
     Weights (I, J) are numbers of observations, by default one.
     """
+    part, fit, w = inlying_rows(frames, rows, MOST_FRAMES, weights)
     n_points = frames.shapes.shape[2]
-    chosen = representative_frames(rows, MOST_FRAMES)
-    part = np.asarray(rows.take(chosen), dtype=np.float64)
-    w = None if weights is None else weights[chosen]
-    part, fit = inlying_rows(frames, part, w)
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
-    left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
+    groups = neighbours(mean_shape)
+    parts = [groups != group for group in range(N_GROUPS)]
     seen = np.asarray(np.isfinite(part).all(axis=1))
-    least = np.min([seen[:, ~group].sum(axis=1) for group in left_out], axis=0)
-    known = np.isfinite(fit.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
+    least = np.min([seen[:, kept].sum(axis=1) for kept in parts], axis=0)
+    known = least >= FEWEST_POINTS
     if known.sum() < 2:
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], fit.motion[known]
     tracks, camera = part[known], CAMERAS[frames.camera]
 
-    def refit(kept: NDArray, start: JointState, extents: float = 0.0) -> _Refit:
-        """Return a fit of some points, by a few steps from a start."""
+    def refit(
+        kept: NDArray, start: JointState | None = None, extents: float = 0.0
+    ) -> tuple[JointState, NDArray, NDArray, float]:
+        """Fit the kept points by a few steps, by default from the fit of all points.
+
+        Returns the state, rotations (I, 3, 3), centred depths (I, n_kept) and the
+        objective for each frame, without the prior of the extents.
+        """
         rows = tracks[:, :, kept]
         blocks = FrameBlocks.of_array(rows, len(rows))
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
-        penalty = part.basis_penalty(LIMITS.basis_std)
+        penalty = part.basis_penalty(limits.basis_std)
         likelihood = MarginalLikelihood(part, penalty, extents)
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
-        least = min(noise * n_numbers / energy, LIMITS.least_noise)
+        least = min(noise * n_numbers / energy, limits.least_noise)
+        if start is None:
+            start = JointState(centred(shapes[:, :, kept]), motion, noise)
         start = start._replace(noise=noise)
-        limits: Any = {"least_noise": least, "max_iter": MOST_STEPS, "tol": TOL}
-        state = refine_joint(likelihood, start, camera, **limits).state
+        ends: Any = {"least_noise": least, "max_iter": MOST_STEPS, "tol": TOL}
+        state = refine_joint(likelihood, start, camera, **ends).state
         terms = likelihood._replace(extent_weight=0.0)(*state)
         rotations, scales = full_rotations(state.motion)
         z = np.einsum("ia,kaj->ikj", rotations[:, 2], state.shapes)
         z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", terms.alpha, z[:, 1:]))
-        z -= z.mean(axis=1, keepdims=True)
-        return _Refit(kept, state, rotations, z, terms.value / len(rows))
-
-    def start_of(kept: NDArray) -> JointState:
-        """Return the start from the fit of all points."""
-        chosen = shapes[:, :, kept]
-        return JointState(chosen - chosen.mean(axis=2, keepdims=True), motion, 0.0)
+        return state, rotations, centred(z), terms.value / len(rows)
 
     every = np.ones(len(points), dtype=bool)
-    whole = refit(every, start_of(every), EXTENT_WEIGHT)
-    far = refit(every, far_state(whole.state, camera))
-    deformation = float(np.exp(-max(far.value - whole.value, 0.0)))
-    errors = [refit(~group, start_of(~group)).errors(whole) for group in left_out]
-    sums = (np.sum(terms, axis=0) for terms in zip(*errors, strict=True))
-    total, turns, variances = ((N_GROUPS - 1) / N_GROUPS * each for each in sums)
-    # Each point is left out of one of the fits
-    variances *= N_GROUPS / (N_GROUPS - 1)
-    variances += deformation * np.mean(whole.depths**2, axis=0)
+    whole, rotations, depths, value = refit(every, extents=EXTENT_WEIGHT)
+    *_, far_value = refit(every, far_state(whole, camera))
+    deformation = float(np.exp(-max(far_value - value, 0.0)))
+    total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
+    for kept in parts:
+        _, turned, z, _ = refit(kept)
+        square, turn, squares = differences(turned, z, rotations, depths[:, kept])
+        total, turns = total + square, turns + turn
+        variances[kept] += squares
+    factor = (N_GROUPS - 1) / N_GROUPS
+    # Each point is left out of one of the fits: its factor is one.
+    variances += deformation * np.mean(depths**2, axis=0)
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
     return DepthCertainty(
-        float(np.sqrt(total + deformation)), deformation, turns, variances[nearest]
+        float(np.sqrt(factor * total + deformation)),
+        deformation,
+        factor * turns,
+        variances[nearest],
     )
+
+
+def differences(
+    rotations: NDArray, depths: NDArray, whole_rotations: NDArray, whole_depths: NDArray
+) -> tuple[float, NDArray, NDArray]:
+    """Compute squared differences of a fit of some points from that of all points.
+
+    Relative square of the depths (I, n); mean products of the rotation vectors (3, 3);
+    mean squares of the depths (n,).
+    """
+    z = centred(whole_depths)
+    mirror = np.array([1.0, 1.0, np.sign(np.sum(depths * z))])
+    off = mirror[2] * depths - z
+    # Rotations up to a common rotation of the object
+    turned = Rotation.from_matrix(mirror[:, None] * rotations * mirror)
+    whole = Rotation.from_matrix(whole_rotations)
+    w = (turned * (turned.inv() * whole).mean() * whole.inv()).as_rotvec()
+    turns = w.T @ w / len(w)
+    turns[2, :2] = turns[:2, 2] = 0.0  # the mirror image has the other sign
+    return float(np.sum(off**2) / np.sum(z**2)), turns, np.mean(off**2, axis=0)
 
 
 def far_state(state: JointState, camera: CameraModel) -> JointState:
@@ -283,45 +320,10 @@ def far_state(state: JointState, camera: CameraModel) -> JointState:
 
 def neighbours(points: NDArray) -> NDArray:
     """Assign points (3, n_points) to groups of equal size around distant points."""
-    centred = points.T - points.mean(axis=1)
-    centres = [np.argmax(np.sum(centred**2, axis=1))]
+    points = centred(points).T
+    centres = [np.argmax(np.sum(points**2, axis=1))]
     while len(centres) < N_GROUPS:
-        centres.append(np.argmax(cdist(centred, centred[centres]).min(axis=1)))
-    sizes = np.full(N_GROUPS, len(centred) // N_GROUPS)
-    sizes[: len(centred) % N_GROUPS] += 1
-    places = np.repeat(np.arange(N_GROUPS), sizes)
-    squares = cdist(centred, centred[centres][places], "sqeuclidean")
+        centres.append(np.argmax(cdist(points, points[centres]).min(axis=1)))
+    places = np.sort(np.arange(len(points)) % N_GROUPS)
+    squares = cdist(points, points[centres][places], "sqeuclidean")
     return places[linear_sum_assignment(squares)[1]]
-
-
-class _Refit(NamedTuple):
-    """A fit of the kept points: state, rotations (I, 3, 3), centred depths (I, n).
-
-    value: the objective for each frame, without the prior of the extents.
-    """
-
-    kept: NDArray
-    state: JointState
-    rotations: NDArray
-    depths: NDArray
-    value: float
-
-    def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray]:
-        """Compute squared differences from the fit of all points.
-
-        Relative square of the depths; mean products of the rotation vectors (3, 3);
-        mean squares of the depths (n_points,).
-        """
-        z = whole.depths[:, self.kept]
-        z = z - z.mean(axis=1, keepdims=True)
-        mirror = np.array([1.0, 1.0, np.sign(np.sum(self.depths * z))])
-        off = mirror[2] * self.depths - z
-        points = np.zeros(len(self.kept))
-        points[self.kept] = np.mean(off**2, axis=0)
-        # Rotations up to a common rotation of the object
-        turned = Rotation.from_matrix(mirror[:, None] * self.rotations * mirror)
-        rotations = Rotation.from_matrix(whole.rotations)
-        w = (turned * (turned.inv() * rotations).mean() * rotations.inv()).as_rotvec()
-        turns = w.T @ w / len(w)
-        turns[2, :2] = turns[:2, 2] = 0.0  # the mirror image has the other sign
-        return float(np.sum(off**2) / np.sum(z**2)), turns, points

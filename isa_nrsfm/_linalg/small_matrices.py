@@ -208,6 +208,11 @@ def padded(frames: NDArray) -> NDArray:
     return np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % LANES)])
 
 
+def centred(values: NDArray) -> NDArray:
+    """Return values (..., n), such as depths or shapes, without their mean."""
+    return values - values.mean(axis=-1, keepdims=True)
+
+
 def of_frames(values: Any, frames: NDArray | slice) -> Any:
     """Return some frames of an array (..., n), or of each part of a tuple.
 

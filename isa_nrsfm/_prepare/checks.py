@@ -79,7 +79,7 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
     others = [
         str(name)
         for name in names
-        if (coordinate := parse_coordinate(name)) is None or coordinate.axis > 1
+        if (coordinate := parse_coordinate(name)) is None or coordinate[0] > 1
     ]
     if others:
         raise ValueError(

@@ -274,7 +274,7 @@ def _known_frames(
     classes = np.unique(labels, return_inverse=True)[1]
     rows = np.column_stack([features, classes, numbers])[known]
     known = known[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
-    order = FrameOrder.of(numbers[known], seconds[known])
+    order = FrameOrder(numbers[known], seconds[known])
     return features[known], labels[known], numbers[known], order
 
 

@@ -10,7 +10,6 @@ random walks.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,24 +34,18 @@ JUMPS = (
 )
 
 
-class FrameOrder(NamedTuple):
-    """Frames sorted by group, and by time within each group."""
+class FrameOrder:
+    """Frames sorted by group (n_frames,), and by time (n_frames,) within each group.
 
-    rows: NDArray  # numbers of the frames in this order
-    groups: NDArray  # ascending number of the group of each frame
-    sizes: NDArray  # number of frames of each group
+    rows, groups (n_frames,): numbers of the frames in this order, and of their groups.
+    sizes, first (n_groups,): number of frames of each group, and place of its first.
+    """
 
-    @classmethod
-    def of(cls, groups: NDArray, time: NDArray) -> "FrameOrder":
-        """Sort frames by groups (n_frames,) and time (n_frames,)."""
+    def __init__(self, groups: NDArray, time: NDArray):
         numbers = np.unique(groups, return_inverse=True)[1]
-        rows = np.lexsort((time, numbers))
-        return cls(rows, numbers[rows], np.bincount(numbers))
-
-    @property
-    def first(self) -> NDArray:
-        """Place of the first frame of each group (n_groups,)."""
-        return np.asarray(np.cumsum(self.sizes) - self.sizes)
+        self.rows = np.lexsort((time, numbers))
+        self.groups, self.sizes = numbers[self.rows], np.bincount(numbers)
+        self.first = np.cumsum(self.sizes) - self.sizes
 
     def means(self, values: NDArray) -> NDArray:
         """Average ordered values (n_frames, k) over each group (n_groups, k)."""

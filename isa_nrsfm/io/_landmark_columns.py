@@ -125,11 +125,10 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
     Sets have an x and a y column or more (``x0, x1, x2`` are those of any table).
     """
     members: dict[tuple[str, str, str], list[set[int | str]]] = {}
-    coordinates = [found for name in names if (found := parse_coordinate(name))]
-    for coordinate in coordinates:
-        for columns, key in coordinate.memberships:
+    for axis, _, memberships in filter(None, map(parse_coordinate, names)):
+        for columns, key in memberships:
             keys = members.setdefault(columns, [set(), set(), set()])
-            keys[coordinate.axis].add(key)
+            keys[axis].add(key)
     sizes = {
         (before + axes[0] + after, before + axes[1] + after): len(x | y)
         for (before, axes, after), (x, y, _) in members.items()
@@ -274,7 +273,7 @@ def _z_of(names: Sequence[Hashable], x_columns: Iterable[str]) -> tuple[str, ...
 def _coordinates(names: Iterable[Hashable]) -> list[tuple[str, int, tuple]]:
     """Return the coordinates among columns: name, axis, set and key of the point."""
     found = [(str(name), parse_coordinate(name)) for name in names]
-    return [(name, c.axis, c.memberships[0]) for name, c in found if c is not None]
+    return [(name, c[0], c[2][0]) for name, c in found if c is not None]
 
 
 def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str:

@@ -13,7 +13,7 @@ sets, ``thumb_#_x`` and ``*_x``.
 import re
 from collections.abc import Hashable, Iterable
 from itertools import pairwise, zip_longest
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 _SEPARATORS = r"[ _.\-]"
 # x0, x_0, eye_lmk_x_0. Words may hold line breaks, which a dot matches with DOTALL.
@@ -29,22 +29,14 @@ _AXIS_LABEL = re.compile(rf"([xyzXYZ])({_SEPARATORS})([^ _.\-].*)", re.DOTALL)
 _TRAILING_NUMBER = re.compile(r"(.*?)(\d+)", re.DOTALL)
 
 
-class Coordinate(NamedTuple):
-    """The parts of the name of a landmark column.
-
-    ``axis`` is 0, 1 or 2 for x, y or z; ``point`` is the name without its axis letter
-    (``"3"``, ``"nose"``, ``"eye_lmk_3"``). ``memberships`` are its sets, the narrowest
-    first: the text before the axis letter, the three letters and the text after it;
-    each with the key of the point.
-    """
-
-    axis: int
-    point: str
-    memberships: tuple[tuple[tuple[str, str, str], int | str], ...]
+# The axis, 0, 1 or 2 for x, y or z; the point, the name without its axis letter ("3",
+# "nose", "eye_lmk_3"); and the sets, the narrowest first: the text before the axis
+# letter, the three letters and the text after it, each with the key of the point.
+Coordinate = tuple[int, str, list[tuple[tuple[str, str, str], int | str]]]
 
 
 def parse_coordinate(name: Hashable) -> Coordinate | None:
-    """Read the name of a landmark coordinate; None for other names."""
+    """Return axis, point and sets of a landmark coordinate; None for other names."""
     if not isinstance(name, str) or not {",", "#", "*"}.isdisjoint(name):
         return None
     name = name.strip()
@@ -69,7 +61,7 @@ def parse_coordinate(name: Hashable) -> Coordinate | None:
         return None
     axes = "XYZ" if axis.isupper() else "xyz"
     memberships = [((before, axes, after), key) for before, after, key in sets]
-    return Coordinate(axes.index(axis), point, tuple(memberships))
+    return axes.index(axis), point, memberships
 
 
 def names_layout(
@@ -87,8 +79,8 @@ def names_layout(
         if coordinate is None:
             rest.append(str(name).lower().replace("x", "y"))
             continue
-        (before, _, after), key = coordinate.memberships[0]
-        axes.append(coordinate.axis)
+        axis, _, [((before, _, after), key), *_] = coordinate
+        axes.append(axis)
         points.append((before, after, key))
     pairs = [a == b for a, b in zip_longest(rest[0::2], rest[1::2])]
     if 0 not in axes or 1 not in axes:
@@ -110,8 +102,8 @@ def names_layout(
 def point_names(x_columns: Iterable[str]) -> tuple[str, ...]:
     """Name points after their x columns, without the axis if this stays unique."""
     x_columns = [name.strip() for name in x_columns]
-    coordinates = [parse_coordinate(name) for name in x_columns]
-    points = tuple(point.point for point in coordinates if point is not None)
+    coordinates = map(parse_coordinate, x_columns)
+    points = tuple(point for _, point, _ in filter(None, coordinates))
     return points if len(set(points)) == len(x_columns) else tuple(x_columns)
 
 
