@@ -8,7 +8,6 @@ split starts from that of all frames with the same number of basis shapes.
 import copy
 import time
 import warnings
-from collections.abc import Sequence
 from numbers import Integral
 from typing import Any, ClassVar, Self
 
@@ -54,7 +53,6 @@ class StartedNRSfM(AffineNRSfM):
     """A fit that starts from another one, without warnings and errors of depths."""
 
     start: TableModel | None = None
-    unconverged = False
 
     def __sklearn_clone__(self) -> Self:
         """Return a copy with the same start."""
@@ -62,10 +60,9 @@ class StartedNRSfM(AffineNRSfM):
 
     def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
         """Fit a table, and remember whether the fit has not converged."""
-        with warnings.catch_warnings(record=True, action="ignore") as unconverged:
-            warnings.simplefilter("always", ConvergenceWarning)
+        with warnings.catch_warnings(record=True, action="always") as caught:
             self._fit(X, point_weight, NoProgress(), start=self.start)
-        self.unconverged = bool(unconverged)
+        self.unconverged = ConvergenceWarning in [each.category for each in caught]
         return self
 
 
@@ -244,8 +241,8 @@ class AffineNRSfMCV(
         X, y = indexable(X, y)
         for_splitter, for_scorer = self._routed("fit", params)
         splits = list(plain.cv.split(X, y, **for_splitter))
-        trial = StartedNRSfM(**estimator.get_params(deep=False))
-        trial.set_params(frames_folder=None)
+        given = estimator.get_params(deep=False) | {"frames_folder": None}
+        trial = StartedNRSfM(**given)
         joint = trial.refinement in JOINT_REFINEMENTS
         if joint:  # a consensus only with the chosen K
             trial.set_params(refinement="joint")
@@ -256,24 +253,17 @@ class AffineNRSfMCV(
         tol = 4.0 * (JOINT_TOL if trial.tol is None else trial.tol)
         whole = copy.copy(trial).set_params(tol=tol)
         parts, n_unconverged = [], []
+        validation = {"cv": splits, "scoring": scorer, "params": for_scorer}
+        validation |= {"return_estimator": True, "error_score": "raise"}
         for k in candidates:
             since = time.perf_counter()
             if joint:
                 whole.set_params(n_components=k).fit(X)
                 whole.start = trial.start = whole._model
             seconds = time.perf_counter() - since
-            part = cross_validate(
-                trial.set_params(n_components=k),
-                X,
-                y,
-                cv=splits,
-                scoring=scorer,
-                params=for_scorer,
-                n_jobs=self.n_jobs,
-                return_estimator=True,
-                error_score="raise",
-            )
-            fits = [whole, *part.pop("estimator")]
+            trial.set_params(n_components=k)
+            part = cross_validate(trial, X, y, n_jobs=self.n_jobs, **validation)
+            fits = part.pop("estimator") + [whole] * joint
             n_unconverged.append(sum(fit.unconverged for fit in fits))
             parts.append(part | {"path_time": seconds})
             if self.verbose:
@@ -293,13 +283,13 @@ class AffineNRSfMCV(
         if self.scoring is None and np.nanmax(scores.mean(axis=1)) <= -1:
             warn_caller(NO_SHAPE)
         since = time.perf_counter()
-        fitted = estimator.set_params(n_components=candidates[best]).fit(X)
+        estimator.set_params(n_components=candidates[best])
+        self.best_estimator_, self.scorer_ = estimator.fit(X), scorer
         self.refit_time_ = time.perf_counter() - since
-        self.best_estimator_, self.scorer_ = fitted, scorer
-        self.best_index_, self.n_components_ = best, candidates[best]
-        self.n_splits_, self.best_score_ = len(splits), float(scores[best].mean())
+        self.best_index_, self.n_splits_ = best, len(splits)
+        self.n_components_ = self._n_features_out = candidates[best]
+        self.best_score_ = float(scores[best].mean())
         validate_data(self, X, skip_check_array=True)  # number and names of columns
-        self._n_features_out = self.n_components_
         return self
 
     def transform(self, X: Any) -> NDArray:
@@ -316,8 +306,7 @@ class AffineNRSfMCV(
         ndarray of shape (n_frames, `n_components_`)
             As in `AffineNRSfM.transform`.
         """
-        check_is_fitted(self)
-        return self.best_estimator_.transform(X)
+        return self._fitted().transform(X)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -339,8 +328,7 @@ class AffineNRSfMCV(
         ndarray of shape (n_frames, 2 * n_points)
             The table.
         """
-        check_is_fitted(self)
-        return self.best_estimator_.inverse_transform(alpha, motion, translation)
+        return self._fitted().inverse_transform(alpha, motion, translation)
 
     def decompose(self, X: Any) -> Decomposition:
         """
@@ -356,8 +344,7 @@ class AffineNRSfMCV(
         Decomposition
             As in `AffineNRSfM.decompose`.
         """
-        check_is_fitted(self)
-        return self.best_estimator_.decompose(X)
+        return self._fitted().decompose(X)
 
     def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
         """
@@ -375,8 +362,7 @@ class AffineNRSfMCV(
         ndarray of shape (n_frames, n_points, 3)
             As in `AffineNRSfM.reconstruct`.
         """
-        check_is_fitted(self)
-        return self.best_estimator_.reconstruct(X, camera)
+        return self._fitted().reconstruct(X, camera)
 
     def reproject(self, X: Any) -> NDArray:
         """
@@ -392,8 +378,7 @@ class AffineNRSfMCV(
         ndarray of shape (n_frames, 2 * n_points)
             As in `AffineNRSfM.reproject`.
         """
-        check_is_fitted(self)
-        return self.best_estimator_.reproject(X)
+        return self._fitted().reproject(X)
 
     def score(self, X: Any, y: Any = None, **params: Any) -> float:
         """
@@ -413,9 +398,8 @@ class AffineNRSfMCV(
         float
             The score; larger is better.
         """
-        check_is_fitted(self)
-        _, for_scorer = self._routed("score", params)
-        return float(self.scorer_(self.best_estimator_, X, y, **for_scorer))
+        estimator, (_, for_scorer) = self._fitted(), self._routed("score", params)
+        return float(self.scorer_(estimator, X, y, **for_scorer))
 
     def get_metadata_routing(self) -> MetadataRouter:
         """
@@ -431,6 +415,11 @@ class AffineNRSfMCV(
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""
         return hasattr(self, "best_estimator_")
+
+    def _fitted(self) -> AffineNRSfM:
+        """Return the fit of all frames, or raise if there is none."""
+        check_is_fitted(self)
+        return self.best_estimator_
 
     def _plain_search(self) -> GridSearchCV:
         """Return a search with a clone of the estimator, its scorer and splitter."""
@@ -470,7 +459,7 @@ def checked_candidates(n_components: Any) -> list[int]:
 
 
 def check_rows(
-    estimator: AffineNRSfM, X: Any, splits: Sequence[NDArray], n_components: int
+    estimator: AffineNRSfM, X: Any, splits: list[NDArray], n_components: int
 ) -> None:
     """Refuse a table, or rows of it that are fitted, not enough for K basis shapes."""
 
@@ -495,9 +484,7 @@ def check_rows(
             ) from error
 
 
-def results_of(
-    candidates: Sequence[int], parts: Sequence[dict[str, NDArray]]
-) -> dict[str, Any]:
+def results_of(candidates: list[int], parts: list[dict[str, Any]]) -> dict[str, Any]:
     """Return `cv_results_` as in `GridSearchCV`, from results of `cross_validate`."""
     results: dict[str, Any] = {
         "param_n_components": np.array(candidates),
@@ -532,14 +519,12 @@ def selected(scores: NDArray, select: str) -> int:
     best = int(np.nanargmax(mean))
     if select == "best":
         return best
-    n_splits = scores.shape[1]
-    if n_splits < 2:
+    if scores.shape[1] < 2:
         raise ValueError(
             f"select={select!r} needs the standard error over at least two splits; cv "
             "has one"
         )
-    error = standard_errors(scores)[best]
-    return int(np.argmax(mean >= mean[best] - error))
+    return int(np.argmax(mean >= mean[best] - standard_errors(scores)[best]))
 
 
 def standard_errors(scores: NDArray) -> NDArray:
@@ -553,9 +538,7 @@ def standard_errors(scores: NDArray) -> NDArray:
 def line(n_components: int, scores: NDArray, held_out: bool) -> str:
     """Return scores (n_splits,) as text; a held-out error is minus the score."""
     mean, error = scores.mean(), standard_errors(scores)
-    score = f"score {mean:.4g}, standard error {error:.2g}"
+    text = f"score {mean:.4g}, standard error {error:.2g}"
     if held_out:
-        score = (
-            f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
-        )
-    return f"n_components={n_components}: {score}"
+        text = f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
+    return f"n_components={n_components}: {text}"
