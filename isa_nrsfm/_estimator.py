@@ -546,21 +546,18 @@ class AffineNRSfM(
             "frames_scaled_": settings.scale_frames,
         }
         if self.keep_frames:
-            kept = keep(frames._asdict())
-            frames = Decomposition(*map(source.as_collected, kept.values()))
-            attributes |= {
-                f"{name}_": value for name, value in frames._asdict().items()
-            }
+            for name, part in keep(frames._asdict()).items():
+                attributes[f"{name}_"] = source.as_collected(part)
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
-                R, scales = full_rotations(frames.motion)
+                R, scales = full_rotations(attributes["motion_"])
                 attributes |= {"rotations_": R, "scales_": scales}
         else:
             del attributes["_frame_sizes"]
         opened.__dict__.update(attributes)
         if errors and not model.frames.certainty.determined:
-            share, _ = gross_residuals(source.joined(model.distances))
+            share, _ = gross_residuals(source.joined(model.distances, *frames[:3]))
             warn_caller(depth_advice(facts_of(opened, outlier_share=share)))
         self.__dict__.update(vars(opened))
 
@@ -942,19 +939,18 @@ class AffineNRSfM(
         True
         """
         check_is_fitted(self)
-        mirror, dtype = copy.copy(self), self.mean_shape_.dtype
-        mirror._model = model = self._model.mirrored()
-        mirror.mean_shape_, mirror.basis_ = model.mean_shape, model.basis
+        mirror, signs = copy.copy(self), MIRROR.astype(self.mean_shape_.dtype)
+        mirror._model = self._model.mirrored()
         # Not in files of older versions
         mirror.mirror_certainty_ = 1.0 - getattr(self, "mirror_certainty_", np.nan)
-        for name in ("reference_motion_", "motion_"):
+        shapes_and_cameras = "mean_shape_", "basis_", "reference_motion_", "motion_"
+        factors = dict.fromkeys(shapes_and_cameras, signs)
+        factors["rotations_"] = np.outer(signs, signs)
+        of_modes = np.tile(signs, len(self.basis_))
+        factors["mode_covariance_"] = np.outer(of_modes, of_modes)
+        for name, factor in factors.items():
             if hasattr(self, name):
-                setattr(mirror, name, getattr(self, name) * MIRROR.astype(dtype))
-        if hasattr(self, "rotations_"):
-            turned = MIRROR[:, None] * self.rotations_ * MIRROR
-            mirror.rotations_ = turned.astype(dtype, copy=False)
-        signs = np.tile(MIRROR, len(self.basis_))
-        mirror.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
+                setattr(mirror, name, getattr(self, name) * factor)
         return mirror
 
     def reproject(self, X: Any) -> NDArray:
@@ -1104,8 +1100,7 @@ class AffineNRSfM(
         if not reset:
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
-            joint = isinstance(frames, PosteriorFrames)
-            loss = frames.loss if isinstance(frames, PosteriorFrames) else "linear"
+            joint, loss = isinstance(frames, PosteriorFrames), frames.loss
         if point_weight is not None:
             check_weightable(X, joint, loss)
         if is_read_later(X):

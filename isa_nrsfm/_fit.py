@@ -51,7 +51,7 @@ from isa_nrsfm._gauge import (
     reorder_blocks,
     rigid_gauge,
 )
-from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
+from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import (
@@ -157,7 +157,9 @@ def fit_table(
     if settings.joint:
         settings = settings._replace(on_step=progress.step)
         fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
-        model = _frame_model(fit.state.shapes, fit.state.noise, alpha, settings)
+        (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
+        gauge = FrameMap.identity(n_components)
+        model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
         progress(JOINT_STAGE)
         attributes = {
             "camera_noise_ratio_": fit.camera_noise_ratio,
@@ -175,7 +177,7 @@ def fit_table(
             n_numbers, square = tracks.totals
             noise = factorised.noise_level(n_components) * square / n_numbers
             if wanted > n_components or fit.misfit > noise:
-                model = _consensus_model(table, model, settings, wanted, free)
+                model = consensus(model, table.rows, settings, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
         if errors and camera != "affine":
@@ -345,34 +347,6 @@ def _paper_frames(
     covariance = reorder_blocks(covariance, order)
     attributes = {"mode_covariance_": (table.unit or 1.0) ** 2 * covariance}
     return fitted(mean_shape, basis), frames, attributes
-
-
-def _frame_model(
-    shapes: NDArray, noise: float, alpha: NDArray, settings: FitSettings
-) -> PosteriorFrames:
-    """Return the model of a frame for shapes (K + 1, 3, J), before the gauge."""
-    starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
-    return PosteriorFrames(shapes, noise, starts, settings.loss, gauge, settings.camera)
-
-
-def _consensus_model(
-    table: ScaledTable,
-    model: PosteriorFrames,
-    settings: FitSettings,
-    wanted: int,
-    free: bool,
-) -> PosteriorFrames:
-    """Return the consensus of groups of points, with the errors of the depths."""
-    if free:
-        most = most_components(len(table.sizes), table.n_points, settings.camera)
-        wanted = min(most, MOST_COMPONENTS)
-    merged = consensus(model, table.rows, settings, wanted, free)
-    shapes, noise, alpha, squares = merged
-    certainty = model.certainty
-    if squares is not None:
-        certainty = certainty.of_consensus(*squares)
-    model = _frame_model(shapes, noise, alpha, settings)
-    return replace(model, certainty=certainty)
 
 
 def _joint_frames(

@@ -177,12 +177,19 @@ class TableModel(NamedTuple):
         shapes = compose(self.mean_shape, self.basis, alpha)
         return tracks_to_table(project(shapes, motion, translation), self.layout)
 
-    def distances(self, rows: NDArray) -> NDArray:
-        """Return lengths of residuals (n, n_points) of frames of size one."""
-        usable, centred, _, sizes, _ = self._ready(rows)
-        fit = self.frames.fit(centred, sizes, False)
-        shapes = compose(self.mean_shape, self.basis, fit.alpha)
-        images = project(shapes, fit.motion, fit.translation).transpose(0, 2, 1)
+    def distances(self, rows: NDArray, *fitted: NDArray) -> NDArray:
+        """Return lengths of residuals (n, n_points) of frames of size one.
+
+        Cameras, positions and coefficients of the rows are fitted, if not given.
+        """
+        usable, centred, centre, sizes, _ = self._ready(rows)
+        if fitted:
+            motion, translation, alpha = (part[usable] for part in fitted)
+            translation = translation - centre
+        else:
+            motion, translation, alpha, _ = self.frames.fit(centred, sizes, False)
+        shapes = compose(self.mean_shape, self.basis, alpha)
+        images = project(shapes, motion, translation).transpose(0, 2, 1)
         distance = np.linalg.norm(centred - images, axis=1)
         return of_all_rows(distance / sizes[:, None], usable)
 
@@ -252,10 +259,9 @@ class TableModel(NamedTuple):
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None]:
         """Return a mask of usable rows; these centred, centres, sizes and weights."""
         centred, report = centred_frames(rows)
-        usable, translation, sizes = report.usable, report.translation, report.size
-        if not usable.all():
-            fitted = centred, translation, sizes
-            centred, translation, sizes = (part[usable] for part in fitted)
+        usable = report.usable
+        parts = centred, report.translation, report.size
+        centred, translation, sizes = (part[usable] for part in parts)
         if self.frames.loss != "linear" and len(centred):
             centred, translation = robustly_centred(rows[usable])
             sizes = robust_sizes(centred)

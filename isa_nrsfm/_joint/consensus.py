@@ -25,7 +25,7 @@ from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, full_rotations
-from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, spread_starts
 from isa_nrsfm._joint.common_depths import (
     LAST_SHARE,
     WEIGHT_OF_WHOLE,
@@ -39,6 +39,7 @@ from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._joint.uncertainty import inlying_rows
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
@@ -99,16 +100,12 @@ def consensus(
     settings: FitSettings,
     most: int,
     free: bool,
-) -> tuple[NDArray, float, NDArray, NDArray | None]:
-    """Fit groups of neighbouring points, and merge them.
+) -> PosteriorFrames:
+    """Fit groups of neighbouring points, and return the model that merges them.
 
-    The model is a joint fit with calibrated cameras, the rows are frames (I, 2, J) of
-    size one, NaN where a point is missing. There are `most` basis shapes, or if their
-    number is free at most as many, those that exceed the noise.
-
-    Returns centred shapes (K + 1, 3, J) for coefficients of variance one, the noise
-    variance of a coordinate, the coefficients (n, K) of some frames, and the mean
-    squares (2, J) of errors and of depths, None without groups.
+    The given model is a joint fit with calibrated cameras, the rows are frames (I, 2,
+    J) of size one, NaN where a point is missing. The result has `most` basis shapes, or
+    if their number is free those that exceed the noise.
     """
     part, fit, _ = inlying_rows(model, rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
@@ -123,7 +120,7 @@ def consensus(
     price = 1.0 / (limits.basis_std**2 * mean_square)
     floor = FLOOR_SHARE * limits.least_noise * mean_square
     scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
-    noise, S, groups, squares = model.noise_variance, shapes, [], None
+    noise, S, groups, certainty = model.noise_variance, shapes, [], model.certainty
     distances = neighbour_distances(shapes[:, :, chosen])
     # Groups cannot improve a fit whose noise is below their floor.
     if noise >= scene.floor:
@@ -132,13 +129,13 @@ def consensus(
         noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
         share = 1.0 - scene.floor / noise
         groups = weighted(scene, groups)
-        merged = together(scene, groups, distances, scales, noise)
+        joined = together(scene, groups, distances, scales, noise)
         noise -= (1.0 - LAST_SHARE) * scene.floor
         weights = interpolation(model.shapes[0], chosen)
-        depths = centred(merged[:, 2] @ weights)
-        errors = disagreements(groups, merged[:, 2]) @ weights
-        squares = np.array([errors, np.mean(depths**2, axis=0)])
-        change = (merged - scene.first) @ weights
+        depths = centred(joined[:, 2] @ weights)
+        errors = disagreements(groups, joined[:, 2]) @ weights
+        certainty = certainty.of_consensus(errors, np.mean(depths**2, axis=0))
+        change = (joined - scene.first) @ weights
         others = np.setdiff1d(np.arange(n_points), chosen)
         off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
         change[:, :2, others] = off[:, :, others]
@@ -146,8 +143,14 @@ def consensus(
         S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
         S = aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S
     # Their principal components
-    shapes, alpha, rest = principal_shapes(S, most, LEFT * noise if free else 0.0)
-    return shapes, noise + rest, alpha, squares
+    left = 0.0
+    if free:
+        possible = most_components(rows.n_frames, n_points, model.camera)
+        most, left = min(possible, MOST_COMPONENTS), LEFT * noise
+    shapes, alpha, rest = principal_shapes(S, most, left)
+    starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
+    merged = shapes, noise + rest, starts, model.loss, gauge, model.camera, certainty
+    return PosteriorFrames(*merged)
 
 
 def together(
