@@ -40,13 +40,7 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
-from isa_nrsfm._joint.settings import (
-    JOINT_TOL,
-    LIMITS,
-    PAPER_TOL,
-    FitSettings,
-    Limits,
-)
+from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CALIBRATED_CAMERAS,
@@ -1115,9 +1109,9 @@ class AffineNRSfM(
         table = open_table(
             X, layout, names, counted=reset, n_jobs=n_jobs, working_memory=memory
         )
-        if point_weight is None:
-            return table, ()
-        return weighted_rows(table, point_weight)
+        return (
+            (table, ()) if point_weight is None else weighted_rows(table, point_weight)
+        )
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:

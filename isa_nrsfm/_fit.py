@@ -54,10 +54,7 @@ from isa_nrsfm._gauge import (
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames
-from isa_nrsfm._joint.problem import (
-    FactorisedTable,
-    JointState,
-)
+from isa_nrsfm._joint.problem import FactorisedTable, JointState
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (

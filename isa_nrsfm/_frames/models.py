@@ -219,13 +219,8 @@ class RigidFrames:
         if the camera does not show B_k. Otherwise the solution of least norm. Ignores
         the other parameters.
         """
-        n_frames, n_components = len(rows), len(self.basis)
-        fit = Decomposition(
-            np.empty((n_frames, 2, 3)),
-            np.empty((n_frames, 2)),
-            np.empty((n_frames, n_components)),
-            np.full((n_frames, n_components), np.nan),
-        )
+        shapes = (2, 3), (2,), (len(self.basis),), (len(self.basis),)
+        fit = Decomposition(*(np.full((len(rows), *size), np.nan) for size in shapes))
         complete = np.asarray(seen_points(rows).all(axis=1))
         parts = [(np.array([i]), self._together) for i in np.flatnonzero(~complete)]
         for frames, fitted in [(complete, self._separately), *parts]:

@@ -172,10 +172,8 @@ class FrameSearch:
             if len(chosen):
                 frames = padded(chosen)
                 own = None if complete[frames[0]] else weights[frames]
-                whole = len(chosen) == len(frames) == n_frames
-                part = rows if whole else rows[frames]
                 fit = self.fit(
-                    frame_tracks(part, own),
+                    frame_tracks(rows[frames], own),
                     noise[frames],
                     initial=None if initial is None else initial[frames],
                     starts=starts,

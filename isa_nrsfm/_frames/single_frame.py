@@ -8,12 +8,7 @@ Frames that are not regular are left to it.
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.newton import (
-    LARGE_RISE,
-    REVERSED,
-    SAME_WELL,
-    calibrated_starts,
-)
+from isa_nrsfm._frames.newton import LARGE_RISE, REVERSED, SAME_WELL, calibrated_starts
 from isa_nrsfm._frames.search import (
     LARGEST_DAMPING,
     MAX_STEPS,

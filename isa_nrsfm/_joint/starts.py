@@ -19,11 +19,7 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rigid_cameras,
 )
-from isa_nrsfm._joint.problem import (
-    FactorisedTable,
-    JointProblem,
-    JointState,
-)
+from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState
 from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last

@@ -8,11 +8,7 @@ from numpy.typing import NDArray
 from sklearn.utils import check_array
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._prepare.checks import (
-    check_points,
-    check_size,
-    warn_if_other_layout,
-)
+from isa_nrsfm._prepare.checks import check_points, check_size, warn_if_other_layout
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import is_read_later, unmasked

@@ -21,6 +21,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm.analysis._frame_columns import (
     checked_column,
     checked_times,
@@ -284,7 +285,7 @@ def _step_down_p_values(energies: NDArray) -> NDArray:
     energies = energies[:, weakest_first]
     largest = np.maximum.accumulate(energies, axis=1)
     # Tolerance for rounding: equal energies count as large.
-    larger = (largest >= energies[0] * (1 - 1e-12)).mean(axis=0)
+    larger = (largest >= energies[0] * (1 - OF_DIFFERENCES)).mean(axis=0)
     p_value = np.empty(len(larger))
     p_value[weakest_first] = np.maximum.accumulate(larger[::-1])[::-1]
     return p_value

@@ -18,10 +18,9 @@ from scipy.sparse import csr_array, hstack
 from scipy.sparse.linalg import lsmr
 from scipy.stats import norm
 
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm.analysis._within_groups import between_share
 
-# Sum of squares, relative to that of the labels, that is due to rounding errors.
-ROUNDING = 1e-12
 # Why a label cannot be tested.
 ONE_EVENT = (
     "the coefficients and the label change slowly or with one period: they have one "
@@ -152,12 +151,12 @@ def permuted_energies(
     untested = ""
     weights = _weights(labels, order)
     between = _standard(of_labels, weights)
-    if np.sum(between**2) > ROUNDING * total:
+    if np.sum(between**2) > OF_DIFFERENCES * total:
         centres = _standard(means, weights)
         orders = (rng.permutation(len(means)) for _ in range(n_permutations))
         energies += _energies(centres, between, (centres[i] for i in orders))
         permuted.append("groups")
-    if square - np.sum(sizes * of_labels**2) > ROUNDING * total:
+    if square - np.sum(sizes * of_labels**2) > OF_DIFFERENCES * total:
         rest = unexplained(alpha, labels, order)
         length, in_runs = independent_length(rest), _are_sorted(labels, order)
         units = "frames" if length == 1 else f"blocks of {length} frames"
