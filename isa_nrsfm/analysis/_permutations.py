@@ -92,22 +92,6 @@ def independent_length(rest: NDArray) -> int:
     return length
 
 
-def powers(values: NDArray, labels: csr_array, order: FrameOrder) -> NDArray:
-    """Return products (n_frames, k) of the powers of values and labels of norm one.
-
-    Times the number of frames, their sum is the integrated autocorrelation time of
-    both: ``1 + 2 sum_h r_h s_h`` with the autocorrelations r and s of the series
-    (Bartlett, "Some aspects of the time-correlation problem", 1935).
-    """
-    power = np.zeros((len(values), 1))
-    for c in range(labels.shape[1]):
-        power += order.spectrum(labels[:, [c]].toarray()) ** 2
-    power[order.first] = 0.0
-    products = power / power.sum() * order.spectrum(values) ** 2
-    energy = np.sum(values**2, axis=0)
-    return np.asarray(products / np.where(energy > 0, energy, 1.0))
-
-
 def seams(alpha: NDArray) -> NDArray:
     """Return the frames (n,) before which coefficients jump, as where clips are joined.
 
@@ -195,8 +179,15 @@ def _are_sorted(labels: csr_array, order: FrameOrder) -> bool:
 
 
 def _one_event(alpha: NDArray, labels: csr_array, order: FrameOrder) -> bool:
-    """Return whether labels share less than two frequencies with alpha, in effect."""
-    products = powers(alpha, labels, order)
+    """Return whether labels share less than two frequencies with alpha, in effect.
+
+    The part of a frequency is the product of the powers of both.
+    """
+    power = np.zeros((len(alpha), 1))
+    for c in range(labels.shape[1]):
+        power += order.spectrum(labels[:, [c]].toarray()) ** 2
+    power[order.first] = 0.0  # means of groups
+    products = power * order.spectrum(alpha) ** 2
     shared = np.sum(products / np.maximum(products.sum(axis=0), 1e-300), axis=1)
     return bool(np.sum(shared) ** 2 < 2 * np.sum(shared**2))
 
