@@ -197,9 +197,8 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
         f"{rows[np.nanargmax(np.abs(alpha[:, k]))]})"
         for k in np.flatnonzero(few)
     ]
-    return f"a few of the {n_frames} frames determine {first_items(shown, 5)}" * any(
-        few
-    )
+    text = f"a few of the {n_frames} frames determine {first_items(shown, 5)}"
+    return text if shown else ""
 
 
 def _of_pose(

@@ -143,15 +143,15 @@ def permuted_energies(
     if square - np.sum(sizes * of_labels**2) > OF_DIFFERENCES * total:
         rest = unexplained(alpha, labels, order)
         length, in_runs = independent_length(rest), _are_sorted(labels, order)
-        units = "frames" if length == 1 else f"blocks of {length} frames"
+        units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
         shuffled = _shuffled(alpha, order, length, n_permutations, rng)
-        if length > 1 and not in_runs:
+        if length == 1:
+            units = "frames"
+        elif not in_runs:
             units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
+            one_event = _one_event(alpha, labels, order)
         if length > 1 and not permuted:
-            few = (
-                8 * length > len(alpha) if in_runs else _one_event(alpha, labels, order)
-            )
-            untested = few * ONE_EVENT
+            untested = ONE_EVENT * one_event
             if len(means) == 1:
                 cuts = np.intersect1d(seams(values[order.rows]), seams(rest))
                 if len(cuts):
