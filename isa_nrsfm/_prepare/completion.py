@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
-from isa_nrsfm._linalg.small_matrices import unpacked
+from isa_nrsfm._linalg.small_matrices import centred, unpacked
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
 # Low-rank model of the rows of a measurement matrix: B (rank, n_points), rows centred,
@@ -65,7 +65,7 @@ def filled_in(rows: NDArray, model: Model) -> NDArray:
     """Return frames (n_frames, 2, n_points), NaN filled in by the model, centred."""
     z, t, *_ = _posterior(*_frames(rows), *model)
     filled = np.where(np.isnan(rows), z @ model[0] + t, rows)
-    return filled - filled.mean(axis=2, keepdims=True)
+    return centred(filled)
 
 
 def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -97,7 +97,7 @@ def _principal_axes(rows: NDArray, rank: int) -> Model:
     variances = np.maximum(values, 1e-3 * max(values[-1], OF_STEPS))
     B = (axes * np.sqrt(variances)).T
     noise = max(rest, 1e-6 * values[-1], OF_STEPS)
-    return B - B.mean(axis=1, keepdims=True), noise
+    return centred(B), noise
 
 
 def _posterior(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import seen_points
 
@@ -55,13 +56,13 @@ def distant_points(rows: NDArray) -> NDArray:
     return distance > DISTANT * sizes[:, None]
 
 
-def robust_sizes(centred: NDArray) -> NDArray:
+def robust_sizes(rows: NDArray) -> NDArray:
     """Return sizes (I,) of rows (I, 2, J), robust against outliers.
 
     The root of half the median squared distance of the visible points from their
     `spatial_median`. If half of them coincide, the RMS.
     """
-    return _spread(centred)[1]
+    return _spread(rows)[1]
 
 
 def robustly_centred(rows: NDArray) -> tuple[NDArray, NDArray]:
@@ -153,8 +154,7 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     filled = np.where(hidden[:, None], 0.0, target)
     for _ in range(100):
         # Rigid factorisation, rank 3, of the filled rows
-        centred = filled - filled.mean(axis=2, keepdims=True)
-        W = centred.reshape(-1, rows.shape[2])
+        W = centred(filled).reshape(-1, rows.shape[2])
         axes = np.linalg.eigh(W.T @ W)[1][:, -3:]
         rigid = _rigid_part(target, ~hidden, axes)
         # Typical distances, of the table and of each point
