@@ -260,7 +260,7 @@ class AffineNRSfMCV(
             if joint:
                 whole.set_params(n_components=k).fit(X)
                 whole.start = trial.start = whole._model
-            seconds = time.perf_counter() - since
+            seconds = joint * (time.perf_counter() - since)
             trial.set_params(n_components=k)
             part = cross_validate(trial, X, y, n_jobs=self.n_jobs, **validation)
             fits = part.pop("estimator") + [whole] * joint
