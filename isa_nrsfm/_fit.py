@@ -41,7 +41,6 @@ from isa_nrsfm._frames.models import (
     FrameMap,
     PosteriorFrames,
     RigidFrames,
-    leverages,
     spread_starts,
 )
 from isa_nrsfm._gauge import (
@@ -60,6 +59,7 @@ from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
     depth_certainty,
     fitted_frames,
+    frame_certainty,
     n_reliable,
     reliabilities,
     shape_uncertainty,
@@ -351,7 +351,7 @@ def _joint_frames(
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of a joint fit in the independent gauge."""
     fits = fitted_frames(model, tracks, table.rows)
-    posteriors, motion, alpha, covariance, residual = fits
+    posteriors, motion, alpha, covariance, _ = fits
     unknown = np.isnan(motion).any(axis=(1, 2))
     if unknown.any():
         row = np.flatnonzero(table.shown)[unknown.argmax()]
@@ -366,9 +366,7 @@ def _joint_frames(
         model.shapes, motion, alpha, s.independence, s.camera, unit
     )
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
-    certainty = model.certainty._replace(residual=residual / weight.sum())
-    if certainty.leverage is not None:  # of coefficients from the images
-        certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
+    certainty = frame_certainty(model, fits, table.n_seen, weight)
     model = replace(model, gauge=frame_map, certainty=certainty)
     share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)

@@ -253,7 +253,9 @@ def test_likelihood_of_frames_is_linearised(name, loss):
     if loss == "linear":
         assert_allclose(alone.slope[row], T.mean(axis=2), rtol=1e-6, atol=1e-6)
         T = (T - T.mean(axis=2, keepdims=True)).reshape(len(T), -1)
+        constant, slope = frames.certainty.images
         noise = frames.noise_variance * model._frame_sizes[row] ** 2
+        noise *= constant + slope * (1 + np.sum(alone.alpha[row] ** 2))
         assert_allclose(alone.precision[row], T @ T.T / noise, rtol=1e-5, atol=1e-2)
     # The posterior covariance has the Hessian, the precision that of Gauss-Newton.
     whole = alone.precision[row] + np.diag(np.arange(len(start)) < 2)

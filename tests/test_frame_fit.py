@@ -171,6 +171,20 @@ class TestPosteriorFrames:
         motion = expected.motion * scale[..., None]
         assert_allclose(fitted.motion, motion, atol=1e-8 * np.abs(motion).max())
 
+    def test_errors_of_shapes_lower_the_precision_of_the_images(self):
+        frames, tracks = posterior_frames(0)
+        rows, sizes = tracks.transpose(0, 2, 1), np.ones(len(tracks))
+        alone = frames.fit(rows, sizes)
+        certainty = DepthCertainty(images=(1.5, 0.2))
+        fitted = replace(frames, certainty=certainty).fit(rows, sizes)
+        assert_array_equal(fitted.alpha, alone.alpha)
+        ratio = 1.5 + 0.2 * (1 + np.sum(alone.alpha**2, axis=1))
+        prior = np.eye(2)
+        precision = np.linalg.inv(frames.posterior(rows).covariance) - prior
+        expected = np.linalg.inv(precision / ratio[:, None, None] + prior)
+        variances = np.diagonal(expected, axis1=1, axis2=2)
+        assert_allclose(fitted.alpha_std**2, variances, rtol=1e-8)
+
     @GAPS
     @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_weights_of_a_robust_loss_agree_with_the_fit(self, loss, missing):

@@ -54,6 +54,9 @@ class DepthCertainty(NamedTuple):
         equal errors of all shapes. None if all frames have the mean variance.
     residual : float
         Mean squared residual of a point of the fitted frames, of size one.
+    images : tuple of two floats
+        Error variance of a coordinate of an image, with the errors of the shapes, over
+        the noise variance: the first plus the second times the leverage of the frame.
     """
 
     total: float = np.nan
@@ -62,6 +65,7 @@ class DepthCertainty(NamedTuple):
     points: NDArray | None = None
     leverage: float | None = None
     residual: float = np.nan
+    images: tuple[float, float] = (1.0, 0.0)
 
     @property
     def determined(self) -> bool:
@@ -330,15 +334,28 @@ class PosteriorFrames:
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""
         covariance = posterior.covariance
+        known = covariance.shape[1] == len(self.shapes) - 1
         motion, alpha, deviation = self.gauge.apply(
             posterior.motion,
             posterior.alpha,
-            covariance if covariance.shape[1] == len(self.shapes) - 1 else None,
+            self.widened(posterior.alpha, covariance)[0] if known else None,
         )
         translation = posterior.translation * sizes[:, None]
         return Decomposition(
             motion * sizes[:, None, None], translation, alpha, deviation
         )
+
+    def widened(self, alpha: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
+        """Return covariances (n, K, K) with the errors of the shapes.
+
+        The precision is the sum of that of the prior, I, and of the images. The latter
+        is divided by the error variance of the images over that of the noise. These
+        ratios (n, 1, 1) are returned, too.
+        """
+        constant, slope = self.certainty.images
+        ratio = (constant + slope * leverages(alpha))[:, None, None]
+        rest = np.eye(alpha.shape[1]) + (ratio - 1.0) * covariance
+        return np.linalg.solve(rest, ratio * covariance), ratio
 
     def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
         """Return the fit of prepared frames of size one, before the gauge."""
@@ -369,12 +386,13 @@ class PosteriorFrames:
         T = T.reshape(*T.shape[:2], 2 * rows.shape[2]) / sizes[:, None, None]
         precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
+        covariance, ratio = self.widened(fit.alpha, fit.covariance)
         return LinearisedFrames(
             motion,
             fit.translation * sizes[:, None],
             fit.alpha,
-            fit.covariance,
-            precision,
+            covariance,
+            precision / ratio,
             slope,
         )
 

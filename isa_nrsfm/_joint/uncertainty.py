@@ -36,6 +36,7 @@ from isa_nrsfm._frames.models import (
     Decomposition,
     DepthCertainty,
     PosteriorFrames,
+    leverages,
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
@@ -130,6 +131,31 @@ def shape_uncertainty(
         X = stacked_motion(motion[frames], alpha[frames])
         information += X.T @ (np.repeat(share[frames], 2)[:, None] * X)
     return np.linalg.pinv(information, hermitian=True)
+
+
+def frame_certainty(
+    frames: PosteriorFrames, fits: Any, n_seen: NDArray, weight: NDArray
+) -> DepthCertainty:
+    """Return the certainty with that of `fits`, the result of `fitted_frames`.
+
+    n_seen (n,): numbers of seen points. weight (n,): sums of their weights. Camera,
+    position and coefficients fit a part of the coordinates of a frame. All other
+    coordinates determine the 3 J unknowns of each shape, whose errors in an image are
+    proportional to the leverage of the frame. The noise variance neglects that the
+    coefficients fit noise, too, but not with a robust loss, nor at its floor.
+    """
+    *_, alpha, covariance, residual = fits
+    certainty, mean = frames.certainty, float(leverages(alpha).mean())
+    unknowns, numbers = 3 * frames.shapes[:, 0].size, 2.0 * n_seen.sum()
+    n_own = 2 + CAMERAS[frames.camera].n_parameters + np.trace(1 - covariance)
+    left = max(numbers - len(alpha) * n_own, 0.1 * numbers)
+    noise = frames.noise_variance
+    if frames.loss == "linear":
+        noise = max(noise, residual / max(left - unknowns, 0.1 * numbers))
+    ratio, square = noise / frames.noise_variance, residual / weight.sum()
+    images, leverage = (ratio, ratio * unknowns / left / mean), certainty.leverage
+    leverage = leverage and mean  # of coefficients from the images
+    return certainty._replace(residual=square, leverage=leverage, images=images)
 
 
 def shown_frames(

@@ -261,7 +261,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((P,), ["depth_variances"]),
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
-        ((2,), ["reference_translation_", "certainty"]),
+        ((2,), ["reference_translation_", "certainty", "image_errors"]),
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_"]),
         ((N, 2, 3), ["motion_"]),
@@ -307,6 +307,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "depth_variances": frames.certainty.points,
         "leverage": frames.certainty.leverage,
         "residual": frames.certainty.residual,
+        "image_errors": np.array(frames.certainty.images),
     }
 
 
@@ -331,6 +332,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
             entries["depth_variances"],
             entries.get("leverage"),
             entries.get("residual", np.nan),
+            tuple(entries.get("image_errors", (1.0, 0.0))),
         ),
     )
 
