@@ -208,8 +208,10 @@ class AffineNRSfM(
         Coefficients of the frames, scaled to unit variance; signs chosen so that the
         skewness is non-negative. Their mean is zero after the joint refinement.
     alpha_std_ : ndarray of shape (n_frames, n_components)
-        Posterior standard deviations of `alpha_` for known shapes and noise (joint
-        refinement only).
+        Posterior standard deviations of `alpha_`, with the errors of the shapes (joint
+        refinement only). They assume independent noise, so they are too small for
+        deformation that the basis shapes do not model, and for coefficients without
+        `reliability_`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Affine cameras, in the units of the table.
     translation_ : ndarray of shape (n_frames, 2)
