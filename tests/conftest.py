@@ -91,9 +91,9 @@ def load_data(data_path):
 
 @pytest.fixture(scope="module")
 def one_start():
-    """Let joint fits of small tables have one start, as those of large ones do."""
-    limits = AffineNRSfM._limits
-    quick = limits._replace(few_frames=0)
+    """Let joint fits have one start, and few steps for the errors of their depths."""
+    limits = {"few_frames": 0, "widths": (), "error_steps": 3}
+    quick = AffineNRSfM._limits._replace(**limits)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(AffineNRSfM, "_limits", quick)
         yield

@@ -118,7 +118,7 @@ def assert_zero_from(model, first):
 
 @pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
 @pytest.mark.parametrize("refinement", ["alternating", None])
-@pytest.mark.parametrize("n_components", range(1, 7))
+@pytest.mark.parametrize("n_components", [2, 3, 6])
 def test_shark_has_one_shape_of_rank_two(load_data, n_components, refinement, isa):
     tracks = real_tracks(load_data, "shark_torresani")
     model = fitted(tracks, n_components, isa=isa, refinement=refinement)

@@ -21,16 +21,24 @@ from sklearn.model_selection import (
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
+from isa_nrsfm._estimator import limited
+from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm._selection import results_of, selected
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0).data
 PERSON = np.arange(len(X)) % 6
+OneStartNRSfM = limited(Limits(few_frames=0, widths=()))
 
 
 def inner(**parameters):
     return AffineNRSfM(random_state=0, **parameters)
+
+
+def quick(**parameters):
+    """Return an estimator with one start, for tests of what a search does with it."""
+    return OneStartNRSfM(random_state=0, **parameters)
 
 
 def mean_abs_alpha(estimator, X, y=None):
@@ -129,7 +137,7 @@ def test_neither_order_nor_workers_change_the_result(fitted):
 
 
 def test_lines_come_while_the_search_runs_and_parameters_stay(capsys):
-    estimator, tried = inner(n_components=5), [2, 1]
+    estimator, tried = quick(n_components=5), [2, 1]
     AffineNRSfMCV(tried, estimator=estimator, cv=2, verbose=1).fit(X)
     assert tried == [2, 1]
     assert estimator.n_components == 5
@@ -199,7 +207,7 @@ def test_groups_are_routed_through_a_pipeline():
 
 def test_metadata_are_routed_to_a_scorer():
     with sklearn.config_context(enable_metadata_routing=True):
-        search = AffineNRSfMCV((1, 2), estimator=inner(), scoring=Weighing())
+        search = AffineNRSfMCV((1, 2), estimator=quick(), scoring=Weighing())
         search.fit(X, weight=np.ones(len(X)))
     # The weights of the held-out rows only
     assert_array_equal(search.cv_results_["split0_test_score"], [19.0, 18.0])
@@ -243,7 +251,7 @@ def test_fewest_basis_shapes_are_fitted():
 
     first = np.median(X[[0, 30], 0])
     options = {"cv": 2, "scoring": scorer, "select": "one_standard_error"}
-    search = AffineNRSfMCV((1, 2, 3), estimator=inner(), **options).fit(X)
+    search = AffineNRSfMCV((1, 2, 3), estimator=quick(), **options).fit(X)
     assert search.n_components_ == len(search.best_estimator_.basis_) == 2
 
 
@@ -302,14 +310,14 @@ def test_a_memory_map_is_a_table(tmp_path, fitted):
 @may_not_converge
 def test_a_table_of_noise_is_told():
     noise = np.random.default_rng(0).normal(size=(45, 24))
-    estimator = inner(refinement=None)
+    estimator = inner(refinement=None, isa=FastISA(n_init=1))
     with pytest.warns(UserWarning, match="better than the centroid"):
         search = AffineNRSfMCV((1, 2), estimator=estimator).fit(noise)
     assert search.best_score_ < -1
 
 
 def test_fits_that_do_not_converge_are_counted():
-    search = AffineNRSfMCV((1, 2), estimator=inner(max_iter=2))
+    search = AffineNRSfMCV((1, 2), estimator=quick(max_iter=2))
     with pytest.warns(ConvergenceWarning) as told:
         search.fit(X)
     first = str(told[0].message)
@@ -319,7 +327,8 @@ def test_fits_that_do_not_converge_are_counted():
 # Whether FastICA converges for this table depends on the rounding of the BLAS.
 @may_not_converge
 def test_held_out_rows_are_not_fitted_without_joint_refinement():
-    table, estimator = X[:, :20], inner(n_components=1, refinement=None)
+    table, isa = X[:, :20], FastISA(n_init=1)
+    estimator = inner(n_components=1, refinement=None, isa=isa)
     search = AffineNRSfMCV((1,), estimator=estimator, cv=2).fit(table)
     ours = [search.cv_results_[f"split{i}_test_score"][0] for i in range(2)]
     assert_allclose(ours, cross_val_score(estimator, table, cv=2), rtol=1e-9)

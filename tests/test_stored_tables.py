@@ -26,8 +26,8 @@ NEEDED = r"needs the cameras .* keep_frames=False"
 FEW_POINTS = np.repeat([1.0, 2.0, 4.0, np.nan], [2, 2, 2, 34])
 CHUNKS = (35, 75, 0, 40)
 # Small tables are worked on as large ones are.
-# Their starts are none of their own, and one is quick.
-ALL = Limits(few_frames=0)
+# Their starts and ends are none of their own: one start and few steps are quick.
+ALL = Limits(few_frames=0, widths=())
 SAMPLED = ALL._replace(small_table=1000, sample=50, model_frames=100)
 KRYLOV = ALL._replace(dense=300)
 
@@ -47,8 +47,8 @@ def table(missing=0.0, n_points=20, n_frames=150, outliers=False, planar=False):
     return (tracks.swapaxes(1, 2) if planar else tracks).reshape(n_frames, -1)
 
 
-def estimator(limits=ALL, **params):
-    return limited(limits)(K, random_state=0, **params)
+def estimator(limits=ALL, tol=1.0, **params):
+    return limited(limits)(K, random_state=0, tol=tol, **params)
 
 
 @cache

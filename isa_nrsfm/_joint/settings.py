@@ -58,6 +58,9 @@ class Limits(NamedTuple):
     # determines. On artificial tables with 2 % noise true shapes have 0.998 and more,
     # others 0.83 and less.
     determined: float = 0.95
+    # Largest number of steps of a fit that estimates errors of depths. 30 steps
+    # understate those of undetermined depths.
+    error_steps: int = 100
 
 
 LIMITS = Limits()

@@ -54,10 +54,9 @@ OUTLYING = 4.0
 LEAST_RELIABILITY = 0.1
 # Groups have equal size: docs/benchmarks/README.md, "Thresholds".
 N_GROUPS = 5
-# Largest number of steps of a fit, and its convergence tolerance. 30 steps understate
-# the errors of undetermined depths. A tolerance of 1e-6 changes determined ones by less
-# than 2 %; 1e-2 understates undetermined ones.
-MOST_STEPS, TOL = 100, 1e-3
+# Convergence tolerance of a fit. A tolerance of 1e-6 changes determined depths by less
+# than 2 %; 1e-2 understates the errors of undetermined ones.
+TOL = 1e-3
 # Largest numbers of frames and points of the fits. With 100 frames one deviation
 # changed from 12 to 19 %. Points are assigned to groups in cubic time.
 MOST_FRAMES, MOST_POINTS = 200, 200
@@ -282,7 +281,7 @@ def depth_certainty(
         if start is None:
             start = JointState(centred(shapes[:, :, kept]), motion, noise)
         start = start._replace(noise=noise)
-        ends: Any = {"least_noise": least, "max_iter": MOST_STEPS, "tol": TOL}
+        ends: Any = {"least_noise": least, "max_iter": limits.error_steps, "tol": TOL}
         state = refine_joint(likelihood, start, camera, **ends).state
         terms = likelihood._replace(extent_weight=0.0)(*state)
         rotations, scales = full_rotations(state.motion)
