@@ -33,8 +33,11 @@ CALIBRATED = pytest.mark.parametrize(
 )
 GAPS = pytest.mark.parametrize("gaps", [False, True])
 ROBUST = pytest.mark.parametrize("loss", LOSSES[1:])
+# Errors of depths are tested in test_frame_fit.py.
+QUICK = Limits(error_steps=3)
+QuickNRSfM = limited(QUICK)
 # The first steps are made on few frames, as of large tables.
-SampledNRSfM = limited(Limits()._replace(small_table=1000, sample=40))
+SampledNRSfM = limited(QUICK._replace(small_table=1000, sample=40))
 
 
 def noisy(tracks, deviation, seed=0, unit=False):
@@ -60,7 +63,7 @@ def table_of(tracks):
     return tracks.reshape(len(tracks), -1)
 
 
-def fitted(tracks, n_components=2, kind=AffineNRSfM, **params):
+def fitted(tracks, n_components=2, kind=QuickNRSfM, **params):
     return kind(n_components, random_state=0, **params).fit(table_of(tracks))
 
 
