@@ -244,7 +244,8 @@ def depth_certainty(
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
-    Weights (I, J) are numbers of observations, by default one.
+    Weights (I, J) are numbers of observations; without them each is one. A fit has at
+    most so many steps.
     """
     part, fit, w = inlying_rows(frames, rows, MOST_FRAMES, weights)
     n_points = frames.shapes.shape[2]
