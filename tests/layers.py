@@ -14,11 +14,11 @@ start_may_not_converge = pytest.mark.filterwarnings(
 one_start = pytest.mark.usefixtures("one_start")
 
 
-def slow_after(n_quick, values, together=False):
+def slow_after(n_quick, values):
     """Return parameters of which those after the first ones are slow.
 
-    With `together` each value has those of several arguments.
+    A tuple has the values of several arguments.
     """
-    sets = [value if together else (value,) for value in values]
+    sets = [value if isinstance(value, tuple) else (value,) for value in values]
     marks = [[]] * n_quick + [pytest.mark.slow] * len(sets)
     return [pytest.param(*each, marks=m) for each, m in zip(sets, marks, strict=False)]

@@ -462,7 +462,6 @@ sparse = partial(CompressibleNRSfM, 1)
                 (SHARK, sparse(n_atoms=3, random_state=2), 0.27, 1.3),
                 (SHARK, sparse(n_atoms=20, random_state=0), 1.0, 2.6),
             ],
-            together=True,
         ),
     ],
 )

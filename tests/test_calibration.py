@@ -760,7 +760,6 @@ class TestTruth:
                     ("akhter_pickup", 3, (0.040, 0.125)),
                     ("akhter_yoga", 4, (0.068, 0.245)),
                 ],
-                together=True,
             ),
         ],
     )

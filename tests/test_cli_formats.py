@@ -158,7 +158,6 @@ def with_confidences(folder, axes):
             ("{0}{1}", "c"),
             ("{0}_{1}", "score"),
         ],
-        together=True,
     ),
 )
 def test_confidences_of_a_plain_table(fits, transforms, tmp_path, axes, word):

@@ -309,7 +309,7 @@ OTHERS += [(n, range(6, 80 if n in WIDE else 250)) for n in FORMATS]
 
 @pytest.mark.parametrize(
     ("format", "numbers"),
-    slow_after(len(QUICK), [(n, range(6)) for n in QUICK] + OTHERS, together=True),
+    slow_after(len(QUICK), [(n, range(6)) for n in QUICK] + OTHERS),
 )
 def test_damaged_files_are_read_or_refused(format, numbers, tmp_path):
     for folder in ("first", "corpus"):

@@ -93,7 +93,7 @@ class TestReliabilities:
 
     @pytest.mark.parametrize(
         ("n_frames", "n_points", "n_components"),
-        slow_after(1, [(100, 68, 4), (300, 68, 1), (60, 478, 2)], together=True),
+        slow_after(1, [(100, 68, 4), (300, 68, 1), (60, 478, 2)]),
     )
     @pytest.mark.parametrize("loss", ["linear", "cauchy"])
     def test_noise_of_rigid_objects(self, n_frames, n_points, n_components, loss):

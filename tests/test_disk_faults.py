@@ -85,7 +85,6 @@ def every_fault(folder, strike, prepare, act, stride=1):
         1,
         [(strike, True) for strike in STRIKES]
         + [(strike, False) for strike in ("disk full", "killed")],
-        together=True,
     ),
 )
 @pytest.mark.parametrize("name", WRITERS)

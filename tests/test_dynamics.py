@@ -183,7 +183,7 @@ class TestEstimation:
 
 class TestPeople:
     @pytest.mark.parametrize(
-        ("n_people", "n_frames"), slow_after(1, [(4, 30), (30, 3)], together=True)
+        ("n_people", "n_frames"), slow_after(1, [(4, 30), (30, 3)])
     )
     def test_photos_in_any_order_have_no_dynamics(self, n_people, n_frames):
         rng = np.random.default_rng(0)

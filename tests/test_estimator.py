@@ -536,10 +536,7 @@ BAD_TABLES = {
     ),
     "infinite values": (with_value(np.inf), "X contains infinity"),
     "one frame": (TABLE[:1], "minimum of 2 is required|at least 8 frames"),
-    "one dimension": (TABLE[0], "Expected 2D array, got 1D array"),
     "three dimensions": (FACES.tracks, r"one row per frame .*: give X\.reshape"),
-    "text": (np.full(TABLE.shape, "a"), "could not convert|not compatible"),
-    "complex numbers": (TABLE + 1j, "Complex data not supported"),
 }
 
 
@@ -591,8 +588,6 @@ def test_bad_new_tables_are_refused(model, method, table, message):
             r"translation must have shape \(4, 2\) or \(2,\); got \(1, 2\)",
         ),
         ((np.zeros((4, 3)), np.full((2, 3), np.nan)), "motion contains NaN"),
-        ((np.zeros((4, 3)), np.full((2, 3), np.inf)), "motion contains infinity"),
-        ((np.zeros((4, 3)), None, [np.nan, 0.0]), "translation contains NaN"),
         ((np.zeros((4, 3)), None, [np.inf, 0.0]), "translation contains infinity"),
     ],
 )

@@ -165,7 +165,6 @@ def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, variant):
             ("ict_bu3dfe_like_68", 9),
             ("akhter_drink", 3),
         ],
-        together=True,
     ),
 )
 def test_default_strategies_are_invariant(load_data, name, n_components, refinement):

@@ -105,7 +105,6 @@ def frames_with_outliers(n_frames=24):
             ("cauchy", "weak_perspective"),
             ("huber", "orthographic"),
         ],
-        together=True,
     ),
 )
 @pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")

@@ -117,7 +117,7 @@ SLOW_FITS = [
 
 @pytest.mark.parametrize(
     ("kind", "memory", "limits", "params", "given"),
-    slow_after(len(FITS), FITS + SLOW_FITS, together=True),
+    slow_after(len(FITS), FITS + SLOW_FITS),
 )
 def test_fit_is_that_in_memory(tmp_path, kind, memory, limits, params, given):
     expected = in_memory(limits, tuple(params.items()), tuple(given.items()))
