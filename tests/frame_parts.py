@@ -5,8 +5,9 @@ from numpy.testing import assert_allclose
 
 from isa_nrsfm._frames.models import frame_search
 
-# What a fitted model has of each frame.
-ATTRIBUTES_OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
+# What a fitted model has of its shapes, and of each frame.
+OF_SHAPES = ("mean_shape_", "basis_", "singular_values_", "mode_covariance_")
+OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
 
 
 def camera_and_alpha(fits):
@@ -24,6 +25,15 @@ def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     return frame_search(camera, shapes).fit_rows(
         tracks.transpose(0, 2, 1), noise, **given
     )
+
+
+def assert_same_model(got, expected):
+    """Compare models of the same table that was read in different ways."""
+    single = {"inverse_snr_": 1e-8, "noise_variance_": 1e-8, "rank_floor_": 1e-6}
+    for name in (*OF_SHAPES, *OF_FRAMES, *single):
+        found, value = (np.asarray(getattr(each, name)) for each in (got, expected))
+        atol = single.get(name, 1e-8) * np.abs(value).max()
+        assert_allclose(found, value, rtol=0, atol=atol, err_msg=name)
 
 
 def assert_same_fits(got, expected, atol):

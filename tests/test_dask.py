@@ -6,6 +6,7 @@ import signal
 import joblib
 import numpy as np
 import pytest
+from frame_parts import assert_same_model
 from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
@@ -19,7 +20,6 @@ array = pytest.importorskip("dask.array")
 distributed = pytest.importorskip("distributed")
 
 K = 2
-ATTRIBUTES = ("mean_shape_", "basis_", "alpha_", "alpha_std_", "motion_")
 FRAMES = (70, 150, 0, 80)
 
 
@@ -33,14 +33,6 @@ def table(missing=0.0):
 
 def chunked(X, columns=40):
     return array.from_array(X, chunks=(FRAMES, columns))
-
-
-def assert_same_model(got, expected):
-    for name in ATTRIBUTES:
-        value = getattr(expected, name)
-        found = np.asarray(getattr(got, name))
-        assert_allclose(found, value, rtol=0, atol=1e-8 * np.abs(value).max())
-    assert got.inverse_snr_ == pytest.approx(expected.inverse_snr_, rel=1e-8)
 
 
 @pytest.fixture(scope="module")

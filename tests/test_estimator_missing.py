@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from frame_parts import ATTRIBUTES_OF_FRAMES
+from frame_parts import OF_FRAMES
 from layers import one_start, slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused, warned
@@ -177,7 +177,7 @@ def fitted_without_empty_rows(**params):
 def test_rows_that_show_nothing_are_left_out_of_the_fit(params):
     fitted = fitted_with_empty_rows(**params)
     expected = fitted_without_empty_rows(**params)
-    names = [name for name in ATTRIBUTES_OF_FRAMES if name in vars(expected)]
+    names = [name for name in OF_FRAMES if name in vars(expected)]
     assert len(names) > 2
     for name in names:
         assert np.isnan(getattr(fitted, name)[EMPTY]).all()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frame_parts import OF_FRAMES, OF_SHAPES, assert_same_model
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
@@ -19,8 +20,6 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 K = 2
-OF_SHAPES = ("mean_shape_", "basis_", "singular_values_", "mode_covariance_")
-OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
 NEEDED = r"needs the cameras .* keep_frames=False"
 # A row that shows three of 20 points.
 FEW_POINTS = np.repeat([1.0, 2.0, 4.0, np.nan], [2, 2, 2, 34])
@@ -75,16 +74,6 @@ def stored(X, path, kind="memmap", n_files=3):
             columns = pa.table(dict(zip(names, part.T, strict=True)))
             pq.write_table(columns, file, row_group_size=17)
     return open_table(path)
-
-
-def assert_same_model(got, expected):
-    for name in OF_SHAPES + OF_FRAMES:
-        value = getattr(expected, name)
-        atol = 1e-8 * np.abs(value).max()
-        assert_allclose(getattr(got, name), value, rtol=0, atol=atol, err_msg=name)
-    assert got.inverse_snr_ == pytest.approx(expected.inverse_snr_, rel=1e-8)
-    assert got.noise_variance_ == pytest.approx(expected.noise_variance_, rel=1e-8)
-    assert got.rank_floor_ == pytest.approx(expected.rank_floor_, rel=1e-6)
 
 
 HOLES = {"missing": 0.1}
