@@ -460,7 +460,7 @@ def test_frames_that_show_less_are_known_less_well():
 
 @pytest.mark.parametrize(("n_jobs", "piped"), [(None, True), (2, False)])
 def test_warnings_point_to_the_line_of_the_user(n_jobs, piped):
-    model = AffineNRSfM(1, refinement=None, n_jobs=n_jobs, random_state=0)
+    model = estimator(refinement=None, n_jobs=n_jobs)
     if piped:
         model = make_pipeline(FunctionTransformer(), model)
     X = scene().data
