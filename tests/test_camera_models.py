@@ -574,7 +574,7 @@ class TestReversal:
         M = M * REVERSED
         _, better = self.search(scene, camera, 1e-4, frames_first(M) @ search.space)
         M, _ = search.descend(problem, search.evaluate(problem, M), 6)
-        posterior = coefficient_posterior(problem.products, M, problem.noise)
+        posterior = coefficient_posterior(problem[0], M, problem[1])
         value = search.evaluate(problem, M).value
         steep = _rise(problem, M, posterior) > LARGE_RISE * value
         assert (better & steep).sum() >= 3
@@ -605,7 +605,7 @@ class TestReversal:
     def test_rise_on_the_way_is_that_of_the_quadratic_approximation(self, camera):
         scene = random_scene(camera, noise=0.0, n_frames=3)
         search, problem, M = problem_of(scene, camera, 1e-9)
-        posterior = coefficient_posterior(problem.products, M, problem.noise)
+        posterior = coefficient_posterior(problem[0], M, problem[1])
         shapes, h = search.shared.shapes, 1e-3
 
         def f(i, change):

@@ -676,7 +676,7 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
         starts, gauge = np.zeros((0, 1)), FrameMap.identity(1)
         given = shapes, noise**2, starts, loss, gauge
         frames = PosteriorFrames(*given, camera="weak_perspective")
-        return depth_certainty(frames, FrameBlocks.of_array(rows, 8), None, 100).total
+        return depth_certainty(frames, FrameBlocks.of_array(rows, 8)).total
 
     expected = error(hidden)
     assert_allclose(error(spoilt), expected, rtol=0.002)
