@@ -50,6 +50,7 @@ from isa_nrsfm._parameters.choices import (
     LOSSES,
     REFINEMENTS,
 )
+from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import check_table, validated_table
 from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -127,13 +128,26 @@ class AffineNRSfM(
         about 60 with it.
         "alternating" is the paper's alternating least squares for basis shapes and
         coefficients, with fixed rigid cameras.
-    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+    camera : {"affine", "weak_perspective", "orthographic", "perspective"}, \
+default="affine"
         Camera model. "affine" assumes nothing: shapes are known up to an affinity of
         space, and cameras absorb part of large deformations, such as those of bodies.
         "weak_perspective" cameras are rotations with a scale for each frame, a good
         model of photos of objects that are far away for their size. "orthographic" ones
         have the same scale in all frames. With these two, shapes, lengths and angles
-        are true, up to one mirror image (`mirrored`).
+        are true, up to one mirror image (`mirrored`). "perspective" cameras are pinhole
+        cameras, for objects nearer than ten times their size, or at the side of the
+        image, as before a webcam; see `principal_point`. They need the joint
+        refinement.
+    focal_length : float, array-like of shape (n_frames,) or None, default=None
+        Focal length of perspective cameras, in units of the table, such as pixels. An
+        array has one for each frame, of `fit` and of each table of other methods. None
+        estimates one for all frames (`focal_length_`).
+    principal_point : tuple of float (x, y), default=None
+        Point of the image on the axis of perspective cameras, in units of the table:
+        half of the image's width and height, if nothing else is known. Normalised
+        coordinates have ``focal_length=1, principal_point=(0, 0)``. Needed with
+        ``camera="perspective"``.
     independence : {"shapes", "coefficients", None}, default="shapes"
         Criterion for the basis of the joint refinement. The likelihood does not depend
         on the mixing of the basis shapes. "shapes" makes them independent of each other
@@ -233,6 +247,15 @@ class AffineNRSfM(
         Scales of calibrated cameras, in units of the table per unit of the shapes; one
         for orthographic cameras. The image of frame i is ``scales_[i] * S_i @
         rotations_[i, :2].T + translation_[i]`` with ``S_i = reconstruct(X)[i]``.
+    positions_ : ndarray of shape (n_frames, 3)
+        Origins of the shapes in the axes of perspective cameras, in units of the
+        shapes: x, y and z, the distance along the axis. NaN without perspective. Each
+        frame may have another scale (gauge): distances of one object are comparable.
+    focal_length_ : float or ndarray of shape (n_frames,)
+        Focal length of perspective cameras. Infinite if the table shows no perspective.
+    focal_length_std_ : float
+        Standard deviation of an estimated `focal_length_`, from a jackknife over groups
+        of points; zero if it was given.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -335,6 +358,9 @@ class AffineNRSfM(
     noise_variance_: float
     camera_noise_ratio_: float
     depth_uncertainty_: float
+    positions_: NDArray
+    focal_length_: float | NDArray
+    focal_length_std_: float
     mirror_certainty_: float
     reliability_: NDArray
     objective_history_: NDArray
@@ -363,6 +389,8 @@ class AffineNRSfM(
         "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
         "refinement": [StrOptions(set(REFINEMENTS)), None],
         "camera": [StrOptions(set(CAMERA_NAMES))],
+        "focal_length": [None, Interval(Real, 0, None, closed="neither"), "array-like"],
+        "principal_point": [None, "array-like"],
         "independence": [StrOptions(set(INDEPENDENCE)), None],
         "loss": [StrOptions(set(LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],
@@ -386,6 +414,8 @@ class AffineNRSfM(
         block_recovery: str = "generalized_eigen",
         refinement: str | None = "joint",
         camera: str = "affine",
+        focal_length: Any = None,
+        principal_point: tuple[float, float] | None = None,
         independence: str | None = "shapes",
         loss: str = "linear",
         layout: Layout = "interleaved",
@@ -405,6 +435,8 @@ class AffineNRSfM(
         self.block_recovery = block_recovery
         self.refinement = refinement
         self.camera = camera
+        self.focal_length = focal_length
+        self.principal_point = principal_point
         self.independence = independence
         self.loss = loss
         self.layout = layout
@@ -514,15 +546,28 @@ class AffineNRSfM(
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
         isa, n_components = self._strategy(settings.joint), self.n_components
-        auto = n_components == "auto"
-        if auto:
+        auto, perspective = n_components == "auto", self.camera == "perspective"
+        if perspective:
+            x, y = map(float, self.principal_point)
+            of_table = PerspectiveTable(source, weights, isa, settings, (x, y))
+            focal_length = self.focal_length
+            if focal_length is not None:
+                focal_length = common(np.asarray(focal_length, dtype=float))
+            number = None if auto else n_components
+            model, frames, converged, fitted = fit_perspective(
+                of_table, number, focal_length, progress, start, errors
+            )
+            if np.ndim(self.focal_length):
+                fitted["focal_length_"] = np.array(self.focal_length, dtype=float)
+        elif auto:
             with warnings.catch_warnings(action="ignore"):  # the fit warns again
                 table = ready_table(source, weights, 1, settings)
             n_components, most = supported_components(table, isa, settings)
-        table = ready_table(source, weights, n_components, settings)
-        model, frames, converged, fitted = fit_table(
-            table, n_components, isa, settings, progress, start, auto, errors
-        )
+        if not perspective:
+            table = ready_table(source, weights, n_components, settings)
+            model, frames, converged, fitted = fit_table(
+                table, n_components, isa, settings, progress, start, auto, errors
+            )
         # A consensus has more components.
         if auto and self.refinement == "joint" and len(model.basis) == most:
             warn_caller(
@@ -549,6 +594,11 @@ class AffineNRSfM(
             if self.camera != "affine":
                 R, scales = full_rotations(attributes["motion_"])
                 attributes |= {"rotations_": R, "scales_": scales}
+            if model.pinhole is not None:
+                far = np.isinf(fitted["focal_length_"])
+                fits = attributes["motion_"], attributes["translation_"]
+                place = np.nan if far else model.pinhole.positions(*fits)
+                attributes["positions_"] = place
         else:
             del attributes["_frame_sizes"]
         opened.__dict__.update(attributes)
@@ -579,6 +629,8 @@ class AffineNRSfM(
                 raise ValueError(f"a table that is not in memory {got}")
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
+        if self.camera == "perspective":
+            self._check_perspective()
         if self.refinement == "consensus" and self.camera == "affine":
             raise ValueError(
                 "refinement='consensus' needs calibrated cameras, because depths of "
@@ -603,7 +655,46 @@ class AffineNRSfM(
         )
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
+        if self.camera == "perspective":  # fits of images without perspective
+            settings = settings._replace(camera="weak_perspective")
         return source, weights[0] if weights else None, settings
+
+    def _check_perspective(self) -> None:
+        """Refuse parameters that perspective cameras do not have, or lack."""
+        if self.refinement != "joint":
+            raise ValueError(
+                "camera='perspective' needs refinement='joint', whose fits are repeated "
+                "until the depths of the points agree with their images; got "
+                f"refinement={self.refinement!r}"
+            )
+        centre = np.asarray(self.principal_point, dtype=float)
+        if centre.shape != (2,) or not np.isfinite(centre).all():
+            raise ValueError(
+                "camera='perspective' needs principal_point=(x, y), the point of the "
+                "image on the axis of the camera. If nothing else is known, give half "
+                "of the image's width and height in pixels, such as (640, 360); "
+                "normalised coordinates have focal_length=1, principal_point=(0, 0); "
+                f"got principal_point={self.principal_point!r}"
+            )
+
+    def _in_common_unit(self, rows: FrameBlocks, reset: bool) -> FrameBlocks:
+        """Return perspective images as if all had the mean of their focal lengths."""
+        focal = self.focal_length if reset else getattr(self, "focal_length_", None)
+        if not np.ndim(focal):
+            return rows
+        focal = np.asarray(focal, dtype=float)
+        if focal.shape != (rows.n_frames,) or not (focal > 0).all():
+            raise ValueError(
+                "focal_length must be one positive number, or one for each of the "
+                f"{rows.n_frames} rows of the table; got shape {focal.shape}. For "
+                "tables of other lengths fit (x - x0) / f, (y - y0) / f with "
+                "focal_length=1, principal_point=(0, 0)"
+            )
+        centre = np.reshape(self.principal_point, (2, 1))
+        share = (common(focal) / focal)[:, None, None]
+        scaled = rows.derive(lambda part, s: (part - centre) * s + centre, share)
+        scaled.empty = rows.empty
+        return scaled
 
     def _strategy(self, joint: bool) -> Any:
         """Return the unfitted strategy, with parameters inherited where not set."""
@@ -763,9 +854,11 @@ class AffineNRSfM(
         table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("smooth")
         alone = table.joined(self._model.linearised, *weights)
-        camera, limits = CAMERAS[self.camera_], (max_gap, max_iter, tol)
+        camera, limits = CAMERAS[frames.camera], (max_gap, max_iter, tol)
         dtype = table.empty.dtype
-        return smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
+        result = smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
+        in_table = self._model.in_table_cameras(table, result.decomposition)
+        return result._replace(decomposition=in_table)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """
@@ -935,6 +1028,13 @@ class AffineNRSfM(
         True
         """
         check_is_fitted(self)
+        pinhole = self._model.pinhole
+        if pinhole is not None and pinhole.near:
+            raise ValueError(
+                "the images of perspective cameras decide between the two mirror "
+                "images: the other one does not fit. mirror_certainty_ is the "
+                "probability that the depth has the right sign"
+            )
         mirror, signs = copy.copy(self), MIRROR.astype(self.mean_shape_.dtype)
         mirror._model = self._model.mirrored()
         # Not in files of older versions
@@ -964,7 +1064,9 @@ class AffineNRSfM(
             Points of the fitted shapes in the fitted cameras. NaN for rows with too
             few visible points.
         """
-        return self._opened(X)[0].collect(self._model.reproject)
+        table, _ = self._opened(X)
+        images = table.collect(self._model.reproject)
+        return images
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1004,7 +1106,10 @@ class AffineNRSfM(
         motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
         translation = checked("translation", translation, (n_frames, 2), (2,))
         shapes = compose(self.mean_shape_, self.basis_, alpha)
-        return tracks_to_table(project(shapes, motion, translation), self._model.layout)
+        motion = np.broadcast_to(motion, (n_frames, 2, 3))
+        translation = np.broadcast_to(translation, (n_frames, 2))
+        images = self._model.images(shapes, motion, translation)
+        return tracks_to_table(images, self._model.layout)
 
     def score(self, X: Any, y: Any = None, *, point_weight: Any = None) -> float:
         """
@@ -1111,14 +1216,20 @@ class AffineNRSfM(
         table = open_table(
             X, layout, names, counted=reset, n_jobs=n_jobs, working_memory=memory
         )
-        return (
-            (table, ()) if point_weight is None else weighted_rows(table, point_weight)
-        )
+        table = self._in_common_unit(table, reset)
+        if point_weight is None:
+            return table, ()
+        return weighted_rows(table, point_weight)
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:
     """Return a subclass of `AffineNRSfM` with other limits, for tests."""
     return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
+
+
+def common(focal_length: NDArray) -> float:
+    """Return the geometric mean of focal lengths."""
+    return float(np.exp(np.mean(np.log(focal_length))))
 
 
 def check_class(estimator: object, where: str) -> None:

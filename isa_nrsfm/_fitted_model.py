@@ -1,5 +1,6 @@
 """The fitted model, applied to a table block by block."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,9 @@ from isa_nrsfm._frames.models import (
     PosteriorFrames,
     RigidFrames,
 )
+from isa_nrsfm._frames.pinhole import Pinhole, line_of_sight
 from isa_nrsfm._frames.search import FramePosterior
+from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import (
@@ -30,6 +33,9 @@ from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 # Level of the two-sided test by which missing points decide on the mirror image: false
 # decisions are in docs/depth.md, "The mirror image".
 MIRROR_LEVEL = 0.01
+# Depths and fit of a perspective frame agree if a repeat changes depths by less than
+# this share. Most frames need three repeats.
+SETTLED, MOST_REPEATS = 1e-3, 30
 
 
 class TableModel(NamedTuple):
@@ -37,7 +43,8 @@ class TableModel(NamedTuple):
 
     Methods take rows (n, 2, n_points) of a table and return NaN for frames with too few
     visible points. The mean shape (J, 3) and the basis (K, J, 3) are in the gauge.
-    `unit` is the common size of all frames, or None if each frame has its own.
+    `unit` is the common size of all frames, or None if each frame has its own. With a
+    pinhole the rows are perspective images, and frames those of weak-perspective ones.
     """
 
     frames: RigidFrames | PosteriorFrames
@@ -45,6 +52,7 @@ class TableModel(NamedTuple):
     basis: NDArray
     layout: Layout
     unit: float | None
+    pinhole: Pinhole | None = None
 
     def decompose(
         self,
@@ -57,11 +65,53 @@ class TableModel(NamedTuple):
 
         Weights (n, n_points) are zero where points are missing, by default one.
         """
+        dtype = rows.dtype if dtype is None else dtype
+        fit, turns = self.in_virtual_cameras(rows, weights, deviations)
+        if self.pinhole is not None:
+            real = self.pinhole.real(fit.motion, fit.translation, turns)
+            fit = fit._replace(motion=real[0], translation=real[1])
+        return Decomposition(*(part.astype(dtype) for part in fit))
+
+    def in_virtual_cameras(
+        self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
+    ) -> tuple[Decomposition, NDArray]:
+        """Return fits of weak-perspective images, and rotations of their cameras."""
+        rows, turns = self.straightened(rows, weights)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
-        dtype = rows.dtype if dtype is None else dtype
-        return Decomposition(*(of_all_rows(part, usable).astype(dtype) for part in fit))
+        return Decomposition(*(of_all_rows(part, usable) for part in fit)), turns
+
+    def straightened(
+        self, rows: NDArray, weights: NDArray | None = None
+    ) -> tuple[NDArray, NDArray]:
+        """Return weak-perspective images, and the rotations of virtual cameras.
+
+        Depths and fits of a frame are repeated until they agree.
+        """
+        pinhole = self.pinhole
+        if pinhole is None:
+            return rows, np.empty(len(rows))
+        images, turns = pinhole.virtual(rows, self.frames.loss != "linear")
+        straight, depths = images.copy(), np.zeros(images[:, 0].shape)
+        weak, moving = self._replace(pinhole=None), np.arange(len(rows))
+        for _ in range(MOST_REPEATS if pinhole.near else 0):
+            moving = padded(moving) if len(rows) > 1 else moving
+            own = None if weights is None else weights[moving]
+            fit = weak.decompose(straight[moving], own, deviations=False)
+            before, depths[moving] = depths[moving], self.depths(fit)
+            straight[moving] = pinhole.straight(images[moving], depths[moving])
+            change = np.square(depths[moving] - before).sum(axis=1)
+            large = change > SETTLED**2 * np.square(depths[moving]).sum(axis=1)
+            moving = np.unique(moving[large])
+            if not len(moving):
+                break
+        return straight, turns
+
+    def depths(self, fit: Decomposition) -> NDArray:
+        """Return the depths (n, J) of points, in units of the table."""
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        return np.vecdot(shapes, line_of_sight(fit.motion)[:, None])
 
     def mirrored(self) -> "TableModel":
         """Return the model with shapes mirrored in depth."""
@@ -113,6 +163,7 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None
     ) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
+        rows, _ = self.straightened(rows, weights)
         assert isinstance(self.frames, PosteriorFrames)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
         whole = FramePosterior.unknown(len(rows), len(self.basis))
@@ -124,6 +175,7 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None
     ) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
+        rows, _ = self.straightened(rows, weights)
         assert isinstance(self.frames, PosteriorFrames)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.linearised(centred, sizes, weights)
@@ -163,10 +215,13 @@ class TableModel(NamedTuple):
     ) -> tuple[NDArray, NDArray]:
         """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
         assert isinstance(self.frames, PosteriorFrames)
-        fit = self.decompose(rows, weights, deviations=False)
+        dtype = rows.dtype
+        rows, _ = self.straightened(rows, weights)
+        weak = self._replace(pinhole=None)
+        fit = weak.decompose(rows, weights, deviations=False, dtype=dtype)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
         deviations = self.frames.depth_deviations(centred, sizes, weights)
-        deviations = of_all_rows(deviations, usable).astype(rows.dtype, copy=False)
+        deviations = of_all_rows(deviations, usable).astype(dtype, copy=False)
         _, scales = full_rotations(fit.motion)
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         return shapes, deviations / scales[:, None]
@@ -175,23 +230,36 @@ class TableModel(NamedTuple):
         """Return the images of the fitted shapes, in the layout of the table."""
         motion, translation, alpha, _ = self.decompose(rows, deviations=False)
         shapes = compose(self.mean_shape, self.basis, alpha)
-        return tracks_to_table(project(shapes, motion, translation), self.layout)
+        return tracks_to_table(self.images(shapes, motion, translation), self.layout)
+
+    def images(self, shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
+        """Return images (n, J, 2) of shapes (n, J, 3) in the cameras of the table."""
+        if self.pinhole is None:
+            return project(shapes, motion, translation)
+        return self.pinhole.projected(shapes, motion, translation)
+
+    def in_table_cameras(self, rows: FrameBlocks, fit: Decomposition) -> Decomposition:
+        """Return a fit of rows in virtual cameras with the cameras of the table."""
+        if self.pinhole is None:
+            return fit
+        virtual = partial(self.pinhole.virtual, robust=self.frames.loss != "linear")
+        turns = rows.joined(lambda part: virtual(part)[1])
+        real = self.pinhole.real(fit.motion, fit.translation, turns)
+        motion, translation = (part.astype(fit.alpha.dtype) for part in real)
+        return fit._replace(motion=motion, translation=translation)
 
     def distances(self, rows: NDArray, *fitted: NDArray) -> NDArray:
-        """Return lengths of residuals (n, n_points) of frames of size one.
+        """Return lengths of residuals (n, n_points), in sizes of their frames.
 
         Cameras, positions and coefficients of the rows are fitted, if not given.
         """
-        usable, centred, centre, sizes, _ = self._ready(rows)
-        if fitted:
-            motion, translation, alpha = (part[usable] for part in fitted)
-            translation = translation - centre
-        else:
-            motion, translation, alpha, _ = self.frames.fit(centred, sizes, False)
+        usable, _, _, sizes, _ = self._ready(rows)
+        fit = fitted or self.decompose(rows, deviations=False, dtype=np.float64)
+        motion, translation, alpha, *_ = fit
         shapes = compose(self.mean_shape, self.basis, alpha)
-        images = project(shapes, motion, translation).transpose(0, 2, 1)
-        distance = np.linalg.norm(centred - images, axis=1)
-        return of_all_rows(distance / sizes[:, None], usable)
+        images = self.images(shapes, motion, translation).swapaxes(1, 2)
+        distance = np.linalg.norm(rows - images, axis=1)
+        return distance / of_all_rows(sizes, usable)[:, None]
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of the error and the signal of held-out points.
@@ -218,6 +286,7 @@ class TableModel(NamedTuple):
         frames = self.frames
         complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
         complete = complete and weights is None and bool(seen.all())
+        complete = complete and self.pinhole is None
         noise = signal = 0.0
         for fold in range(5):
             held = folds == fold
@@ -237,11 +306,13 @@ class TableModel(NamedTuple):
                 others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
             else:
                 own = None if weights is None else weights[usable]
-                fit = frames.fit(visible[usable], sizes[usable], False, own)
+                if self.pinhole is None:
+                    fit = frames.fit(visible[usable], sizes[usable], False, own)
+                else:
+                    fit = self.decompose(visible[usable], own, False)
             # Prediction of the held-out points, and its error
-            predicted = project(
-                compose(mean, others, fit.alpha), fit.motion, fit.translation
-            )
+            shapes = compose(mean, others, fit.alpha)
+            predicted = self.images(shapes, fit.motion, fit.translation)
             part = np.ascontiguousarray(rows[usable].transpose(0, 2, 1))
             centre = np.nanmean(part, axis=1, keepdims=True)
             weight = counts[np.ix_(usable, held)][..., None]

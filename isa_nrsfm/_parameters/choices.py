@@ -8,7 +8,7 @@ REFINEMENTS = ("joint", "consensus", "alternating")
 # Refinements that begin with the joint fit.
 JOINT_REFINEMENTS = ("joint", "consensus")
 CALIBRATED_CAMERAS = ("weak_perspective", "orthographic")
-CAMERA_NAMES = ("affine", *CALIBRATED_CAMERAS)
+CAMERA_NAMES = ("affine", *CALIBRATED_CAMERAS, "perspective")
 INDEPENDENCE = ("shapes", "coefficients")
 LOSSES = ("linear", "huber", "cauchy")
 # Sets of points in the files of OpenPose.

@@ -33,6 +33,7 @@ from isa_nrsfm._frames.models import (
     PosteriorFrames,
     RigidFrames,
 )
+from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.tracks import LAYOUTS
 
@@ -231,9 +232,11 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
         estimator.basis_,
         entries["layout"],
         entries["unit"],
+        _pinhole(entries),
     )
     estimator._n_features_out = len(estimator.basis_)
-    estimator.camera_ = entries["camera"]
+    pinhole = estimator._model.pinhole
+    estimator.camera_ = entries["camera"] if pinhole is None else "perspective"
     estimator.frames_scaled_ = entries["unit"] is None
     if entries["sizes"] is not None:
         estimator._frame_sizes = entries["sizes"]
@@ -262,12 +265,14 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
         ((2,), ["reference_translation_", "certainty", "image_errors"]),
+        ((4,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_"]),
         ((N, 2, 3), ["motion_"]),
         ((N, 2), ["translation_"]),
         ((N, K), ["alpha_", "alpha_std_"]),
         ((N, 3, 3), ["rotations_"]),
+        ((N, 3), ["positions_"]),
         ((N,), ["scales_", "sizes"]),
         ((), [*single, "deformation", "residual", "mirror_certainty_"]),
     )
@@ -291,6 +296,9 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "unit": model.unit,
         "sizes": vars(estimator).get("_frame_sizes"),
     }
+    if model.pinhole is not None:
+        f, (x, y), near = model.pinhole
+        entries["pinhole"] = np.array([f, x, y, near], dtype=float)
     if isinstance(frames, RigidFrames):
         return {**entries, "mean_shape": frames.mean_shape, "basis": frames.basis}
     return {
@@ -309,6 +317,14 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "residual": frames.certainty.residual,
         "image_errors": np.array(frames.certainty.images),
     }
+
+
+def _pinhole(entries: dict[str, Any]) -> Pinhole | None:
+    """Return the perspective camera of `_frame_entries`, if any."""
+    if "pinhole" not in entries:
+        return None
+    f, x, y, near = entries["pinhole"].tolist()
+    return Pinhole(f, (x, y), bool(near))
 
 
 def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:

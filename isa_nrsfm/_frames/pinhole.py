@@ -1,0 +1,133 @@
+"""Perspective cameras: images that weak-perspective cameras would show.
+
+A pinhole camera with focal length f and principal point c shows a point X of its axes at
+``w = f (X_1, X_2) / X_3 + c``. Two steps make such images weak-perspective:
+
+1. A virtual camera is turned about the centre of the camera until the middle of the
+   object is on its axis. With the smallest rotation H that does so, and ``q = H ((w -
+   c) / f, 1)``, it shows ``y = f (q_1, q_2) / q_3``, for points at any depth.
+2. With scale s, rotation R and position t of a weak-perspective camera, and the depth
+   ``z = s r_3 . S`` of a point S, ``y (1 + z / f) = s R_12 S + t`` (POSIT: DeMenthon,
+   Davis, "Model-based object pose in 25 lines of code", 1995).
+
+The rotation of the real camera is ``H^T R``, and ``H^T (t, f) / s`` the position of the
+shapes' origin in its axes. Public cameras (n, 2, 3) and translations (n, 2) are those of
+the weak-perspective camera with the same rotation and position: ``s_i = f / T_3``,
+``t_i = s_i T_12 + c``.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._prepare.robust import spatial_median
+from isa_nrsfm._tables.tracks import seen_points
+
+
+class Pinhole(NamedTuple):
+    """A perspective camera, in units of the table.
+
+    near: whether depths of points are taken into account, or only virtual cameras.
+    """
+
+    focal_length: float
+    principal_point: tuple[float, float]
+    near: bool = True
+
+    @property
+    def centre(self) -> NDArray:
+        """The principal point (2, 1)."""
+        return np.reshape(self.principal_point, (2, 1))
+
+    def virtual(self, rows: NDArray, robust: bool) -> tuple[NDArray, NDArray]:
+        """Return images (n, 2, J) of virtual cameras, and their rotations H (n, 3, 3).
+
+        Their axes go through the centroids of the rows, or the medians if `robust`.
+        """
+        rows = rows.astype(np.float64, copy=False)
+        turns = turns_to(self.rays(_middles(rows, robust)[:, :, None])[..., 0])
+        q = turns @ self.rays(rows)
+        return self.focal_length * q[:, :2] / q[:, 2:], turns
+
+    def rays(self, rows: NDArray) -> NDArray:
+        """Return the rays (n, 3, J) of image points, with third coordinate one."""
+        v = (rows - self.centre) / self.focal_length
+        return np.concatenate([v, np.ones_like(v[:, :1])], axis=1)
+
+    def straight(self, images: NDArray, depths: NDArray) -> NDArray:
+        """Return weak-perspective images (n, 2, J), for depths (n, J)."""
+        return images * (1.0 + depths / self.focal_length)[:, None]
+
+    def images(self, straight: NDArray, depths: NDArray) -> NDArray:
+        """Return perspective images, the inverse of `straight`."""
+        if not self.near:
+            return straight
+        return straight / (1.0 + depths / self.focal_length)[:, None]
+
+    def projected(
+        self, shapes: NDArray, motion: NDArray, translation: NDArray
+    ) -> NDArray:
+        """Return images (n, J, 2) of shapes (n, J, 3), with cameras as `real` has them.
+
+        Unless `near`, all points have the distance of the origin.
+        """
+        R, _ = full_rotations(motion)
+        place = self.positions(motion, translation)
+        turned = shapes @ R.mT
+        if not self.near:
+            sight = place / np.linalg.norm(place, axis=1, keepdims=True)
+            along = np.vecdot(turned, sight[:, None])
+            turned = turned - along[..., None] * sight[:, None]
+        X = turned + place[:, None]
+        return self.focal_length * X[..., :2] / X[..., 2:] + self.centre[:, 0]
+
+    def real(
+        self, motion: NDArray, translation: NDArray, turns: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """Return cameras and translations of the real camera, from virtual ones."""
+        f = self.focal_length
+        R, scales = full_rotations(motion)
+        place = np.column_stack([translation, np.full(len(translation), f)])
+        place = (turns.mT @ place[..., None])[..., 0]  # s T
+        far = f / place[:, 2:]
+        R = far[..., None] * scales[:, None, None] * (turns.mT @ R)[:, :2]
+        return R, far * place[:, :2] + self.centre[:, 0]
+
+    def positions(self, motion: NDArray, translation: NDArray) -> NDArray:
+        """Return the shapes' origins (n, 3) in the axes of the real camera."""
+        _, scales = full_rotations(motion)
+        f = np.full(len(motion), self.focal_length)
+        place = np.column_stack([translation - self.centre[:, 0], f])
+        return place / scales[:, None]
+
+
+def _middles(rows: NDArray, robust: bool) -> NDArray:
+    """Return centroids or medians (n, 2) of rows, NaN for rows without points."""
+    shown = seen_points(rows).any(axis=1)
+    middle = np.full((len(rows), 2), np.nan)
+    middle[shown] = (spatial_median if robust else _centroids)(rows[shown])
+    return middle
+
+
+def _centroids(rows: NDArray) -> NDArray:
+    """Return centroids (n, 2) of the visible points of rows."""
+    return np.asarray(np.nanmean(rows, axis=2))
+
+
+def turns_to(rays: NDArray) -> NDArray:
+    """Return the smallest rotations (n, 3, 3) of rays (n, 3) to the third axis."""
+    x, y, z = (rays / np.linalg.norm(rays, axis=1)[:, None]).T
+    share = 1.0 / (1.0 + z)
+    H = np.empty((len(rays), 3, 3))
+    H[:, 0] = np.stack([1.0 - share * x * x, -share * x * y, -x], axis=1)
+    H[:, 1] = np.stack([-share * x * y, 1.0 - share * y * y, -y], axis=1)
+    H[:, 2] = np.stack([x, y, z], axis=1)
+    return H
+
+
+def line_of_sight(motion: NDArray) -> NDArray:
+    """Return ``s r_3`` (n, 3) of cameras (n, 2, 3): products with points are depths."""
+    R, scales = full_rotations(motion)
+    return scales[:, None] * R[:, 2]
