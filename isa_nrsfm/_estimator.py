@@ -552,7 +552,7 @@ default="affine"
             of_table = PerspectiveTable(source, weights, isa, settings, (x, y))
             focal_length = self.focal_length
             if focal_length is not None:
-                focal_length = common(np.asarray(focal_length, dtype=float))
+                focal_length = common(focal_length)
             number = None if auto else n_components
             model, frames, converged, fitted = fit_perspective(
                 of_table, number, focal_length, progress, start, errors
@@ -595,10 +595,10 @@ default="affine"
                 R, scales = full_rotations(attributes["motion_"])
                 attributes |= {"rotations_": R, "scales_": scales}
             if model.pinhole is not None:
-                far = np.isinf(fitted["focal_length_"])
-                fits = attributes["motion_"], attributes["translation_"]
-                place = np.nan if far else model.pinhole.positions(*fits)
-                attributes["positions_"] = place
+                place = model.pinhole.positions(frames.motion, frames.translation)
+                if np.isinf(fitted["focal_length_"]).any():
+                    place[:] = np.nan
+                attributes["positions_"] = source.as_collected(place)
         else:
             del attributes["_frame_sizes"]
         opened.__dict__.update(attributes)
@@ -1227,8 +1227,10 @@ def limited(limits: Limits) -> type[AffineNRSfM]:
     return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
 
 
-def common(focal_length: NDArray) -> float:
-    """Return the geometric mean of focal lengths."""
+def common(focal_length: Any) -> float:
+    """Return a focal length, or the geometric mean of several."""
+    if not np.ndim(focal_length):
+        return float(focal_length)
     return float(np.exp(np.mean(np.log(focal_length))))
 
 

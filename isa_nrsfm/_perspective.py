@@ -7,8 +7,8 @@ images determine depths up to their sign, so both mirror images are continued.
 Let E be the mean squared distance of points from their images, in sizes of frames. As a
 function of g = 1/f it is least for the focal length f. g = 0 is the weak-perspective
 fit, and -g the mirror image of the fit for g. An unknown f is found from there: g is
-doubled until E rises, then parabolas through three neighbouring fits have their minimum
-at g. Without the points of one of several groups the minimum moves (jackknife).
+doubled until E rises, then the minima of parabolas through the three best fits lead to
+it. Without the points of one of several groups the minimum moves (jackknife).
 """
 
 import warnings
@@ -51,10 +51,6 @@ NEAR, MOST_FITS = 0.01, 10
 WEAKER = (
     ". The fit is that of weak-perspective cameras, turned to the middle of each object"
 )
-UNDETERMINED = (
-    "perspective was not fitted, because the images of weak-perspective cameras do not "
-    f"determine the depth of the shapes{WEAKER}"
-)
 UNSTEADY = (
     "the fit of perspective has not settled: depths and fit do not agree. The focal "
     f"length may be wrong, or there are too few basis shapes{WEAKER}"
@@ -86,11 +82,6 @@ class PerspectiveFit(NamedTuple):
     def energy(self) -> float:
         """Mean squared distance E of the points from their images."""
         return float(self.energies.sum())
-
-    @property
-    def unsteady(self) -> bool:
-        """Whether repeats have not made depths and fit agree."""
-        return self.changes[-1] > UNSETTLED
 
     def depths(self, part: slice) -> NDArray:
         """Return depths (n, J) of the points of some frames."""
@@ -198,15 +189,13 @@ class PerspectiveTable(NamedTuple):
         pinhole: Pinhole,
         n_components: int | None,
         progress: FitProgress | NoProgress,
-        errors: bool = False,
     ) -> PerspectiveFit:
         """Return the fit for equal depths, of as many basis shapes as are relevant."""
-        auto = n_components is None
+        auto, pinhole = n_components is None, pinhole._replace(near=False)
         with warnings.catch_warnings(action="ignore"):  # the last fit warns
             if n_components is None:
                 n_components = self.supported(pinhole, None)
-            options = {"free": auto, "errors": errors}
-            return self.fit(pinhole, n_components, None, progress, **options)
+            return self.fit(pinhole, n_components, None, progress, free=auto)
 
     def with_fewer_shapes(self, fit: PerspectiveFit) -> PerspectiveFit:
         """Return a fit of as many basis shapes as corrected images have."""
@@ -239,14 +228,13 @@ class PerspectiveTable(NamedTuple):
 
     def around(self, first: PerspectiveFit, errors: bool) -> dict[float, PerspectiveFit]:
         """Return fits for a given 1/f, its mirror image, and, for errors, neighbours."""
-        g, n_components = 1.0 / first.pinhole.focal_length, len(first.model.basis)
+        f, n_components = first.pinhole.focal_length, len(first.model.basis)
         images = first, first.mirrored()
-        better, worse = self.settled(first.pinhole, n_components, *images)
-        fits = {g: better, -g: worse}
-        if errors:
-            for other in (0.8 * g, 1.25 * g):
-                pinhole = self.pinhole(1.0 / other)
-                (fits[other],) = self.settled(pinhole, n_components, better)
+        better, worse = self.settled(self.pinhole(f), n_components, *images)
+        fits = {1.0 / f: better, -1.0 / f: worse}
+        for share in (0.8, 1.25) if errors and better.changes[-1] < UNSETTLED else ():
+            pinhole = self.pinhole(f / share)
+            (fits[share / f],) = self.settled(pinhole, n_components, better)
         return fits
 
     def searched(self, first: PerspectiveFit, reach: float) -> dict[float, PerspectiveFit]:
@@ -257,11 +245,15 @@ class PerspectiveTable(NamedTuple):
         fits = {0.0: first, g: better, -g: worse}
         while len(fits) < MOST_FITS:
             lowest = min(fits, key=lambda g: fits[g].energy)
-            place, deviation = minimum(fits)
-            if lowest == max(fits):
-                place = 2.0 * lowest
-            near = min(abs(np.array(list(fits)) - place))
-            if near < max(NEAR * place, 0.25 * deviation) or place <= 0:
+            place, _ = minimum(fits)
+            near = np.abs(np.array(list(fits)) - place).min()
+            above = min((g for g in fits if g > lowest), default=4.0 * lowest)
+            below = max((g for g in fits if g < lowest), default=-np.inf)
+            if not below < place < above:
+                place = np.sqrt(lowest * above) if lowest > 0 else 0.0
+            elif near < NEAR * place:
+                break
+            if place <= 0:
                 break
             start = fits[lowest] if lowest > 0 else better
             pinhole = self.pinhole(1.0 / place)
@@ -284,20 +276,13 @@ class Minimum(NamedTuple):
     place: float
     deviation: float
 
-    @property
-    def positive(self) -> float:
-        """Probability that g is positive, and the mirror image the right one."""
-        return float(student.cdf(self.place / self.deviation, N_GROUPS - 1))
 
 
 def minimum(fits: dict[float, PerspectiveFit]) -> Minimum:
-    """Return the minimum of a parabola through three neighbours, by their g."""
-    places = np.array(sorted(fits))
-    lowest = int(np.argmin([fits[g].energy for g in places]))
-    first = min(max(lowest - 1, 0), len(places) - 3)
-    g = places[first : first + 3]
-    energies = np.array([fits[place].energies for place in g])
-    groups = neighbours(fits[g[0]].model.mean_shape.T)
+    """Return the minimum of the parabola through the three best fits."""
+    g = np.array(sorted(fits, key=lambda g: fits[g].energy)[:3])
+    energies = np.array([fits[place].energies for place in g.tolist()])
+    groups = neighbours(fits[float(g[0])].model.mean_shape.T)
 
     def vertex(kept: NDArray) -> float:
         """Return the minimum of the parabola for some of the points."""
@@ -309,8 +294,9 @@ def minimum(fits: dict[float, PerspectiveFit]) -> Minimum:
 
     every = vertex(np.ones(len(groups), dtype=bool))
     parts = np.array([vertex(groups != group) for group in range(N_GROUPS)])
-    variance = (N_GROUPS - 1) * np.mean((parts - parts.mean()) ** 2)
-    return Minimum(every, float(np.sqrt(variance)))
+    if not np.isfinite(parts).all():
+        return Minimum(every, np.inf)
+    return Minimum(every, float(np.sqrt(N_GROUPS - 1) * parts.std()))
 
 
 def fit_perspective(
@@ -332,13 +318,11 @@ def fit_perspective(
         best = table.started(start, n_components)
     elif focal_length is not None:
         pinhole = table.pinhole(focal_length)
-        best = table.first(pinhole, n_components, progress, errors)
-        if best.model.frames.certainty.determined:
-            fits = table.around(best, errors)
-            fit = fits[1.0 / focal_length]
-            best, why = (best, UNSTEADY) if fit.unsteady else (fit, "")
-        else:
-            why = UNDETERMINED
+        first = table.first(pinhole, n_components, progress)
+        fits = table.around(first, errors)
+        best = fits[1.0 / focal_length]
+        if best.changes[-1] > UNSETTLED or best.energy > first.energy:
+            best, why = first, UNSTEADY
     else:
         reach = max(table.source.map(table.reach))
         pinhole = table.pinhole(ENDLESS * reach)
@@ -358,17 +342,20 @@ def fit_perspective(
     fit = table.fit(pinhole, len(best.model.basis), before, **options)
     attributes = fit.attributes | {"isa_": best.attributes["isa_"]}
     frames = fit.model.frames
-    if fits and not why:
-        place, share = 1.0 / pinhole.focal_length, deviation * pinhole.focal_length
-        other = minimum(fits)
-        if not deviation:  # a given focal length, which the table may contradict
-            square = (other.place / place - 1.0) ** 2 - (other.deviation / place) ** 2
-            share = float(np.sqrt(max(square, 0.0)))
+    if errors and not why:
+        place = 1.0 / pinhole.focal_length
+        other, least = minimum(fits), min(fits)
+        share = deviation / place
+        if not deviation and np.isfinite(other.deviation):
+            # The table may contradict a given focal length
+            square = (other.place - place) ** 2 - other.deviation**2
+            share = np.sqrt(max(square, 0.0)) / place
         total = np.hypot(frames.certainty.total, share * depth_slope(fits, place))
+        total = float(total)
         frames = replace(frames, certainty=frames.certainty._replace(total=total))
         attributes |= {
             "depth_uncertainty_": total,
-            "mirror_certainty_": other.positive,
+            "mirror_certainty_": better_than(fits[-least], fits[least]),
         }
     if why:
         warn_caller(why)
@@ -393,6 +380,14 @@ def fit_perspective(
     return model, shown, fit.converged, attributes
 
 
+def better_than(fit: PerspectiveFit, other: PerspectiveFit) -> float:
+    """Return the probability that E is smaller than that of another fit, by groups."""
+    groups = neighbours(fit.model.mean_shape.T)
+    off = np.bincount(groups, other.energies - fit.energies)
+    deviation = off.std(ddof=1) / np.sqrt(len(off))
+    return float(student.cdf(off.mean() / deviation, len(off) - 1))
+
+
 def nearest_to(fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
     """Return the fit with the nearest g."""
     return fits[min(fits, key=lambda g: abs(g - place))]
@@ -400,7 +395,7 @@ def nearest_to(fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFi
 
 def depth_slope(fits: dict[float, PerspectiveFit], place: float) -> float:
     """Return the relative change of the depths by a relative change of g."""
-    g, other = sorted((g for g in fits if g > 0), key=lambda g: abs(g - place))[:2]
+    g, other = sorted((g for g in fits if g >= 0), key=lambda g: abs(g - place))[:2]
     whole = slice(None)
     z, changed = fits[g].depths(whole), fits[other].depths(whole)
     share = np.sqrt(np.nansum((z - changed) ** 2) / np.nansum(z**2))
