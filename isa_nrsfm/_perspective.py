@@ -6,9 +6,9 @@ images determine depths up to their sign, so both mirror images are continued.
 
 Let E be the mean squared distance of points from their images, in sizes of frames. As a
 function of g = 1/f it is least for the focal length f. g = 0 is the weak-perspective
-fit, and -g the mirror image of the fit for g. An unknown f is found from there: g is
-doubled until E rises, then the minima of parabolas through the three best fits lead to
-it. Without the points of one of several groups the minimum moves (jackknife).
+fit, and -g the mirror image of the fit for g. Minima of parabolas through the three best
+fits lead to an unknown f. Without one of several groups of points the minimum moves,
+which gives its deviation (jackknife).
 """
 
 import warnings
@@ -42,9 +42,9 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
 # A mirror image is given up if E is larger than this multiple of the other one's.
 WORSE = 1.3
-# Focal length of the weak-perspective fit, and of the first perspective ones, in
-# largest coordinates from the principal point.
-ENDLESS, FIRST = 1e7, 4.0
+# Focal lengths of the weak-perspective fit and of the first perspective one, in largest
+# distances from the principal point, and how much longer the next one is if that fails.
+ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
 # The search ends if the minimum is that near to a fit, as a share of 1/f.
 NEAR, MOST_FITS = 0.01, 10
 
@@ -237,27 +237,37 @@ class PerspectiveTable(NamedTuple):
             (fits[share / f],) = self.settled(pinhole, n_components, better)
         return fits
 
-    def searched(self, first: PerspectiveFit, reach: float) -> dict[float, PerspectiveFit]:
-        """Return fits around the minimum of E, from the weak-perspective fit."""
+    def searched(
+        self, n_components: int | None, progress: FitProgress | NoProgress
+    ) -> dict[float, PerspectiveFit]:
+        """Return fits around the minimum of E; 0 is the weak-perspective fit."""
+        reach = max(np.max(np.abs(self.principal_point)), *self.source.map(self.reach))
+        first = self.first(self.pinhole(FIRST * reach), n_components, progress)
         n_components, g = len(first.model.basis), 1.0 / (FIRST * reach)
-        images = first, first.mirrored()
-        better, worse = self.settled(self.pinhole(1.0 / g), n_components, *images)
-        fits = {0.0: first, g: better, -g: worse}
+        far = self.first(self.pinhole(ENDLESS * reach), n_components, NoProgress())
+        fits = {0.0: far} | self.around(first, False)
+        if far.energy < fits[g].energy:  # a long focal length, or none
+            pinhole = self.pinhole(LONGER / g)
+            images = self.settled(pinhole, n_components, far, far.mirrored())
+            fits |= dict(zip((g / LONGER, -g / LONGER), images, strict=True))
         while len(fits) < MOST_FITS:
             lowest = min(fits, key=lambda g: fits[g].energy)
-            place, _ = minimum(fits)
-            near = np.abs(np.array(list(fits)) - place).min()
-            above = min((g for g in fits if g > lowest), default=4.0 * lowest)
-            below = max((g for g in fits if g < lowest), default=-np.inf)
-            if not below < place < above:
-                place = np.sqrt(lowest * above) if lowest > 0 else 0.0
-            elif near < NEAR * place:
+            if lowest <= 0:
                 break
-            if place <= 0:
-                break
-            start = fits[lowest] if lowest > 0 else better
+            below = max(g for g in fits if g < lowest)
+            above = min((g for g in fits if g > lowest), default=0.0)
+            place = minimum(fits).place
+            if not above:
+                place = 1.5 * lowest
+            elif not below < place < above:
+                place = float(np.sqrt(lowest * above))
+            elif min(abs(g - place) for g in fits) < NEAR * place:
+                # A parabola through distant fits is biased.
+                place = 0.9 * lowest
+                if sum(abs(g / lowest - 1.0) < 0.15 for g in fits) > 1:
+                    break
             pinhole = self.pinhole(1.0 / place)
-            (fits[place],) = self.settled(pinhole, n_components, start)
+            (fits[place],) = self.settled(pinhole, n_components, fits[lowest])
         return fits
 
     def _ends(self, fit: PerspectiveFit, best: float) -> bool:
@@ -324,16 +334,13 @@ def fit_perspective(
         if best.changes[-1] > UNSETTLED or best.energy > first.energy:
             best, why = first, UNSTEADY
     else:
-        reach = max(table.source.map(table.reach))
-        pinhole = table.pinhole(ENDLESS * reach)
-        best = table.first(pinhole, n_components, progress)
-        fits = table.searched(best, reach)
+        fits = table.searched(n_components, progress)
         place, deviation = minimum(fits)
-        if place > 2.0 * deviation:
-            pinhole, nearest = table.pinhole(1.0 / place), nearest_to(fits, place)
-            (best,) = table.settled(pinhole, len(best.model.basis), nearest)
+        if min(fits, key=lambda g: fits[g].energy) <= 0 or place < 2.0 * deviation:
+            best, why = fits[0.0], NO_PERSPECTIVE
         else:
-            why = NO_PERSPECTIVE
+            pinhole, nearest = table.pinhole(1.0 / place), nearest_to(fits, place)
+            (best,) = table.settled(pinhole, len(nearest.model.basis), nearest)
     if n_components is None and not why:
         best = table.with_fewer_shapes(best)
     # The last fit, with warnings and errors of depths
@@ -344,7 +351,7 @@ def fit_perspective(
     frames = fit.model.frames
     if errors and not why:
         place = 1.0 / pinhole.focal_length
-        other, least = minimum(fits), min(fits)
+        other, least = minimum(fits), max(g for g in fits if g < 0)
         share = deviation / place
         if not deviation and np.isfinite(other.deviation):
             # The table may contradict a given focal length
