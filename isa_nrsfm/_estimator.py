@@ -38,7 +38,7 @@ from isa_nrsfm._fit import (
     supported_components,
 )
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations, project
+from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._parameters.choices import (
@@ -548,7 +548,7 @@ default="affine"
         isa, n_components = self._strategy(settings.joint), self.n_components
         auto, perspective = n_components == "auto", self.camera == "perspective"
         if perspective:
-            x, y = map(float, self.principal_point)
+            x, y = np.asarray(self.principal_point, dtype=float).tolist()
             of_table = PerspectiveTable(source, weights, isa, settings, (x, y))
             focal_length = self.focal_length
             if focal_length is not None:
@@ -663,7 +663,7 @@ default="affine"
         """Refuse parameters that perspective cameras do not have, or lack."""
         if self.refinement != "joint":
             raise ValueError(
-                "camera='perspective' needs refinement='joint', whose fits are repeated "
+                "camera='perspective' needs refinement='joint', whose fits repeat "
                 "until the depths of the points agree with their images; got "
                 f"refinement={self.refinement!r}"
             )
@@ -677,24 +677,21 @@ default="affine"
                 f"got principal_point={self.principal_point!r}"
             )
 
-    def _in_common_unit(self, rows: FrameBlocks, reset: bool) -> FrameBlocks:
-        """Return perspective images as if all had the mean of their focal lengths."""
-        focal = self.focal_length if reset else getattr(self, "focal_length_", None)
-        if not np.ndim(focal):
-            return rows
-        focal = np.asarray(focal, dtype=float)
-        if focal.shape != (rows.n_frames,) or not (focal > 0).all():
+    def _focal_shares(self, n_frames: int, reset: bool) -> NDArray | None:
+        """Return the mean of the focal lengths over those of frames, if they differ."""
+        focal = np.asarray(getattr(self, "focal_length_", 0.0), dtype=float)
+        if reset and self.focal_length is not None:
+            focal = np.asarray(self.focal_length, dtype=float)
+        if not focal.ndim:
+            return None
+        if focal.shape != (n_frames,) or not (focal > 0).all():
             raise ValueError(
                 "focal_length must be one positive number, or one for each of the "
-                f"{rows.n_frames} rows of the table; got shape {focal.shape}. For "
-                "tables of other lengths fit (x - x0) / f, (y - y0) / f with "
-                "focal_length=1, principal_point=(0, 0)"
+                f"{n_frames} rows of the table; got shape {focal.shape}. For tables of "
+                "other lengths fit (x - x0) / f, (y - y0) / f with focal_length=1, "
+                "principal_point=(0, 0)"
             )
-        centre = np.reshape(self.principal_point, (2, 1))
-        share = (common(focal) / focal)[:, None, None]
-        scaled = rows.derive(lambda part, s: (part - centre) * s + centre, share)
-        scaled.empty = rows.empty
-        return scaled
+        return common(focal) / focal[:, None]
 
     def _strategy(self, joint: bool) -> Any:
         """Return the unfitted strategy, with parameters inherited where not set."""
@@ -1065,8 +1062,14 @@ default="affine"
             few visible points.
         """
         table, _ = self._opened(X)
-        images = table.collect(self._model.reproject)
-        return images
+        if (shares := self._focal_shares(table.n_frames, False)) is None:
+            return table.collect(self._model.reproject)
+        empty = np.zeros((1, len(self.mean_shape_), 2))
+        centre = tracks_to_table(empty + self.principal_point, self._model.layout)
+        return table.collect(
+            lambda rows, share: zoomed(self._model.reproject(rows), 1 / share, centre),
+            shares,
+        )
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1216,7 +1219,12 @@ default="affine"
         table = open_table(
             X, layout, names, counted=reset, n_jobs=n_jobs, working_memory=memory
         )
-        table = self._in_common_unit(table, reset)
+        if (shares := self._focal_shares(table.n_frames, reset)) is not None:
+            centre, empty = np.reshape(self.principal_point, (2, 1)), table.empty
+            table = table.derive(
+                lambda rows, share: zoomed(rows, share[..., None], centre), shares
+            )
+            table.empty = empty
         if point_weight is None:
             return table, ()
         return weighted_rows(table, point_weight)
@@ -1232,6 +1240,11 @@ def common(focal_length: Any) -> float:
     if not np.ndim(focal_length):
         return float(focal_length)
     return float(np.exp(np.mean(np.log(focal_length))))
+
+
+def zoomed(rows: NDArray, share: NDArray, centre: NDArray) -> NDArray:
+    """Return coordinates with their distances from a centre times a share."""
+    return ((rows - centre) * share + centre).astype(rows.dtype)
 
 
 def check_class(estimator: object, where: str) -> None:

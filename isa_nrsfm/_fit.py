@@ -198,10 +198,8 @@ def fit_table(
     if settings.hidden_points and not table.complete:
         probability = fitted.mirror_certainty(table.rows, frames)
     if probability < 0.5:
-        probability, fitted = 1.0 - probability, fitted.mirrored()
-        frames = frames._replace(motion=frames.motion * MIRROR)
-        signs = np.tile(MIRROR, len(fitted.basis))
-        measures["mode_covariance_"] *= np.outer(signs, signs)
+        probability = 1.0 - probability
+        fitted, frames, measures = mirror_image(fitted, frames, measures)
     attributes["mirror_certainty_"] = probability
     # 6. Measures of the fit
     attributes |= measures | _measures(table, factorised, fitted, frames, settings)
@@ -401,11 +399,7 @@ def _measures(
     mean_shape, basis = model.mean_shape, model.basis
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
-    reference = reference_camera(cameras, table.sizes)
-    if settings.camera != "affine":
-        (row,), (scale,) = nearest_calibrated(reference[None])
-        reference = scale * row
-    centre = frames.translation.mean(axis=0)
+    reference = mean_camera(frames, table.sizes, settings.camera)
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
@@ -419,6 +413,25 @@ def _measures(
             (frames.translation - table.translation) / table.sizes[:, None],
             frames.alpha,
         ),
-        "reference_motion_": reference.astype(table.dtype),
-        "reference_translation_": centre.astype(table.dtype),
-    }
+    } | {name: value.astype(table.dtype) for name, value in reference.items()}
+
+
+def mean_camera(frames: Decomposition, sizes: NDArray, camera: str) -> dict[str, Any]:
+    """Return the attributes of the mean view of frames of some sizes (n,)."""
+    reference = reference_camera(frames.motion / sizes[:, None, None], sizes)
+    if camera != "affine":
+        (row,), (scale,) = nearest_calibrated(reference[None])
+        reference = scale * row
+    centre = frames.translation.mean(axis=0)
+    return {"reference_motion_": reference, "reference_translation_": centre}
+
+
+def mirror_image(
+    model: TableModel, frames: Decomposition, attributes: dict[str, Any]
+) -> tuple[TableModel, Decomposition, dict[str, Any]]:
+    """Return the mirror image in depth of a fit."""
+    model, signs = model.mirrored(), np.tile(MIRROR, len(model.basis))
+    shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis}
+    covariance = attributes["mode_covariance_"] * np.outer(signs, signs)
+    attributes = attributes | shapes | {"mode_covariance_": covariance}
+    return model, frames._replace(motion=frames.motion * MIRROR), attributes

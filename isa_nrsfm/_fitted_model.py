@@ -1,6 +1,5 @@
 """The fitted model, applied to a table block by block."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,7 +91,7 @@ class TableModel(NamedTuple):
         pinhole = self.pinhole
         if pinhole is None:
             return rows, np.empty(len(rows))
-        images, turns = pinhole.virtual(rows, self.frames.loss != "linear")
+        images, turns = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
         weak, moving = self._replace(pinhole=None), np.arange(len(rows))
         for _ in range(MOST_REPEATS if pinhole.near else 0):
@@ -242,11 +241,9 @@ class TableModel(NamedTuple):
         """Return a fit of rows in virtual cameras with the cameras of the table."""
         if self.pinhole is None:
             return fit
-        virtual = partial(self.pinhole.virtual, robust=self.frames.loss != "linear")
-        turns = rows.joined(lambda part: virtual(part)[1])
+        _, turns = rows.joined(self.pinhole.virtual)
         real = self.pinhole.real(fit.motion, fit.translation, turns)
-        motion, translation = (part.astype(fit.alpha.dtype) for part in real)
-        return fit._replace(motion=motion, translation=translation)
+        return fit._replace(motion=real[0], translation=real[1])
 
     def distances(self, rows: NDArray, *fitted: NDArray) -> NDArray:
         """Return lengths of residuals (n, n_points), in sizes of their frames.

@@ -6,9 +6,9 @@ images determine depths up to their sign, so both mirror images are continued.
 
 Let E be the mean squared distance of points from their images, in sizes of frames. As a
 function of g = 1/f it is least for the focal length f. g = 0 is the weak-perspective
-fit, and -g the mirror image of the fit for g. Minima of parabolas through the three best
-fits lead to an unknown f. Without one of several groups of points the minimum moves,
-which gives its deviation (jackknife).
+fit, and -g the mirror image of the fit for g. Minima of parabolas through the three
+best fits lead to an unknown f. Without one of several groups of points the minimum
+moves, which gives its deviation (jackknife).
 """
 
 import warnings
@@ -22,18 +22,20 @@ from scipy.stats import t as student
 
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._fit import fit_table, ready_table, supported_components
-from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import (
-    compose,
-    nearest_calibrated,
-    project,
-    reference_camera,
+from isa_nrsfm._fit import (
+    fit_table,
+    mean_camera,
+    mirror_image,
+    ready_table,
+    supported_components,
 )
-from isa_nrsfm._frames.models import MIRROR, Decomposition
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.camera_models import compose, project
+from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
+from isa_nrsfm._prepare.robust import robust_square
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks
 
@@ -48,12 +50,10 @@ ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
 # The search ends if the minimum is that near to a fit, as a share of 1/f.
 NEAR, MOST_FITS = 0.01, 10
 
-WEAKER = (
-    ". The fit is that of weak-perspective cameras, turned to the middle of each object"
-)
 UNSTEADY = (
     "the fit of perspective has not settled: depths and fit do not agree. The focal "
-    f"length may be wrong, or there are too few basis shapes{WEAKER}"
+    "length may be wrong, the objects may turn too little, or there are too few basis "
+    "shapes. The fit is that of weak-perspective cameras, turned to each object"
 )
 NO_PERSPECTIVE = (
     "the table shows no perspective: its focal length is too long, or the objects are "
@@ -83,18 +83,19 @@ class PerspectiveFit(NamedTuple):
         """Mean squared distance E of the points from their images."""
         return float(self.energies.sum())
 
+    @property
+    def n_components(self) -> int:
+        """Number of basis shapes."""
+        return len(self.model.basis)
+
     def depths(self, part: slice) -> NDArray:
         """Return depths (n, J) of the points of some frames."""
         return self.model.depths(Decomposition(*(v[part] for v in self.frames)))
 
     def mirrored(self) -> "PerspectiveFit":
         """Return the mirror image in depth."""
-        frames = self.frames._replace(motion=self.frames.motion * MIRROR)
-        signs = np.tile(MIRROR, len(self.model.basis))
-        covariance = self.attributes["mode_covariance_"] * np.outer(signs, signs)
-        attributes = self.attributes | {"mode_covariance_": covariance}
-        model = self.model.mirrored()
-        return self._replace(model=model, frames=frames, attributes=attributes)
+        image = mirror_image(self.model, self.frames, self.attributes)
+        return self._replace(model=image[0], frames=image[1], attributes=image[2])
 
 
 class PerspectiveTable(NamedTuple):
@@ -106,25 +107,20 @@ class PerspectiveTable(NamedTuple):
     settings: FitSettings
     principal_point: tuple[float, float]
 
-    @property
-    def robust(self) -> bool:
-        """Whether the middle of a frame is a median."""
-        return self.settings.loss != "linear"
-
-    def pinhole(self, focal_length: float) -> Pinhole:
+    def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
         """Return the camera with a focal length."""
-        return Pinhole(focal_length, self.principal_point)
+        robust = self.settings.loss != "linear"
+        return Pinhole(focal_length, self.principal_point, robust, near)
 
     def straight(
         self, pinhole: Pinhole, n_components: int, fit: PerspectiveFit | None
     ) -> ScaledTable:
-        """Return weak-perspective images, for the depths of a fit, or for equal ones."""
-        by_frame: tuple[NDArray, ...] = ()
-        function = partial(_straight, pinhole=pinhole, robust=self.robust)
-        if fit is not None:
-            function = partial(function, model=fit.model)
-            by_frame = fit.frames.motion, fit.frames.alpha
-        rows = self.source.derive(function, *by_frame)
+        """Return weak-perspective images, for the depths of a fit, or equal ones."""
+        if fit is None:
+            rows = self.source.derive(lambda rows: pinhole.virtual(rows)[0])
+        else:
+            function = partial(_straight, pinhole=pinhole, model=fit.model)
+            rows = self.source.derive(function, fit.frames.motion, fit.frames.alpha)
         rows.empty = self.source.empty
         return ready_table(rows, self.weights, n_components, self.settings)
 
@@ -140,29 +136,28 @@ class PerspectiveTable(NamedTuple):
 
         It has the mirror image with those depths. Options are those of `fit_table`.
         """
-        table = self.straight(pinhole, n_components, before)
+        table, settings = self.straight(pinhole, n_components, before), self.settings
         progress = progress or NoProgress()
-        result = fit_table(
-            table, n_components, self.isa, self.settings, progress, **options
-        )
+        result = fit_table(table, n_components, self.isa, settings, progress, **options)
         fit = PerspectiveFit(pinhole, *result)
         if before is not None:
-            if fit.attributes["isa_"] is None:
-                fit.attributes["isa_"] = before.attributes["isa_"]
             parts = [(before.depths(p), fit.depths(p)) for p in self.source.slices]
             same, other, total = (
                 sum(float(np.nansum((z - sign * old) ** 2)) for old, z in parts)
                 for sign in (1.0, -1.0, 0.0)
             )
             change = float(np.sqrt(min(same, other) / (total or 1.0)))
-            fit = fit._replace(changes=(*before.changes, change))
             fit = fit.mirrored() if other < same else fit
-        motion, translation, alpha, _ = fit.frames
-        squares = self.source.map(
-            partial(_squares, fit=fit, robust=self.robust), motion, translation, alpha
-        )
+            fit.attributes["isa_"] = fit.attributes["isa_"] or before.attributes["isa_"]
+            fit = fit._replace(changes=(*before.changes, change))
+        squares = self.source.map(partial(_squares, fit=fit), *fit.frames[:3])
         square, counts = np.sum(list(squares), axis=0)
         return fit._replace(energies=square / counts.sum())
+
+    def quick_fit(self, *args: Any, **options: Any) -> PerspectiveFit:
+        """Return a fit without warnings: the last fit warns."""
+        with warnings.catch_warnings(action="ignore"):
+            return self.fit(*args, **options)
 
     def settled(
         self, pinhole: Pinhole, n_components: int, *fits: PerspectiveFit
@@ -171,45 +166,36 @@ class PerspectiveTable(NamedTuple):
 
         A fit also ends if it is clearly worse than the best one.
         """
-        running, ended = [fit._replace(changes=()) for fit in fits], []
+        running = [fit._replace(changes=()) for fit in fits]
+        ended: list[PerspectiveFit] = []
         while running:
-            with warnings.catch_warnings(action="ignore"):  # the last fit warns
-                running = [
-                    self.fit(pinhole, n_components, fit, start=fit.model)
-                    for fit in running
-                ]
+            running = [
+                self.quick_fit(pinhole, n_components, fit, start=fit.model)
+                for fit in running
+            ]
             best = min(fit.energy for fit in [*running, *ended])
-            ends = [self._ends(fit, best) for fit in running]
-            ended += [f for f, end in zip(running, ends, strict=True) if end]
-            running = [f for f, end in zip(running, ends, strict=True) if not end]
+            ended += [fit for fit in running if self._ends(fit, best)]
+            running = [fit for fit in running if not self._ends(fit, best)]
         return sorted(ended, key=lambda fit: fit.energy)
+
+    def _ends(self, fit: PerspectiveFit, best: float) -> bool:
+        """Return whether further repeats of a fit would not help."""
+        n_repeats, change = len(fit.changes), fit.changes[-1]
+        most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
+        agrees = change < SETTLED * self.settings.tol / JOINT_TOL
+        return agrees or n_repeats >= (2 if fit.energy > WORSE * best else most)
 
     def first(
         self,
-        pinhole: Pinhole,
+        focal_length: float,
         n_components: int | None,
         progress: FitProgress | NoProgress,
     ) -> PerspectiveFit:
         """Return the fit for equal depths, of as many basis shapes as are relevant."""
-        auto, pinhole = n_components is None, pinhole._replace(near=False)
-        with warnings.catch_warnings(action="ignore"):  # the last fit warns
-            if n_components is None:
-                n_components = self.supported(pinhole, None)
-            return self.fit(pinhole, n_components, None, progress, free=auto)
-
-    def with_fewer_shapes(self, fit: PerspectiveFit) -> PerspectiveFit:
-        """Return a fit of as many basis shapes as corrected images have."""
-        supported, pinhole = self.supported(fit.pinhole, fit), fit.pinhole
-        if supported == len(fit.model.basis):
-            return fit
-        with warnings.catch_warnings(action="ignore"):
-            new = self.fit(pinhole, supported, fit, free=True)
-        return self.settled(pinhole, len(new.model.basis), new)[0]
-
-    def reach(self, rows: NDArray) -> float:
-        """Return the largest coordinate of rows, from the principal point."""
-        centre = np.reshape(self.principal_point, (2, 1))
-        return float(np.fmax.reduce(np.abs(rows - centre), axis=None, initial=0.0))
+        pinhole, auto = self.pinhole(focal_length, near=False), n_components is None
+        if n_components is None:
+            n_components = self.supported(pinhole, None)
+        return self.quick_fit(pinhole, n_components, None, progress, free=auto)
 
     def supported(self, pinhole: Pinhole, fit: PerspectiveFit | None) -> int:
         """Return the number of relevant basis shapes, for the depths of a fit."""
@@ -217,46 +203,42 @@ class PerspectiveTable(NamedTuple):
             table = self.straight(pinhole, 1, fit)
         return supported_components(table, self.isa, self.settings)[0]
 
+    def corrected_number(self, fit: PerspectiveFit) -> PerspectiveFit:
+        """Return a fit with as many basis shapes as images without perspective have."""
+        supported = self.supported(fit.pinhole, fit)
+        if supported == fit.n_components:
+            return fit
+        fit = self.quick_fit(fit.pinhole, supported, fit, free=True)
+        return self.settled(fit.pinhole, fit.n_components, fit)[0]
+
     def started(self, start: TableModel, n_components: int) -> PerspectiveFit:
         """Return the fit from the model of a similar table, with its focal length."""
         assert start.pinhole is not None
-        weights = () if self.weights is None else (self.weights,)
-        frames = self.source.joined(lambda *block: start.in_virtual_cameras(*block)[0], *weights)
+        frames = self.source.joined(lambda rows: start.in_virtual_cameras(rows)[0])
         model, pinhole = start._replace(pinhole=None), start.pinhole
         fit = PerspectiveFit(pinhole, model, frames, True, {"isa_": None})
         return self.settled(pinhole, n_components, fit)[0]
 
-    def around(self, first: PerspectiveFit, errors: bool) -> dict[float, PerspectiveFit]:
-        """Return fits for a given 1/f, its mirror image, and, for errors, neighbours."""
-        f, n_components = first.pinhole.focal_length, len(first.model.basis)
-        images = first, first.mirrored()
-        better, worse = self.settled(self.pinhole(f), n_components, *images)
-        fits = {1.0 / f: better, -1.0 / f: worse}
-        for share in (0.8, 1.25) if errors and better.changes[-1] < UNSETTLED else ():
-            pinhole = self.pinhole(f / share)
-            (fits[share / f],) = self.settled(pinhole, n_components, better)
-        return fits
+    def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
+        """Return the fits for 1/f and -1/f from a first fit."""
+        images, pinhole = (first, first.mirrored()), self.pinhole(f)
+        better, worse = self.settled(pinhole, first.n_components, *images)
+        return {1.0 / f: better, -1.0 / f: worse}
 
     def searched(
         self, n_components: int | None, progress: FitProgress | NoProgress
     ) -> dict[float, PerspectiveFit]:
         """Return fits around the minimum of E; 0 is the weak-perspective fit."""
-        reach = max(np.max(np.abs(self.principal_point)), *self.source.map(self.reach))
-        first = self.first(self.pinhole(FIRST * reach), n_components, progress)
-        n_components, g = len(first.model.basis), 1.0 / (FIRST * reach)
-        far = self.first(self.pinhole(ENDLESS * reach), n_components, NoProgress())
-        fits = {0.0: far} | self.around(first, False)
-        if far.energy < fits[g].energy:  # a long focal length, or none
-            pinhole = self.pinhole(LONGER / g)
-            images = self.settled(pinhole, n_components, far, far.mirrored())
-            fits |= dict(zip((g / LONGER, -g / LONGER), images, strict=True))
-        while len(fits) < MOST_FITS:
-            lowest = min(fits, key=lambda g: fits[g].energy)
-            if lowest <= 0:
-                break
+        f = FIRST * max(self.source.map(self._reach))
+        first = self.first(f, n_components, progress)
+        far = self.first(ENDLESS * f, first.n_components, NoProgress())
+        fits = {0.0: far, **self.images(first, f)}
+        if far.energy < fits[1.0 / f].energy:  # a long focal length, or none
+            fits |= self.images(far, LONGER * f)
+        while len(fits) < MOST_FITS and (lowest := best_of(fits)) > 0:
             below = max(g for g in fits if g < lowest)
             above = min((g for g in fits if g > lowest), default=0.0)
-            place = minimum(fits).place
+            place, _ = minimum(fits)
             if not above:
                 place = 1.5 * lowest
             elif not below < place < above:
@@ -266,47 +248,42 @@ class PerspectiveTable(NamedTuple):
                 place = 0.9 * lowest
                 if sum(abs(g / lowest - 1.0) < 0.15 for g in fits) > 1:
                     break
-            pinhole = self.pinhole(1.0 / place)
-            (fits[place],) = self.settled(pinhole, n_components, fits[lowest])
+            fits[place] = self.near(fits, place)
         return fits
 
-    def _ends(self, fit: PerspectiveFit, best: float) -> bool:
-        """Return whether further repeats of a fit would not help."""
-        n_repeats, change = len(fit.changes), fit.changes[-1]
-        if n_repeats >= 2 and fit.energy > WORSE * best:
-            return True
-        if n_repeats >= MOST_REPEATS * (1 if change > UNSETTLED else 2):
-            return True
-        return change < SETTLED * self.settings.tol / JOINT_TOL
+    def _reach(self, rows: NDArray) -> float:
+        """Return the largest coordinate of points and image, from its middle."""
+        centre = np.reshape(self.principal_point, (2, 1))
+        largest = np.fmax.reduce(np.abs(rows - centre), axis=None, initial=0.0)
+        return float(max(largest, *np.abs(centre[:, 0])))
+
+    def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
+        """Return the fit for g, from that with the nearest one."""
+        fit = fits[min((g for g in fits if g > 0), key=lambda g: abs(g - place))]
+        return self.settled(self.pinhole(1.0 / place), fit.n_components, fit)[0]
 
 
-class Minimum(NamedTuple):
-    """The minimum of E: its place g = 1/f, and the standard deviation of g."""
-
-    place: float
-    deviation: float
+def best_of(fits: dict[float, PerspectiveFit]) -> float:
+    """Return the g of the fit with the least E."""
+    return min(fits, key=lambda g: fits[g].energy)
 
 
-
-def minimum(fits: dict[float, PerspectiveFit]) -> Minimum:
-    """Return the minimum of the parabola through the three best fits."""
-    g = np.array(sorted(fits, key=lambda g: fits[g].energy)[:3])
-    energies = np.array([fits[place].energies for place in g.tolist()])
-    groups = neighbours(fits[float(g[0])].model.mean_shape.T)
+def minimum(fits: dict[float, PerspectiveFit]) -> tuple[float, float]:
+    """Return the minimum of a parabola through the three best fits, its deviation."""
+    g = sorted(fits, key=lambda g: fits[g].energy)[:3]
+    energies = np.array([fits[place].energies for place in g])
+    groups = neighbours(fits[g[0]].model.mean_shape.T)
 
     def vertex(kept: NDArray) -> float:
-        """Return the minimum of the parabola for some of the points."""
-        unit = np.abs(g).max()
+        """Return the minimum for some of the points, or infinity if there is none."""
+        unit = np.max(np.abs(g))
         square, slope, _ = np.polyfit(g / unit, energies[:, kept].sum(axis=1), 2)
-        if not square > 0:  # it has no minimum between the fits
-            return float(np.sign(-slope) * np.inf)
-        return float(-0.5 * slope / square * unit)
+        return float(-0.5 * slope / square * unit) if square > 0 else np.inf
 
-    every = vertex(np.ones(len(groups), dtype=bool))
+    every = vertex(groups >= 0)
     parts = np.array([vertex(groups != group) for group in range(N_GROUPS)])
-    if not np.isfinite(parts).all():
-        return Minimum(every, np.inf)
-    return Minimum(every, float(np.sqrt(N_GROUPS - 1) * parts.std()))
+    known = np.isfinite(parts).all()
+    return every, float(np.sqrt(N_GROUPS - 1) * parts.std()) if known else np.inf
 
 
 def fit_perspective(
@@ -327,103 +304,95 @@ def fit_perspective(
     if start is not None and n_components is not None:
         best = table.started(start, n_components)
     elif focal_length is not None:
-        pinhole = table.pinhole(focal_length)
-        first = table.first(pinhole, n_components, progress)
-        fits = table.around(first, errors)
+        first = table.first(focal_length, n_components, progress)
+        fits = table.images(first, focal_length)
         best = fits[1.0 / focal_length]
         if best.changes[-1] > UNSETTLED or best.energy > first.energy:
             best, why = first, UNSTEADY
+        elif errors:  # neighbours tell how far a focal length contradicts the table
+            places = [share / focal_length for share in (0.8, 1.25)]
+            fits |= {place: table.near(fits, place) for place in places}
     else:
         fits = table.searched(n_components, progress)
         place, deviation = minimum(fits)
-        if min(fits, key=lambda g: fits[g].energy) <= 0 or place < 2.0 * deviation:
-            best, why = fits[0.0], NO_PERSPECTIVE
+        deviation = float(np.hypot(deviation, 0.5 * NEAR * place))  # of the search
+        if best_of(fits) > 0 and place > 2.0 * deviation:
+            best = table.near(fits, place)
         else:
-            pinhole, nearest = table.pinhole(1.0 / place), nearest_to(fits, place)
-            (best,) = table.settled(pinhole, len(nearest.model.basis), nearest)
+            best, why = fits[0.0], NO_PERSPECTIVE
     if n_components is None and not why:
-        best = table.with_fewer_shapes(best)
+        best = table.corrected_number(best)
     # The last fit, with warnings and errors of depths
-    pinhole, before = best.pinhole._replace(near=not why), None if why else best
-    options = {"start": best.model, "errors": errors}
-    fit = table.fit(pinhole, len(best.model.basis), before, **options)
-    attributes = fit.attributes | {"isa_": best.attributes["isa_"]}
-    frames = fit.model.frames
-    if errors and not why:
-        place = 1.0 / pinhole.focal_length
-        other, least = minimum(fits), max(g for g in fits if g < 0)
-        share = deviation / place
-        if not deviation and np.isfinite(other.deviation):
-            # The table may contradict a given focal length
-            square = (other.place - place) ** 2 - other.deviation**2
-            share = np.sqrt(max(square, 0.0)) / place
-        total = np.hypot(frames.certainty.total, share * depth_slope(fits, place))
-        total = float(total)
-        frames = replace(frames, certainty=frames.certainty._replace(total=total))
-        attributes |= {
-            "depth_uncertainty_": total,
-            "mirror_certainty_": better_than(fits[-least], fits[least]),
-        }
+    fit = table.fit(
+        best.pinhole,
+        best.n_components,
+        None if why else best,
+        start=best.model,
+        errors=errors,
+    )
+    f, attributes = best.pinhole.focal_length, fit.attributes
+    model = fit.model._replace(pinhole=best.pinhole)
     if why:
         warn_caller(why)
-    model = fit.model._replace(frames=frames, pinhole=pinhole)
+    elif errors and isinstance(model.frames, PosteriorFrames):
+        certainty = model.frames.certainty
+        total = float(np.hypot(certainty.total, focal_error(fits, f, deviation)))
+        certainty = certainty._replace(total=total)
+        model = model._replace(frames=replace(model.frames, certainty=certainty))
+        least = max(g for g in fits if g < 0)
+        probability = better_than(fits[-least], fits[least])
+        attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
+    # Frames as new tables have them
     weights = () if table.weights is None else (table.weights,)
     decompose = partial(model.decompose, dtype=np.float64)
-    shown = table.source.joined(decompose, *weights)
-    seen = np.isfinite(shown.motion).all(axis=(1, 2))
-    sizes = attributes["_frame_sizes"][seen]
-    row, scale = nearest_calibrated(
-        reference_camera(shown.motion[seen] / sizes[:, None, None], sizes)[None]
-    )
+    frames: Decomposition = table.source.joined(decompose, *weights)
+    shown = np.isfinite(frames.motion).all(axis=(1, 2))
+    seen, sizes = Decomposition(*(v[shown] for v in frames)), attributes["_frame_sizes"]
     dtype = table.source.empty.dtype
-    centre = shown.translation[seen].mean(axis=0)
+    for name, value in mean_camera(seen, sizes[shown], "perspective").items():
+        attributes[name] = value.astype(dtype)
     attributes |= {
-        "reference_motion_": (scale * row[0]).astype(dtype),
-        "reference_translation_": centre.astype(dtype),
-        "focal_length_": np.inf if why == NO_PERSPECTIVE else pinhole.focal_length,
-        "focal_length_std_": deviation * pinhole.focal_length**2,
+        "isa_": best.attributes["isa_"],
+        "focal_length_": np.inf if why == NO_PERSPECTIVE else f,
+        "focal_length_std_": deviation * f**2,
     }
-    shown = Decomposition(*(part.astype(dtype) for part in shown))
-    return model, shown, fit.converged, attributes
+    frames = Decomposition(*(part.astype(dtype) for part in frames))
+    return model, frames, fit.converged, attributes
+
+
+def focal_error(
+    fits: dict[float, PerspectiveFit], focal_length: float, deviation: float
+) -> float:
+    """Return the relative error of the depths due to that of the focal length.
+
+    The error of 1/f is its deviation. For a given f it is the distance of the minimum
+    of E, as far as the deviation of the minimum does not explain it.
+    """
+    g = 1.0 / focal_length
+    if not deviation:
+        place, other = minimum(fits)
+        deviation = np.sqrt(np.fmax((place - g) ** 2 - other**2, 0.0))
+    first, second = sorted((g for g in fits if g >= 0), key=lambda o: abs(o - g))[:2]
+    z, moved = (fits[place].depths(slice(None)) for place in (first, second))
+    change = np.sqrt(np.nansum((moved - z) ** 2) / np.nansum(z**2))
+    return float(change * deviation / abs(second - first))
 
 
 def better_than(fit: PerspectiveFit, other: PerspectiveFit) -> float:
-    """Return the probability that E is smaller than that of another fit, by groups."""
-    groups = neighbours(fit.model.mean_shape.T)
-    off = np.bincount(groups, other.energies - fit.energies)
-    deviation = off.std(ddof=1) / np.sqrt(len(off))
-    return float(student.cdf(off.mean() / deviation, len(off) - 1))
-
-
-def nearest_to(fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
-    """Return the fit with the nearest g."""
-    return fits[min(fits, key=lambda g: abs(g - place))]
-
-
-def depth_slope(fits: dict[float, PerspectiveFit], place: float) -> float:
-    """Return the relative change of the depths by a relative change of g."""
-    g, other = sorted((g for g in fits if g >= 0), key=lambda g: abs(g - place))[:2]
-    whole = slice(None)
-    z, changed = fits[g].depths(whole), fits[other].depths(whole)
-    share = np.sqrt(np.nansum((z - changed) ** 2) / np.nansum(z**2))
-    return float(share * place / abs(g - other))
+    """Return the probability that E is less than that of another fit, by groups."""
+    gain = np.bincount(
+        neighbours(fit.model.mean_shape.T), other.energies - fit.energies
+    )
+    deviation = gain.std(ddof=1) / np.sqrt(len(gain))
+    return float(student.cdf(gain.mean() / deviation, len(gain) - 1))
 
 
 def _straight(
-    rows: NDArray,
-    motion: NDArray | None = None,
-    alpha: NDArray | None = None,
-    *,
-    pinhole: Pinhole,
-    robust: bool,
-    model: TableModel | None = None,
+    rows: NDArray, motion: NDArray, alpha: NDArray, pinhole: Pinhole, model: TableModel
 ) -> NDArray:
     """Return weak-perspective images (n, 2, J) of rows, for the depths of a model."""
-    images, _ = pinhole.virtual(rows, robust)
-    if model is None or motion is None or alpha is None:
-        return images
     fit = Decomposition(motion, motion[:, :, 0], alpha, alpha)
-    return pinhole.straight(images, model.depths(fit))
+    return pinhole.straight(pinhole.virtual(rows)[0], model.depths(fit))
 
 
 def _squares(
@@ -431,16 +400,16 @@ def _squares(
     motion: NDArray,
     translation: NDArray,
     alpha: NDArray,
-    *,
     fit: PerspectiveFit,
-    robust: bool,
 ) -> NDArray:
-    """Return squared distances (J,) from the images, in sizes of frames, and counts."""
-    images, _ = fit.pinhole.virtual(rows, robust)
+    """Return sums (J,) of squared distances, in sizes of frames, and counts."""
+    images, _ = fit.pinhole.virtual(rows)
     shapes = compose(fit.model.mean_shape, fit.model.basis, alpha)
     flat = project(shapes, motion, translation).swapaxes(1, 2)
     depths = fit.model.depths(Decomposition(motion, translation, alpha, alpha))
     square = np.sum((fit.pinhole.images(flat, depths) - images) ** 2, axis=1)
     centred = images - np.nanmean(images, axis=2, keepdims=True)
     square /= np.nanmean(centred**2, axis=(1, 2))[:, None]
+    if fit.pinhole.robust and isinstance(fit.model.frames, PosteriorFrames):
+        square = robust_square(square, fit.model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

@@ -1,7 +1,7 @@
 """Perspective cameras: images that weak-perspective cameras would show.
 
-A pinhole camera with focal length f and principal point c shows a point X of its axes at
-``w = f (X_1, X_2) / X_3 + c``. Two steps make such images weak-perspective:
+A pinhole camera with focal length f and principal point c shows a point X of its axes
+at ``w = f (X_1, X_2) / X_3 + c``. Two steps make such images weak-perspective:
 
 1. A virtual camera is turned about the centre of the camera until the middle of the
    object is on its axis. With the smallest rotation H that does so, and ``q = H ((w -
@@ -10,10 +10,10 @@ A pinhole camera with focal length f and principal point c shows a point X of it
    ``z = s r_3 . S`` of a point S, ``y (1 + z / f) = s R_12 S + t`` (POSIT: DeMenthon,
    Davis, "Model-based object pose in 25 lines of code", 1995).
 
-The rotation of the real camera is ``H^T R``, and ``H^T (t, f) / s`` the position of the
-shapes' origin in its axes. Public cameras (n, 2, 3) and translations (n, 2) are those of
-the weak-perspective camera with the same rotation and position: ``s_i = f / T_3``,
-``t_i = s_i T_12 + c``.
+The rotation of the real camera is ``H^T R``, and ``T = H^T (t, f) / s`` the position of
+the shapes' origin in its axes. Public cameras (n, 2, 3) and translations (n, 2) are
+those of the weak-perspective camera with the same rotation and position: ``s_i = f /
+T_3``, ``t_i = s_i T_12 + c``.
 """
 
 from typing import NamedTuple
@@ -29,11 +29,13 @@ from isa_nrsfm._tables.tracks import seen_points
 class Pinhole(NamedTuple):
     """A perspective camera, in units of the table.
 
+    robust: whether the middle of the points of a frame is their median, or their mean.
     near: whether depths of points are taken into account, or only virtual cameras.
     """
 
     focal_length: float
     principal_point: tuple[float, float]
+    robust: bool = False
     near: bool = True
 
     @property
@@ -41,13 +43,19 @@ class Pinhole(NamedTuple):
         """The principal point (2, 1)."""
         return np.reshape(self.principal_point, (2, 1))
 
-    def virtual(self, rows: NDArray, robust: bool) -> tuple[NDArray, NDArray]:
+    def virtual(self, rows: NDArray) -> tuple[NDArray, NDArray]:
         """Return images (n, 2, J) of virtual cameras, and their rotations H (n, 3, 3).
 
-        Their axes go through the centroids of the rows, or the medians if `robust`.
+        Their axes go through the middles of the points.
         """
         rows = rows.astype(np.float64, copy=False)
-        turns = turns_to(self.rays(_middles(rows, robust)[:, :, None])[..., 0])
+        shown = seen_points(rows).any(axis=1)
+        middle = np.full((len(rows), 2, 1), np.nan)
+        if self.robust:
+            middle[shown, :, 0] = spatial_median(rows[shown])
+        else:
+            middle[shown] = np.nanmean(rows[shown], axis=2, keepdims=True)
+        turns = turns_to(self.rays(middle)[..., 0])
         q = turns @ self.rays(rows)
         return self.focal_length * q[:, :2] / q[:, 2:], turns
 
@@ -101,19 +109,6 @@ class Pinhole(NamedTuple):
         f = np.full(len(motion), self.focal_length)
         place = np.column_stack([translation - self.centre[:, 0], f])
         return place / scales[:, None]
-
-
-def _middles(rows: NDArray, robust: bool) -> NDArray:
-    """Return centroids or medians (n, 2) of rows, NaN for rows without points."""
-    shown = seen_points(rows).any(axis=1)
-    middle = np.full((len(rows), 2), np.nan)
-    middle[shown] = (spatial_median if robust else _centroids)(rows[shown])
-    return middle
-
-
-def _centroids(rows: NDArray) -> NDArray:
-    """Return centroids (n, 2) of the visible points of rows."""
-    return np.asarray(np.nanmean(rows, axis=2))
 
 
 def turns_to(rays: NDArray) -> NDArray:

@@ -265,7 +265,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
         ((2,), ["reference_translation_", "certainty", "image_errors"]),
-        ((4,), ["pinhole"]),
+        ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_"]),
         ((N, 2, 3), ["motion_"]),
@@ -297,8 +297,8 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "sizes": vars(estimator).get("_frame_sizes"),
     }
     if model.pinhole is not None:
-        f, (x, y), near = model.pinhole
-        entries["pinhole"] = np.array([f, x, y, near], dtype=float)
+        f, (x, y), *kinds = model.pinhole
+        entries["pinhole"] = np.array([f, x, y, *kinds], dtype=float)
     if isinstance(frames, RigidFrames):
         return {**entries, "mean_shape": frames.mean_shape, "basis": frames.basis}
     return {
@@ -323,8 +323,8 @@ def _pinhole(entries: dict[str, Any]) -> Pinhole | None:
     """Return the perspective camera of `_frame_entries`, if any."""
     if "pinhole" not in entries:
         return None
-    f, x, y, near = entries["pinhole"].tolist()
-    return Pinhole(f, (x, y), bool(near))
+    f, x, y, robust, near = entries["pinhole"].tolist()
+    return Pinhole(f, (x, y), bool(robust), bool(near))
 
 
 def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
