@@ -547,6 +547,7 @@ default="affine"
         source, weights, settings = opened._ready(X, point_weight)
         isa, n_components = self._strategy(settings.joint), self.n_components
         auto, perspective = n_components == "auto", self.camera == "perspective"
+        most = None
         if perspective:
             x, y = np.asarray(self.principal_point, dtype=float).tolist()
             of_table = PerspectiveTable(source, weights, isa, settings, (x, y))

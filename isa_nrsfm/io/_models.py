@@ -370,6 +370,10 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
             return {"random_state": [packed(key, name, arrays), *rest]}
     elif isinstance(value, Path):
         return {"path": str(value)}
+    elif type(value) in (tuple, list):
+        numbers = np.array(value)
+        if numbers.ndim == 1 and numbers.dtype.kind in "iuf":
+            return {type(value).__name__: numbers.tolist()}
     elif type(value) in STORED.values():
         parts = packed_parts(value, f"{name}.", arrays)
         return {"object": {"class": type(value).__name__, **parts}}
@@ -408,6 +412,10 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
             return np.array(names, dtype=object)
         case {"path": str(path)}:
             return Path(path)
+        case {"tuple": [*numbers]} if all(type(n) in (int, float) for n in numbers):
+            return tuple(numbers)
+        case {"list": [*numbers]} if all(type(n) in (int, float) for n in numbers):
+            return numbers
         case {"random_state": [key, int(position), int(has_gauss), float(gauss)]}:
             key = unpacked(key, arrays)
             # NumPy does not check the position, and reads there.

@@ -1,0 +1,316 @@
+"""Perspective cameras: tests by definition of geometry, fit and methods."""
+
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from sklearn.base import clone
+
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._estimator import limited
+from isa_nrsfm._frames.pinhole import Pinhole
+from isa_nrsfm._joint.settings import LIMITS
+from isa_nrsfm.io import load_model, save_model
+
+F, CENTRE = 1000.0, (640.0, 360.0)
+# Few steps for the errors of depths
+Quick = limited(LIMITS._replace(error_steps=3))
+
+
+def scene(
+    seed=0, n_frames=60, yaw=25.0, distance=4.0, noise=0.0, spread=0.25, n_points=16
+):
+    """Return images X of shapes S, of radius one with two basis shapes, and cameras."""
+    rng = np.random.RandomState(seed)
+    mean_shape = rng.standard_normal((n_points, 3)) * (0.6, 0.7, 0.5)
+    basis = 0.12 * rng.standard_normal((2, n_points, 3))
+    alpha = rng.standard_normal((n_frames, 2))
+    S = mean_shape + np.tensordot(alpha, basis, 1)
+    S -= S.mean(axis=1, keepdims=True)
+    angles = rng.uniform(-1, 1, (n_frames, 3)) * (yaw, 0.6 * yaw, 0.5 * yaw)
+    R = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+    z = distance * rng.uniform(0.85, 1.15, n_frames)
+    xy = rng.uniform(-1, 1, (n_frames, 2)) * (spread, 0.6 * spread)
+    T = np.column_stack([xy * z[:, None], z])
+    X = S @ R.mT + T[:, None]
+    w = F * X[..., :2] / X[..., 2:] + CENTRE
+    size = np.sqrt(np.mean((w - w.mean(axis=1, keepdims=True)) ** 2))
+    w += noise * size * rng.standard_normal(w.shape)
+    X = w.reshape(n_frames, -1)
+    return SimpleNamespace(X=X, S=S, R=R, T=T, noise=noise * size)
+
+
+def fitted(X, **params):
+    """Return a fit with perspective cameras."""
+    given = {"n_components": 2, "focal_length": F, "principal_point": CENTRE}
+    model = Quick(camera="perspective", random_state=0, **given | params)
+    return model.fit(X)
+
+
+def frame_error(shapes, truth):
+    """Return the mean error of shapes after a rotation and a scale for each frame."""
+    errors = []
+    for a, b in zip(shapes - shapes.mean(axis=1, keepdims=True), truth, strict=True):
+        U, values, V = np.linalg.svd(a.T @ b)
+        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ V))])
+        scale = (sign * values).sum() / np.sum(a**2)
+        errors.append(np.linalg.norm(scale * a @ (U * sign) @ V - b))
+    return np.mean(errors) / np.sqrt(np.mean(np.sum(truth**2, axis=(1, 2))))
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """A table with noise, its truth and its fit."""
+    table = scene(noise=0.005)
+    table.model = fitted(table.X)
+    return table
+
+
+def virtual_scene():
+    """Return a scene with virtual images, and points in the axes of their cameras."""
+    s = scene()
+    s.pinhole = Pinhole(F, CENTRE)
+    s.images, s.H = s.pinhole.virtual(s.X.reshape(len(s.X), -1, 2).swapaxes(1, 2))
+    s.points = (s.S @ s.R.mT + s.T[:, None]) @ s.H.mT
+    return s
+
+
+def test_virtual_images_are_those_of_a_turned_camera():
+    s = virtual_scene()
+    images = F * s.points[..., :2] / s.points[..., 2:]
+    np.testing.assert_allclose(s.images, images.swapaxes(1, 2))
+    np.testing.assert_allclose(s.H @ s.H.mT, [np.eye(3)] * len(s.H), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(s.H), 1.0)
+
+
+def test_images_with_true_depths_are_weak_perspective():
+    s = virtual_scene()
+    R, place = s.H @ s.R, (s.H @ s.T[..., None])[..., 0]
+    scale = (F / place[:, 2])[:, None, None]
+    z = scale[..., 0] * (s.S @ R[:, 2, :, None])[..., 0]
+    flat = scale * (s.S @ R[:, :2].mT + place[:, None, :2])
+    straight = s.pinhole.straight(s.images, z)
+    np.testing.assert_allclose(straight, flat.swapaxes(1, 2), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(s.pinhole.images(straight, z), s.images)
+    motion, translation = s.pinhole.real(
+        scale * R[:, :2], scale[..., 0] * place[:, :2], s.H
+    )
+    np.testing.assert_allclose(s.pinhole.positions(motion, translation), s.T)
+    np.testing.assert_allclose(motion, (F / s.T[:, 2])[:, None, None] * s.R[:, :2])
+    projected = s.pinhole.projected(s.S, motion, translation)
+    np.testing.assert_allclose(projected.reshape(s.X.shape), s.X)
+
+
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 20))]
+)
+def test_without_noise_the_fit_is_exact(seed):
+    s = scene(seed, yaw=40.0, distance=2.4 * (2.5 + 0.25 * seed))  # radii
+    X, S, R = s.X, s.S, s.R
+    model = fitted(X, tol=1e-3)
+    assert frame_error(model.reconstruct(X), S) < 1e-4
+    turned = model.rotations_.mT @ R
+    assert np.abs(turned - turned[0]).max() < 2e-3
+
+
+def test_frames(noisy):
+    X, S, T, noise, model = noisy.X, noisy.S, noisy.T, noisy.noise, noisy.model
+    assert frame_error(model.reconstruct(X), S) < 0.01
+    np.testing.assert_array_equal(model.transform(X), model.alpha_)
+    rest = model.reproject(X) - X
+    assert 0.7 * noise < np.sqrt(np.mean(rest**2)) < noise
+    images = model.inverse_transform(model.alpha_, model.motion_, model.translation_)
+    np.testing.assert_allclose(images, model.reproject(X))
+    # Distances and directions, up to the unit of the shapes
+    distance, true = (np.linalg.norm(v, axis=1) for v in (model.positions_, T))
+    assert np.std(distance / true) < 0.03 * np.mean(distance / true)
+    ray = np.vecdot(model.positions_, T) / distance / true
+    assert ray.min() > 1.0 - 1e-5
+    assert model.score(X) > -3e-4
+    std = model.reconstruct(X, return_std=True)[1]
+    assert 0.0 < std.min() < std.max() < 0.5
+    assert model.diagnostics(X).outlier_share == 0.0
+
+
+def test_rotation_covariance_and_smoothing(noisy):
+    X, model = noisy.X, noisy.model
+    deviations = np.sqrt(np.trace(model.rotation_covariance(X), axis1=1, axis2=2))
+    assert 0.001 < deviations.mean() < 0.05
+    motion = model.smooth(X).decomposition.motion
+    np.testing.assert_allclose(motion, model.motion_, rtol=0, atol=0.05 * motion.max())
+
+
+def test_perspective_decides_the_mirror_image(noisy):
+    X, S, model = noisy.X, noisy.S, noisy.model
+    assert model.mirror_certainty_ > 0.9
+    assert (
+        np.linalg.det(np.linalg.lstsq(model.mean_shape_, S.mean(axis=0), rcond=None)[0])
+        > 0
+    )
+    with pytest.raises(ValueError, match="decide between the two mirror images"):
+        model.mirrored()
+    # Images flipped left-right show an object that is flipped left-right
+    tracks = X.reshape(len(X), -1, 2) * (-1, 1) + (2 * CENTRE[0], 0)
+    other = fitted(tracks.reshape(X.shape))
+    flipped = other.reconstruct(tracks.reshape(X.shape))
+    assert frame_error(flipped * (-1, 1, 1), S) < 0.01
+
+
+def same_model(model, other, tol=2e-3, turn=None):
+    """Assert that fits have equal coefficients, and rotations but for a common one."""
+    signs = np.sign(np.sum(model.alpha_ * other.alpha_, axis=0))
+    np.testing.assert_allclose(other.alpha_ * signs, model.alpha_, atol=tol)
+    R = model.rotations_ if turn is None else turn @ model.rotations_
+    common = other.rotations_.mT @ R
+    np.testing.assert_allclose(
+        common, np.tile(common[0], (len(common), 1, 1)), atol=tol
+    )
+
+
+def test_units(noisy):
+    X, model = noisy.X, noisy.model
+    tenfold = fitted(10 * X, focal_length=10 * F, principal_point=(6400, 3600))
+    same_model(model, tenfold)
+    np.testing.assert_allclose(tenfold.translation_, 10 * model.translation_, rtol=1e-3)
+    np.testing.assert_allclose(tenfold.positions_, model.positions_, rtol=1e-3)
+    unit = ((X.reshape(len(X), -1, 2) - CENTRE) / F).reshape(X.shape)
+    same_model(model, fitted(unit, focal_length=1, principal_point=(0, 0)))
+
+
+def test_a_camera_that_turns_about_its_centre():
+    X = scene(noise=0.002).X
+    model = fitted(X)
+    Q = Rotation.from_euler("xyz", (4, -6, 10), degrees=True).as_matrix()
+    rays = np.pad(X.reshape(len(X), -1, 2) - CENTRE, ((0, 0), (0, 0), (0, 1)))
+    rays[..., 2] = F
+    turned = rays @ Q.T
+    images = F * turned[..., :2] / turned[..., 2:] + CENTRE
+    same_model(model, fitted(images.reshape(X.shape)), 5e-3, Q)
+
+
+def test_a_long_focal_length_is_weak_perspective():
+    s = scene(noise=0.005)
+    X, S, R = s.X, s.S, s.R
+    flat = (S @ R[:, :2].mT).reshape(len(X), -1)
+    flat += 0.002 * np.random.RandomState(0).standard_normal(flat.shape)
+    with warnings.catch_warnings(action="ignore"):
+        model = fitted(flat, focal_length=1e6, principal_point=(0, 0))
+    weak = AffineNRSfM(2, camera="weak_perspective", random_state=0).fit(flat)
+    other = weak if frame_error(weak.reconstruct(flat), S) < 0.1 else weak.mirrored()
+    error = frame_error(other.reconstruct(flat), S)
+    best = min(frame_error(model.reconstruct(flat) * (1, 1, z), S) for z in (-1, 1))
+    np.testing.assert_allclose(best, error, rtol=0.05)
+
+
+def test_focal_length_is_estimated(noisy):
+    X, S = noisy.X, noisy.S
+    model = fitted(X, focal_length=None)
+    assert abs(model.focal_length_ / F - 1) < 0.03
+    assert abs(model.focal_length_ - F) < 3 * model.focal_length_std_ < 0.1 * F
+    assert frame_error(model.reconstruct(X), S) < 0.012
+
+
+def test_focal_lengths_of_frames(noisy):
+    X, model = noisy.X, noisy.model
+    f = F * np.linspace(0.8, 1.25, len(X))
+    tracks = X.reshape(len(X), -1, 2) - CENTRE
+    zoomed = (tracks * (f / F)[:, None, None] + CENTRE).reshape(X.shape)
+    other = fitted(zoomed, focal_length=f)
+    same_model(model, other)
+    np.testing.assert_array_equal(other.focal_length_, f)
+    np.testing.assert_allclose(other.reproject(zoomed), zoomed, atol=6.0)
+    with pytest.raises(ValueError, match="one for each of the 5 rows"):
+        other.transform(zoomed[:5])
+
+
+def test_tables_without_perspective_say_so():
+    s = scene(noise=0.005)
+    X, S, R = s.X, s.S, s.R
+    flat = 100 * (S @ R[:, :2].mT)
+    flat += np.random.RandomState(1).uniform(-300, 300, (len(X), 1, 2)) + CENTRE
+    flat += 0.3 * np.random.RandomState(2).standard_normal(flat.shape)
+    with pytest.warns(UserWarning, match="shows no perspective"):
+        model = fitted(flat.reshape(X.shape), focal_length=None)
+    assert np.isinf(model.focal_length_)
+    assert np.isnan(model.positions_).all()
+    shapes = model.reconstruct(flat.reshape(X.shape))
+    assert min(frame_error(shapes * (1, 1, z), S) for z in (-1, 1)) < 0.02
+
+
+def test_frontal_objects_in_the_middle_say_so():
+    X = scene(yaw=0.5, spread=0.02, noise=0.01).X
+    with warnings.catch_warnings(record=True, action="always") as messages:
+        model = fitted(X)
+    assert any("has not settled" in str(each.message) for each in messages)
+    assert not model._model.pinhole.near
+    np.testing.assert_array_equal(model.transform(X), model.alpha_)
+    assert model.mirrored().score(X) == pytest.approx(model.score(X), rel=0.2)
+
+
+def test_missing_points_order_blocks_and_threads(noisy):
+    X, S, model = noisy.X, noisy.S, noisy.model
+    rng = np.random.RandomState(0)
+    order = rng.permutation(len(X))
+    other = fitted(X[order], n_jobs=2, working_memory=0.01)
+    signs = np.sign(np.sum(model.alpha_[order] * other.alpha_, axis=0))
+    np.testing.assert_allclose(other.alpha_ * signs, model.alpha_[order], atol=2e-3)
+    holes = X.reshape(len(X), -1, 2).copy()
+    holes[rng.uniform(size=holes.shape[:2]) < 0.15] = np.nan
+    holes = holes.reshape(X.shape)
+    missing = fitted(holes)
+    assert frame_error(missing.reconstruct(holes), S) < 0.015
+    assert np.isfinite(missing.reproject(holes)).all()
+    np.testing.assert_array_equal(missing.transform(holes), missing.alpha_)
+
+
+@pytest.mark.slow
+def test_outliers(noisy):
+    X, S = noisy.X, noisy.S
+    wrong = X.reshape(len(X), -1, 2).copy()
+    rng = np.random.RandomState(3)
+    where = rng.uniform(size=wrong.shape[:2]) < 0.03
+    wrong[where] += 400 * rng.standard_normal((where.sum(), 2))
+    wrong = wrong.reshape(X.shape)
+    model = fitted(wrong, loss="cauchy")
+    assert frame_error(model.reconstruct(wrong), S) < 0.02
+
+
+def test_number_of_basis_shapes(noisy):
+    X = noisy.X
+    assert len(fitted(X, n_components="auto").basis_) == 2
+    trial = AffineNRSfM(
+        camera="perspective", focal_length=F, principal_point=CENTRE, random_state=0
+    )
+    search = AffineNRSfMCV((1, 2), estimator=trial, cv=2).fit(X)
+    assert search.n_components_ == 2
+
+
+def test_files_copies_and_memory_maps(noisy, tmp_path):
+    X, model = noisy.X, noisy.model
+    model = AffineNRSfM(**model.get_params()).fit(X)
+    save_model(model, tmp_path / "model.npz")
+    loaded = load_model(tmp_path / "model.npz")
+    np.testing.assert_array_equal(loaded.transform(X), model.alpha_)
+    np.testing.assert_array_equal(loaded.positions_, model.positions_)
+    assert loaded.camera_ == "perspective"
+    np.save(tmp_path / "X.npy", X)
+    mapped = clone(model).fit(np.load(tmp_path / "X.npy", mmap_mode="r"))
+    np.testing.assert_array_equal(mapped.alpha_, model.alpha_)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"principal_point": None}, "needs principal_point"),
+        ({"principal_point": (1, np.nan)}, "needs principal_point"),
+        ({"focal_length": [1.0, 2.0]}, "one for each of the 60 rows"),
+        ({"focal_length": -1.0}, "focal_length"),
+        ({"refinement": "consensus"}, "needs refinement='joint'"),
+        ({"refinement": None}, "needs refinement='joint'"),
+    ],
+)
+def test_refused(params, message):
+    with pytest.raises(ValueError, match=message):
+        fitted(scene().X, **params)
