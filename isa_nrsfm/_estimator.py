@@ -255,7 +255,7 @@ default="affine"
         Focal length of perspective cameras. Infinite if the table shows no perspective.
     focal_length_std_ : float
         Standard deviation of an estimated `focal_length_`, from a jackknife over groups
-        of points; zero if it was given.
+        of points; zero if it was given, infinite if the depth is not determined.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.

@@ -282,8 +282,11 @@ def minimum(fits: dict[float, PerspectiveFit]) -> tuple[float, float]:
 
     every = vertex(groups >= 0)
     parts = np.array([vertex(groups != group) for group in range(N_GROUPS)])
-    known = np.isfinite(parts).all()
-    return every, float(np.sqrt(N_GROUPS - 1) * parts.std()) if known else np.inf
+    if not np.isfinite(parts).all():
+        return every, np.inf
+    # Few groups: the error has a t distribution, whose deviation is larger.
+    n_free = N_GROUPS - 1
+    return every, float(parts.std() * np.sqrt(n_free * n_free / (n_free - 2)))
 
 
 def fit_perspective(
@@ -351,10 +354,11 @@ def fit_perspective(
     dtype = table.source.empty.dtype
     for name, value in mean_camera(seen, sizes[shown], "perspective").items():
         attributes[name] = value.astype(dtype)
+    known = np.isfinite(deviation) and model.frames.certainty.determined
     attributes |= {
         "isa_": best.attributes["isa_"],
         "focal_length_": np.inf if why == NO_PERSPECTIVE else f,
-        "focal_length_std_": deviation * f**2,
+        "focal_length_std_": deviation * f**2 if known or not deviation else np.inf,
     }
     frames = Decomposition(*(part.astype(dtype) for part in frames))
     return model, frames, fit.converged, attributes
