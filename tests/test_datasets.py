@@ -22,6 +22,8 @@ BODIES = {
 }
 LINEAR = {"random": make_nonrigid_tracks, "face": make_face_tracks}
 MAKERS = LINEAR | {kind: BODIES[kind] for kind in ("hand-21", "coco-17")}
+# Distances of perspective cameras
+FILMED = {"face": 500, "hand-21": 500, "coco-17": 3500}
 CAMERAS = ["weak_perspective", "affine", "orthographic"]
 TRUTHS = "mean_shape", "shapes", "motion", "translation", "clean"
 
@@ -112,7 +114,7 @@ COMMON = {
     "n_frames": (1, 10.5, True),
     "noise": (-0.1, np.nan, False),
     "missing": (1.0, -0.1),
-    "camera": ("perspective",),
+    "camera": ("fisheye",),
     "layout": ("columns",),
     "random_state": ("seed",),
 }
@@ -132,7 +134,10 @@ COMMON = {
         (make_nonrigid_tracks, "shapes", "sparse"),
         (make_nonrigid_tracks, "coefficients", "uniform"),
         (make_nonrigid_tracks, "n_components", -1),
+        (make_nonrigid_tracks, "camera", "perspective"),
         (make_face_tracks, "n_components", 9),
+        (make_face_tracks, "focal_length", 0.0),
+        (make_face_tracks, "distance", -1.0),
         (make_hand_tracks, "n_people", 0),
         (make_body_tracks, "scheme", "body-25"),
     ],
@@ -158,6 +163,62 @@ def test_linear_models(make, n_components):
     rank = 3 * n_components + 3
     assert values[rank - 1] > 1e-5 * values[0]
     assert values[rank] < 1e-12 * values[0]
+
+
+@pytest.mark.parametrize("kind", FILMED)
+class TestPerspective:
+    def test_tables_are_images_of_the_points_before_the_camera(self, kind):
+        options = {"focal_length": 800.0, "distance": 3 * FILMED[kind]}
+        scene = MAKERS[kind](60, camera="perspective", **options, random_state=0)
+        assert (scene.focal_length, scene.principal_point) == (800.0, (640.0, 360.0))
+        X, Y, Z = (scene.shapes @ scene.rotations.mT + scene.positions[:, None]).T
+        x, y = scene.clean.T
+        assert_allclose(x, 800 * X / Z + 640, rtol=0, atol=1e-9)
+        assert_allclose(y, 800 * Y / Z + 360, rtol=0, atol=1e-9)
+        assert_allclose(
+            scene.rotations @ scene.rotations.mT, [np.eye(3)] * 60, atol=1e-12
+        )
+        assert_allclose(np.linalg.det(scene.rotations), 1)
+
+    def test_cameras_are_weak_perspective_ones_at_the_same_place(self, kind):
+        scene = MAKERS[kind](60, camera="perspective", random_state=0)
+        far = scene.positions[:, 2]
+        scales = scene.focal_length / far
+        assert_allclose(scene.motion, scales[:, None, None] * scene.rotations[:, :2])
+        place = scales[:, None] * scene.positions[:, :2] + scene.principal_point
+        assert_allclose(scene.translation, place)
+        # Far away, their images are the same.
+        options = {"focal_length": 1e9, "distance": 1e6 * FILMED[kind]}
+        scene = MAKERS[kind](9, camera="perspective", **options, random_state=0)
+        images = scene.shapes @ scene.motion.mT + scene.translation[:, None]
+        assert_allclose(scene.clean, images, rtol=0, atol=1e-3)
+
+    def test_objects_are_everywhere_in_the_image(self, kind):
+        scene = MAKERS[kind](800, camera="perspective", random_state=0)
+        distances = scene.positions[:, 2] / FILMED[kind]
+        assert 0.85 <= distances.min() < 0.9
+        assert 1.1 < distances.max() <= 1.15
+        assert (scene.clean.min(axis=(0, 1)) >= 0).all()
+        assert (scene.clean.max(axis=(0, 1)) <= (1280, 720)).all()
+        assert (scene.clean.min(axis=(0, 1)) < (60, 60)).all()
+        assert (scene.clean.max(axis=(0, 1)) > (1180, 660)).all()
+        near = {"camera": "perspective", "distance": FILMED[kind] / 4}
+        refused("too small for the object in 9 frames", MAKERS[kind], 9, **near)
+
+    def test_truth_about_the_object_is_that_of_other_cameras(self, kind):
+        plain = MAKERS[kind](30, missing=0.2, random_state=4)
+        scene = MAKERS[kind](30, missing=0.2, camera="perspective", random_state=4)
+        for name in ("shapes", "mean_shape", "angles", "labels", "visible"):
+            assert_array_equal(plain[name], scene[name])
+        noise = [
+            np.divide(s.tracks - s.clean, s.noise_variance**0.5) for s in (plain, scene)
+        ]
+        assert_allclose(*noise, atol=1e-9)
+        size = root_mean_square(centred(scene.clean))
+        assert_allclose(np.sqrt(scene.noise_variance), 0.005 * size)
+        assert "positions" not in plain
+        for name in ("focal_length", "distance"):
+            refused("are for camera='perspective'", MAKERS[kind], **{name: 1000.0})
 
 
 class TestRandomTables:

@@ -10,7 +10,7 @@ indices of the iBUG-68 scheme; the other half is the mirror image.
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 from numbers import Integral, Real
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.random import RandomState
@@ -22,13 +22,16 @@ from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_paramet
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.skeletons import get_skeleton
 
-Camera = Literal["weak_perspective", "affine", "orthographic"]
-CAMERAS: tuple[Camera, ...] = ("weak_perspective", "affine", "orthographic")
+FlatCamera = Literal["weak_perspective", "affine", "orthographic"]
+Camera = FlatCamera | Literal["perspective"]
+FLAT_CAMERAS = get_args(FlatCamera)
 
 # Constraints of the parameters that all generated tables have in common.
 PARAMETERS: dict[str, list[Any]] = {
     "n_frames": [Interval(Integral, 2, None, closed="left")],
-    "camera": [StrOptions(set(CAMERAS))],
+    "camera": [StrOptions({*FLAT_CAMERAS, "perspective"})],
+    "focal_length": [Interval(Real, 0, None, closed="neither"), None],
+    "distance": [Interval(Real, 0, None, closed="neither"), None],
     "noise": [Interval(Real, 0, None, closed="left")],
     "missing": [Interval(Real, 0, 1, closed="left")],
     "layout": [StrOptions(set(LAYOUTS))],
@@ -36,6 +39,61 @@ PARAMETERS: dict[str, list[Any]] = {
 }
 # Frame rate of the videos.
 FRAMES_A_SECOND = 25.0
+# Pixels of translations of films: their middle, and the largest way from it
+MIDDLE, REACH = np.array([640.0, 480.0]), np.array([320.0, 240.0])
+# Perspective cameras: pixels of the image; nearest and largest relative distance
+IMAGE, NEAREST, FARTHEST = np.array([1280.0, 720.0]), 0.85, 1.15
+
+
+def lens_of(
+    camera: Camera,
+    focal_length: float | None,
+    distance: float | None,
+    scales: tuple[float, float],
+    usual_distance: float,
+) -> tuple[tuple[float, float], float | None]:
+    """Return the scales of cameras, other ones if perspective, and a focal length."""
+    if camera == "perspective":
+        focal_length = float(focal_length or 1000.0)
+        scale = focal_length / (distance or usual_distance)
+        return (scale / FARTHEST, scale / NEAREST), focal_length
+    if focal_length is not None or distance is not None:
+        raise ValueError(
+            "focal_length and distance are for camera='perspective'; got "
+            f"camera={camera!r}, focal_length={focal_length!r}, distance={distance!r}"
+        )
+    return scales, None
+
+
+def see_in_perspective(
+    shapes: NDArray, motion: NDArray, place: NDArray, focal_length: float
+) -> tuple[NDArray, dict[str, Any]]:
+    """Return images (n, J, 2) of pinhole cameras, and the truth about the cameras.
+
+    The place (n, 2) is between -1 and 1, from the left to the right edge of the image
+    and from the upper to the lower.
+    """
+    scales = np.linalg.norm(motion[:, :1], axis=2)
+    depth = np.cross(motion[:, 0], motion[:, 1])[:, None] / scales[..., None]
+    flat = shapes @ motion.mT
+    ratio = 1 + shapes @ depth.mT / focal_length  # of a point's depth to the object's
+    edge = ratio * IMAGE / 2
+    # Translations from the principal point for which all points are in the image
+    least, most = np.max(-edge - flat, axis=1), np.min(edge - flat, axis=1)
+    if (least > most).any():
+        raise ValueError(
+            f"the image of {IMAGE[0]:g} x {IMAGE[1]:g} pixels is too small for the "
+            f"object in {np.sum((least > most).any(axis=1))} frames; take a larger "
+            "distance or a smaller focal_length"
+        )
+    translation = (least + most + place * (most - least)) / 2
+    return (flat + translation[:, None]) / ratio + IMAGE / 2, {
+        "translation": translation + IMAGE / 2,
+        "positions": np.insert(translation, 2, focal_length, axis=1) / scales,
+        "rotations": np.append(motion, depth, axis=1) / scales[..., None],
+        "focal_length": focal_length,
+        "principal_point": tuple((IMAGE / 2).tolist()),
+    }
 
 
 def draw_motion(
@@ -83,9 +141,18 @@ def observe(
     noise: float,
     missing: float,
     layout: Layout,
+    focal_length: float | None = None,
 ) -> dict[str, Any]:
-    """Return the table of shapes seen by cameras, and its ground truth."""
-    clean = shapes @ motion.transpose(0, 2, 1) + translation[:, None]
+    """Return the table of shapes seen by cameras, and its ground truth.
+
+    With a focal length, translations up to `REACH` are places up to the image's edge.
+    """
+    truth: dict[str, Any] = {"translation": translation}
+    if focal_length is None:
+        clean = shapes @ motion.transpose(0, 2, 1) + translation[:, None]
+    else:
+        place = (translation - MIDDLE) / REACH
+        clean, truth = see_in_perspective(shapes, motion, place, focal_length)
     centred = clean - clean.mean(axis=1, keepdims=True)
     noise_variance = noise**2 * np.mean(centred**2)
 
@@ -102,10 +169,10 @@ def observe(
         "clean": clean,
         "visible": visible,
         "motion": motion,
-        "translation": translation,
         "shapes": shapes,
         "noise_variance": float(noise_variance),
         "feature_names": tracks_to_table(names[None], layout)[0].tolist(),
+        **truth,
     }
 
 
@@ -128,6 +195,8 @@ def make_face_tracks(
     *,
     n_components: int = 4,
     camera: Camera = "weak_perspective",
+    focal_length: float | None = None,
+    distance: float | None = None,
     noise: float = 0.005,
     missing: float = 0.0,
     layout: Layout = "interleaved",
@@ -151,12 +220,20 @@ def make_face_tracks(
         Number of basis shapes K, 0 to 8: the first of "jaw open", "smile",
         "brow raise", "blink", "lip pucker", "brow lower", "nose wrinkle" and
         "face width".
-    camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
+    camera : {"weak_perspective", "affine", "orthographic", "perspective"}, \
+default="weak_perspective"
         The head turns by yaw, pitch and roll (see `angles` below), uniform within
         45, 25 and 20 degrees to either side. Orthographic cameras have 2 pixels a
         millimetre, weak-perspective and affine ones 1 to 4, drawn log-uniformly for
         each frame. Affine ones also stretch the image along a random axis; their
-        smaller singular value is 0.5 to 1 times the larger.
+        smaller singular value is 0.5 to 1 times the larger. Perspective ones are
+        pinhole cameras with images of 1280 x 720 pixels. The faces are everywhere in
+        them, but not cut off.
+    focal_length : float or None, default=None
+        Focal length of perspective cameras in pixels; None means 1000.
+    distance : float or None, default=None
+        Mean distance of perspective cameras along their axis, in millimetres; None
+        means 500. That of a frame is up to 15 % smaller or larger.
     noise : float, default=0.005
         Standard deviation of the Gaussian noise that is added to every coordinate,
         divided by the root mean square of all coordinates of the tracks without
@@ -198,12 +275,24 @@ def make_face_tracks(
             The coefficients, independent of each other; each has zero mean and unit
             variance over the frames.
         motion : ndarray of shape (n_frames, 2, 3)
-            The cameras, in pixels per millimetre.
+            The cameras, in pixels per millimetre. Perspective ones are given by the
+            weak-perspective cameras with the same rotations and positions.
         translation : ndarray of shape (n_frames, 2)
-            The centroids of the faces in pixels, uniform in x from 320 to 960 and y
-            from 240 to 720.
+            The images of the centroids of the faces, in pixels. With other than
+            perspective cameras they are uniform in x from 320 to 960 and y from 240 to
+            720.
         shapes : ndarray of shape (n_frames, 68, 3)
             The shape of every frame, ``mean_shape + tensordot(alpha, basis, 1)``.
+        positions : ndarray of shape (n_frames, 3)
+            The centroids of the points in millimetres, in the axes of the camera: x
+            to the right, y down, z away from it. Only perspective cameras have
+            `positions`, `rotations`, `focal_length` and `principal_point`.
+        rotations : ndarray of shape (n_frames, 3, 3)
+            Rotations of the shapes to the axes of the camera.
+        focal_length : float
+            The focal length in pixels.
+        principal_point : tuple of float
+            The middle of the image, (640.0, 360.0).
         noise_variance : float
             Variance of the noise in one coordinate, in squared pixels.
         feature_names : list of str
@@ -232,7 +321,9 @@ def make_face_tracks(
     Raises
     ------
     ValueError
-        If a parameter is not of the kind or in the range given above.
+        If a parameter is not of the kind or in the range given above, if
+        `focal_length` or `distance` are given with other cameras, or if the image of
+        a perspective camera is too small for a face.
 
     See Also
     --------
@@ -266,10 +357,11 @@ def make_face_tracks(
 
     angles = rng.uniform(-1.0, 1.0, (n_frames, 3)) * (45.0, 25.0, 20.0)
     rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
-    motion = draw_motion(rotations, camera, (1.0, 4.0), rng)
+    scales, focal = lens_of(camera, focal_length, distance, (1.0, 4.0), 500.0)
+    motion = draw_motion(rotations, camera, scales, rng)
     translation = rng.uniform((320.0, 240.0), (960.0, 720.0), size=(n_frames, 2))
     shapes = mean_shape + np.tensordot(alpha, basis, 1)
-    table = observe(shapes, motion, translation, rng, noise, missing, layout)
+    table = observe(shapes, motion, translation, rng, noise, missing, layout, focal)
     return Bunch(
         **table,
         mean_shape=mean_shape,
@@ -307,6 +399,7 @@ DISTRIBUTIONS = [StrOptions({"heavy_tailed", "gaussian"})]
 @checked_parameters(
     {
         **PARAMETERS,
+        "camera": [StrOptions(set(FLAT_CAMERAS))],
         "n_points": [Interval(Integral, 4, None, closed="left")],
         "n_components": [Interval(Integral, 0, None, closed="left")],
         "amplitude": [Interval(Real, 0, None, closed="left")],
@@ -321,7 +414,7 @@ def make_nonrigid_tracks(
     *,
     amplitude: float = 0.2,
     noise: float = 0.0,
-    camera: Camera = "weak_perspective",
+    camera: FlatCamera = "weak_perspective",
     shapes: Distribution = "heavy_tailed",
     coefficients: Distribution = "gaussian",
     missing: float = 0.0,
@@ -480,6 +573,8 @@ def make_body_tracks(
     n_people: int = 4,
     scheme: Literal["coco-17", "h36m-17"] = "coco-17",
     camera: Camera = "weak_perspective",
+    focal_length: float | None = None,
+    distance: float | None = None,
     noise: float = 0.005,
     missing: float = 0.0,
     layout: Layout = "interleaved",
@@ -500,11 +595,19 @@ def make_body_tracks(
         Number of people.
     scheme : {"coco-17", "h36m-17"}, default="coco-17"
         Points and their order: a layout of `isa_nrsfm.skeletons`.
-    camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
+    camera : {"weak_perspective", "affine", "orthographic", "perspective"}, \
+default="weak_perspective"
         Camera model. The camera moves smoothly around the person within 80, 20 and 8
         degrees of yaw, pitch and roll to either side. Weak-perspective and affine
         cameras have 0.2 to 0.5 pixels per millimetre, orthographic cameras their
         geometric mean. Affine cameras also stretch each image, see `make_face_tracks`.
+        Perspective cameras are pinhole cameras with images of 1280 x 720 pixels. The
+        bodies are everywhere in them, but not cut off.
+    focal_length : float or None, default=None
+        Focal length of perspective cameras in pixels; None means 1000.
+    distance : float or None, default=None
+        Mean distance of perspective cameras along their axis, in millimetres; None
+        means 3500. That of a frame is up to 15 % smaller or larger.
     noise : float, default=0.005
         Standard deviation of the Gaussian noise that is added to every coordinate,
         divided by the root mean square of all coordinates of the tracks without
@@ -539,9 +642,10 @@ def make_body_tracks(
             Their mean. The shapes are no linear function of a few coefficients: joints
             turn.
         motion : ndarray of shape (n_frames, 2, 3)
-            The cameras, in pixels per millimetre.
+            The cameras, in pixels per millimetre. Perspective ones are given by the
+            weak-perspective cameras with the same rotations and positions.
         translation : ndarray of shape (n_frames, 2)
-            The centroids in pixels.
+            The images of the centroids, in pixels.
         angles : ndarray of shape (n_frames, 3)
             Yaw, pitch and roll of the camera in degrees, see `make_face_tracks`.
         labels : ndarray of shape (n_frames,), dtype=str
@@ -550,6 +654,16 @@ def make_body_tracks(
             The number of the person, from 0. Each has lengths of bones of their own.
         time : ndarray of shape (n_frames,)
             Seconds since the person was first seen, at 25 frames per second.
+        positions : ndarray of shape (n_frames, 3)
+            The centroids of the points in millimetres, in the axes of the camera: x
+            to the right, y down, z away from it. Only perspective cameras have
+            `positions`, `rotations`, `focal_length` and `principal_point`.
+        rotations : ndarray of shape (n_frames, 3, 3)
+            Rotations of the shapes to the axes of the camera.
+        focal_length : float
+            The focal length in pixels.
+        principal_point : tuple of float
+            The middle of the image, (640.0, 360.0).
         noise_variance : float
             Variance of the noise in one coordinate, in squared pixels.
         feature_names : list of str
@@ -560,8 +674,9 @@ def make_body_tracks(
     Raises
     ------
     ValueError
-        If a parameter is not of the kind or in the range given above, or there are
-        fewer than two frames for each person.
+        If a parameter is not of the kind or in the range given above, there are fewer
+        than two frames for each person, `focal_length` or `distance` are given with
+        other cameras, or the image of a perspective camera is too small.
 
     See Also
     --------
@@ -585,8 +700,9 @@ def make_body_tracks(
 
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, ACTIONS, build, rng)
-    angles, motion, translation = film(path, (80.0, 20.0, 8.0), (0.2, 0.5), camera, rng)
-    table = observe(shapes, motion, translation, rng, noise, missing, layout)
+    scales, focal = lens_of(camera, focal_length, distance, (0.2, 0.5), 3500.0)
+    angles, motion, translation = film(path, (80.0, 20.0, 8.0), scales, camera, rng)
+    table = observe(shapes, motion, translation, rng, noise, missing, layout, focal)
     return Bunch(**table, **truths, angles=angles, point_names=list(names))
 
 
@@ -684,6 +800,8 @@ def make_hand_tracks(
     *,
     n_people: int = 4,
     camera: Camera = "weak_perspective",
+    focal_length: float | None = None,
+    distance: float | None = None,
     noise: float = 0.005,
     missing: float = 0.0,
     layout: Layout = "interleaved",
@@ -703,11 +821,19 @@ def make_hand_tracks(
         Number of frames of all people, at least two for each.
     n_people : int, default=4
         Number of people.
-    camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
+    camera : {"weak_perspective", "affine", "orthographic", "perspective"}, \
+default="weak_perspective"
         Camera model. The camera moves smoothly around the person within 60, 35 and 35
         degrees of yaw, pitch and roll to either side. Weak-perspective and affine
         cameras have 1 to 3 pixels per millimetre, orthographic cameras their geometric
         mean. Affine cameras also stretch each image, see `make_face_tracks`.
+        Perspective cameras are pinhole cameras with images of 1280 x 720 pixels. The
+        hands are everywhere in them, but not cut off.
+    focal_length : float or None, default=None
+        Focal length of perspective cameras in pixels; None means 1000.
+    distance : float or None, default=None
+        Mean distance of perspective cameras along their axis, in millimetres; None
+        means 500. That of a frame is up to 15 % smaller or larger.
     noise : float, default=0.005
         Standard deviation of the Gaussian noise that is added to every coordinate,
         divided by the root mean square of all coordinates of the tracks without
@@ -742,9 +868,10 @@ def make_hand_tracks(
             Their mean. The shapes are no linear function of a few coefficients: joints
             turn.
         motion : ndarray of shape (n_frames, 2, 3)
-            The cameras, in pixels per millimetre.
+            The cameras, in pixels per millimetre. Perspective ones are given by the
+            weak-perspective cameras with the same rotations and positions.
         translation : ndarray of shape (n_frames, 2)
-            The centroids in pixels.
+            The images of the centroids, in pixels.
         angles : ndarray of shape (n_frames, 3)
             Yaw, pitch and roll of the camera in degrees, see `make_face_tracks`.
         labels : ndarray of shape (n_frames,), dtype=str
@@ -753,6 +880,16 @@ def make_hand_tracks(
             The number of the person, from 0. Each has lengths of bones of their own.
         time : ndarray of shape (n_frames,)
             Seconds since the person was first seen, at 25 frames per second.
+        positions : ndarray of shape (n_frames, 3)
+            The centroids of the points in millimetres, in the axes of the camera: x
+            to the right, y down, z away from it. Only perspective cameras have
+            `positions`, `rotations`, `focal_length` and `principal_point`.
+        rotations : ndarray of shape (n_frames, 3, 3)
+            Rotations of the shapes to the axes of the camera.
+        focal_length : float
+            The focal length in pixels.
+        principal_point : tuple of float
+            The middle of the image, (640.0, 360.0).
         noise_variance : float
             Variance of the noise in one coordinate, in squared pixels.
         feature_names : list of str
@@ -763,8 +900,9 @@ def make_hand_tracks(
     Raises
     ------
     ValueError
-        If a parameter is not of the kind or in the range given above, or there are
-        fewer than two frames for each person.
+        If a parameter is not of the kind or in the range given above, there are fewer
+        than two frames for each person, `focal_length` or `distance` are given with
+        other cameras, or the image of a perspective camera is too small.
 
     See Also
     --------
@@ -782,9 +920,9 @@ def make_hand_tracks(
     """
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, POSES, _hand, rng)
-    largest = (60.0, 35.0, 35.0)
-    angles, motion, translation = film(path, largest, (1.0, 3.0), camera, rng)
-    table = observe(shapes, motion, translation, rng, noise, missing, layout)
+    scales, focal = lens_of(camera, focal_length, distance, (1.0, 3.0), 500.0)
+    angles, motion, translation = film(path, (60.0, 35.0, 35.0), scales, camera, rng)
+    table = observe(shapes, motion, translation, rng, noise, missing, layout, focal)
     point_names = list(get_skeleton("hand-21").point_names or ())
     return Bunch(**table, **truths, angles=angles, point_names=point_names)
 
@@ -862,7 +1000,8 @@ def film(
         sizes = np.full(len(path), np.sqrt(np.prod(scales)))
     rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
     motion = draw_motion(rotations, camera, (1.0, 1.0), rng)
-    translation = (640.0, 480.0) + path[:, 4:] * (160.0, 100.0)
+    reach = REACH if camera == "perspective" else (160.0, 100.0)
+    translation = MIDDLE + path[:, 4:] * reach
     return angles, sizes[:, None, None] * motion, translation
 
 
