@@ -11,6 +11,9 @@ import warnings
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from sklearn.linear_model import LinearRegression
+from sklearn.metrics import r2_score
+from sklearn.model_selection import cross_val_predict
 
 from benchmarks._methods import found_by_ours
 from benchmarks._run import run_sections
@@ -30,6 +33,7 @@ from benchmarks._sets import (
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._joint.settings import Limits
+from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 PAPER = {
@@ -58,6 +62,9 @@ TURNED = CALIBRATED[:4]
 TURNING_ROUNDS = 10
 # Distances of perspective cameras, in radii of the object.
 DISTANCES = (8.0, 4.0, 2.5)
+# Faces before a webcam: millimetres and degrees, factors of wrong focal lengths, pixels
+NEAR_AND_FAR = ((400, 20), (400, 5), (400, 40), (5000, 5), (5000, 40))
+FACTORS, OFF_CENTRE, MIDDLE = (0.5, 0.7, 0.85, 1.2, 1.4), (50, 100, 200), (640, 360)
 # Sets with too few basis shapes, and one with nearly enough; more of them.
 TOO_SMALL = (("yoga", 3), ("pickup", 3), ("drink", 3), ("shark", 1), ("ict_68", 9))
 LARGER = (("yoga", 12), ("pickup", 12), ("drink", 12), ("shark", 2), ("flag", 5))
@@ -331,11 +338,81 @@ def calibrated(options):
         print(line, flush=True)
 
 
+def before_a_webcam(distance, degrees, seed):
+    """
+    Return images of a face with 1280 x 720 pixels, its shapes, poses, coefficients.
+
+    The face is anywhere in the image, up to 15 % nearer or farther than the distance,
+    and turns to either side by so many degrees: yaw, and 60 and 50 % of it for pitch
+    and roll. The focal length is 1000 pixels.
+    """
+    faces, rng = make_face_tracks(300, random_state=seed), np.random.default_rng(seed)
+    angles = rng.uniform(-1, 1, (300, 3)) * degrees * (1.0, 0.6, 0.5)
+    rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+    rays = np.append(rng.uniform(-1, 1, (300, 2)) * (0.25, 0.15), np.ones((300, 1)), 1)
+    place = rng.uniform(0.85, 1.15, (300, 1)) * distance * rays
+    x, y, z = np.moveaxis(faces.shapes @ rotations.mT + place[:, None], 2, 0)
+    images = 1000 * np.stack([x, y], axis=2) / z[..., None] + MIDDLE
+    size = np.sqrt(np.mean(centred_tracks(images) ** 2, axis=(1, 2), keepdims=True))
+    images += 0.005 * size * rng.normal(size=images.shape)
+    return as_table(images), faces.shapes, rotations, faces.alpha
+
+
+def webcam(options):
+    """Near and distant faces: errors of shapes and angles, R^2 of true coefficients.
+
+    Focal lengths are given as factors of the true one, or estimated; principal points
+    are off by so many pixels to the right.
+    """
+    weak = {"camera": "weak_perspective"}
+    print(f"{'':44}{'frame':>8}{'R^2':>8}{'median angle':>14}{'f':>9}{'its std':>9}")
+    for distance, degrees in NEAR_AND_FAR:
+        given = {"f estimated": (None, 0), "f given": (1, 0)}
+        if (distance, degrees) in NEAR_AND_FAR[:2]:
+            given |= {f"f times {factor:g}": (factor, 0) for factor in FACTORS}
+            given |= {f"centre off by {off} px": (1, off) for off in OFF_CENTRE}
+        fits = {"weak perspective": weak} | {
+            title: {
+                "camera": "perspective",
+                "focal_length": factor and 1000.0 * factor,
+                "principal_point": (MIDDLE[0] + off, MIDDLE[1]),
+            }
+            for title, (factor, off) in given.items()
+        }
+        for title, parameters in fits.items():
+            rows = []
+            for seed in range(options.seeds):
+                X, shapes, rotations, alpha = before_a_webcam(distance, degrees, seed)
+                model = fit_set(X, n_components=4, **parameters)
+                folds = LinearRegression(), model.alpha_, alpha
+                error = mean_shape_error_3d(
+                    shapes, model.reconstruct(X), convention="frame"
+                )
+                angles = turn_errors(rotations, model.rotations_)
+                rows.append(
+                    (
+                        error,
+                        r2_score(alpha, cross_val_predict(*folds)),
+                        np.median(angles),
+                        getattr(model, "focal_length_", np.nan),
+                        getattr(model, "focal_length_std_", np.nan),
+                    )
+                )
+            row = np.median(rows, axis=0)
+            title = f"{distance / 1000:g} m, +-{degrees} degrees, {title}"
+            print(
+                f"{title:44}{row[0]:8.4f}{row[1]:8.3f}{row[2]:14.2f}{row[3]:9.1f}"
+                f"{row[4]:9.1f}",
+                flush=True,
+            )
+
+
 SECTIONS = {
     "tables": tables,
     "noise": noise,
     "cameras": cameras,
     "calibrated": calibrated,
+    "webcam": webcam,
     "paper": paper,
 }
 
