@@ -62,9 +62,9 @@ TURNED = CALIBRATED[:4]
 TURNING_ROUNDS = 10
 # Distances of perspective cameras, in radii of the object.
 DISTANCES = (8.0, 4.0, 2.5)
-# Faces before a webcam: millimetres and degrees, factors of wrong focal lengths, pixels
+# Faces before a webcam: millimetres and degrees, pixels, wrong factors and pixels
 NEAR_AND_FAR = ((400, 20), (400, 5), (400, 40), (5000, 5), (5000, 40))
-FACTORS, OFF_CENTRE, MIDDLE = (0.5, 0.7, 0.85, 1.2, 1.4), (50, 100, 200), (640, 360)
+FOCAL_LENGTH, FACTORS, OFF_CENTRE = 1000.0, (0.5, 0.7, 0.85, 1.2, 1.4), (50, 100, 200)
 # Sets with too few basis shapes, and one with nearly enough; more of them.
 TOO_SMALL = (("yoga", 3), ("pickup", 3), ("drink", 3), ("shark", 1), ("ict_68", 9))
 LARGER = (("yoga", 12), ("pickup", 12), ("drink", 12), ("shark", 2), ("flag", 5))
@@ -340,71 +340,63 @@ def calibrated(options):
 
 def before_a_webcam(distance, degrees, seed):
     """
-    Return images of a face with 1280 x 720 pixels, its shapes, poses, coefficients.
+    Return images of a face, and the truth: shapes, coefficients, rotations, positions.
 
-    The face is anywhere in the image, up to 15 % nearer or farther than the distance,
-    and turns to either side by so many degrees: yaw, and 60 and 50 % of it for pitch
-    and roll. The focal length is 1000 pixels.
+    The face is everywhere in images of 1280 x 720 pixels, up to 15 % nearer or farther
+    than the distance. It turns to either side by so many degrees (yaw), and by 60 and
+    50 % of them (pitch, roll).
     """
     faces, rng = make_face_tracks(300, random_state=seed), np.random.default_rng(seed)
     angles = rng.uniform(-1, 1, (300, 3)) * degrees * (1.0, 0.6, 0.5)
     rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
-    rays = np.append(rng.uniform(-1, 1, (300, 2)) * (0.25, 0.15), np.ones((300, 1)), 1)
-    place = rng.uniform(0.85, 1.15, (300, 1)) * distance * rays
-    x, y, z = np.moveaxis(faces.shapes @ rotations.mT + place[:, None], 2, 0)
-    images = 1000 * np.stack([x, y], axis=2) / z[..., None] + MIDDLE
+    rays = rng.uniform(-1, 1, (300, 3)) * (0.25, 0.15, 0) + (0, 0, 1)
+    places = distance * rng.uniform(0.85, 1.15, (300, 1)) * rays
+    points = faces.shapes @ rotations.mT + places[:, None]
+    images = FOCAL_LENGTH * points[..., :2] / points[..., 2:] + (640, 360)
     size = np.sqrt(np.mean(centred_tracks(images) ** 2, axis=(1, 2), keepdims=True))
     images += 0.005 * size * rng.normal(size=images.shape)
-    return as_table(images), faces.shapes, rotations, faces.alpha
+    return as_table(images), faces.shapes, faces.alpha, rotations, places
 
 
 def webcam(options):
-    """Near and distant faces: errors of shapes and angles, R^2 of true coefficients.
+    """Faces before a webcam: errors of shapes, poses, distances; R^2 of coefficients.
 
-    Focal lengths are given as factors of the true one, or estimated; principal points
-    are off by so many pixels to the right.
+    Errors are "frame", the median angle and the standard deviation of log distances.
+    Focal lengths are given or estimated, principal points are off to the right.
     """
-    weak = {"camera": "weak_perspective"}
-    print(f"{'':44}{'frame':>8}{'R^2':>8}{'median angle':>14}{'f':>9}{'its std':>9}")
+    print(f"{'':43}    frame      R^2    angle distance        f      std")
     for distance, degrees in NEAR_AND_FAR:
-        given = {"f estimated": (None, 0), "f given": (1, 0)}
-        if (distance, degrees) in NEAR_AND_FAR[:2]:
-            given |= {f"f times {factor:g}": (factor, 0) for factor in FACTORS}
-            given |= {f"centre off by {off} px": (1, off) for off in OFF_CENTRE}
-        fits = {"weak perspective": weak} | {
-            title: {
-                "camera": "perspective",
-                "focal_length": factor and 1000.0 * factor,
-                "principal_point": (MIDDLE[0] + off, MIDDLE[1]),
-            }
-            for title, (factor, off) in given.items()
+        fits = {
+            "weak perspective": ("weak_perspective", None, 0),
+            "f estimated": ("perspective", None, 0),
+            "f given": ("perspective", 1.0, 0),
         }
-        for title, parameters in fits.items():
+        if (distance, degrees) in NEAR_AND_FAR[:2]:
+            fits |= {f"f times {x:g}": ("perspective", x, 0) for x in FACTORS}
+            fits |= {f"centre off by {x}": ("perspective", 1.0, x) for x in OFF_CENTRE}
+        for title, (camera, factor, off) in fits.items():
             rows = []
             for seed in range(options.seeds):
-                X, shapes, rotations, alpha = before_a_webcam(distance, degrees, seed)
-                model = fit_set(X, n_components=4, **parameters)
-                folds = LinearRegression(), model.alpha_, alpha
-                error = mean_shape_error_3d(
-                    shapes, model.reconstruct(X), convention="frame"
-                )
-                angles = turn_errors(rotations, model.rotations_)
-                rows.append(
-                    (
-                        error,
-                        r2_score(alpha, cross_val_predict(*folds)),
-                        np.median(angles),
-                        getattr(model, "focal_length_", np.nan),
-                        getattr(model, "focal_length_std_", np.nan),
-                    )
-                )
-            row = np.median(rows, axis=0)
+                X, shapes, *truth = before_a_webcam(distance, degrees, seed)
+                alpha, rotations, places = truth
+                lens = {"focal_length": factor and factor * FOCAL_LENGTH}
+                lens |= {"principal_point": (640 + off, 360)}
+                model = fit_set(X, camera, 4, **lens)
+                found = found_by_ours(model, X).euclidean
+                told = cross_val_predict(LinearRegression(), model.alpha_, alpha)
+                row = [
+                    mean_shape_error_3d(shapes, found, convention="frame"),
+                    r2_score(alpha, told),
+                    np.median(turn_errors(rotations, model.rotations_)),
+                ]
+                if camera == "perspective":
+                    ratios = model.positions_[:, 2] / places[:, 2]
+                    focal = model.focal_length_, model.focal_length_std_
+                    row += [np.std(np.log(ratios)), *focal]
+                rows.append(row)
             title = f"{distance / 1000:g} m, +-{degrees} degrees, {title}"
-            print(
-                f"{title:44}{row[0]:8.4f}{row[1]:8.3f}{row[2]:14.2f}{row[3]:9.1f}"
-                f"{row[4]:9.1f}",
-                flush=True,
-            )
+            figures = [f"{value:9.4g}" for value in np.median(rows, axis=0)]
+            print(f"{title:43}", *figures, sep="", flush=True)
 
 
 SECTIONS = {

@@ -83,6 +83,7 @@ sphinx_gallery_conf = {
             "plot_method.py",
             "plot_independence.py",
             "plot_cameras.py",
+            "plot_webcam.py",
             "plot_consensus.py",
             "plot_choosing_k.py",
             "plot_missing_and_outliers.py",

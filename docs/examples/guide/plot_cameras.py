@@ -2,7 +2,7 @@
 Which camera
 ============
 
-`AffineNRSfM` has three camera models:
+`AffineNRSfM` has four camera models:
 
 - ``camera="affine"``, the default, makes no assumption. Use it for stretched images, or
   if coefficients matter more than proportions.
@@ -11,8 +11,10 @@ Which camera
   and for objects that deform much, such as bodies.
 - ``camera="orthographic"`` has one scale for all frames. Use it for motion capture, or
   for one camera with constant distance and focal length.
+- ``camera="perspective"`` is a pinhole camera. Use it for objects that are nearer than
+  ten times their size, or at the side of the image: :doc:`/perspective`.
 
-The last two are called *calibrated*; their shapes have true proportions.
+The last three are called *calibrated*; their shapes have true proportions.
 ``camera_noise_ratio_`` measures whether a table agrees with calibrated cameras. It is
 the noise variance of the fit with calibrated cameras divided by that of the fit with
 affine cameras. Every joint fit computes it.
