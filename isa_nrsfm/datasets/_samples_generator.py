@@ -202,7 +202,7 @@ def make_face_tracks(
     layout: Layout = "interleaved",
     random_state: int | RandomState | None = None,
 ) -> Bunch:
-    r"""
+    """
     Generate the 68 landmarks of a face that moves its head and its features.
 
     The face is drawn by hand, not measured. The points are in the order of the
@@ -210,7 +210,8 @@ def make_face_tracks(
     tip of the nose 27 to 30, nostrils 31 to 35, right eye 36 to 41, left eye 42 to 47,
     outer lips 48 to 59, inner lips 60 to 67. Right is the subject's right, on the
     left of the image. The table follows the model of `AffineNRSfM`: the points of
-    frame i are :math:`(B_0 + \sum_k \alpha_{ik} B_k) M_i^T + t_i` plus noise.
+    frame i are ``(B_0 + sum_k alpha_ik B_k) M_i^T + t_i`` plus noise, unless cameras
+    are perspective.
 
     Parameters
     ----------
