@@ -960,11 +960,12 @@ default="affine"
         already. They are not rotated, so that `scales_` and `rotations_` are those of
         their cameras.
         """
-        if camera is not None and camera not in CALIBRATED_CAMERAS:
+        check_is_fitted(self)
+        own = ("perspective",) * (self.camera_ == "perspective")
+        if camera not in (None, *CALIBRATED_CAMERAS, *own):
             raise ValueError(
                 f"camera must be None or one of {CALIBRATED_CAMERAS}; got {camera!r}"
             )
-        check_is_fitted(self)
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
         if decomposed and point_weight is not None:
             raise ValueError(

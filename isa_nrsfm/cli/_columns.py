@@ -14,12 +14,13 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.cli._options import DEFAULTS
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import read_times, video_times
 from isa_nrsfm.export import point_distances
-from isa_nrsfm.export._poses import point_numbers
+from isa_nrsfm.export._poses import EYES, point_numbers
 from isa_nrsfm.export._viewer import MOST_LABELS
 
 
@@ -52,8 +53,8 @@ def asked_columns(args: Namespace, frames: Frames) -> Frames:
     args.distance = [_numbered(pair, names, "--distance") for pair in args.distance]
     if args.unit is not None:
         args.unit = _numbered(args.unit, names, "--unit")
-        if not args.distance:
-            raise ValueError("--unit needs --distance")
+        if not args.distance and args.camera != "perspective":
+            raise ValueError("--unit needs --distance, or --camera perspective")
     elif args.distance and len(names) != 68:
         raise ValueError(
             f"--distance needs --unit: the {len(names)} points are not the 68 of a "
@@ -97,15 +98,22 @@ def column_results(
             "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),
         }
         columns |= {f"alpha_{k}_smooth": each for k, each in enumerate(found.T, 1)}
-    if args.distance:
+    has_positions = hasattr(estimator, "positions_")
+    has_unit = args.unit is not None or args.length != DEFAULTS["length"]
+    if args.distance or (has_positions and has_unit):
         names = [f"distance_{a}_{b}" for a, b in args.distance]
+        a, b = args.unit or EYES
         try:
             found = point_distances(
-                estimator, args.distance, unit=args.unit, length=args.length
+                estimator, args.distance or [(a, b)], unit=args.unit, length=args.length
             )
-            columns |= zip(names, found.T, strict=True)
+            columns |= zip(names, found.T, strict=False)
+            if has_positions:
+                size = np.linalg.norm(np.subtract(*estimator.mean_shape_[[a, b]]))
+                report["position_unit"] = args.length / size
         except ValueError as error:
-            warn_caller(f"alpha.csv has no distances: {error}")
+            what = "alpha.csv has no distances" if names else "--length has no effect"
+            warn_caller(f"{what}: {error}")
     return report, X[[]].assign(**columns), smooth
 
 

@@ -23,7 +23,7 @@ from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
-from isa_nrsfm.cli._options import AUTO, NONE
+from isa_nrsfm.cli._options import AUTO, NONE, flag_of
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
@@ -36,8 +36,8 @@ from isa_nrsfm.io._tables import TABLE_SUFFIXES
 N_PARTS = 3
 # Options that are parameters of the same name; none stands for None.
 _PARAMETERS = (
-    *("block_recovery", "refinement", "camera", "independence", "loss"),
-    *("random_state", "n_jobs"),
+    *("block_recovery", "refinement", "camera", "focal_length", "independence"),
+    *("loss", "random_state", "n_jobs"),
 )
 
 
@@ -67,6 +67,13 @@ def fit_table(
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
     frames = asked_columns(args, frames)
+    if args.camera == "perspective" and frames.principal_point is None:
+        raise ValueError(
+            "--camera perspective needs the size of the images, with --image-size "
+            "WIDTHxHEIGHT such as 1280x720, or the point of the image on the axis of "
+            "the camera, with --principal-point X Y (0 0 and --focal-length 1 for "
+            "normalised coordinates)"
+        )
     figures = {} if args.no_figures else figures_of(args, frames)
     drawn = drawing(args, frames.columns.points, frames.skeleton)
     results, inputs = _outputs.RESULTS, drawing_files(args)
@@ -97,14 +104,15 @@ def fit_table(
                 shown["depth_std"] = estimator.reconstruct(
                     X, return_std=True, **frames.weighting
                 )[1]
-            _outputs.write_results(new, estimator, frames, smooth, drawn, **shown)
+            unit = answers.get("position_unit", 1.0)
+            _outputs.write_results(new, estimator, frames, smooth, drawn, unit, **shown)
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args, frames),
                 **({} if search is None else {"choice": choice_report(search, X)}),
-                "model": model_report(estimator, X, frames.weighting, drawn["edges"]),
+                "model": model_report(estimator, frames, drawn["edges"]),
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
@@ -140,6 +148,12 @@ def _check_options(args: Namespace) -> None:
         )
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
+    for name in ("focal_length", "principal_point"):
+        if getattr(args, name) is not None and args.camera != "perspective":
+            raise ValueError(
+                f"{flag_of(name)} needs --camera perspective; got --camera "
+                f"{args.camera}"
+            )
     joint = {"--std": args.std, "--n-components auto": args.n_components[0] == AUTO}
     for option, is_given in joint.items():
         if is_given and args.refinement not in JOINT_REFINEMENTS:
@@ -172,11 +186,13 @@ def _fitted(
         name: None if getattr(args, name) == NONE else getattr(args, name)
         for name in _PARAMETERS
     }
+    perspective = args.camera == "perspective"
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=isa,
         scale_frames=not args.no_scale_frames,
         hidden_points=not args.no_hidden_points,
+        principal_point=frames.principal_point if perspective else None,
         **given,
     )
     search, X, groups = None, frames.X, frames.groups

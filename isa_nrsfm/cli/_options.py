@@ -142,7 +142,9 @@ TYPES: dict[str, Callable[[str], Any]] = {
     ),
     "SEED": _whole_number(0, 2**32 - 1),
     "STARTS": _whole_number(1),
-    "VALUE": _reader("a number, such as -1", float, math.isfinite),
+    **dict.fromkeys(
+        ("VALUE", "X Y"), _reader("a number, such as -1", float, math.isfinite)
+    ),
     "WIDTHxHEIGHT": _reader("WIDTHxHEIGHT, such as 1920x1080", _image_size),
 }
 
@@ -173,6 +175,9 @@ HELP = {
     "in the file (confidence); points of confidence zero are missing",
     "image_size WIDTHxHEIGHT": "size of the images for MediaPipe, in pixels, such as "
     "1920x1080",
+    "fit.image_size WIDTHxHEIGHT": "size of the images in pixels, such as 1920x1080: "
+    "for MediaPipe, for perspective cameras, and with weak_perspective ones to say "
+    "whether perspective explains the table better",
     "part PART": "the points of OpenPose to read, if the files have several: "
     f"{', '.join(choices.OPENPOSE_PARTS)}",
     "points POINTS": "fit some of the points: inner (without the visible outline of a "
@@ -219,8 +224,13 @@ HELP = {
     "3,6,9, the best in cross-validation is used; auto uses as many as the table "
     "determines, at most twelve",
     "camera": "camera model: affine (no assumption), weak_perspective (a rotation and "
-    "a scale per frame), or orthographic (one scale). The last two estimate depth and "
-    "proportions",
+    "a scale per frame), orthographic (one scale), or perspective (for objects near "
+    "the camera, as before a webcam). All but affine estimate depth and proportions",
+    "focal_length NUMBER": "of perspective cameras, in pixels (default: estimated). "
+    "For images of width w and height h OpenFace assumes 500 w / 640, and MediaPipe "
+    "0.816 h (63 degrees vertically)",
+    "principal_point X Y": "of perspective cameras: the point of the image on the axis "
+    "of the camera, in pixels (default: the middle of the images)",
     "export.camera": "camera model for a model with affine cameras; none exports "
     "affine shapes, whose angles and depth are not true (default: weak_perspective)",
     "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
@@ -308,6 +318,7 @@ examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
   isa-nrsfm fit faces.csv --n-components 1-12 --output results
   isa-nrsfm fit body.csv --camera weak_perspective -k auto --output results
+  isa-nrsfm fit webcam.csv --camera perspective --image-size 1280x720 --output results
   isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
       --n-components 9 --output muct
   isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results
@@ -323,7 +334,8 @@ coefficients. The results replace those of an earlier run in the output folder."
                 "time_format",
             ),
             "method": (
-                *("n_components", "camera", "isa", "n_init", "block_recovery"),
+                *("n_components", "camera", "focal_length", "principal_point"),
+                *("isa", "n_init", "block_recovery"),
                 *("refinement", "independence", "loss", "no_scale_frames"),
                 *("no_hidden_points", "random_state", "n_jobs"),
             ),
@@ -360,8 +372,9 @@ examples:
   isa-nrsfm export results/model.npz faces.csv --label expression --output faces.html
 
 Shapes are upright and frontal, with the proportions that weak-perspective cameras
-determine; .npz and .mat have the arrays of the model unchanged. Models of
-'fit --camera weak_perspective' or 'orthographic' keep the proportions of the fit.""",
+determine; .npz and .mat have the arrays of the model unchanged. Models that were
+fitted with --camera weak_perspective, orthographic or perspective keep their
+proportions.""",
         {
             "model": ("model",),
             "output": (
@@ -391,7 +404,8 @@ def build_parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command, (line, description, examples, groups) in _COMMANDS.items():
         own = commands.add_parser(command, help=line, **_manners(description, examples))
-        own.set_defaults(weights=None, points=None)  # for commands without these
+        # For commands without these
+        own.set_defaults(weights=None, points=None, principal_point=None)
         for title, entries in groups.items():
             group = own.add_argument_group(title)
             for entry in entries:
@@ -416,6 +430,8 @@ def _settings(command: str, name: str) -> dict[str, Any]:
     settings: dict[str, Any] = {"default": default, "choices": CHOICES.get(key)}
     if metavar:
         settings |= {"metavar": metavar, "type": TYPES.get(metavar)}
+    if metavar == "X Y":
+        settings |= {"metavar": ("X", "Y"), "nargs": 2}
     if key == "export.table":
         settings["nargs"] = "?"
     if name == "output":

@@ -36,11 +36,14 @@ RESULTS = {
     "distance_62_66 (--distance): distance of points 62 and 66, in units of --unit",
     "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
     "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; for "
-    "calibrated cameras a scale times two rows of a rotation; inverse_snr is the "
+    "calibrated cameras a scale times two rows of a rotation (perspective cameras, "
+    "which see near points larger, at the origin of the shapes); inverse_snr is the "
     "energy of the reprojection error relative to that of the frame; yaw, pitch and "
     "roll in degrees, if the cameras determine them: zero for a frontal, upright "
     "object of a known layout, and for the mean camera of other objects; yaw_smooth, "
-    "pitch_smooth, roll_smooth (--time, --fps): smoothed",
+    "pitch_smooth, roll_smooth (--time, --fps): smoothed; position_x, position_y, "
+    "position_z (--camera perspective): position in the axes of the camera, z along "
+    "its axis, in units of the shapes, or of distances (--distance, --unit, --length)",
     "shapes.csv": "mean shape and basis shapes, a row for each point; the shape of a "
     "frame is mean + sum_k alpha_k basis_k, in the axes X, Y, Z of cameras.csv",
     "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
@@ -111,11 +114,13 @@ def write_results(
     frames: Frames,
     smooth: SmoothedCoefficients | None,
     drawn: dict[str, Any],
+    unit: float = 1.0,
     **shown: Any,
 ) -> None:
     """Write cameras, shapes, the viewer with the `shown` data, and the model.
 
-    The cameras have a row for each frame, empty if it could not be fitted.
+    The cameras have a row for each frame, empty if it could not be fitted. `unit` is
+    the length of a unit of the shapes, for positions.
     """
     X, motion = frames.X, estimator.motion_
     cameras = pd.DataFrame(
@@ -125,6 +130,9 @@ def write_results(
     )
     energy, error, _ = frame_energies(X, fitted_table(estimator), estimator.layout)
     cameras["inverse_snr"] = error / energy
+    if hasattr(estimator, "positions_"):
+        names = [f"position_{axis}" for axis in "xyz"]
+        cameras[names] = unit * estimator.positions_
     shown["camera"] = None
     if frames_of(estimator).certainty.determined:  # otherwise the fit has warned
         try:

@@ -41,6 +41,8 @@ from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 # Options of one format, and that format.
 _OF_FORMATS = {"image_size": "mediapipe", "part": "openpose"}
 INNER, WITHOUT = "inner", "without:"
+# The columns of the size of an image, in pixels, by format.
+_SIZES = {"coco": ("width", "height"), "pyfeat": ("FrameWidth", "FrameHeight")}
 # Words for an empty cell in the column of a label or a group. "None" is a class, such
 # as that of people without glasses.
 _MISSING = ("", "na", "n/a", "#n/a", "<na>", "nan", "nat", "null")
@@ -57,6 +59,7 @@ class Frames(NamedTuple):
     ``weighting`` has the weights of the points of X as an argument of `fit`, if asked
     for. Labels, groups and times of the usable rows come from `asked_columns`. Labels
     are NaN where they are not known. Those of classes are categories.
+    ``principal_point`` is given, or the middle of images of one known size.
     """
 
     points: "pd.DataFrame"
@@ -72,6 +75,7 @@ class Frames(NamedTuple):
     groups: NDArray | None = None
     times: NDArray | None = None
     time_unit: str = "seconds"
+    principal_point: tuple[float, float] | None = None
 
     @property
     def X(self) -> "pd.DataFrame":
@@ -95,7 +99,8 @@ def read_frames(
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
         given = ((name, getattr(args, name)) for name in _OF_FORMATS)
-        options = {name: value for name, value in given if value is not None}
+        known = FORMATS[args.format].options
+        options = {n: value for n, value in given if value is not None and n in known}
         found = read_landmarks(
             args.table, args.format, min_confidence=args.min_confidence, **options
         )
@@ -157,6 +162,7 @@ def read_frames(
         skeleton=layout,
         images=image_numbers(table),
         weighting={} if weights is None else {"point_weight": weights[report.usable]},
+        principal_point=_principal_point(args, other),
     )
 
 
@@ -200,11 +206,34 @@ def _format(args: Namespace) -> str:
     if args.columns is not None and found != TABLE:
         raise ValueError(f"--columns needs --format table; got --format {found}")
     for name, of in _OF_FORMATS.items():
-        if getattr(args, name) is not None and name not in FORMATS[found].options:
+        if getattr(args, name) is None or name in FORMATS[found].options:
+            continue
+        if name != "image_size" or not _with_perspective(args):
             raise ValueError(
                 f"{flag_of(name)} needs --format {of}; {args.table} has format {found}"
             )
     return found
+
+
+def _with_perspective(args: Namespace) -> bool:
+    """Return whether the size of the images is of use, whatever the format."""
+    cameras = ("weak_perspective", "perspective")
+    return args.command == "fit" and args.camera in cameras
+
+
+def _principal_point(
+    args: Namespace, other: "pd.DataFrame"
+) -> tuple[float, float] | None:
+    """Return the point on the axis of the camera, or the middle of the images."""
+    if args.principal_point is not None:
+        return tuple(args.principal_point)
+    names = [*_SIZES.get(args.format, ("image_width", "image_height"))]
+    size = args.image_size
+    if size is None and {*names} <= {*other}:
+        sizes = other[names].apply(pd.to_numeric, errors="coerce").drop_duplicates()
+        if len(sizes) == 1 and (sizes > 0).all(axis=None):
+            size = sizes.to_numpy()[0]
+    return None if size is None else (float(size[0]) / 2, float(size[1]) / 2)
 
 
 def _with_confidences(

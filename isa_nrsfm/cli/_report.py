@@ -2,6 +2,7 @@
 
 import contextlib
 import platform
+import warnings
 from argparse import Namespace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -9,22 +10,33 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis._advice import camera_meaning
+from isa_nrsfm.analysis._advice import (
+    MOST_GROSS,
+    advice,
+    camera_meaning,
+    facts_of,
+    perspective_advice,
+)
 from isa_nrsfm.analysis._diagnostics import Diagnostics, outlier_text
 from isa_nrsfm.cli._outputs import fitted_table
+from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.export._upright import sees_perspective
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Rows and points that are listed, and classes whose means are shown, at most.
 MOST_LISTED, MOST_CLASSES = 10, 12
+# Rows and basis shapes of fits that are compared, at most.
+MOST_ROWS, MOST_SHAPES = 300, 12
 
 
 def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
@@ -71,19 +83,19 @@ def quality_report(
 
 
 def model_report(
-    estimator: AffineNRSfM, X: Any, weighting: dict[str, Any], edges: Any = "auto"
+    estimator: AffineNRSfM, frames: Frames, edges: Any = "auto"
 ) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
     from isa_nrsfm.plotting._views import view_and_layout  # not needed by transform
 
-    alpha, explained = estimator.alpha_, fitted_table(estimator)
+    X, alpha, explained = frames.X, estimator.alpha_, fitted_table(estimator)
     errors = np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2, axis=1))
     ratio = getattr(estimator, "camera_noise_ratio_", None)
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     is_joint = estimator.refinement in JOINT_REFINEMENTS
     found = estimator.diagnostics(X) if is_joint else None
-    for message in () if found is None else found.messages:
+    for message in () if found is None else _advice(found, estimator, frames):
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)
     coefficients = pd.DataFrame(
@@ -102,7 +114,7 @@ def model_report(
     )
     return {
         "n_components": alpha.shape[1],
-        **quality_report(estimator, X, explained, weighting),
+        **quality_report(estimator, X, explained, frames.weighting),
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "inverse_snr": estimator.inverse_snr_,
         # Known only if the fit has seen the table as it is.
@@ -114,6 +126,10 @@ def model_report(
         "camera_meaning": None if ratio is None else camera_meaning(ratio),
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "mirror_certainty": estimator.mirror_certainty_,
+        "mirror_decided_by_perspective": sees_perspective(estimator),
+        "focal_length": getattr(estimator, "focal_length_", None),
+        "focal_length_std": getattr(estimator, "focal_length_std_", None),
+        "principal_point": estimator.principal_point,
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
@@ -123,6 +139,45 @@ def model_report(
         "parameters": estimator.get_params(deep=True),
         "alpha": coefficients.to_dict("records"),
     }
+
+
+def _advice(
+    found: Diagnostics, estimator: AffineNRSfM, frames: Frames
+) -> tuple[str, ...]:
+    """Return messages on a fit, of perspective if that explains the table better."""
+    share = found.outlier_share
+    bent = estimator.loss == "linear" and share > MOST_GROSS
+    if (
+        frames.principal_point is None
+        or estimator.camera_ != "weak_perspective"
+        or bent
+    ):
+        return found.messages
+    text = _perspective_advice(estimator, frames, frames.principal_point)
+    if not text:
+        return found.messages
+    return advice(facts_of(estimator, outlier_share=share, perspective=text))
+
+
+def _perspective_advice(
+    estimator: AffineNRSfM, frames: Frames, point: tuple[float, float]
+) -> str:
+    """Compare fits of some rows with perspective and without; return advice, or none.
+
+    A fit with perspective takes some six times as long as one without.
+    """
+    show_stage("comparison with perspective")
+    rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
+    X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
+    weighting = {name: w[rows] for name, w in frames.weighting.items()}
+    weak = clone(estimator).set_params(n_components=K, refinement="joint")
+    other = clone(weak).set_params(camera="perspective", principal_point=point)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            errors = [-m.fit(X, **weighting).score(X) for m in (other, weak)]
+    except ValueError:  # too few of the rows show a point
+        return ""
+    return perspective_advice(*errors) if np.isfinite(other.focal_length_) else ""
 
 
 def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:

@@ -34,6 +34,7 @@ _CAMERAS = {
     "image in depth",
     "orthographic": "orthographic: shapes are known up to a mirror image in depth, in "
     "the units of the table",
+    "perspective": "perspective: shapes are known up to size",
 }
 
 
@@ -77,7 +78,7 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     elif model["parameters"]["n_components"] == AUTO:
         sections["Choice"] = [f"K = {model['n_components']}: found by {AUTO}"]
     sections["Fit"] = _fit(report)
-    sections["Cameras"] = _cameras(model)
+    sections["Cameras"] = _cameras(model, "position_unit" in report)
     sections["Alpha"] = _alpha(model["alpha"])
     if "labels" in report:
         labels = [_label(label) for label in report["labels"]]
@@ -284,7 +285,7 @@ def _fit(report: dict[str, Any]) -> Section:
     return parts
 
 
-def _cameras(model: dict[str, Any]) -> Section:
+def _cameras(model: dict[str, Any], lengths: bool = False) -> Section:
     """Return the camera model, the certainty of the depth, and what the noise means."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
     if model["camera"] != "affine" and not model["depth_determined"]:
@@ -292,7 +293,7 @@ def _cameras(model: dict[str, Any]) -> Section:
             f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
             "no angles, and proportions in viewer.html are not true."
         ]  # the ratio of the noise means nothing
-    parts = [title]
+    parts = [title, *_perspective(model, lengths)]
     if uncertainty and math.isfinite(uncertainty):
         parts.append(
             f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
@@ -301,13 +302,34 @@ def _cameras(model: dict[str, Any]) -> Section:
     mirror = model["mirror_certainty"]
     if mirror and math.isfinite(mirror):
         least = min(math.floor(1000 * mirror) / 10, 99.9)
+        probability = f"right with a probability of at least {least:g} %"
         parts.append(
-            "mirror image in depth: the one in which missing points are farther away, "
-            f"right with a probability of at least {least:g} % if the object hides "
-            "them. If it does not, use --no-hidden-points."
+            f"mirror image in depth: the one that fits perspective, {probability}"
+            if model["mirror_decided_by_perspective"]
+            else "mirror image in depth: the one in which missing points are farther "
+            f"away, {probability} if the object hides them. If it does not, use "
+            "--no-hidden-points."
         )
     meaning = model["camera_meaning"]
     return [*parts, _sentence(meaning)] if meaning else parts
+
+
+def _perspective(model: dict[str, Any], lengths: bool) -> list[str]:
+    """Return the focal length of perspective cameras, and the unit of positions."""
+    focal, deviation = model["focal_length"], model["focal_length_std"]
+    if focal is None:
+        return []
+    if not math.isfinite(focal):
+        return ["no perspective: the focal length is too long to estimate it"]
+    shown = "given"
+    if model["parameters"]["focal_length"] is None:
+        shown = f"estimated, standard deviation {deviation:.2g}"
+    x, y = model["principal_point"]
+    unit = "distances (--distance, --unit, --length)" if lengths else "the shapes"
+    return [
+        f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})",
+        f"positions in cameras.csv are in units of {unit}",
+    ]
 
 
 def _alpha(coefficients: list[dict[str, Any]]) -> Section:

@@ -22,6 +22,9 @@ from isa_nrsfm.export._upright import (
 from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
 
+# The outer corners of the eyes, of the 68 points of a face.
+EYES = (36, 45)
+
 
 class FramePoses(NamedTuple):
     """
@@ -265,7 +268,7 @@ def point_distances(
             raise ValueError(
                 "unit must name two points, as these are not the 68 of a face"
             )
-        unit = (36, 45)  # the outer corners of the eyes
+        unit = EYES
     a, b = point_numbers(unit, names)
     shapes = upright_frames(space, model, *frames_of_table(model, X)).shapes
     mean = np.nanmean(shapes, axis=0)

@@ -96,10 +96,17 @@ def upright_space(
         transform, shape = UPSIDE_DOWN @ transform, shape @ UPSIDE_DOWN
     transform = upright_turn(shape, layout, "upper") @ transform
     if mirrored:
+        model.mirrored()  # raises if perspective decides
         transform = MIRROR @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
     return UprightSpace(known, metric, transform, image_axes, layout)
+
+
+def sees_perspective(model: Any) -> bool:
+    """Return whether perspective decides between the mirror images in depth."""
+    pinhole = model._model.pinhole
+    return pinhole is not None and pinhole.near
 
 
 def upright_frames(

@@ -24,6 +24,7 @@ from isa_nrsfm.export._drawing import Links, choose_drawing, edges_of
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
     Camera,
+    sees_perspective,
     upright_frames,
     upright_space,
     viewed_shapes,
@@ -39,10 +40,12 @@ UNLABELLED = "(no label)"
 ABOUT = {
     "weak_perspective": "Proportions are estimated with weak-perspective cameras.",
     "orthographic": "Proportions are estimated with orthographic cameras.",
+    "perspective": "Proportions are estimated with perspective cameras.",
     None: "Affine shapes: angles and depth are not those of the object.",
     "unknown": "The depth is not determined: angles and proportions are not those of "
     "the object.",
 }
+MIRRORED = " The mirror image in depth fits the images as well."
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
 FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125
 VERTICES, INDICES = 34962, 34963
@@ -191,7 +194,7 @@ def write_viewer(
     labelled = hasattr(X, "iloc")  # pandas: rows have names
     known = space.camera if frames_of(model).certainty.determined else "unknown"
     content = {
-        "about": ABOUT[known] + " The mirror image in depth fits the images as well.",
+        "about": ABOUT[known] + MIRRORED * (not sees_perspective(model)),
         "points": list(names_of_points(model)),
         "components": components,
         "categories": categories,

@@ -123,7 +123,8 @@ def read_mediapipe(
     elif image_size is not None:
         raise ValueError(
             "image_size is for coordinates that are shares of the image's width and "
-            f"height; these are in pixels (median {np.median(known):.3g})"
+            f"height; these are in pixels (median {np.median(known):.3g}), for the "
+            "format table"
             if known.size
             else "image_size is given, but there are no points"
         )
