@@ -110,7 +110,11 @@ def column_results(
             columns |= zip(names, found.T, strict=False)
             if has_positions:
                 size = np.linalg.norm(np.subtract(*estimator.mean_shape_[[a, b]]))
-                report["position_unit"] = args.length / size
+                report["position_unit"] = {
+                    "points": [a, b],
+                    "length": args.length,
+                    "per_unit_of_shapes": args.length / size,
+                }
         except ValueError as error:
             what = "alpha.csv has no distances" if names else "--length has no effect"
             warn_caller(f"{what}: {error}")

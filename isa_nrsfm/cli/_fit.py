@@ -104,7 +104,7 @@ def fit_table(
                 shown["depth_std"] = estimator.reconstruct(
                     X, return_std=True, **frames.weighting
                 )[1]
-            unit = answers.get("position_unit", 1.0)
+            unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
             _outputs.write_results(new, estimator, frames, smooth, drawn, unit, **shown)
             report = {
                 "command": "fit",

@@ -123,7 +123,7 @@ def model_report(
         "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
-        "camera_meaning": None if ratio is None else camera_meaning(ratio),
+        "camera_meaning": None if pd.isna(ratio) else camera_meaning(ratio),
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "mirror_certainty": estimator.mirror_certainty_,
         "mirror_decided_by_perspective": sees_perspective(estimator),
@@ -145,15 +145,11 @@ def _advice(
     found: Diagnostics, estimator: AffineNRSfM, frames: Frames
 ) -> tuple[str, ...]:
     """Return messages on a fit, of perspective if that explains the table better."""
-    share = found.outlier_share
+    share, point = found.outlier_share, frames.principal_point
     bent = estimator.loss == "linear" and share > MOST_GROSS
-    if (
-        frames.principal_point is None
-        or estimator.camera_ != "weak_perspective"
-        or bent
-    ):
+    if point is None or bent or estimator.camera_ != "weak_perspective":
         return found.messages
-    text = _perspective_advice(estimator, frames, frames.principal_point)
+    text = _perspective_advice(estimator, frames, point)
     if not text:
         return found.messages
     return advice(facts_of(estimator, outlier_share=share, perspective=text))

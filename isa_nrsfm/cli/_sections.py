@@ -78,7 +78,7 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     elif model["parameters"]["n_components"] == AUTO:
         sections["Choice"] = [f"K = {model['n_components']}: found by {AUTO}"]
     sections["Fit"] = _fit(report)
-    sections["Cameras"] = _cameras(model, "position_unit" in report)
+    sections["Cameras"] = _cameras(model, report.get("position_unit"))
     sections["Alpha"] = _alpha(model["alpha"])
     if "labels" in report:
         labels = [_label(label) for label in report["labels"]]
@@ -285,7 +285,7 @@ def _fit(report: dict[str, Any]) -> Section:
     return parts
 
 
-def _cameras(model: dict[str, Any], lengths: bool = False) -> Section:
+def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Section:
     """Return the camera model, the certainty of the depth, and what the noise means."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
     if model["camera"] != "affine" and not model["depth_determined"]:
@@ -293,7 +293,7 @@ def _cameras(model: dict[str, Any], lengths: bool = False) -> Section:
             f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
             "no angles, and proportions in viewer.html are not true."
         ]  # the ratio of the noise means nothing
-    parts = [title, *_perspective(model, lengths)]
+    parts = [title, *_perspective(model, unit)]
     if uncertainty and math.isfinite(uncertainty):
         parts.append(
             f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
@@ -314,7 +314,7 @@ def _cameras(model: dict[str, Any], lengths: bool = False) -> Section:
     return [*parts, _sentence(meaning)] if meaning else parts
 
 
-def _perspective(model: dict[str, Any], lengths: bool) -> list[str]:
+def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str]:
     """Return the focal length of perspective cameras, and the unit of positions."""
     focal, deviation = model["focal_length"], model["focal_length_std"]
     if focal is None:
@@ -325,10 +325,13 @@ def _perspective(model: dict[str, Any], lengths: bool) -> list[str]:
     if model["parameters"]["focal_length"] is None:
         shown = f"estimated, standard deviation {deviation:.2g}"
     x, y = model["principal_point"]
-    unit = "distances (--distance, --unit, --length)" if lengths else "the shapes"
+    length = "in units of the shapes"
+    if unit is not None:
+        a, b = unit["points"]
+        length = f"points {a} and {b} of the mean shape are {unit['length']:g} apart"
     return [
         f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})",
-        f"positions in cameras.csv are in units of {unit}",
+        f"positions in cameras.csv: {length}",
     ]
 
 
