@@ -14,6 +14,7 @@ from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
@@ -90,7 +91,7 @@ def model_report(
 
     X, alpha, explained = frames.X, estimator.alpha_, fitted_table(estimator)
     errors = np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2, axis=1))
-    ratio = getattr(estimator, "camera_noise_ratio_", None)
+    ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     is_joint = estimator.refinement in JOINT_REFINEMENTS
@@ -123,7 +124,7 @@ def model_report(
         "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
-        "camera_meaning": None if pd.isna(ratio) else camera_meaning(ratio),
+        "camera_meaning": None if np.isnan(ratio) else camera_meaning(ratio),
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "mirror_certainty": estimator.mirror_certainty_,
         "mirror_decided_by_perspective": sees_perspective(estimator),
@@ -160,20 +161,28 @@ def _perspective_advice(
 ) -> str:
     """Compare fits of some rows with perspective and without; return advice, or none.
 
-    A fit with perspective takes some six times as long as one without.
+    The first focal length is too long for most cameras, which does no harm. It takes
+    two or three times as long as the fit without perspective, and the estimate ten.
     """
     show_stage("comparison with perspective")
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
     X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
-    weighting = {name: w[rows] for name, w in frames.weighting.items()}
-    weak = clone(estimator).set_params(n_components=K, refinement="joint")
-    other = clone(weak).set_params(camera="perspective", principal_point=point)
+    weights = {name: values[rows] for name, values in frames.weighting.items()}
+    model = clone(estimator).set_params(n_components=K, refinement="joint")
+    seen = {"camera": "perspective", "principal_point": point}
+    errors = []
     try:
-        with warnings.catch_warnings(action="ignore"):
-            errors = [-m.fit(X, **weighting).score(X) for m in (other, weak)]
+        for focal in ({}, seen | {"focal_length": 5 * max(point)}, seen):
+            model = clone(model).set_params(**{"focal_length": None} | focal)
+            with warnings.catch_warnings(action="ignore"):
+                model._fit(X, weights.get("point_weight"), NoProgress())
+            errors.append(-model.score(X, **weights))
+            if errors[-1] > errors[0]:
+                return ""
     except ValueError:  # too few of the rows show a point
         return ""
-    return perspective_advice(*errors) if np.isfinite(other.focal_length_) else ""
+    perspective = np.isfinite(model.focal_length_)
+    return perspective_advice(errors[-1], errors[0]) if perspective else ""
 
 
 def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
