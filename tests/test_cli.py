@@ -17,6 +17,7 @@ from fit_runs import FIGURES, FILES as FIT_FILES, MODEL, Results
 from layers import one_start, slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm.cli import main
@@ -187,6 +188,8 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     X = pd.DataFrame(faces.data, columns=faces.feature_names)
     X.to_csv(tmp_path / "faces.csv", index=False)
     options = ["--camera", camera, "-k", "auto", "--fps", 25, "--no-figures"]
+    if camera == "weak_perspective":  # no advice on perspective
+        options += ["--image-size", "1280x720"]
     found = fits(tmp_path / "faces.csv", *options)
     out, model, report = found.out, found.model, found.report["model"]
     assert found.err == ""
@@ -216,6 +219,72 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     assert_allclose(gram, scales * np.eye(2), atol=atol)
     page = (tmp_path / "viewer.html").read_text(encoding="utf-8")
     assert f"{camera.replace('_', '-')} cameras" in page
+
+
+@pytest.fixture
+def webcam(tmp_path):
+    """Return the path of a table of faces before a webcam, and their positions."""
+    faces = make_face_tracks(40, n_components=1, random_state=0)
+    rng = np.random.RandomState(0)
+    angles = rng.uniform(-25, 25, (40, 3))
+    R = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+    T = rng.uniform((-90, -50, 350), (90, 50, 450), (40, 3))
+    points = faces.shapes @ R.mT + T[:, None]
+    images = 900.0 * points[..., :2] / points[..., 2:] + (640.0, 360.0)
+    images += 0.2 * rng.standard_normal(images.shape)
+    table = pd.DataFrame(images.reshape(40, -1), columns=LANDMARKS)
+    return saved(table, tmp_path), T
+
+
+def test_perspective_cameras(fits, fails, transforms, webcam, tmp_path):
+    (path, T), f, centre = webcam, 900.0, (640.0, 360.0)
+    options = [path, "--no-figures", "-k", 1, "--length", 90]
+    given = [*options, "--camera", "perspective", "--image-size", "1280x720"]
+    found = fits(*given, "--focal-length", f, "--std")
+    model, report, cameras = found.model, found.report["model"], found.cameras
+    assert found.err == ""
+    assert all(len(line) <= 120 for line in found.out.splitlines())
+    assert "focal length 900 (given), principal point (640, 360)" in found.out
+    assert (
+        "positions in cameras.csv: points 36 and 45 of the mean shape are" in found.out
+    )
+    assert "mirror image in depth: the one that fits perspective" in found.out
+    assert (report["focal_length"], report["focal_length_std"]) == (f, 0.0)
+    assert tuple(report["principal_point"]) == model.principal_point == centre
+    # The images are those of shapes.npz in the cameras and positions of cameras.csv.
+    S = np.load(tmp_path / "shapes.npz")["mean_shape"] + np.tensordot(
+        found.alpha["alpha_1"], model.basis_[0], 0
+    )
+    unit = found.report["position_unit"]
+    size = np.linalg.norm(model.mean_shape_[36] - model.mean_shape_[45])
+    assert unit["per_unit_of_shapes"] * size == pytest.approx(unit["length"]) == 90
+    rows = cameras.filter(regex="^m[01][012]$").to_numpy().reshape(-1, 2, 3)
+    rows /= cameras["scale"].to_numpy()[:, None, None]
+    turns = np.concatenate([rows, np.cross(rows[:, :1], rows[:, 1:])], axis=1)
+    places = cameras.filter(like="position_").to_numpy()
+    X = S @ turns.mT + places[:, None] / unit["per_unit_of_shapes"]
+    again = (f * X[..., :2] / X[..., 2:] + centre).reshape(40, -1)
+    table = pd.read_csv(path)
+    assert_allclose(again, model.reproject(table), atol=1e-6)
+    assert np.sqrt(np.mean((again - table.to_numpy()) ** 2)) < 0.25
+    assert_allclose(
+        places[:, 2] / T[:, 2], np.median(places[:, 2] / T[:, 2]), rtol=0.05
+    )
+    written, *_ = transforms(found.path, path, "--std")
+    assert_allclose(written["alpha_1"], found.alpha["alpha_1"], atol=0.01)
+    page = (tmp_path / "viewer.html").read_text(encoding="utf-8")
+    assert "perspective cameras." in page
+    assert "The mirror image in depth fits" not in page
+    message = fails("export", found.path, "-o", tmp_path / "a.glb", "--mirrored")
+    assert "decide between the two mirror images" in message
+
+
+@pytest.mark.slow
+def test_perspective_is_advised(fits, webcam):
+    options = ["--camera", "weak_perspective", "--image-size", "1280x720"]
+    found = fits(webcam[0], "--no-figures", "-k", 1, *options)
+    assert "warning: perspective explains the table better: error of held" in found.err
+    assert found.err.endswith(". Use --camera perspective\n")
 
 
 def test_outliers_are_reported(fits, tmp_path):
@@ -569,6 +638,8 @@ FIT = "fit t.csv -o d"
         (f"{FIT} --image-size 640", "expected WIDTHxHEIGHT"),
         (f"{FIT} --image-size 0x480", "expected WIDTHxHEIGHT"),
         (f"{FIT} --fps 0", "expected a number above zero; got '0'"),
+        (f"{FIT} --focal-length 0", "expected a number above zero; got '0'"),
+        (f"{FIT} --principal-point 640", "expected 2 arguments"),
         (f"{FIT} --fps 5 --time seconds", "not allowed with"),
         (f"{FIT} --distance 3", "expected two points with a comma between them"),
         (f"{FIT} --skeleton cat", "expected one of ibug-68"),

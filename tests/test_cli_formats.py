@@ -104,6 +104,9 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
             "--columns needs --format table; got --format openface",
         ),
         (write_openface, "--image-size 640x480", "--image-size needs --format mediapi"),
+        (write_openface, "--focal-length 1000", "--focal-length needs --camera persp"),
+        (write_openface, "--principal-point 1 2", "--principal-point needs --camera"),
+        (write_openface, "--camera perspective", "needs the size of the images, with"),
         (write_openface, "--part face", "--part needs --format openpose"),
         (write_openpose, "", "has points of pose, face: choose one with part"),
         (
@@ -118,6 +121,49 @@ def test_options_without_effect_are_refused(fails, tmp_path, write, options, mes
     path, *_ = write(tmp_path)
     folder = ["-o", tmp_path / "results", *QUICK]
     assert message in fails("fit", path, *options.split(), *folder)
+
+
+def write_sized_mesh(folder):
+    return files.write_mesh(folder / "mesh.csv", tracks(478), sizes=True), []
+
+
+def write_sized_pyfeat(folder, heights=480):
+    path = files.write_pyfeat(folder / "fex.csv", tracks(68))
+    table = pd.read_csv(path)
+    table.copy().assign(FrameHeight=heights, FrameWidth=640).to_csv(path, index=False)
+    return path, []
+
+
+def write_several_sizes(folder):
+    return write_sized_pyfeat(folder, [480, *[720] * (N_FRAMES - 1)])
+
+
+def write_coco(folder):
+    content = files.coco_annotations(tracks(14), names=[f"p{j}" for j in range(14)])
+    return files.write_json(folder / "coco.json", content), []
+
+
+@pytest.mark.parametrize(
+    ("write", "options", "expected"),
+    [
+        (write_openface, "--principal-point 1 2 --focal-length 3", "(1.0, 2.0) 3.0"),
+        (write_openface, "--image-size 640x480", "(320.0, 240.0) None"),
+        (write_mediapipe, "", "(320.0, 240.0) None"),
+        (write_sized_mesh, "--principal-point 3 4", "(3.0, 4.0) None"),
+        (write_sized_mesh, "", "(320.0, 240.0) None"),
+        (write_sized_pyfeat, "", "(320.0, 240.0) None"),
+        (write_several_sizes, "", "needs the size of the images"),
+        (write_coco, "", "(320.0, 240.0) None"),
+    ],
+)
+def test_the_axis_of_the_camera(fails, tmp_path, monkeypatch, write, options, expected):
+    def stop(model, *_, **__):
+        raise ValueError(f"{model.principal_point} {model.focal_length}")
+
+    monkeypatch.setattr(AffineNRSfM, "fit", stop)
+    path, own, *_ = write(tmp_path)
+    options = [*own, *options.split(), "--camera", "perspective", "--no-figures"]
+    assert expected in fails("fit", path, *options, "-o", tmp_path / "out")
 
 
 def test_columns_make_any_file_a_table(fits, tmp_path):

@@ -293,6 +293,8 @@ def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Secti
             f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
             "no angles, and proportions in viewer.html are not true."
         ]  # the ratio of the noise means nothing
+    if model["camera"] == "perspective" and not model["mirror_decided_by_perspective"]:
+        title += " and a mirror image in depth"
     parts = [title, *_perspective(model, unit)]
     if uncertainty and math.isfinite(uncertainty):
         parts.append(
