@@ -208,17 +208,12 @@ def _format(args: Namespace) -> str:
     for name, of in _OF_FORMATS.items():
         if getattr(args, name) is None or name in FORMATS[found].options:
             continue
-        if name != "image_size" or not _with_perspective(args):
+        perspective = args.command == "fit" and "perspective" in args.camera
+        if name != "image_size" or not perspective:
             raise ValueError(
                 f"{flag_of(name)} needs --format {of}; {args.table} has format {found}"
             )
     return found
-
-
-def _with_perspective(args: Namespace) -> bool:
-    """Return whether the size of the images is of use, whatever the format."""
-    cameras = ("weak_perspective", "perspective")
-    return args.command == "fit" and args.camera in cameras
 
 
 def _principal_point(
