@@ -1027,8 +1027,7 @@ default="affine"
         True
         """
         check_is_fitted(self)
-        pinhole = self._model.pinhole
-        if pinhole is not None and pinhole.near:
+        if sees_perspective(self):
             raise ValueError(
                 "the images of perspective cameras decide between the two mirror "
                 "images: the other one does not fit. mirror_certainty_ is the "
@@ -1255,6 +1254,12 @@ def check_class(estimator: object, where: str) -> None:
         raise ValueError(
             f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
         )
+
+
+def sees_perspective(estimator: AffineNRSfM) -> bool:
+    """Return whether perspective decides between the mirror images in depth."""
+    pinhole = estimator._model.pinhole
+    return pinhole is not None and pinhole.near
 
 
 def frames_of(estimator: AffineNRSfM) -> Any:

@@ -2,7 +2,6 @@
 
 import contextlib
 import platform
-import warnings
 from argparse import Namespace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -10,14 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._estimator import frames_of
+from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._selection import StartedNRSfM
 from isa_nrsfm.analysis._advice import (
     MOST_GROSS,
     advice,
@@ -30,7 +28,6 @@ from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
-from isa_nrsfm.export._upright import sees_perspective
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -168,15 +165,14 @@ def _perspective_advice(
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
     X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
     weights = {name: values[rows] for name, values in frames.weighting.items()}
-    model = clone(estimator).set_params(n_components=K, refinement="joint")
+    fixed = {"n_components": K, "refinement": "joint"}
+    params = estimator.get_params(deep=False) | fixed
     seen = {"camera": "perspective", "principal_point": point}
     errors = []
     try:
-        for focal in ({}, seen | {"focal_length": 5 * max(point)}, seen):
-            model = clone(model).set_params(**{"focal_length": None} | focal)
-            with warnings.catch_warnings(action="ignore"):
-                model._fit(X, weights.get("point_weight"), NoProgress())
-            errors.append(-model.score(X, **weights))
+        for camera in ({}, seen | {"focal_length": 5 * max(point)}, seen):
+            model = StartedNRSfM(**params | camera)
+            errors.append(-model.fit(X, **weights).score(X, **weights))
             if errors[-1] > errors[0]:
                 return ""
     except ValueError:  # too few of the rows show a point

@@ -29,8 +29,8 @@ class ShapeArrays(NamedTuple):
     The arrays of a fitted model.
 
     The image of frame i is ``(mean_shape + tensordot(alpha[i], basis, 1)) @
-    motion[i].T + translation[i]``. Perspective cameras show it in the same view, but near
-    points larger (`AffineNRSfM.inverse_transform`).
+    motion[i].T + translation[i]``. Perspective cameras show it in the same view, but
+    near points larger (`AffineNRSfM.inverse_transform`).
 
     Attributes
     ----------

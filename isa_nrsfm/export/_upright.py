@@ -103,12 +103,6 @@ def upright_space(
     return UprightSpace(known, metric, transform, image_axes, layout)
 
 
-def sees_perspective(model: Any) -> bool:
-    """Return whether perspective decides between the mirror images in depth."""
-    pinhole = model._model.pinhole
-    return pinhole is not None and pinhole.near
-
-
 def upright_frames(
     space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
 ) -> EuclideanFrames:

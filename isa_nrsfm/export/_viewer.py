@@ -18,13 +18,12 @@ from sklearn.utils import check_array
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._estimator import frames_of
+from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
 from isa_nrsfm.export._drawing import Links, choose_drawing, edges_of
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
     Camera,
-    sees_perspective,
     upright_frames,
     upright_space,
     viewed_shapes,
