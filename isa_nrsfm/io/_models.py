@@ -368,8 +368,6 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
         if value.get_state(legacy=False)["bit_generator"] == "MT19937":
             _, key, *rest = value.get_state()
             return {"random_state": [packed(key, name, arrays), *rest]}
-    elif isinstance(value, tuple | list) and np.asarray(value).dtype.kind in "iuf":
-        return {"numbers": np.asarray(value).tolist()}
     elif isinstance(value, Path):
         return {"path": str(value)}
     elif type(value) in (tuple, list):
@@ -412,8 +410,6 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
             return arrays[name] if arrays[name].ndim else arrays[name][()]
         case {"names": [*names]} if all(type(item) is str for item in names):
             return np.array(names, dtype=object)
-        case {"numbers": [*numbers]} if all(type(n) in (int, float) for n in numbers):
-            return tuple(numbers)
         case {"path": str(path)}:
             return Path(path)
         case {"tuple": [*numbers]} if all(type(n) in (int, float) for n in numbers):
