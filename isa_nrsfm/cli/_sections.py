@@ -291,7 +291,8 @@ def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Secti
     if model["camera"] != "affine" and not model["depth_determined"]:
         return [
             f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
-            "no angles, and proportions in viewer.html are not true."
+            "no angles, and proportions in viewer.html are not true.",
+            *_perspective(model, unit),
         ]  # the ratio of the noise means nothing
     if model["camera"] == "perspective" and not model["mirror_decided_by_perspective"]:
         title += " and a mirror image in depth"
