@@ -40,6 +40,7 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
+from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
@@ -51,7 +52,13 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
 )
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
-from isa_nrsfm._prepare.checks import check_table, validated_table
+from isa_nrsfm._prepare.checks import (
+    check_camera,
+    check_frames_kept,
+    check_table,
+    checked,
+    validated_table,
+)
 from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
@@ -136,18 +143,13 @@ default="affine"
         model of photos of objects that are far away for their size. "orthographic" ones
         have the same scale in all frames. With these two, shapes, lengths and angles
         are true, up to one mirror image (`mirrored`). "perspective" cameras are pinhole
-        cameras, for objects nearer than ten times their size, or at the side of the
-        image, as before a webcam; see `principal_point`. They need the joint
-        refinement.
+        cameras, for objects nearer than ten times their size or at the side of images.
     focal_length : float, array-like of shape (n_frames,) or None, default=None
-        Focal length of perspective cameras, in units of the table, such as pixels. An
-        array has one for each frame, of `fit` and of each table of other methods. None
+        Focal length of perspective cameras, in units of the table, or one a row. None
         estimates one for all frames (`focal_length_`).
     principal_point : tuple of float (x, y), default=None
-        Point of the image on the axis of perspective cameras, in units of the table:
-        half of the image's width and height, if nothing else is known. Normalised
-        coordinates have ``focal_length=1, principal_point=(0, 0)``. Needed with
-        ``camera="perspective"``.
+        Point of the image on the axis of perspective cameras, which need it: half of the
+        image's width and height, if nothing else is known.
     independence : {"shapes", "coefficients", None}, default="shapes"
         Criterion for the basis of the joint refinement. The likelihood does not depend
         on the mixing of the basis shapes. "shapes" makes them independent of each other
@@ -227,7 +229,8 @@ default="affine"
         deformation that the basis shapes do not model, and for coefficients without
         `reliability_`.
     motion_ : ndarray of shape (n_frames, 2, 3)
-        Affine cameras, in the units of the table.
+        Affine cameras, in the units of the table. With perspective, those of
+        weak-perspective cameras with the same rotations and positions.
     translation_ : ndarray of shape (n_frames, 2)
         Images of the origin of the shapes, in the units of the table: the centroids of
         complete frames.
@@ -237,9 +240,9 @@ default="affine"
         deformation explains as well as turning. Above 0.55, depths and angles are
         withheld.
     mirror_certainty_ : float
-        Probability that the depth has the right sign, if missing points decide it: a
-        test of whether they are farther away is significant at 1 %. Otherwise NaN, and
-        the sign is a convention; see `hidden_points` and `mirrored`.
+        Probability that the depth has the right sign, if perspective decides it, or
+        missing points do: a test of whether they are farther away is significant at
+        1 %. Otherwise NaN, and the sign is a convention; see `mirrored`.
     rotations_ : ndarray of shape (n_frames, 3, 3)
         Rotations of calibrated cameras, with determinant one. The rows are the axes of
         the image, x, y and z. Like `scales_`, only with such cameras.
@@ -249,13 +252,12 @@ default="affine"
         rotations_[i, :2].T + translation_[i]`` with ``S_i = reconstruct(X)[i]``.
     positions_ : ndarray of shape (n_frames, 3)
         Origins of the shapes in the axes of perspective cameras, in units of the
-        shapes: x, y and z, the distance along the axis. NaN without perspective. Each
-        frame may have another scale (gauge): distances of one object are comparable.
+        shapes. NaN if the table shows no perspective.
     focal_length_ : float or ndarray of shape (n_frames,)
         Focal length of perspective cameras. Infinite if the table shows no perspective.
     focal_length_std_ : float
-        Standard deviation of an estimated `focal_length_`, from a jackknife over groups
-        of points; zero if it was given, infinite if the depth is not determined.
+        Its standard deviation, from a jackknife over groups of points; zero if it was
+        given, infinite if the depth is not determined.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -415,7 +417,7 @@ default="affine"
         refinement: str | None = "joint",
         camera: str = "affine",
         focal_length: Any = None,
-        principal_point: tuple[float, float] | None = None,
+        principal_point: Any = None,
         independence: str | None = "shapes",
         loss: str = "linear",
         layout: Layout = "interleaved",
@@ -546,29 +548,22 @@ default="affine"
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
         isa, n_components = self._strategy(settings.joint), self.n_components
-        auto, perspective = n_components == "auto", self.camera == "perspective"
-        most = None
-        if perspective:
-            x, y = np.asarray(self.principal_point, dtype=float).tolist()
-            of_table = PerspectiveTable(source, weights, isa, settings, (x, y))
-            focal_length = self.focal_length
-            if focal_length is not None:
-                focal_length = common(focal_length)
+        auto, most = n_components == "auto", None
+        if perspective := self.camera == "perspective":
+            of_fit = source, weights, isa, settings, self.principal_point
             number = None if auto else n_components
-            model, frames, converged, fitted = fit_perspective(
-                of_table, number, focal_length, progress, start, errors
-            )
-            if np.ndim(self.focal_length):
-                fitted["focal_length_"] = np.array(self.focal_length, dtype=float)
+            options = number, self.focal_length, progress, start, errors
+            fit = fit_perspective(PerspectiveTable(*of_fit), *options)
         elif auto:
             with warnings.catch_warnings(action="ignore"):  # the fit warns again
                 table = ready_table(source, weights, 1, settings)
             n_components, most = supported_components(table, isa, settings)
         if not perspective:
             table = ready_table(source, weights, n_components, settings)
-            model, frames, converged, fitted = fit_table(
+            fit = fit_table(
                 table, n_components, isa, settings, progress, start, auto, errors
             )
+        model, frames, converged, fitted = fit
         # A consensus has more components.
         if auto and self.refinement == "joint" and len(model.basis) == most:
             warn_caller(
@@ -597,8 +592,8 @@ default="affine"
                 attributes |= {"rotations_": R, "scales_": scales}
             if model.pinhole is not None:
                 place = model.pinhole.positions(frames.motion, frames.translation)
-                if np.isinf(fitted["focal_length_"]).any():
-                    place[:] = np.nan
+                far = np.isinf(np.max(fitted["focal_length_"]))
+                place = np.where(far, np.nan, place)
                 attributes["positions_"] = source.as_collected(place)
         else:
             del attributes["_frame_sizes"]
@@ -630,14 +625,7 @@ default="affine"
                 raise ValueError(f"a table that is not in memory {got}")
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
-        if self.camera == "perspective":
-            self._check_perspective()
-        if self.refinement == "consensus" and self.camera == "affine":
-            raise ValueError(
-                "refinement='consensus' needs calibrated cameras, because depths of "
-                "groups of points with affine cameras have no common unit. Set "
-                "camera='weak_perspective' or camera='orthographic'"
-            )
+        check_camera(self)
         if self.refinement == "consensus" and point_weight is not None:
             raise ValueError(
                 "point_weight is not supported by the fit with refinement='consensus', "
@@ -656,43 +644,14 @@ default="affine"
         )
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
-        if self.camera == "perspective":  # fits of images without perspective
+        elif self.camera == "perspective":  # fits of images without perspective
             settings = settings._replace(camera="weak_perspective")
         return source, weights[0] if weights else None, settings
 
-    def _check_perspective(self) -> None:
-        """Refuse parameters that perspective cameras do not have, or lack."""
-        if self.refinement != "joint":
-            raise ValueError(
-                "camera='perspective' needs refinement='joint', whose fits repeat "
-                "until the depths of the points agree with their images; got "
-                f"refinement={self.refinement!r}"
-            )
-        centre = np.asarray(self.principal_point, dtype=float)
-        if centre.shape != (2,) or not np.isfinite(centre).all():
-            raise ValueError(
-                "camera='perspective' needs principal_point=(x, y), the point of the "
-                "image on the axis of the camera. If nothing else is known, give half "
-                "of the image's width and height in pixels, such as (640, 360); "
-                "normalised coordinates have focal_length=1, principal_point=(0, 0); "
-                f"got principal_point={self.principal_point!r}"
-            )
-
-    def _focal_shares(self, n_frames: int, reset: bool) -> NDArray | None:
-        """Return the mean of the focal lengths over those of frames, if they differ."""
-        focal = np.asarray(getattr(self, "focal_length_", 0.0), dtype=float)
-        if reset and self.focal_length is not None:
-            focal = np.asarray(self.focal_length, dtype=float)
-        if not focal.ndim:
-            return None
-        if focal.shape != (n_frames,) or not (focal > 0).all():
-            raise ValueError(
-                "focal_length must be one positive number, or one for each of the "
-                f"{n_frames} rows of the table; got shape {focal.shape}. For tables of "
-                "other lengths fit (x - x0) / f, (y - y0) / f with focal_length=1, "
-                "principal_point=(0, 0)"
-            )
-        return common(focal) / focal[:, None]
+    def _focal_shares(self, table: FrameBlocks) -> tuple[NDArray, ...]:
+        """Return the mean focal length over those of frames (n, 1), if they differ."""
+        focal_length = getattr(self, "focal_length_", self.focal_length)
+        return focal_shares(focal_length, table.n_frames)
 
     def _strategy(self, joint: bool) -> Any:
         """Return the unfitted strategy, with parameters inherited where not set."""
@@ -916,7 +875,6 @@ default="affine"
             frames. With "weak_perspective" each camera has its own scale, and the sizes
             of the shapes have no meaning. With "orthographic" all cameras have one
             scale, and shapes are in the units of the table.
-
         return_std : bool, default=False
             Whether to return the standard deviations of the depths, for a model with
             calibrated cameras.
@@ -1029,9 +987,8 @@ default="affine"
         check_is_fitted(self)
         if sees_perspective(self):
             raise ValueError(
-                "the images of perspective cameras decide between the two mirror "
-                "images: the other one does not fit. mirror_certainty_ is the "
-                "probability that the depth has the right sign"
+                "perspective decides between the two mirror images: the other one does "
+                "not fit. mirror_certainty_ is the probability of the right one"
             )
         mirror, signs = copy.copy(self), MIRROR.astype(self.mean_shape_.dtype)
         mirror._model = self._model.mirrored()
@@ -1063,14 +1020,7 @@ default="affine"
             few visible points.
         """
         table, _ = self._opened(X)
-        if (shares := self._focal_shares(table.n_frames, False)) is None:
-            return table.collect(self._model.reproject)
-        empty = np.zeros((1, len(self.mean_shape_), 2))
-        centre = tracks_to_table(empty + self.principal_point, self._model.layout)
-        return table.collect(
-            lambda rows, share: zoomed(self._model.reproject(rows), 1 / share, centre),
-            shares,
-        )
+        return table.collect(self._model.reproject, *self._focal_shares(table))
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1220,12 +1170,8 @@ default="affine"
         table = open_table(
             X, layout, names, counted=reset, n_jobs=n_jobs, working_memory=memory
         )
-        if (shares := self._focal_shares(table.n_frames, reset)) is not None:
-            centre, empty = np.reshape(self.principal_point, (2, 1)), table.empty
-            table = table.derive(
-                lambda rows, share: zoomed(rows, share[..., None], centre), shares
-            )
-            table.empty = empty
+        for share in self._focal_shares(table):
+            table = zoomed_table(table, share, self.principal_point)
         if point_weight is None:
             return table, ()
         return weighted_rows(table, point_weight)
@@ -1234,18 +1180,6 @@ default="affine"
 def limited(limits: Limits) -> type[AffineNRSfM]:
     """Return a subclass of `AffineNRSfM` with other limits, for tests."""
     return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
-
-
-def common(focal_length: Any) -> float:
-    """Return a focal length, or the geometric mean of several."""
-    if not np.ndim(focal_length):
-        return float(focal_length)
-    return float(np.exp(np.mean(np.log(focal_length))))
-
-
-def zoomed(rows: NDArray, share: NDArray, centre: NDArray) -> NDArray:
-    """Return coordinates with their distances from a centre times a share."""
-    return ((rows - centre) * share + centre).astype(rows.dtype)
 
 
 def check_class(estimator: object, where: str) -> None:
@@ -1265,27 +1199,3 @@ def sees_perspective(estimator: AffineNRSfM) -> bool:
 def frames_of(estimator: AffineNRSfM) -> Any:
     """Return the fitted model of single frames."""
     return estimator._model.frames
-
-
-def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
-    """Return values as a finite array of one of the allowed shapes, or raise."""
-    array = check_array(
-        unmasked(values),
-        dtype=[np.float64, np.float32],
-        input_name=name,
-        ensure_2d=False,
-        allow_nd=True,
-    )
-    if array.shape not in allowed:
-        expected = " or ".join(map(str, allowed))
-        raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
-    return array
-
-
-def check_frames_kept(estimator: Any, what: str) -> None:
-    """Raise an error if the frames of the fit are needed and were not kept."""
-    if not hasattr(estimator, "motion_"):
-        raise ValueError(
-            f"{what} needs the cameras and coefficients of the fitted table, which "
-            "were not kept: got keep_frames=False. Fit again with keep_frames=True"
-        )

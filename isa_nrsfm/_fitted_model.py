@@ -14,7 +14,7 @@ from isa_nrsfm._frames.models import (
     PosteriorFrames,
     RigidFrames,
 )
-from isa_nrsfm._frames.pinhole import Pinhole, line_of_sight
+from isa_nrsfm._frames.pinhole import Pinhole, line_of_sight, zoomed
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
@@ -225,11 +225,15 @@ class TableModel(NamedTuple):
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         return shapes, deviations / scales[:, None]
 
-    def reproject(self, rows: NDArray) -> NDArray:
-        """Return the images of the fitted shapes, in the layout of the table."""
+    def reproject(self, rows: NDArray, share: NDArray | None = None) -> NDArray:
+        """Return images of the fitted shapes, as a table; with a share, zoomed back."""
         motion, translation, alpha, _ = self.decompose(rows, deviations=False)
         shapes = compose(self.mean_shape, self.basis, alpha)
-        return tracks_to_table(self.images(shapes, motion, translation), self.layout)
+        images = self.images(shapes, motion, translation)
+        if self.pinhole is not None and share is not None:
+            centre = self.pinhole.centre[:, 0]
+            images = zoomed(images, 1.0 / share[..., None], centre)
+        return tracks_to_table(images, self.layout)
 
     def images(self, shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
         """Return images (n, J, 2) of shapes (n, J, 3) in the cameras of the table."""

@@ -32,7 +32,7 @@ from isa_nrsfm._fit import (
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
-from isa_nrsfm._frames.pinhole import Pinhole
+from isa_nrsfm._frames.pinhole import Pinhole, common
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
@@ -105,12 +105,12 @@ class PerspectiveTable(NamedTuple):
     weights: NDArray | None
     isa: Any
     settings: FitSettings
-    principal_point: tuple[float, float]
+    principal_point: Any
 
     def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
         """Return the camera with a focal length."""
-        robust = self.settings.loss != "linear"
-        return Pinhole(focal_length, self.principal_point, robust, near)
+        x, y = map(float, self.principal_point)
+        return Pinhole(focal_length, (x, y), self.settings.loss != "linear", near)
 
     def straight(
         self, pinhole: Pinhole, n_components: int, fit: PerspectiveFit | None
@@ -292,16 +292,17 @@ def minimum(fits: dict[float, PerspectiveFit]) -> tuple[float, float]:
 def fit_perspective(
     table: PerspectiveTable,
     n_components: int | None,
-    focal_length: float | None,
+    given: Any,
     progress: FitProgress | NoProgress,
     start: TableModel | None = None,
     errors: bool = False,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
     """Fit perspective images as `fit_table` fits weak-perspective ones.
 
-    `n_components` and `focal_length` are estimated if they are None. A fit that starts
-    from the model of a similar table has its focal length.
+    `n_components` and the given focal length are estimated if they are None; the table
+    has the mean of several. A fit from the model of a similar table has that of it.
     """
+    focal_length = None if given is None else common(given)
     fits: dict[float, PerspectiveFit] = {}
     deviation, why = 0.0, ""
     if start is not None and n_components is not None:
@@ -354,11 +355,13 @@ def fit_perspective(
     dtype = table.source.empty.dtype
     for name, value in mean_camera(seen, sizes[shown], "perspective").items():
         attributes[name] = value.astype(dtype)
-    known = np.isfinite(deviation) and model.frames.certainty.determined
+    known = not deviation or model.frames.certainty.determined
+    if why == NO_PERSPECTIVE:
+        f = np.inf
     attributes |= {
         "isa_": best.attributes["isa_"],
-        "focal_length_": np.inf if why == NO_PERSPECTIVE else f,
-        "focal_length_std_": deviation * f**2 if known or not deviation else np.inf,
+        "focal_length_": f if given is None else np.array(given, dtype=float)[()],
+        "focal_length_std_": deviation * f**2 if known else np.inf,
     }
     frames = Decomposition(*(part.astype(dtype) for part in frames))
     return model, frames, fit.converged, attributes

@@ -44,9 +44,9 @@ def scene(
 
 def fitted(X, **params):
     """Return a fit with perspective cameras."""
-    given = {"n_components": 2, "focal_length": F, "principal_point": CENTRE}
-    model = Quick(camera="perspective", random_state=0, **given | params)
-    return model.fit(X)
+    given = {"n_components": 2, "camera": "perspective", "random_state": 0}
+    given |= {"focal_length": F, "principal_point": CENTRE}
+    return Quick(**given | params).fit(X)
 
 
 def frame_error(shapes, truth):
@@ -149,7 +149,7 @@ def test_perspective_decides_the_mirror_image(noisy):
         np.linalg.det(np.linalg.lstsq(model.mean_shape_, S.mean(axis=0), rcond=None)[0])
         > 0
     )
-    with pytest.raises(ValueError, match="decide between the two mirror images"):
+    with pytest.raises(ValueError, match="decides between the two mirror images"):
         model.mirrored()
     # Images flipped left-right show an object that is flipped left-right
     tracks = X.reshape(len(X), -1, 2) * (-1, 1) + (2 * CENTRE[0], 0)
@@ -307,6 +307,7 @@ def test_files_copies_and_memory_maps(noisy, tmp_path):
         ({"principal_point": (1, np.nan)}, "needs principal_point"),
         ({"focal_length": [1.0, 2.0]}, "one for each of the 60 rows"),
         ({"focal_length": -1.0}, "focal_length"),
+        ({"camera": "affine"}, "focal_length is for camera='perspective'"),
         ({"refinement": "consensus"}, "needs refinement='joint'"),
         ({"refinement": None}, "needs refinement='joint'"),
     ],

@@ -16,13 +16,14 @@ those of the weak-perspective camera with the same rotation and position: ``s_i 
 T_3``, ``t_i = s_i T_12 + c``.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._prepare.robust import spatial_median
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import seen_points
 
 
@@ -126,3 +127,38 @@ def line_of_sight(motion: NDArray) -> NDArray:
     """Return ``s r_3`` (n, 3) of cameras (n, 2, 3): products with points are depths."""
     R, scales = full_rotations(motion)
     return scales[:, None] * R[:, 2]
+
+
+def common(focal_length: Any) -> float:
+    """Return a focal length, or the geometric mean of several."""
+    if not np.ndim(focal_length):
+        return float(focal_length)
+    return float(np.exp(np.mean(np.log(focal_length))))
+
+
+def focal_shares(focal_length: Any, n_frames: int) -> tuple[NDArray, ...]:
+    """Return the mean of focal lengths over those of frames (n, 1); none for one."""
+    if not np.ndim(focal_length):
+        return ()
+    focal = np.asarray(focal_length, dtype=float)
+    if focal.shape != (n_frames,) or not (focal > 0).all():
+        raise ValueError(
+            "focal_length must be one positive number, or one for each of the "
+            f"{n_frames} rows of the table; got shape {focal.shape}. For tables of "
+            "other lengths fit (x - x0) / f, (y - y0) / f with focal_length=1, "
+            "principal_point=(0, 0)"
+        )
+    return (np.asarray(common(focal) / focal[:, None]),)
+
+
+def zoomed(rows: NDArray, share: NDArray, centre: NDArray) -> NDArray:
+    """Return coordinates with their distances from a centre times a share."""
+    return ((rows - centre) * share + centre).astype(rows.dtype)
+
+
+def zoomed_table(table: FrameBlocks, shares: NDArray, centre: Any) -> FrameBlocks:
+    """Return the rows (n, 2, J) that cameras with the mean focal length would show."""
+    middle = np.reshape(centre, (2, 1))
+    rows = table.derive(lambda r, share: zoomed(r, share[..., None], middle), shares)
+    rows.empty = table.empty
+    return rows

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
+from sklearn.utils import check_array
 from sklearn.utils.validation import validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
@@ -267,3 +268,61 @@ def _rigid_noise(rows: NDArray) -> float:
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
         return max(float(energy[:-3].sum()), 0.0) / W.size
     return completion_model(rows, rank=3)[1]
+
+
+def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
+    """Return values as a finite array of one of the allowed shapes, or raise."""
+    array = check_array(
+        unmasked(values),
+        dtype=[np.float64, np.float32],
+        input_name=name,
+        ensure_2d=False,
+        allow_nd=True,
+    )
+    if array.shape not in allowed:
+        expected = " or ".join(map(str, allowed))
+        raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
+    return array
+
+
+def check_camera(model: Any) -> None:
+    """Refuse parameters of an estimator that its camera lacks, or does not have."""
+    camera, refinement, centre = model.camera, model.refinement, model.principal_point
+    if refinement == "consensus" and camera == "affine":
+        raise ValueError(
+            "refinement='consensus' needs calibrated cameras, because depths of "
+            "groups of points with affine cameras have no common unit. Set "
+            "camera='weak_perspective' or camera='orthographic'"
+        )
+    if camera != "perspective":
+        for name in ("focal_length", "principal_point"):
+            if getattr(model, name) is not None:
+                raise ValueError(
+                    f"{name} is for camera='perspective'; got camera={camera!r}. Set "
+                    f"{name}=None, or camera='perspective'"
+                )
+        return
+    if refinement != "joint":
+        raise ValueError(
+            "camera='perspective' needs refinement='joint', whose fits repeat until "
+            "the depths of the points agree with their images; got "
+            f"refinement={refinement!r}"
+        )
+    numbers = np.asarray(centre, dtype=float)
+    if numbers.shape != (2,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            "camera='perspective' needs principal_point=(x, y), the point of the image "
+            "on the axis of the camera. If nothing else is known, give half of the "
+            "image's width and height in pixels, such as (640, 360); normalised "
+            "coordinates have focal_length=1, principal_point=(0, 0); got "
+            f"principal_point={centre!r}"
+        )
+
+
+def check_frames_kept(estimator: Any, what: str) -> None:
+    """Raise an error if the frames of the fit are needed and were not kept."""
+    if not hasattr(estimator, "motion_"):
+        raise ValueError(
+            f"{what} needs the cameras and coefficients of the fitted table, which "
+            "were not kept: got keep_frames=False. Fit again with keep_frames=True"
+        )
