@@ -148,8 +148,8 @@ default="affine"
         Focal length of perspective cameras, in units of the table, or one a row. None
         estimates one for all frames (`focal_length_`).
     principal_point : tuple of float (x, y), default=None
-        Point of the image on the axis of perspective cameras, which need it: half of the
-        image's width and height, if nothing else is known.
+        Point of the image on the axis of perspective cameras, which need it: half of
+        the image's width and height, if nothing else is known.
     independence : {"shapes", "coefficients", None}, default="shapes"
         Criterion for the basis of the joint refinement. The likelihood does not depend
         on the mixing of the basis shapes. "shapes" makes them independent of each other
@@ -236,9 +236,8 @@ default="affine"
         complete frames.
     depth_uncertainty_ : float
         Expected RMS error of the depths of the frames, relative to their RMS
-        (calibrated cameras with the joint refinement only). It contains what
-        deformation explains as well as turning. Above 0.55, depths and angles are
-        withheld.
+        (calibrated cameras with the joint refinement only). Above 0.55, depths and
+        angles are withheld. It contains what deformation explains as well as turning.
     mirror_certainty_ : float
         Probability that the depth has the right sign, if perspective decides it, or
         missing points do: a test of whether they are farther away is significant at
@@ -551,9 +550,9 @@ default="affine"
         auto, most = n_components == "auto", None
         if perspective := self.camera == "perspective":
             of_fit = source, weights, isa, settings, self.principal_point
+            options = self.focal_length, progress, start, errors
             number = None if auto else n_components
-            options = number, self.focal_length, progress, start, errors
-            fit = fit_perspective(PerspectiveTable(*of_fit), *options)
+            fit = fit_perspective(PerspectiveTable(*of_fit), number, *options)
         elif auto:
             with warnings.catch_warnings(action="ignore"):  # the fit warns again
                 table = ready_table(source, weights, 1, settings)
@@ -650,8 +649,8 @@ default="affine"
 
     def _focal_shares(self, table: FrameBlocks) -> tuple[NDArray, ...]:
         """Return the mean focal length over those of frames (n, 1), if they differ."""
-        focal_length = getattr(self, "focal_length_", self.focal_length)
-        return focal_shares(focal_length, table.n_frames)
+        given = getattr(self, "focal_length_", self.focal_length)
+        return focal_shares(given, table.n_frames)
 
     def _strategy(self, joint: bool) -> Any:
         """Return the unfitted strategy, with parameters inherited where not set."""
