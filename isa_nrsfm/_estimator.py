@@ -587,12 +587,12 @@ default="affine"
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
-                R, scales = full_rotations(attributes["motion_"])
+                R, scales = map(source.as_collected, full_rotations(frames.motion))
                 attributes |= {"rotations_": R, "scales_": scales}
             if model.pinhole is not None:
                 place = model.pinhole.positions(frames.motion, frames.translation)
                 far = np.isinf(np.max(fitted["focal_length_"]))
-                place = np.where(far, np.nan, place)
+                place = np.where(far, np.nan, place).astype(frames.alpha.dtype)
                 attributes["positions_"] = source.as_collected(place)
         else:
             del attributes["_frame_sizes"]

@@ -93,7 +93,9 @@ class TableModel(NamedTuple):
             return rows, np.empty(len(rows))
         images, turns = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
-        weak, moving = self._replace(pinhole=None), np.arange(len(rows))
+        assert isinstance(self.frames, PosteriorFrames)
+        weak = self._replace(frames=self.frames.without_starts, pinhole=None)
+        moving = np.arange(len(rows))
         for _ in range(MOST_REPEATS if pinhole.near else 0):
             moving = padded(moving) if len(rows) > 1 else moving
             own = None if weights is None else weights[moving]

@@ -38,6 +38,7 @@ from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.tracks import centred_frames
 
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
 # tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
@@ -56,8 +57,9 @@ UNSTEADY = (
     "shapes. The fit is that of weak-perspective cameras, turned to each object"
 )
 NO_PERSPECTIVE = (
-    "the table shows no perspective: its focal length is too long, or the objects are "
-    "too far away, to estimate it. The fit is that of weak-perspective cameras"
+    "no perspective was found: the focal length is very long, or there are too few "
+    "basis shapes to estimate it. If it is known, give focal_length. The fit is that of "
+    "weak-perspective cameras"
 )
 
 
@@ -415,8 +417,8 @@ def _squares(
     flat = project(shapes, motion, translation).swapaxes(1, 2)
     depths = fit.model.depths(Decomposition(motion, translation, alpha, alpha))
     square = np.sum((fit.pinhole.images(flat, depths) - images) ** 2, axis=1)
-    centred = images - np.nanmean(images, axis=2, keepdims=True)
-    square /= np.nanmean(centred**2, axis=(1, 2))[:, None]
+    size = centred_frames(images)[1].size
+    square /= np.where(size > 0, size, np.nan)[:, None] ** 2
     if fit.pinhole.robust and isinstance(fit.model.frames, PosteriorFrames):
         square = robust_square(square, fit.model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

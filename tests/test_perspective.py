@@ -231,7 +231,7 @@ def test_tables_without_perspective_say_so():
     flat = 100 * (S @ R[:, :2].mT)
     flat += np.random.RandomState(1).uniform(-300, 300, (len(X), 1, 2)) + CENTRE
     flat += 0.3 * np.random.RandomState(2).standard_normal(flat.shape)
-    with pytest.warns(UserWarning, match="shows no perspective"):
+    with pytest.warns(UserWarning, match="no perspective was found"):
         model = fitted(flat.reshape(X.shape), focal_length=None)
     assert np.isinf(model.focal_length_)
     assert np.isnan(model.positions_).all()

@@ -304,6 +304,11 @@ class PosteriorFrames:
         """The search for one complete frame."""
         return SingleSearch(self._search)
 
+    @cached_property
+    def without_starts(self) -> "PosteriorFrames":
+        """The model that fits each frame from zero only."""
+        return replace(self, starts=self.starts[:0])
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
