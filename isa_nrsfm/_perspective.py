@@ -58,8 +58,8 @@ UNSTEADY = (
 )
 NO_PERSPECTIVE = (
     "no perspective was found: the focal length is very long, or there are too few "
-    "basis shapes to estimate it. If it is known, give focal_length. The fit is that of "
-    "weak-perspective cameras"
+    "basis shapes to estimate it. If it is known, give focal_length. The fit is that "
+    "of weak-perspective cameras"
 )
 
 

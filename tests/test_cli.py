@@ -276,7 +276,7 @@ def test_perspective_cameras(fits, fails, transforms, webcam, tmp_path):
     assert "perspective cameras." in page
     assert "The mirror image in depth fits" not in page
     message = fails("export", found.path, "-o", tmp_path / "a.glb", "--mirrored")
-    assert "decide between the two mirror images" in message
+    assert "decides between the two mirror images" in message
 
 
 @pytest.mark.slow
