@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
@@ -393,7 +393,7 @@ def better_than(fit: PerspectiveFit, other: PerspectiveFit) -> float:
         neighbours(fit.model.mean_shape.T), other.energies - fit.energies
     )
     deviation = gain.std(ddof=1) / np.sqrt(len(gain))
-    return float(student.cdf(gain.mean() / deviation, len(gain) - 1))
+    return float(stdtr(len(gain) - 1, gain.mean() / deviation))
 
 
 def _straight(

@@ -207,6 +207,7 @@ def codes_of_calls(column):
     return [code for row in rows for code in re.findall(r"`([^`]+)`", row[column])]
 
 
+@pytest.mark.filterwarnings("ignore:no perspective")
 @pytest.mark.usefixtures("video")
 def test_python_calls_for_questions_run():
     names = run("docs/which_call.md")
@@ -262,7 +263,10 @@ def test_variables_of_matlab_are_the_model(sequence):
 
 # Of these pages each runs in a test of its own.
 WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
-REFERENCE = ("conventions", "depth", "export", "formats", "large_tables", "skeletons")
+REFERENCE = (
+    *("conventions", "depth", "export", "formats", "large_tables", "perspective"),
+    "skeletons",
+)
 # Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
 OF_OTHERS = ("from_movement", "dask")
 
@@ -314,7 +318,8 @@ def test_code_of_reference_pages_runs(page, fitted):
             if page == "skeletons":
                 names["model"] = clone(model)
     if page == "depth":
-        assert round(names["model"].depth_uncertainty_, 3) == 0.006
+        # The errors of depths of the tests take few steps.
+        assert names["model"].depth_uncertainty_ == pytest.approx(0.006, abs=0.001)
         assert names["depth_std"].shape == (200, 68)
 
 

@@ -15,7 +15,6 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._selection import StartedNRSfM
 from isa_nrsfm.analysis._advice import (
     MOST_GROSS,
     advice,
@@ -161,6 +160,8 @@ def _perspective_advice(
     The first focal length is too long for most cameras, which does no harm. It takes
     two or three times as long as the fit without perspective, and the estimate ten.
     """
+    from isa_nrsfm._selection import StartedNRSfM  # not needed by transform
+
     show_stage("comparison with perspective")
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
     X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
