@@ -14,6 +14,7 @@ moves, which gives its deviation (jackknife).
 import warnings
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +70,8 @@ class PerspectiveFit(NamedTuple):
 
     model: that of weak-perspective images. frames: in virtual cameras. converged,
     attributes: as `fit_table` returns them. changes: shares by which repeats have
-    changed the depths. energies (J,): contributions of the points to E.
+    changed the depths. energies (J,): contributions of the points to E. earlier: at
+    most three fits before, the last one first.
     """
 
     pinhole: Pinhole
@@ -79,6 +81,7 @@ class PerspectiveFit(NamedTuple):
     attributes: dict[str, Any]
     changes: tuple[float, ...] = ()
     energies: NDArray = np.zeros(0)
+    earlier: tuple["PerspectiveFit", ...] = ()
 
     @property
     def energy(self) -> float:
@@ -93,6 +96,12 @@ class PerspectiveFit(NamedTuple):
     def depths(self, part: slice) -> NDArray:
         """Return depths (n, J) of the points of some frames."""
         return self.model.depths(Decomposition(*(v[part] for v in self.frames)))
+
+    @property
+    def for_depths(self) -> list["PerspectiveFit"]:
+        """The fits whose depths correct the next images: several if they oscillate."""
+        slow = any(new > 0.5 * old for old, new in pairwise(self.changes))
+        return [self, *self.earlier] if slow else [self]
 
     def mirrored(self) -> "PerspectiveFit":
         """Return the mirror image in depth."""
@@ -121,8 +130,11 @@ class PerspectiveTable(NamedTuple):
         if fit is None:
             rows = self.source.derive(lambda rows: pinhole.virtual(rows)[0])
         else:
-            function = partial(_straight, pinhole=pinhole, model=fit.model)
-            rows = self.source.derive(function, fit.frames.motion, fit.frames.alpha)
+            fits = fit.for_depths
+            by_frame = [v for f in fits for v in (f.frames.motion, f.frames.alpha)]
+            models = [f.model for f in fits]
+            function = partial(_straight, pinhole=pinhole, models=models)
+            rows = self.source.derive(function, *by_frame)
         rows.empty = self.source.empty
         return ready_table(rows, self.weights, n_components, self.settings)
 
@@ -151,7 +163,8 @@ class PerspectiveTable(NamedTuple):
             change = float(np.sqrt(min(same, other) / (total or 1.0)))
             fit = fit.mirrored() if other < same else fit
             fit.attributes["isa_"] = fit.attributes["isa_"] or before.attributes["isa_"]
-            fit = fit._replace(changes=(*before.changes, change))
+            earlier = (before._replace(earlier=()), *before.earlier)[:3]
+            fit = fit._replace(changes=(*before.changes, change), earlier=earlier)
         squares = self.source.map(partial(_squares, fit=fit), *fit.frames[:3])
         square, counts = np.sum(list(squares), axis=0)
         return fit._replace(energies=square / counts.sum())
@@ -168,7 +181,7 @@ class PerspectiveTable(NamedTuple):
 
         A fit also ends if it is clearly worse than the best one.
         """
-        running = [fit._replace(changes=()) for fit in fits]
+        running = [fit._replace(changes=(), earlier=()) for fit in fits]
         ended: list[PerspectiveFit] = []
         while running:
             running = [
@@ -397,11 +410,21 @@ def better_than(fit: PerspectiveFit, other: PerspectiveFit) -> float:
 
 
 def _straight(
-    rows: NDArray, motion: NDArray, alpha: NDArray, pinhole: Pinhole, model: TableModel
+    rows: NDArray, *by_frame: NDArray, pinhole: Pinhole, models: list[TableModel]
 ) -> NDArray:
-    """Return weak-perspective images (n, 2, J) of rows, for the depths of a model."""
-    fit = Decomposition(motion, motion[:, :, 0], alpha, alpha)
-    return pinhole.straight(pinhole.virtual(rows)[0], model.depths(fit))
+    """Return weak-perspective images (n, 2, J) of rows, for weighted means of depths.
+
+    Cameras and coefficients of the frames follow each other, for one model each. Each
+    model has half of the weight of the one before it.
+    """
+    cameras, alpha = by_frame[::2], by_frame[1::2]
+    fits = [
+        Decomposition(M, M[:, :, 0], a, a) for M, a in zip(cameras, alpha, strict=True)
+    ]
+    depths = [model.depths(fit) for model, fit in zip(models, fits, strict=True)]
+    weights = 0.5 ** np.arange(len(depths))
+    mean = np.average(depths, axis=0, weights=weights)
+    return pinhole.straight(pinhole.virtual(rows)[0], mean)
 
 
 def _squares(
