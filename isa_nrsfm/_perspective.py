@@ -41,6 +41,7 @@ from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import centred_frames
 
+# Measured: docs/benchmarks/README.md, "Thresholds".
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
 # tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
 SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
