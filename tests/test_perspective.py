@@ -42,11 +42,11 @@ def scene(
     return SimpleNamespace(X=X, S=S, R=R, T=T, noise=noise * size)
 
 
-def fitted(X, **params):
+def fitted(X, kind=Quick, **params):
     """Return a fit with perspective cameras."""
     given = {"n_components": 2, "camera": "perspective", "random_state": 0}
     given |= {"focal_length": F, "principal_point": CENTRE}
-    return Quick(**given | params).fit(X)
+    return kind(**given | params).fit(X)
 
 
 def frame_error(shapes, truth):
@@ -64,7 +64,7 @@ def frame_error(shapes, truth):
 def noisy():
     """A table with noise, its truth and its fit."""
     table = scene(noise=0.005)
-    table.model = fitted(table.X)
+    table.model = fitted(table.X, AffineNRSfM)
     return table
 
 
@@ -277,6 +277,7 @@ def test_outliers(noisy):
     assert frame_error(model.reconstruct(wrong), S) < 0.02
 
 
+@pytest.mark.slow
 def test_number_of_basis_shapes(noisy):
     X = noisy.X
     assert len(fitted(X, n_components="auto").basis_) == 2
@@ -289,7 +290,6 @@ def test_number_of_basis_shapes(noisy):
 
 def test_files_copies_and_memory_maps(noisy, tmp_path):
     X, model = noisy.X, noisy.model
-    model = AffineNRSfM(**model.get_params()).fit(X)
     save_model(model, tmp_path / "model.npz")
     loaded = load_model(tmp_path / "model.npz")
     np.testing.assert_array_equal(loaded.transform(X), model.alpha_)
