@@ -579,7 +579,7 @@ default="affine"
             "_model": model,
             "_n_features_out": len(model.basis),
             "camera_": self.camera,
-            "frames_scaled_": settings.scale_frames,
+            "frames_scaled_": bool(settings.scale_frames),
         }
         if self.keep_frames:
             for name, part in keep(frames._asdict()).items():
