@@ -548,16 +548,16 @@ default="affine"
         source, weights, settings = opened._ready(X, point_weight)
         isa, n_components = self._strategy(settings.joint), self.n_components
         auto, most = n_components == "auto", None
-        if perspective := self.camera == "perspective":
+        if self.camera == "perspective":
             of_fit = source, weights, isa, settings, self.principal_point
             options = self.focal_length, progress, start, errors
             number = None if auto else n_components
             fit = fit_perspective(PerspectiveTable(*of_fit), number, *options)
-        elif auto:
-            with warnings.catch_warnings(action="ignore"):  # the fit warns again
-                table = ready_table(source, weights, 1, settings)
-            n_components, most = supported_components(table, isa, settings)
-        if not perspective:
+        else:
+            if auto:
+                with warnings.catch_warnings(action="ignore"):  # the fit warns again
+                    table = ready_table(source, weights, 1, settings)
+                n_components, most = supported_components(table, isa, settings)
             table = ready_table(source, weights, n_components, settings)
             fit = fit_table(
                 table, n_components, isa, settings, progress, start, auto, errors

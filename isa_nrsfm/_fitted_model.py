@@ -33,7 +33,7 @@ from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 # decisions are in docs/depth.md, "The mirror image".
 MIRROR_LEVEL = 0.01
 # Depths and fit of a perspective frame agree if a repeat changes depths by less than
-# this share. Most frames need three repeats.
+# this share: docs/benchmarks/README.md, "Thresholds".
 SETTLED, MOST_REPEATS = 1e-3, 30
 
 
@@ -100,7 +100,8 @@ class TableModel(NamedTuple):
             moving = padded(moving) if len(rows) > 1 else moving
             own = None if weights is None else weights[moving]
             fit = weak.decompose(straight[moving], own, deviations=False)
-            before, depths[moving] = depths[moving], self.depths(fit)
+            before = depths[moving]
+            depths[moving] = self.depths(fit.motion, fit.alpha)
             straight[moving] = pinhole.straight(images[moving], depths[moving])
             change = np.square(depths[moving] - before).sum(axis=1)
             large = change > SETTLED**2 * np.square(depths[moving]).sum(axis=1)
@@ -109,10 +110,10 @@ class TableModel(NamedTuple):
                 break
         return straight, turns
 
-    def depths(self, fit: Decomposition) -> NDArray:
+    def depths(self, motion: NDArray, alpha: NDArray) -> NDArray:
         """Return the depths (n, J) of points, in units of the table."""
-        shapes = compose(self.mean_shape, self.basis, fit.alpha)
-        return np.vecdot(shapes, line_of_sight(fit.motion)[:, None])
+        shapes = compose(self.mean_shape, self.basis, alpha)
+        return np.vecdot(shapes, line_of_sight(motion)[:, None])
 
     def mirrored(self) -> "TableModel":
         """Return the model with shapes mirrored in depth."""

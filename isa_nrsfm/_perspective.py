@@ -41,7 +41,7 @@ from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import centred_frames
 
-# Measured: docs/benchmarks/README.md, "Thresholds".
+# Effects of the next two lines: docs/benchmarks/README.md, "Thresholds".
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
 # tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
 SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
@@ -96,7 +96,7 @@ class PerspectiveFit(NamedTuple):
 
     def depths(self, part: slice) -> NDArray:
         """Return depths (n, J) of the points of some frames."""
-        return self.model.depths(Decomposition(*(v[part] for v in self.frames)))
+        return self.model.depths(self.frames.motion[part], self.frames.alpha[part])
 
     @property
     def for_depths(self) -> list["PerspectiveFit"]:
@@ -269,7 +269,7 @@ class PerspectiveTable(NamedTuple):
 
     def _reach(self, rows: NDArray) -> float:
         """Return the largest coordinate of points and image, from its middle."""
-        centre = np.reshape(self.principal_point, (2, 1))
+        centre = self.pinhole(1.0).centre
         largest = np.fmax.reduce(np.abs(rows - centre), axis=None, initial=0.0)
         return float(max(largest, *np.abs(centre[:, 0])))
 
@@ -418,11 +418,8 @@ def _straight(
     Cameras and coefficients of the frames follow each other, for one model each. Each
     model has half of the weight of the one before it.
     """
-    cameras, alpha = by_frame[::2], by_frame[1::2]
-    fits = [
-        Decomposition(M, M[:, :, 0], a, a) for M, a in zip(cameras, alpha, strict=True)
-    ]
-    depths = [model.depths(fit) for model, fit in zip(models, fits, strict=True)]
+    fits = zip(models, by_frame[::2], by_frame[1::2], strict=True)
+    depths = [model.depths(motion, alpha) for model, motion, alpha in fits]
     weights = 0.5 ** np.arange(len(depths))
     mean = np.average(depths, axis=0, weights=weights)
     return pinhole.straight(pinhole.virtual(rows)[0], mean)
@@ -439,7 +436,7 @@ def _squares(
     images, _ = fit.pinhole.virtual(rows)
     shapes = compose(fit.model.mean_shape, fit.model.basis, alpha)
     flat = project(shapes, motion, translation).swapaxes(1, 2)
-    depths = fit.model.depths(Decomposition(motion, translation, alpha, alpha))
+    depths = fit.model.depths(motion, alpha)
     square = np.sum((fit.pinhole.images(flat, depths) - images) ** 2, axis=1)
     size = centred_frames(images)[1].size
     square /= np.where(size > 0, size, np.nan)[:, None] ** 2
