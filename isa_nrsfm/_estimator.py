@@ -43,6 +43,7 @@ from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._parameters.choices import (
+    ADAPTED,
     BLOCK_RECOVERIES,
     CALIBRATED_CAMERAS,
     CAMERA_NAMES,
@@ -392,6 +393,8 @@ default="affine"
         "camera": [StrOptions(set(CAMERA_NAMES))],
         "focal_length": [None, Interval(Real, 0, None, closed="neither"), "array-like"],
         "principal_point": [None, "array-like"],
+        "prior": [None, HasMethods(["fit", "get_params"])],
+        "adapt": [StrOptions(set(ADAPTED))],
         "independence": [StrOptions(set(INDEPENDENCE)), None],
         "loss": [StrOptions(set(LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],
@@ -417,6 +420,8 @@ default="affine"
         camera: str = "affine",
         focal_length: Any = None,
         principal_point: Any = None,
+        prior: Any = None,
+        adapt: str = "mean",
         independence: str | None = "shapes",
         loss: str = "linear",
         layout: Layout = "interleaved",
@@ -438,6 +443,8 @@ default="affine"
         self.camera = camera
         self.focal_length = focal_length
         self.principal_point = principal_point
+        self.prior = prior
+        self.adapt = adapt
         self.independence = independence
         self.loss = loss
         self.layout = layout
@@ -498,7 +505,7 @@ default="affine"
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep:
-            stages = stages_of(self.refinement)
+            stages = stages_of(self.refinement, self.prior is not None)
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, errors=True)
         progress.end()
@@ -547,6 +554,8 @@ default="affine"
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
         isa, n_components = self._strategy(settings.joint), self.n_components
+        if settings.prior is not None:
+            n_components = len(settings.prior.basis)
         auto, most = n_components == "auto", None
         if self.camera == "perspective":
             of_fit = source, weights, isa, settings, self.principal_point
@@ -625,6 +634,7 @@ default="affine"
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
         check_camera(self)
+        prior = checked_prior(self)
         if self.refinement == "consensus" and point_weight is not None:
             raise ValueError(
                 "point_weight is not supported by the fit with refinement='consensus', "
@@ -641,10 +651,16 @@ default="affine"
             silent_isa=joint and self.isa is None,
             limits=self._limits,
         )
+        settings = settings._replace(prior=prior)
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
         elif self.camera == "perspective":  # fits of images without perspective
             settings = settings._replace(camera="weak_perspective")
+        if prior is not None and prior.n_points != source.empty.shape[2]:
+            raise ValueError(
+                f"the prior has {prior.n_points} points, the table "
+                f"{source.empty.shape[2]}. Give the table and the prior the same points"
+            )
         return source, weights[0] if weights else None, settings
 
     def _focal_shares(self, table: FrameBlocks) -> tuple[NDArray, ...]:
@@ -678,6 +694,14 @@ default="affine"
         private = ("_model", "_frame_sizes", "_n_features_out")
         names = [n for n in vars(self) if n not in private and not n.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in names}
+
+    def __sklearn_clone__(self) -> Any:
+        """Return an unfitted copy, whose prior is still fitted."""
+        plain = copy.copy(self)
+        plain.prior = None
+        plain = super(AffineNRSfM, plain).__sklearn_clone__()
+        plain.prior = self.prior
+        return plain
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""
@@ -1174,6 +1198,43 @@ default="affine"
         if point_weight is None:
             return table, ()
         return weighted_rows(table, point_weight)
+
+
+def checked_prior(model: AffineNRSfM) -> TableModel | None:
+    """Return the fitted model that is the prior of an estimator, or raise."""
+    prior, n_components = model.prior, model.n_components
+    if prior is None:
+        return None
+    if model.refinement != "joint" or model.camera == "affine":
+        raise ValueError(
+            "prior needs calibrated cameras and the joint refinement; got camera="
+            f"{model.camera!r}, refinement={model.refinement!r}. Set camera="
+            "'weak_perspective', refinement='joint'"
+        )
+    prior = getattr(prior, "estimator", prior)  # of a FrozenEstimator
+    check_class(prior, "prior")
+    if not hasattr(prior, "_model"):
+        raise ValueError(
+            "prior must be fitted. A search over several priors clones them: give "
+            "them as sklearn.frozen.FrozenEstimator(prior)"
+        )
+    prior._jointly_fitted("prior", calibrated=True)
+    if not prior._model.frames.certainty.determined:
+        raise ValueError(
+            "the depth of the prior is not determined, as its diagnostics() say. Fit "
+            "the prior to a table in which the objects turn"
+        )
+    if (prior.camera_ == "orthographic") != (model.camera == "orthographic"):
+        raise ValueError(
+            f"the prior has camera={prior.camera_!r}; got camera={model.camera!r}. "
+            "Set the same"
+        )
+    if n_components not in ("auto", K := len(prior.basis_)):
+        raise ValueError(
+            f"n_components must be that of the prior, {K}, or 'auto'; got "
+            f"{n_components}"
+        )
+    return prior._model
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:

@@ -31,6 +31,7 @@ from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
+    full_rotations,
     nearest_calibrated,
     reference_camera,
     reprojection_error,
@@ -53,11 +54,13 @@ from isa_nrsfm._gauge import (
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames
+from isa_nrsfm._joint.prior import LEAST_NOISE, ShapePrior
 from isa_nrsfm._joint.problem import FactorisedTable, JointState
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
     depth_certainty,
+    depth_errors,
     fitted_frames,
     frame_certainty,
     n_reliable,
@@ -78,18 +81,22 @@ from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm._tables.tracks import of_all_rows, seen_points
 
+# Residual of a table over that of a prior from which the points are other ones:
+# docs/benchmarks/README.md, "Thresholds".
+FOREIGN = 5.0
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
 # Stages that report steps.
 STEPWISE = JOINT_STAGE, CONSENSUS_STAGE
 
 
-def stages_of(refinement: str | None) -> list[str]:
+def stages_of(refinement: str | None, prior: bool = False) -> list[str]:
     """Return the names of the stages of a fit, in order."""
     stages = ["table", "factorisation"]
-    stages += ["independent subspaces", "block structure and refinement"]
+    if not prior:
+        stages += ["independent subspaces", "block structure and refinement"]
     if refinement in JOINT_REFINEMENTS:
         stages.append(JOINT_STAGE)
     if refinement == "consensus":
@@ -104,7 +111,7 @@ def ready_table(
     """Return a table centred, scaled and checked for fits of at most K basis shapes."""
     return scaled_table(
         source,
-        n_components,
+        n_components if s.prior is None else None,
         layout=s.layout,
         names=s.names,
         scale_frames=s.scale_frames,
@@ -141,8 +148,14 @@ def fit_table(
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
-    given = None
-    if start is None:
+    given = prior = None
+    if settings.prior is not None:
+        isa = None
+        given, prior, gauge = prior_start(table, settings)
+        shapes = given.shapes
+        if start is not None:
+            given = _started(table, start, n_components)
+    elif start is None:
         isa = clone(isa)
         shapes, covariance, n_iter, converged = _paper_result(
             factorised.factors, n_components, isa, settings, progress
@@ -153,9 +166,11 @@ def fit_table(
     # 5. Refinement, gauge and frames
     if settings.joint:
         settings = settings._replace(on_step=progress.step)
-        fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
+        fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given, prior)
         (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
-        gauge = FrameMap.identity(n_components)
+        prior = fit.prior
+        if prior is None:
+            gauge = FrameMap.identity(n_components)
         model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
         progress(JOINT_STAGE)
         attributes = {
@@ -166,7 +181,7 @@ def fit_table(
         }
         if errors and camera != "affine":
             certainty = depth_certainty(
-                model, table.rows, table.weights, settings.limits
+                model, table.rows, table.weights, settings.limits, prior
             )
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
@@ -177,9 +192,11 @@ def fit_table(
                 model = consensus(model, table.rows, settings, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
+        fitted, frames, measures = _joint_frames(table, model, tracks, settings, prior)
+        if prior is not None:
+            attributes["prior_std_"] = np.array(prior.widths)
         if errors and camera != "affine":
-            attributes["depth_uncertainty_"] = model.certainty.total
-        fitted, frames, measures = _joint_frames(table, model, tracks, settings)
+            attributes["depth_uncertainty_"] = fitted.frames.certainty.total
         converged = fit.converged
         # Down-weighted outliers, for example, look like basis shapes at first.
         supported = max(n_reliable(measures["reliability_"]), 1)
@@ -195,7 +212,7 @@ def fit_table(
         attributes = {"n_iter_": n_iter}
     # The mirror image in depth
     probability = np.nan
-    if settings.hidden_points and not table.complete:
+    if prior is None and settings.hidden_points and not table.complete:
         probability = fitted.mirror_certainty(table.rows, frames)
     if probability < 0.5:
         probability = 1.0 - probability
@@ -257,6 +274,8 @@ def _factorised(
     shape = 2 * len(table.sizes), n_points
     triplets = block_triplets(completed, shape, n_triplets, limits.dense)
     values, vectors, rest = triplets
+    # With a prior there may be few frames.
+    values = np.pad(values, (0, n_triplets - len(values)))
     if settings.joint:
         rigid, first = vectors[:3], limits.sample
         W, parts = sample_frames(completed, n_points, rigid, first, limits.small_table)
@@ -284,6 +303,31 @@ def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointS
         rows = rows - fit.translation[:, :, None]
         shapes = extended_shapes(rows, shapes, fit.motion, fit.alpha, n_more)
     return JointState(shapes, np.empty((0, 2, 3)), noise)
+
+
+def prior_start(
+    table: ScaledTable, settings: FitSettings
+) -> tuple[JointState, ShapePrior, FrameMap]:
+    """Return a start from the shapes of a fitted model, the prior, and its gauge."""
+    model = settings.prior
+    frames = model.frames
+    n_frames = table.rows.n_frames
+    rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
+    fit = replace(frames, camera="weak_perspective").posterior(rows, False)
+    excess = np.nanmedian(frames.excess(fit, seen_points(rows).sum(axis=1)))
+    if excess > FOREIGN**2:
+        raise ValueError(
+            f"the points of the table lie {np.sqrt(excess):.2g} times as far from the "
+            "shapes of the prior as those of its own table: they are other points, or "
+            "in another order. Check the columns, or leave out the prior"
+        )
+    gauge, shapes = frames.gauge, frames.shapes
+    if settings.camera == "orthographic":
+        shapes = np.nanmedian(full_rotations(fit.motion)[1]) * shapes
+        gauge = gauge._replace(space=table.unit / model.unit * gauge.space)
+    noise = max(frames.noise_variance, LEAST_NOISE)
+    start = JointState(shapes, np.empty((0, 2, 3)), noise)
+    return start, ShapePrior.of_model(shapes, gauge, settings.adapt), gauge
 
 
 def _paper_result(
@@ -345,7 +389,11 @@ def _paper_frames(
 
 
 def _joint_frames(
-    table: ScaledTable, model: PosteriorFrames, tracks: JointFrames, s: FitSettings
+    table: ScaledTable,
+    model: PosteriorFrames,
+    tracks: JointFrames,
+    s: FitSettings,
+    prior: ShapePrior | None,
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of a joint fit in the independent gauge."""
     fits = fitted_frames(model, tracks, table.rows)
@@ -360,14 +408,23 @@ def _joint_frames(
         )
     # Gauge of shapes, cameras and coefficients
     unit = table.unit if s.camera == "orthographic" else None
-    mean_shape, basis, frame_map = independent_gauge(
-        model.shapes, motion, alpha, s.independence, s.camera, unit
-    )
+    if prior is None:
+        mean_shape, basis, gauge = independent_gauge(
+            model.shapes, motion, alpha, s.independence, s.camera, unit
+        )
+    else:
+        gauge = model.gauge
+        mean_shape, basis = gauge.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
-    certainty = frame_certainty(model, fits, table.n_seen, weight)
-    model = replace(model, gauge=frame_map, certainty=certainty)
-    share = weight / table.n_points
-    uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
+    share, slices = weight / table.n_points, posteriors.slices
+    uncertainty = shape_uncertainty(
+        motion, alpha, covariance, share, slices, model.noise_variance, prior
+    )
+    certainty = frame_certainty(model, fits, table.n_seen, weight, prior)
+    if prior is not None:
+        square = model.noise_variance * uncertainty
+        certainty = certainty.of_prior(*depth_errors(model, motion, alpha, square))
+    model = replace(model, gauge=gauge, certainty=certainty)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
     parts, *chance = zip(
         *posteriors.map(last_pass, table.sizes, table.n_seen, weight), strict=True

@@ -81,6 +81,13 @@ class DepthCertainty(NamedTuple):
         total = float(np.sqrt(points.sum() / depths.sum()))
         return self._replace(total=total, points=points, leverage=1.0)
 
+    def of_prior(self, error: float, depth: float) -> "DepthCertainty":
+        """Return that of a prior, with mean squares of its errors and of the depths."""
+        if self.points is None:
+            return self
+        total = float(np.hypot(self.total, np.sqrt(error / depth)))
+        return self._replace(total=total, points=self.points + error)
+
     def variances(self, alpha: NDArray) -> NDArray:
         """Return variances of depths (n, n_points) of frames of size one."""
         points = np.zeros(1) if self.points is None else self.points
@@ -144,6 +151,12 @@ class FrameMap(NamedTuple):
     def identity(cls, n_components: int) -> "FrameMap":
         """Return the identity map."""
         return cls(np.eye(n_components + 1), np.eye(3))
+
+    def public(self, shapes: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the mean shape (J, 3) and basis (K, J, 3) of shapes (K + 1, 3, J)."""
+        mixed = np.tensordot(np.linalg.pinv(self.mixing.T), shapes, 1)
+        mean_shape, *basis = mixed.mT @ self.space.T
+        return mean_shape, np.reshape(basis, (-1, *mean_shape.shape))
 
     @property
     def rotation(self) -> NDArray:
@@ -434,10 +447,16 @@ class PosteriorFrames:
             variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
         variances += self.certainty.variances(fit.alpha)
         # Frames that the model explains less well than those of the fit
-        squares = fit.objective - self.noise_variance * np.vecdot(fit.alpha, fit.alpha)
-        excess = squares / weights.sum(axis=1) / self.certainty.residual
-        excess = np.fmax(excess, 1.0)
+        excess = np.fmax(self.excess(fit, weights.sum(axis=1)), 1.0)
         return sizes[:, None] * np.sqrt(variances * excess[:, None])
+
+    def excess(self, fit: FramePosterior, weight: NDArray) -> NDArray:
+        """Return mean squared residuals (n,) of frames over that of the fitted ones.
+
+        They are NaN for models of older versions. weight (n,): sums over points.
+        """
+        squares = fit.objective - self.noise_variance * np.vecdot(fit.alpha, fit.alpha)
+        return squares / weight / self.certainty.residual
 
     def posterior(
         self, rows: NDArray, covariances: bool = True, weights: NDArray | None = None

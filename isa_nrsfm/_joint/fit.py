@@ -39,6 +39,7 @@ from isa_nrsfm._joint.problem import (
     JointState,
     regular,
 )
+from isa_nrsfm._joint.prior import LEAST_NOISE, ROUNDS, ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import (
     FIXED_STEPS,
@@ -58,15 +59,17 @@ def fit_jointly(
     paper_shapes: NDArray,
     settings: FitSettings,
     start: JointState | None = None,
+    prior: ShapePrior | None = None,
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
     The shapes and the noise of a given start replace the paper's shapes (K + 1, 3, J).
+    With a prior there is no judgement.
     Returns the fit, the fitted frames, and alpha (n_chosen, K) of the sample. Shapes
     are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
     of freedom.
     """
-    problems, seen = _problems(table, paper_shapes, settings)
+    problems, seen = _problems(table, paper_shapes, settings, prior)
     first, sampled = problems[0], len(problems) > 1
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is None:
@@ -74,9 +77,15 @@ def fit_jointly(
     else:
         shapes = first.frames.coordinates(start.shapes)
         start = first.aligned(start._replace(shapes=shapes), first.cameras)
-        fit = first.unreversed(start, first.cameras)
+        least: Any = {} if prior is None else {"least_noise": LEAST_NOISE}
+        fit = first.unreversed(start, first.cameras, **least)
     ratio = fit.camera_noise_ratio
-    fit, least_noise, sufficient = judged(first, table, fit, start)
+    if prior is None:
+        fit, least_noise, sufficient = judged(first, table, fit, start)
+    else:
+        fit, prior = widened(first, fit)
+        problems = [replace(problem, prior=prior) for problem in problems]
+        least_noise, sufficient = LEAST_NOISE, False
     if sufficient:
         problems = [replace(problem, penalty=0.0) for problem in problems]
         if not sampled:  # for a sufficient model a smaller tolerance is safe
@@ -103,9 +112,10 @@ def fit_jointly(
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
     if sampled:
         state = state._replace(motion=state.motion[table.parts[0]])
-    noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose)
+    unknowns = None if prior is None else prior.n_determined
+    noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose, unknowns)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
-    fit = fit._replace(state=end, camera_noise_ratio=ratio)
+    fit = fit._replace(state=end, camera_noise_ratio=ratio, prior=prior)
     return fit, problem.frames, first.likelihood(*state).alpha
 
 
@@ -162,7 +172,10 @@ def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
 
 
 def _problems(
-    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings
+    table: FactorisedTable,
+    paper_shapes: NDArray,
+    settings: FitSettings,
+    prior: ShapePrior | None = None,
 ) -> tuple[list[JointProblem], JointFrames | None]:
     """Return the problems of growing samples and of all frames.
 
@@ -172,7 +185,7 @@ def _problems(
     """
     n_shapes, _, n_points = paper_shapes.shape
     limits, seen = settings.limits, None
-    if n_points > max(24 * n_shapes, limits.many_points):
+    if prior is None and n_points > max(24 * n_shapes, limits.many_points):
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         frames = JointFrames.from_directions(table.completed, directions)
@@ -182,8 +195,8 @@ def _problems(
     else:
         frames = _visible_frames(table)
     thorough = frames.n_frames <= limits.few_frames
-    penalty = frames.basis_penalty(limits.basis_std)
-    problem = JointProblem(frames, settings, thorough, penalty)
+    penalty = 0.0 if prior else frames.basis_penalty(limits.basis_std)
+    problem = JointProblem(frames, settings, thorough, penalty, prior)
     # Each parameter that fits noise only lowers -2 log L by about one. Steps on a
     # sample end when they gain less than 3 % of the number of shape parameters.
     chance = 0.03 * frames.coordinates(paper_shapes).size
@@ -291,19 +304,34 @@ def unregularised(problem: JointProblem, state: JointState) -> JointFit:
 
 
 def _freedom_correction(
-    n_seen: NDArray, shape: tuple[int, int, int], n_pose: int
+    n_seen: NDArray, shape: tuple[int, int, int], n_pose: int, unknowns: float | None
 ) -> float:
     """Return the number of seen coordinates N over the residual's degrees of freedom.
 
     Each frame has n_pose unknowns; coefficients are integrated out. The n centred
     shapes have ``3 n (J - 1)`` unknowns, less the ``n^2 + 8`` of the gauge: the mixing
     and the affinity of space, which share one scale. At least ``N / 10`` degrees are
-    assumed.
+    assumed. With a prior the unknowns of the shapes are given.
     """
     n_shapes, _, n_points = shape
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
-    unknowns = n_pose * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
-    return float(n_numbers / max(n_numbers - unknowns, 0.1 * n_numbers))
+    if unknowns is None:
+        unknowns = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
+    freedom = n_numbers - n_pose * n_frames - unknowns
+    return float(n_numbers / max(freedom, 0.1 * n_numbers))
+
+
+def widened(problem: JointProblem, fit: JointFit) -> tuple[JointFit, ShapePrior]:
+    """Return the fit with the widths of the prior that follow from the table."""
+    prior = problem.prior
+    assert prior is not None
+    for _ in range(ROUNDS):
+        shapes, _, noise = fit.state
+        curvature = problem.likelihood(*fit.state).shape_curvature
+        prior = prior.updated(shapes, prior.covariance(curvature, noise))
+        problem = replace(problem, prior=prior)
+        fit = problem.unreversed(fit.state, problem.cameras, least_noise=LEAST_NOISE)
+    return fit, prior
 
 
 def reweighted(

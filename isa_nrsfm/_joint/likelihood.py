@@ -45,6 +45,7 @@ from isa_nrsfm._frames.point_sums import (
     frame_tracks,
     joined_frames,
 )
+from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._linalg.small_matrices import (
     diagonal_of,
     energies,
@@ -198,11 +199,13 @@ class MarginalLikelihood(NamedTuple):
 
     penalty: factor of ``sum_i tr H_i``, or one (K,) for each diagonal entry.
     extent_weight: weight of the prior of the extents, for each coordinate.
+    prior: that of the shapes, by a fitted model.
     """
 
     frames: JointFrames
     penalty: NDArray | float = 0.0
     extent_weight: float = 0.0
+    prior: ShapePrior | None = None
 
     def __call__(
         self, shapes: NDArray, motion: NDArray, noise: float
@@ -241,6 +244,9 @@ class MarginalLikelihood(NamedTuple):
             # zero.
             seen = curvature.any(axis=(1, 2))
             shape_gradient = shape_gradient + weight * np.where(seen, slope, 0.0)
+        if self.prior is not None:
+            term, slope = self.prior.term(shapes)
+            value, shape_gradient = value + term, shape_gradient + slope
         return LikelihoodTerms(
             float(value),
             float(noise_gradient + n_seen),

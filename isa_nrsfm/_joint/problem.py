@@ -21,6 +21,7 @@ from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 from isa_nrsfm._linalg.small_matrices import centred, frames_first, frames_last
@@ -104,7 +105,7 @@ class JointFit(NamedTuple):
     misfit: the maximum of the noise variance and the mean square residual at the
     posterior means of the coefficients. camera_noise_ratio: noise variance with
     calibrated cameras divided by that with affine ones, for the sample of
-    `fit_jointly`. NaN with given starts.
+    `fit_jointly`. NaN with given starts. prior: with the widths of the fit, if any.
     """
 
     state: JointState
@@ -113,6 +114,7 @@ class JointFit(NamedTuple):
     converged: bool
     misfit: float
     camera_noise_ratio: float = np.nan
+    prior: ShapePrior | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,17 +123,19 @@ class JointProblem:
 
     thorough: whether many starts are compared, as for small tables.
     penalty: factor of the prior of the basis shapes, or one (K,) for each.
+    prior: that of a fitted model, instead of the other priors.
     """
 
     frames: JointFrames
     settings: FitSettings
     thorough: bool = False
     penalty: NDArray | float = 0.0
+    prior: ShapePrior | None = None
 
     def part(self, chosen: NDArray, tol: float) -> "JointProblem":
         """Return the problem of a sample of the frames, with another tolerance."""
         frames, settings = self.frames.take(chosen), self.settings._replace(tol=tol)
-        return JointProblem(frames, settings, False, self.penalty)
+        return JointProblem(frames, settings, False, self.penalty, self.prior)
 
     @property
     def cameras(self) -> CameraModel:
@@ -147,7 +151,7 @@ class JointProblem:
     @cached_property
     def likelihood(self) -> MarginalLikelihood:
         """The objective."""
-        return MarginalLikelihood(self.frames, self.penalty)
+        return MarginalLikelihood(self.frames, self.penalty, prior=self.prior)
 
     def aligned(self, state: JointState, cameras: CameraModel) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes."""
@@ -165,14 +169,15 @@ class JointProblem:
     ) -> JointFit:
         """Refine a state jointly, within the limits of the settings or other ones."""
         cameras, settings = cameras or self.cameras, self.settings
-        extents = 0.0 if cameras.name == "affine" else EXTENT_WEIGHT
+        free = cameras.name == "affine" or self.prior is not None
+        extents = 0.0 if free else EXTENT_WEIGHT
         given = {
             "least_noise": settings.limits.least_noise,
             "max_iter": settings.max_iter,
             "tol": settings.tol * (0.1 if self.thorough else 1.0),
             "on_step": settings.on_step,
         }
-        likelihood = MarginalLikelihood(self.frames, self.penalty, extents)
+        likelihood = self.likelihood._replace(extent_weight=extents)
         return refine_joint(likelihood, state, cameras, **given | limits)
 
     def unreversed(
@@ -281,6 +286,7 @@ class _Iterate:
         state: JointState,
     ):
         self.cameras, self.floor, self.state = cameras, floor, state
+        self.prior = likelihood.prior
         passed = likelihood(*state)
         self.M, noise = frames_last(state.motion), state.noise
         self.n_seen = likelihood.frames.totals[0]
@@ -298,7 +304,11 @@ class _Iterate:
         """Inverses of the curvatures of the shapes and of the cameras."""
         by_shapes, by_cameras = self.curvature
         inverse = self.cameras.inverse_curvature(self.M, by_cameras)
-        return np.linalg.inv(regular(by_shapes)), inverse
+        if self.prior is None:
+            return np.linalg.inv(regular(by_shapes)), inverse
+        noise = self.state.noise
+        covariance = self.prior.covariance(by_shapes, noise)
+        return self.prior.of_shapes(covariance) / noise, inverse
 
     def precondition(self, vector: NDArray) -> NDArray:
         """Return a vector times the inverse of the approximate Hessian.

@@ -1,7 +1,7 @@
 """Settings of a fit: parameters of the estimator, and limits that steer it."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
@@ -70,6 +70,7 @@ class FitSettings(NamedTuple):
     """The parameters of `AffineNRSfM` of the same names, and limits.
 
     scale_frames: False with orthographic cameras. names: those of the columns, if any.
+    prior: the `TableModel` of the estimator, or None.
     silent_isa: whether a strategy that only starts the joint fit may end early.
     on_step: called before each step of the joint fit.
     """
@@ -86,6 +87,8 @@ class FitSettings(NamedTuple):
     tol: float = JOINT_TOL
     n_jobs: int | None = None
     names: NDArray | None = None
+    prior: Any = None
+    adapt: str = "mean"
     silent_isa: bool = True
     limits: Limits = LIMITS
     on_step: Callable[[], None] | None = None

@@ -40,6 +40,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointState, refine_joint
 from isa_nrsfm._joint.settings import LIMITS, Limits
 from isa_nrsfm._linalg.small_matrices import centred
@@ -117,23 +118,32 @@ def shape_uncertainty(
     covariance: NDArray,
     share: NDArray,
     slices: Sequence[slice],
+    noise: float = 1.0,
+    prior: ShapePrior | None = None,
 ) -> NDArray:
-    """Return the covariance of a point of the shapes for noise of variance one.
+    """Return the covariance of a point of the shapes over the noise variance.
 
     The inverse of ``sum_i share_i E_i (x) M_i^T M_i``, with the second moments E_i of
     (1, alpha) and the mean weight of the points of frame i, zero for missing ones. The
-    sum is over slices of frames.
+    sum is over slices of frames. A prior adds its precision.
     """
     seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
     information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
     for frames in slices:
         X = stacked_motion(motion[frames], alpha[frames])
         information += X.T @ (np.repeat(share[frames], 2)[:, None] * X)
+    if prior is not None:
+        covariance = prior.covariance(information[None], noise)
+        return np.asarray(prior.of_shapes(covariance)[0] / noise)
     return np.linalg.pinv(information, hermitian=True)
 
 
 def frame_certainty(
-    frames: PosteriorFrames, fits: Any, n_seen: NDArray, weight: NDArray
+    frames: PosteriorFrames,
+    fits: Any,
+    n_seen: NDArray,
+    weight: NDArray,
+    prior: ShapePrior | None,
 ) -> DepthCertainty:
     """Return the certainty with that of `fits`, the result of `fitted_frames`.
 
@@ -145,7 +155,9 @@ def frame_certainty(
     """
     *_, alpha, covariance, residual = fits
     certainty, mean = frames.certainty, float(leverages(alpha).mean())
-    unknowns, numbers = 3 * frames.shapes[:, 0].size, 2.0 * n_seen.sum()
+    unknowns, numbers = float(frames.shapes.size), 2.0 * n_seen.sum()
+    if prior is not None:
+        unknowns = prior.n_determined
     n_own = 2 + CAMERAS[frames.camera].n_parameters + np.trace(1 - covariance)
     left = max(numbers - len(alpha) * n_own, 0.1 * numbers)
     noise = frames.noise_variance
@@ -241,6 +253,7 @@ def depth_certainty(
     rows: FrameBlocks,
     weights: NDArray | None = None,
     limits: Limits = LIMITS,
+    prior: ShapePrior | None = None,
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
@@ -260,6 +273,7 @@ def depth_certainty(
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], fit.motion[known]
+    prior = None if prior is None else prior.of_points(points)
     tracks, camera = part[known], CAMERAS[frames.camera]
 
     def refit(
@@ -275,8 +289,11 @@ def depth_certainty(
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
-        penalty = part.basis_penalty(limits.basis_std)
-        likelihood = MarginalLikelihood(part, penalty, extents)
+        if prior is None:
+            penalty = part.basis_penalty(limits.basis_std)
+            likelihood = MarginalLikelihood(part, penalty, extents)
+        else:
+            likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         least = min(noise * n_numbers / energy, limits.least_noise)
         if start is None:
@@ -292,8 +309,10 @@ def depth_certainty(
 
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extents=EXTENT_WEIGHT)
-    *_, far_value = refit(every, far_state(whole, camera))
-    deformation = float(np.exp(-max(far_value - value, 0.0)))
+    deformation = 0.0
+    if prior is None:
+        *_, far_value = refit(every, far_state(whole, camera))
+        deformation = float(np.exp(-max(far_value - value, 0.0)))
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept in parts:
         _, turned, z, _ = refit(kept)
@@ -310,6 +329,21 @@ def depth_certainty(
         factor * turns,
         variances[nearest],
     )
+
+
+def depth_errors(
+    frames: PosteriorFrames, motion: NDArray, alpha: NDArray, covariance: NDArray
+) -> tuple[float, float]:
+    """Return mean squares of errors of depths, and of the depths, for a covariance.
+
+    It is that of a point of the shapes (3 (K + 1), 3 (K + 1)).
+    """
+    rotations, scales = full_rotations(motion)
+    sight = scales[:, None] * rotations[:, 2]
+    X = np.einsum("ik,ia->ika", np.insert(alpha, 0, 1.0, axis=1), sight)
+    X = X.reshape(len(alpha), -1)
+    z = X @ centred(frames.shapes).reshape(X.shape[1], -1)
+    return float(np.mean(np.vecdot(X @ covariance, X))), float(np.mean(z**2))
 
 
 def differences(

@@ -9,6 +9,8 @@ REFINEMENTS = ("joint", "consensus", "alternating")
 JOINT_REFINEMENTS = ("joint", "consensus")
 CALIBRATED_CAMERAS = ("weak_perspective", "orthographic")
 CAMERA_NAMES = ("affine", *CALIBRATED_CAMERAS, "perspective")
+# Shapes that move away from those of a prior: the mean shape, or all.
+ADAPTED = ("mean", "shapes")
 INDEPENDENCE = ("shapes", "coefficients")
 LOSSES = ("linear", "huber", "cauchy")
 # Sets of points in the files of OpenPose.

@@ -62,7 +62,7 @@ class ScaledTable(NamedTuple):
 
 def scaled_table(
     blocks: FrameBlocks,
-    n_components: int,
+    n_components: int | None,
     *,
     layout: Layout,
     names: NDArray | None,
@@ -73,10 +73,12 @@ def scaled_table(
 ) -> ScaledTable:
     """Check an opened table, centre and scale its frames, robustly if `robust`.
 
-    Weights (n_rows, J) are zero where points are missing, None where all are one.
+    Weights (n_rows, J) are zero where points are missing, None where all are one. With
+    n_components=None the table need not determine shapes.
     """
     n_points, dtype = blocks.empty.shape[2], blocks.empty.dtype
-    check_size(blocks.n_frames, n_points, n_components, camera)
+    if n_components is not None:
+        check_size(blocks.n_frames, n_points, n_components, camera)
     n_half, first, visible, largest, *rest = blocks.joined(
         partial(_examine, robust=robust)
     )
@@ -97,12 +99,14 @@ def scaled_table(
             f"(first: row {shown.argmin()}). They are left out of the fit, and their "
             "results are NaN"
         )
-        check_size(int(shown.sum()), n_points, n_components, camera)
+        if n_components is not None:
+            check_size(int(shown.sum()), n_points, n_components, camera)
         blocks = blocks.subset(shown)
         visible, largest, *rest = (part[shown] for part in (visible, largest, *rest))
         weights = None if weights is None else weights[shown]
-    check_points(visible, n_points, n_components, layout, names)
-    if weights is not None:
+    if n_components is not None:
+        check_points(visible, n_points, n_components, layout, names)
+    if weights is not None and n_components is not None:
         check_weights(weights, n_components, camera)
     warn_if_other_layout(blocks, n_points, layout, scale_frames)
     translation, size, n_seen, *_ = rest
