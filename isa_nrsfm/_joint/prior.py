@@ -1,14 +1,14 @@
 """A fitted model as the prior of the shapes of another table.
 
-The public shapes are a mean shape and a basis, rows of ``N B`` with the shapes B (K + 1,
-3, J) of the fit and a matrix N. Those of the table differ from those A of the model by
-``E = N (B - A)``, and -2 log L gets the term ::
+The public shapes, mean shape and basis, are N times the shapes B (K + 1, 3, J) of a fit.
+Those of the table differ by ``E = N (B - A)`` from those of the model, and -2 log L has
+the additional term ::
 
     sum_k ||E_k||^2 / v_k,
 
 with v_0 = tau^2 for the mean shape and v_k = rho^2 for the basis shapes. The widths tau
-and rho follow from the table (MacKay, "Bayesian interpolation", 1992): with the posterior
-covariance of E_k, the coefficients' moments held fixed, ::
+and rho follow from the table (MacKay, "Bayesian interpolation", 1992): with the
+posterior covariance of E_k, the coefficients' moments held fixed, ::
 
     g_k = 1 - tr(cov E_k) / (3J v_k),   tau^2 <- ||E_0||^2 / (3J g_0),
                                         rho^2 <- sum_k ||E_k||^2 / (3J sum_k g_k).
@@ -21,80 +21,119 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.models import FrameMap
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred
 
-# Widths of the first fit, in sizes of frames: the last ones do not depend on them.
-FIRST_WIDTHS = 0.05, 0.01
-# Rounds that estimate the widths. Floor of the noise variance, as a share of the mean
-# square: docs/benchmarks/README.md, "Thresholds".
-ROUNDS, LEAST_NOISE = 3, 5e-4
+# All of these: docs/benchmarks/README.md, "Thresholds".
+# Widths of the first fit, in sizes of frames, and rounds that estimate them.
+FIRST_WIDTHS, ROUNDS = (0.05, 0.01), 3
+# Floor of the noise variance, as a share of the mean square; share of the tolerance.
+LEAST_NOISE, TOL_SHARE = 5e-4, 0.01
+# How much more tables differ in the depth of their shapes than in x and y.
+DEPTHS = 2.0
 
 
 class ShapePrior(NamedTuple):
     """A normal prior of shapes.
 
-    shapes (K + 1, 3, J): A. changes (K + 1, n): columns of the inverse of N, for the n
-    public shapes that may differ: the mean shape, or all. widths: tau and rho.
-    n_determined: number of coordinates of the shapes that the table determines.
+    shapes (K + 1, 3, J): A. gauge: maps frames to the public shapes. fixed: whether the
+    basis is that of the model, with rho = 0. depth_error: variance of the depths of
+    each public shape of the model. widths: tau and rho. n_determined: number of
+    coordinates of the shapes that the table determines.
     """
 
     shapes: NDArray
-    changes: NDArray
+    gauge: FrameMap
+    fixed: bool
+    depth_error: float
     widths: tuple[float, float] = FIRST_WIDTHS
     n_determined: float = 0.0
 
     @classmethod
-    def of_model(cls, shapes: NDArray, gauge: FrameMap, adapt: str) -> "ShapePrior":
-        """Return the prior with a model's shapes, for a gauge of its frames."""
-        n_free = 1 if adapt == "mean" else len(shapes)
-        return cls(shapes, gauge.mixing.T[:, :n_free])
+    def of_model(
+        cls, frames: PosteriorFrames, scale: float, gauge: FrameMap, adapt: str
+    ) -> "ShapePrior":
+        """Return the prior with a model's shapes times a scale, for a gauge."""
+        certainty = frames.certainty
+        error = 0.0 if certainty.points is None else np.mean(certainty.points)
+        error *= scale**2 / (certainty.leverage or len(frames.shapes))
+        return cls(scale * frames.shapes, gauge, adapt == "mean", float(error))
+
+    @property
+    def changes(self) -> NDArray:
+        """Changes (K + 1, n) of the shapes for those of the n free public shapes."""
+        return self.gauge.mixing.T[:, : 1 if self.fixed else None]
 
     @property
     def variances(self) -> NDArray:
-        """Prior variances v of the public shapes (n,)."""
+        """Prior variances (n,) of the free public shapes."""
         mean_shape, basis = np.square(self.widths)
-        return np.r_[mean_shape, np.full(self.changes.shape[1] - 1, basis)]
-
-    @property
-    def precision(self) -> NDArray:
-        """The matrix Q (K + 1, K + 1) of the term ``sum_kl Q_kl <D_k, D_l>``, D = B - A."""
-        public = np.linalg.pinv(self.changes)
-        return public.T @ (public / self.variances[:, None])
+        n_free = self.changes.shape[1]
+        variances = np.r_[mean_shape, np.full(n_free - 1, basis)]
+        return np.maximum(variances, OF_DISTANCES**2)
 
     def of_points(self, kept: NDArray) -> "ShapePrior":
         """Return the prior of some of the points."""
         return self._replace(shapes=centred(self.shapes[:, :, kept]))
 
+    def differences(self, shapes: NDArray) -> NDArray:
+        """Return E (n, 3, J)."""
+        return np.tensordot(np.linalg.pinv(self.changes), shapes - self.shapes, 1)
+
     def term(self, shapes: NDArray) -> tuple[float, NDArray]:
         """Return the term of -2 log L, and its derivative by the shapes."""
-        change = shapes - self.shapes
-        pulled = np.tensordot(self.precision, change, 1)
-        return float(np.vdot(change, pulled)), 2.0 * pulled
+        E = self.differences(shapes)
+        pulled = E / self.variances[:, None, None]
+        slope = np.tensordot(np.linalg.pinv(self.changes).T, pulled, 1)
+        return float(np.vdot(E, pulled)), 2.0 * slope
 
     def covariance(self, curvature: NDArray, noise: float) -> NDArray:
-        """Return the covariance of E (m, 3n, 3n), for curvatures of B without prior."""
-        each_axis = np.kron(self.changes, np.eye(3))
-        information = each_axis.T @ curvature @ each_axis / noise
-        prior = np.kron(np.diag(1.0 / self.variances), np.eye(3))
-        return np.asarray(np.linalg.inv(information + prior))
+        """Return the covariance of E (m, 3n, 3n), for curvatures without prior."""
+        along = np.kron(self.changes, np.eye(3))
+        prior = np.repeat(1.0 / self.variances, 3)
+        return np.linalg.inv(along.T @ curvature @ along / noise + np.diag(prior))
 
-    def of_shapes(self, covariance: NDArray) -> NDArray:
-        """Return the covariance of B (m, 3(K + 1), 3(K + 1)) for that of E."""
-        each_axis = np.kron(self.changes, np.eye(3))
-        return np.asarray(each_axis @ covariance @ each_axis.T)
+    def inverse(self, curvature: NDArray, noise: float) -> NDArray:
+        """Return inverses of curvatures (m, 3 (K + 1), 3 (K + 1)) with the prior."""
+        along = np.kron(self.changes, np.eye(3))
+        return along @ self.covariance(curvature, noise) @ along.T / noise
 
-    def updated(self, shapes: NDArray, covariance: NDArray) -> "ShapePrior":
+    def updated(
+        self, shapes: NDArray, curvature: NDArray, noise: float
+    ) -> "ShapePrior":
         """Return the prior with the widths that follow from a fit."""
-        n_points = shapes.shape[2]
-        public = np.linalg.pinv(self.changes)
-        squares = np.sum(np.tensordot(public, shapes - self.shapes, 1) ** 2, axis=(1, 2))
-        n_free = len(squares)
-        trace = np.einsum("mkaka->k", covariance.reshape(-1, n_free, 3, n_free, 3))
-        trace *= n_points / len(covariance)
-        numbers = 3 * n_points * (1.0 - trace / (3 * n_points * self.variances))
-        numbers = np.maximum(numbers, 1e-9)
-        tau = squares[0] / numbers[0]
-        rho = squares[1:].sum() / numbers[1:].sum() if n_free > 1 else 0.0
-        widths = float(np.sqrt(tau)), float(np.sqrt(rho))
-        return self._replace(widths=widths, n_determined=float(numbers.sum()))
+        n_free, n_points = len(self.variances), shapes.shape[2]
+        squares = np.sum(self.differences(shapes) ** 2, axis=(1, 2))
+        covariance = self.covariance(curvature, noise)
+        covariance = covariance.mean(axis=0).reshape(n_free, 3, n_free, 3)
+        trace = np.einsum("kaka->k", covariance)
+        numbers = n_points * np.maximum(3.0 - trace / self.variances, 1e-9)
+        tau = np.sqrt(squares[0] / numbers[0])
+        rho = 0.0 if self.fixed else np.sqrt(squares[1:].sum() / numbers[1:].sum())
+        widths, n_determined = (float(tau), float(rho)), float(numbers.sum())
+        return self._replace(widths=widths, n_determined=n_determined)
+
+    def depth_errors(
+        self, information: NDArray, noise: float, sight: NDArray, alpha: NDArray
+    ) -> NDArray:
+        """Return error variances (I,) of depths of frames of size one.
+
+        Information (3 (K + 1), 3 (K + 1)) of a point of the shapes, for noise of
+        variance one; public lines of sight (I, 3), times the scales, and coefficients.
+        Depths of the model have errors, and differ more between tables than x and y do.
+        A fixed basis keeps the errors of the model.
+        """
+        free = np.arange(len(self.shapes)) < len(self.variances)
+        v = np.where(free, self.variances if free.all() else self.variances[0], 0.0)
+        variances = np.maximum(np.outer(v, [1.0, 1.0, DEPTHS**2]), OF_DISTANCES**2)
+        variances[:, 2] += self.depth_error
+        along = np.kron(self.gauge.mixing.T, self.gauge.rotation.T)
+        known = along.T @ information @ along / noise
+        if self.fixed:
+            known[3:] = known[:, 3:] = 0.0
+        covariance = np.linalg.inv(known + np.diag(1.0 / variances.ravel()))
+        c = np.insert(alpha, 0, 1.0, axis=1)
+        sight = np.cbrt(abs(np.linalg.det(self.gauge.space))) * sight
+        X = (c[:, :, None] * sight[:, None]).reshape(len(c), -1)
+        return np.vecdot(X @ covariance, X)

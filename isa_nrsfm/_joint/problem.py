@@ -306,9 +306,7 @@ class _Iterate:
         inverse = self.cameras.inverse_curvature(self.M, by_cameras)
         if self.prior is None:
             return np.linalg.inv(regular(by_shapes)), inverse
-        noise = self.state.noise
-        covariance = self.prior.covariance(by_shapes, noise)
-        return self.prior.of_shapes(covariance) / noise, inverse
+        return self.prior.inverse(by_shapes, self.state.noise), inverse
 
     def precondition(self, vector: NDArray) -> NDArray:
         """Return a vector times the inverse of the approximate Hessian.

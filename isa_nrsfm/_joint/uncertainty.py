@@ -112,30 +112,25 @@ def fitted_frames(
     return posteriors, motion, alpha, total, residual
 
 
-def shape_uncertainty(
+def shape_information(
     motion: NDArray,
     alpha: NDArray,
     covariance: NDArray,
     share: NDArray,
     slices: Sequence[slice],
-    noise: float = 1.0,
-    prior: ShapePrior | None = None,
 ) -> NDArray:
-    """Return the covariance of a point of the shapes over the noise variance.
+    """Return the information on a point of the shapes for noise of variance one.
 
-    The inverse of ``sum_i share_i E_i (x) M_i^T M_i``, with the second moments E_i of
-    (1, alpha) and the mean weight of the points of frame i, zero for missing ones. The
-    sum is over slices of frames. A prior adds its precision.
+    It is ``sum_i share_i E_i (x) M_i^T M_i``, with the second moments E_i of (1, alpha)
+    and the mean weight of the points of frame i, zero for missing ones. The sum is over
+    slices of frames.
     """
     seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
     information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
     for frames in slices:
         X = stacked_motion(motion[frames], alpha[frames])
         information += X.T @ (np.repeat(share[frames], 2)[:, None] * X)
-    if prior is not None:
-        covariance = prior.covariance(information[None], noise)
-        return np.asarray(prior.of_shapes(covariance)[0] / noise)
-    return np.linalg.pinv(information, hermitian=True)
+    return information
 
 
 def frame_certainty(
@@ -310,7 +305,7 @@ def depth_certainty(
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extents=EXTENT_WEIGHT)
     deformation = 0.0
-    if prior is None:
+    if prior is None:  # which does not let depths grow
         *_, far_value = refit(every, far_state(whole, camera))
         deformation = float(np.exp(-max(far_value - value, 0.0)))
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
@@ -329,21 +324,6 @@ def depth_certainty(
         factor * turns,
         variances[nearest],
     )
-
-
-def depth_errors(
-    frames: PosteriorFrames, motion: NDArray, alpha: NDArray, covariance: NDArray
-) -> tuple[float, float]:
-    """Return mean squares of errors of depths, and of the depths, for a covariance.
-
-    It is that of a point of the shapes (3 (K + 1), 3 (K + 1)).
-    """
-    rotations, scales = full_rotations(motion)
-    sight = scales[:, None] * rotations[:, 2]
-    X = np.einsum("ik,ia->ika", np.insert(alpha, 0, 1.0, axis=1), sight)
-    X = X.reshape(len(alpha), -1)
-    z = X @ centred(frames.shapes).reshape(X.shape[1], -1)
-    return float(np.mean(np.vecdot(X @ covariance, X))), float(np.mean(z**2))
 
 
 def differences(
