@@ -54,6 +54,7 @@ from isa_nrsfm._parameters.choices import (
 )
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (
+    FEWEST_COMPARED,
     check_camera,
     check_frames_kept,
     check_table,
@@ -61,7 +62,7 @@ from isa_nrsfm._prepare.checks import (
     validated_table,
 )
 from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.sources import (
     CHECKS,
     StoredTable,
@@ -79,6 +80,9 @@ from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa import PooledFastICA
 
+# Misfit of frames that the noise and other people do not reach: docs/depth.md, "Other
+# tables".
+LARGEST_MISFIT = 1.3
 _NEEDS_CALIBRATED = (
     "needs a model with calibrated cameras; got camera='affine'. Fit with "
     "camera='weak_perspective' or camera='orthographic'"
@@ -1195,9 +1199,36 @@ default="affine"
         )
         for share in self._focal_shares(table):
             table = zoomed_table(table, share, self.principal_point)
-        if point_weight is None:
-            return table, ()
-        return weighted_rows(table, point_weight)
+        weights: tuple[NDArray, ...] = ()
+        if point_weight is not None:
+            table, weights = weighted_rows(table, point_weight)
+        if not reset and joint and not is_on_dask(X):
+            warn_if_foreign(self, table, *weights)
+        return table, weights
+
+
+def warn_if_foreign(
+    model: AffineNRSfM, table: FrameBlocks, weights: NDArray | None = None
+) -> None:
+    """Warn if frames lie farther from the shapes of a model than its noise explains."""
+    if table.n_frames < FEWEST_COMPARED:
+        return
+    some = spread(np.arange(table.n_frames), min(table.n_frames, 100))
+    weights = None if weights is None else weights[some]
+    misfit = model._model.misfit(table.take(some), weights)
+    if misfit > LARGEST_MISFIT:
+        way = "Fit X by itself"
+        if model.camera_ != "affine":
+            way = (
+                "Adapt the model to X: AffineNRSfM(n_components='auto', camera="
+                f"{model.camera_!r}, prior=model).fit(X)"
+            )
+        warn_caller(
+            f"the points of X lie {misfit:.2g} times as far from the shapes of the "
+            "model as its noise explains: they come from another annotator or tracker, "
+            "or move as the fitted table does not show. Shapes, depths and "
+            f"coefficients may be wrong. {way}"
+        )
 
 
 def checked_prior(model: AffineNRSfM) -> TableModel | None:

@@ -83,9 +83,9 @@ from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import of_all_rows, seen_points
 
-# Residual of a table over that of a prior from which the points are other ones:
-# docs/benchmarks/README.md, "Thresholds".
-FOREIGN = 5.0
+# Distance of points from the shapes of a prior, in sizes of frames and beyond its noise,
+# from which they are other points: docs/benchmarks/README.md, "Thresholds".
+FOREIGN = 0.15
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
 # Stages that report steps.
@@ -314,12 +314,12 @@ def prior_start(
     n_frames = table.rows.n_frames
     rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
     fit = replace(frames, camera="weak_perspective").posterior(rows, False)
-    excess = np.nanmedian(frames.excess(fit, seen_points(rows).sum(axis=1)))
-    if excess > FOREIGN**2:
+    square = np.nanmedian(frames.squares(fit, seen_points(rows).sum(axis=1)))
+    if square > FOREIGN**2 + 2.0 * frames.noise_variance:
         raise ValueError(
-            f"the points of the table lie {np.sqrt(excess):.2g} times as far from the "
-            "shapes of the prior as those of its own table: they are other points, or "
-            "in another order. Check the columns, or leave out the prior"
+            "the table does not show the points of the prior: they lie "
+            f"{np.sqrt(square):.0%} of the size of the object from its shapes. Check "
+            "whether the columns have the same points in the same order"
         )
     gauge, scale = frames.gauge, 1.0
     if settings.camera == "orthographic":

@@ -32,6 +32,8 @@ from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 # Level of the two-sided test by which missing points decide on the mirror image: false
 # decisions are in docs/depth.md, "The mirror image".
 MIRROR_LEVEL = 0.01
+# Least distance of points from the fit, in sizes of frames, of `TableModel.misfit`.
+LEAST_MISFIT = 0.005
 # Depths and fit of a perspective frame agree if a repeat changes depths by less than
 # this share: docs/benchmarks/README.md, "Thresholds".
 SETTLED, MOST_REPEATS = 1e-3, 30
@@ -177,6 +179,21 @@ class TableModel(NamedTuple):
         unit = centred / sizes[:, None, None]
         whole.put(usable, self.frames.posterior(unit, weights=weights))
         return whole
+
+    def misfit(self, rows: NDArray, weights: NDArray | None = None) -> float:
+        """Return the median distance of points from the fit, in deviations of the noise.
+
+        Distances that are tiny for the size of a frame count as noise.
+        """
+        assert isinstance(self.frames, PosteriorFrames)
+        fit = self.posterior(rows, weights)
+        weight = (seen_points(rows) if weights is None else weights).sum(axis=1)
+        known = np.isfinite(fit.objective)
+        if not known.any():
+            return 0.0
+        square = np.median(self.frames.squares(fit, weight)[known])
+        noise = max(2.0 * self.frames.noise_variance, LEAST_MISFIT**2)
+        return float(np.sqrt(square / noise))
 
     def linearised(
         self, rows: NDArray, weights: NDArray | None = None

@@ -447,16 +447,14 @@ class PosteriorFrames:
             variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
         variances += self.certainty.variances(fit.alpha)
         # Frames that the model explains less well than those of the fit
-        excess = np.fmax(self.excess(fit, weights.sum(axis=1)), 1.0)
+        excess = self.squares(fit, weights.sum(axis=1)) / self.certainty.residual
+        excess = np.fmax(excess, 1.0)
         return sizes[:, None] * np.sqrt(variances * excess[:, None])
 
-    def excess(self, fit: FramePosterior, weight: NDArray) -> NDArray:
-        """Return mean squared residuals (n,) of frames over that of the fitted ones.
-
-        They are NaN for models of older versions. weight (n,): sums over points.
-        """
-        squares = fit.objective - self.noise_variance * np.vecdot(fit.alpha, fit.alpha)
-        return squares / weight / self.certainty.residual
+    def squares(self, fit: FramePosterior, weight: NDArray) -> NDArray:
+        """Return mean squared residuals (n,) of points; weight (n,): of all points."""
+        prior = self.noise_variance * np.vecdot(fit.alpha, fit.alpha)
+        return np.asarray((fit.objective - prior) / weight)
 
     def posterior(
         self, rows: NDArray, covariances: bool = True, weights: NDArray | None = None
