@@ -29,7 +29,7 @@ from isa_nrsfm._linalg.small_matrices import centred
 # Widths of the first fit, in sizes of frames, and rounds that estimate them.
 FIRST_WIDTHS, ROUNDS = (0.05, 0.01), 3
 # Floor of the noise variance, as a share of the mean square; share of the tolerance.
-LEAST_NOISE, TOL_SHARE = 5e-4, 0.01
+LEAST_NOISE, TOL_SHARE = 5e-4, 0.1
 # How much more tables differ in the depth of their shapes than in x and y.
 DEPTHS = 2.0
 
