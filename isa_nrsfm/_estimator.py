@@ -33,7 +33,6 @@ from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import (
     STEPWISE,
     fit_table,
-    ready_table,
     stages_of,
     supported_components,
 )
@@ -42,15 +41,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._parameters.choices import (
-    BLOCK_RECOVERIES,
-    CALIBRATED_CAMERAS,
-    CAMERA_NAMES,
-    INDEPENDENCE,
-    JOINT_REFINEMENTS,
-    LOSSES,
-    REFINEMENTS,
-)
+from isa_nrsfm._parameters import choices
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (
     check_camera,
@@ -59,7 +50,7 @@ from isa_nrsfm._prepare.checks import (
     checked,
     validated_table,
 )
-from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
+from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
     CHECKS,
@@ -387,13 +378,13 @@ default="affine"
             StrOptions({"auto"}),
         ],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
-        "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
-        "refinement": [StrOptions(set(REFINEMENTS)), None],
-        "camera": [StrOptions(set(CAMERA_NAMES))],
+        "block_recovery": [StrOptions(set(choices.BLOCK_RECOVERIES))],
+        "refinement": [StrOptions(set(choices.REFINEMENTS)), None],
+        "camera": [StrOptions(set(choices.CAMERA_NAMES))],
         "focal_length": [None, Interval(Real, 0, None, closed="neither"), "array-like"],
         "principal_point": [None, "array-like"],
-        "independence": [StrOptions(set(INDEPENDENCE)), None],
-        "loss": [StrOptions(set(LOSSES))],
+        "independence": [StrOptions(set(choices.INDEPENDENCE)), None],
+        "loss": [StrOptions(set(choices.LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],
         "scale_frames": ["boolean"],
         "hidden_points": ["boolean"],
@@ -556,9 +547,9 @@ default="affine"
         else:
             if auto:
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
-                    table = ready_table(source, weights, 1, settings)
+                    table = scaled_table(source, weights, 1, settings)
                 n_components, most = supported_components(table, isa, settings)
-            table = ready_table(source, weights, n_components, settings)
+            table = scaled_table(source, weights, n_components, settings)
             fit = fit_table(
                 table, n_components, isa, settings, progress, start, auto, errors
             )
@@ -609,12 +600,12 @@ default="affine"
 
         Returns the table, the weights of its points and the settings.
         """
-        joint = self.refinement in JOINT_REFINEMENTS
+        joint = self.refinement in choices.JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
             only_joint = {
                 "n_components": ["auto"],
-                "loss": [*LOSSES[1:]],
+                "loss": [*choices.LOSSES[1:]],
                 "independence": ["coefficients"],
             }
             for name, values in only_joint.items():
@@ -918,10 +909,11 @@ default="affine"
         their cameras.
         """
         check_is_fitted(self)
-        own = ("perspective",) * (self.camera_ == "perspective")
-        if camera not in (None, *CALIBRATED_CAMERAS, *own):
+        known = (None, self.camera_, *choices.CALIBRATED_CAMERAS)
+        if camera == "affine" or camera not in known:
             raise ValueError(
-                f"camera must be None or one of {CALIBRATED_CAMERAS}; got {camera!r}"
+                f"camera must be None or one of {choices.CALIBRATED_CAMERAS}; got "
+                f"{camera!r}"
             )
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
         if decomposed and point_weight is not None:
@@ -1150,7 +1142,7 @@ default="affine"
         table must match the fit: parameters that are set after it have no effect.
         """
         layout, loss = self.layout, self.loss
-        joint = self.refinement in JOINT_REFINEMENTS
+        joint = self.refinement in choices.JOINT_REFINEMENTS
         if not reset:
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames

@@ -76,8 +76,8 @@ from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
-from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
+from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import of_all_rows
 
 JOINT_STAGE = "joint refinement"
@@ -95,23 +95,6 @@ def stages_of(refinement: str | None) -> list[str]:
     if refinement == "consensus":
         stages.append(CONSENSUS_STAGE)
     return [*stages, "gauge and coefficients"]
-
-
-@one_blas_thread
-def ready_table(
-    source: FrameBlocks, weights: NDArray | None, n_components: int, s: FitSettings
-) -> ScaledTable:
-    """Return a table centred, scaled and checked for fits of at most K basis shapes."""
-    return scaled_table(
-        source,
-        n_components,
-        layout=s.layout,
-        names=s.names,
-        scale_frames=s.scale_frames,
-        robust=s.loss != "linear",
-        camera=s.camera if s.joint else None,
-        weights=weights,
-    )
 
 
 @one_blas_thread

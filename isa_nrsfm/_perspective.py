@@ -6,9 +6,9 @@ images determine depths up to their sign, so both mirror images are continued.
 
 Let E be the mean squared distance of points from their images, in sizes of frames. As a
 function of g = 1/f it is least for the focal length f. g = 0 is the weak-perspective
-fit, and -g the mirror image of the fit for g. Minima of parabolas through the three
-best fits lead to an unknown f. Without one of several groups of points the minimum
-moves, which gives its deviation (jackknife).
+fit, and -g the mirror image of the fit for g. For an unknown f, steps up and down lead
+to the best fit: f is the minimum of the parabola through the best three. Without one of
+several groups of points it moves, which gives its deviation (jackknife).
 """
 
 import warnings
@@ -27,7 +27,6 @@ from isa_nrsfm._fit import (
     fit_table,
     mean_camera,
     mirror_image,
-    ready_table,
     supported_components,
 )
 from isa_nrsfm._fitted_model import TableModel
@@ -37,7 +36,7 @@ from isa_nrsfm._frames.pinhole import Pinhole, common
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
-from isa_nrsfm._prepare.scaling import ScaledTable
+from isa_nrsfm._prepare.scaling import ScaledTable, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import centred_frames
 
@@ -50,8 +49,9 @@ WORSE = 1.3
 # Focal lengths of the weak-perspective fit and of the first perspective one, in largest
 # distances from the principal point, and how much longer the next one is if that fails.
 ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
-# The search ends if the minimum is that near to a fit, as a share of 1/f.
-NEAR, MOST_FITS = 0.01, 10
+# Factors of the steps of the search for the minimum, from the best fit up and down; its
+# error, as a share of 1/f; and the largest number of fits.
+STEPS, NEAR, MOST_FITS = (1.5, 1.1), 0.01, 16
 
 UNSTEADY = (
     "the fit of perspective has not settled: depths and fit do not agree. The focal "
@@ -154,8 +154,7 @@ class PerspectiveTable(NamedTuple):
         models = [model for model, _ in fits]
         function = partial(_straight, pinhole=pinhole, models=models)
         rows = self.source.derive(function, *by_frame)
-        rows.empty = self.source.empty
-        return ready_table(rows, self.weights, n_components, self.settings)
+        return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
         self,
@@ -245,14 +244,13 @@ class PerspectiveTable(NamedTuple):
         fits = {0.0: far, **self.images(first, f)}
         if far.energy < fits[1.0 / f].energy:  # a long focal length, or none
             fits |= self.images(far, LONGER * f)
-        while len(fits) < MOST_FITS and (lowest := best_of(fits)) > 0:
-            place = np.clip(minimum(fits)[0], 0.5 * lowest, 1.5 * lowest)
-            if min(abs(g - place) for g in fits) < NEAR * place:
-                # A parabola through distant fits is biased.
-                if sum(abs(g / lowest - 1.0) < 0.15 for g in fits) > 1:
+        for step in STEPS:
+            while len(fits) < MOST_FITS and (lowest := best_of(fits)) > 0:
+                places = lowest * step, lowest / step
+                new = [p for p in places if min(abs(g / p - 1) for g in fits) > NEAR]
+                if not new:
                     break
-                place = 0.9 * lowest
-            fits[place] = self.near(fits, place)
+                fits[new[0]] = self.near(fits, new[0])
         return fits
 
     def _reach(self, rows: NDArray) -> float:

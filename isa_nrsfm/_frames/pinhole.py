@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._prepare.robust import spatial_median
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables.tracks import centred_frames
 
 
 class Pinhole(NamedTuple):
@@ -50,13 +50,11 @@ class Pinhole(NamedTuple):
         Their axes go through the middles of the points.
         """
         rows = rows.astype(np.float64, copy=False)
-        shown = seen_points(rows).any(axis=1)
-        middle = np.full((len(rows), 2, 1), np.nan)
+        middle = centred_frames(rows)[1].translation
         if self.robust:
-            middle[shown, :, 0] = spatial_median(rows[shown])
-        else:
-            middle[shown] = np.nanmean(rows[shown], axis=2, keepdims=True)
-        turns = turns_to(self.rays(middle)[..., 0])
+            shown = np.isfinite(middle[:, 0])
+            middle[shown] = spatial_median(rows[shown])
+        turns = turns_to(self.rays(middle[..., None])[..., 0])
         q = turns @ self.rays(rows)
         return self.focal_length * q[:, :2] / q[:, 2:], turns
 
@@ -114,13 +112,11 @@ class Pinhole(NamedTuple):
 
 def turns_to(rays: NDArray) -> NDArray:
     """Return the smallest rotations (n, 3, 3) of rays (n, 3) to the third axis."""
-    x, y, z = (rays / np.linalg.norm(rays, axis=1)[:, None]).T
-    share = 1.0 / (1.0 + z)
-    H = np.empty((len(rays), 3, 3))
-    H[:, 0] = np.stack([1.0 - share * x * x, -share * x * y, -x], axis=1)
-    H[:, 1] = np.stack([-share * x * y, 1.0 - share * y * y, -y], axis=1)
-    H[:, 2] = np.stack([x, y, z], axis=1)
-    return H
+    axis = np.eye(3)[2]
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    sums = (rays + axis)[:, None]
+    H = np.eye(3) - sums.mT @ sums / (1.0 + rays[:, 2, None, None])
+    return H + 2.0 * axis[:, None] * rays[:, None]
 
 
 def line_of_sight(motion: NDArray) -> NDArray:
@@ -159,6 +155,4 @@ def zoomed(rows: NDArray, share: NDArray, centre: NDArray) -> NDArray:
 def zoomed_table(table: FrameBlocks, shares: NDArray, centre: Any) -> FrameBlocks:
     """Return the rows (n, 2, J) that cameras with the mean focal length would show."""
     middle = np.reshape(centre, (2, 1))
-    rows = table.derive(lambda r, share: zoomed(r, share[..., None], middle), shares)
-    rows.empty = table.empty
-    return rows
+    return table.derive(lambda r, share: zoomed(r, share[..., None], middle), shares)

@@ -25,6 +25,7 @@ from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._gauge import canonical_rotation
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
@@ -117,14 +118,14 @@ class ShapeSequenceNRSfM(
             column names that contradict `layout`.
         """
         X = self._checked(X, reset=True)
-        table = scaled_table(
-            open_table(X, self.layout),
-            self.n_components,
+        settings = FitSettings(
+            refinement=None,
             layout=self.layout,
             names=getattr(self, "feature_names_in_", None),
             scale_frames=self.scale_frames,
-            robust=False,
         )
+        rows = open_table(X, self.layout)
+        table = scaled_table(rows, None, self.n_components, settings)
         W = table.rows.whole().reshape(2 * len(X), -1).astype(np.float64)
 
         cameras, shapes = self._factorise(W)
