@@ -53,9 +53,7 @@ from isa_nrsfm._prepare.checks import (
 from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
-    CHECKS,
     StoredTable,
-    checked_range,
     column_sample,
     is_on_dask,
     is_read_later,
@@ -1153,9 +1151,7 @@ default="affine"
             check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
         else:
-            least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-            X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
-            checked_range(X)
+            X = validated_table(self, X, layout, reset)
         names = getattr(self, "feature_names_in_", None)
         n_jobs, memory = self.n_jobs, self.working_memory
         table = open_table(

@@ -16,7 +16,6 @@ Stages 1, 5 and 6 use all frames, the other stages those of the sample. No funct
 has an estimator: `AffineNRSfM.fit` sets the attributes that `fit_table` returns.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -25,7 +24,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
@@ -127,7 +125,7 @@ def fit_table(
     given = None
     if start is None:
         isa = clone(isa)
-        shapes, covariance, n_iter, converged = _paper_result(
+        shapes, covariance, n_iter, converged = run_paper_pipeline(
             factorised.factors, n_components, isa, settings, progress
         )
     else:
@@ -208,7 +206,7 @@ def supported_components(
     quiet = NoProgress()
     factorised = _factorised(table, most, settings, quiet)
     factors = factorised.factors
-    shapes, *_ = _paper_result(factors, most, clone(isa), settings, quiet)
+    shapes, *_ = run_paper_pipeline(factors, most, clone(isa), settings, quiet)
     supported = count_components(factorised, shapes, settings)
     # Down-weighted outliers look like basis shapes of the joint fit of a consensus.
     if consensus and settings.loss != "linear":
@@ -267,32 +265,6 @@ def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointS
         rows = rows - fit.translation[:, :, None]
         shapes = extended_shapes(rows, shapes, fit.motion, fit.alpha, n_more)
     return JointState(shapes, np.empty((0, 2, 3)), noise)
-
-
-def _paper_result(
-    factors: Factorisation,
-    n_components: int,
-    isa: Any,
-    settings: FitSettings,
-    report: Callable[[str], None],
-) -> tuple[NDArray, NDArray, int, bool]:
-    """Return the result of the paper's pipeline, and fit its strategy."""
-    max_iter, tol = settings.max_iter if settings.refinement else 0, settings.tol
-    with warnings.catch_warnings():
-        if settings.joint:  # it only starts from this result
-            max_iter, tol = 200, 1e-5
-            if settings.silent_isa:
-                message = "PooledFastICA did not"
-                warnings.filterwarnings("ignore", message, ConvergenceWarning)
-        return run_paper_pipeline(
-            factors,
-            n_components,
-            isa,
-            block_recovery=settings.block_recovery,
-            max_iter=max_iter,
-            tol=tol,
-            report=report,
-        )
 
 
 def _paper_frames(

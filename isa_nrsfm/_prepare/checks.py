@@ -13,7 +13,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.sources import CHECKS, checked_range, unmasked
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     LAYOUTS,
@@ -61,15 +61,17 @@ def check_table(X: Any, layout: Layout) -> None:
         )
 
 
-def validated_table(estimator: Any, X: Any, layout: Layout, **options: Any) -> NDArray:
+def validated_table(estimator: Any, X: Any, layout: Layout, reset: bool) -> NDArray:
     """Return a table as an array of numbers, checked by scikit-learn and by name."""
     check_table(X, layout)
+    least = dict.fromkeys(("ensure_min_samples", "ensure_min_features"), 1 + reset)
     try:
-        return np.asarray(validate_data(estimator, unmasked(X), **options))
+        X = validate_data(estimator, unmasked(X), reset=reset, **least, **CHECKS)
     except ValueError as error:
         if "could not convert" in str(error):
             raise ValueError(f"X has texts: {error}. {ONLY_POINTS}") from error
         raise
+    return checked_range(np.asarray(X))
 
 
 def check_names(names: Sequence[Hashable], layout: Layout) -> None:

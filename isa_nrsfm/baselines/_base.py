@@ -29,7 +29,7 @@ from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.sources import CHECKS, checked_range, open_table
+from isa_nrsfm._tables.sources import open_table
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
@@ -261,17 +261,7 @@ class ShapeSequenceNRSfM(
 
     def _checked(self, X: Any, reset: bool) -> NDArray:
         """Return a valid table without missing points."""
-        fewest = 2 if reset else 1
-        X = validated_table(
-            self,
-            X,
-            self.layout,
-            **CHECKS,
-            ensure_min_samples=fewest,
-            ensure_min_features=fewest,
-            reset=reset,
-        )
-        checked_range(X)
+        X = validated_table(self, X, self.layout, reset)
         rows = np.flatnonzero(np.isnan(X).any(axis=1))
         if len(rows):
             raise ValueError(
