@@ -34,7 +34,7 @@ from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 MIRROR_LEVEL = 0.01
 # Depths and fit of a perspective frame agree if a repeat changes depths by less than
 # this share: docs/benchmarks/README.md, "Thresholds".
-SETTLED, MOST_REPEATS = 1e-3, 30
+FRAME_SETTLED, MOST_FRAME_REPEATS = 1e-3, 30
 
 
 class TableModel(NamedTuple):
@@ -96,7 +96,7 @@ class TableModel(NamedTuple):
         assert isinstance(self.frames, PosteriorFrames)
         weak = self._replace(frames=self.frames.without_starts, pinhole=None)
         moving = np.arange(len(rows))
-        for _ in range(MOST_REPEATS if pinhole.near else 0):
+        for _ in range(MOST_FRAME_REPEATS if pinhole.near else 0):
             moving = padded(moving) if len(rows) > 1 else moving
             own = None if weights is None else weights[moving]
             fit = weak.decompose(straight[moving], own, deviations=False)
@@ -104,7 +104,7 @@ class TableModel(NamedTuple):
             depths[moving] = self.depths(fit.motion, fit.alpha)
             straight[moving] = pinhole.straight(images[moving], depths[moving])
             change = np.square(depths[moving] - before).sum(axis=1)
-            large = change > SETTLED**2 * np.square(depths[moving]).sum(axis=1)
+            large = change > FRAME_SETTLED**2 * np.square(depths[moving]).sum(axis=1)
             moving = np.unique(moving[large])
             if not len(moving):
                 break
