@@ -802,7 +802,9 @@ default="affine"
         camera, limits = CAMERAS[frames.camera], (max_gap, max_iter, tol)
         dtype = table.empty.dtype
         result = smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
-        in_table = self._model.in_table_cameras(table, result.decomposition)
+        if self._model.pinhole is None:
+            return result
+        in_table = table.joined(self._model.in_table_cameras, *result.decomposition)
         return result._replace(decomposition=in_table)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
@@ -1049,8 +1051,6 @@ default="affine"
         motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
         translation = checked("translation", translation, (n_frames, 2), (2,))
         shapes = compose(self.mean_shape_, self.basis_, alpha)
-        motion = np.broadcast_to(motion, (n_frames, 2, 3))
-        translation = np.broadcast_to(translation, (n_frames, 2))
         images = self._model.images(shapes, motion, translation)
         return tracks_to_table(images, self._model.layout)
 

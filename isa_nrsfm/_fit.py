@@ -284,15 +284,12 @@ def _paper_frames(
         return TableModel(frames, mean_shape, basis, s.layout, table.unit)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
+    def frames_for(mean_shape: NDArray, basis: NDArray) -> Any:
+        decompose = partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
+        return table.source.joined(decompose)
+
     mean_shape, basis, order, frames = rigid_gauge(
-        shapes[0].T,
-        shapes[1:].mT,
-        table.sizes,
-        lambda mean_shape, basis: table.source.joined(
-            partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
-        ),
-        camera=s.camera,
-        dtype=table.dtype,
+        shapes[0].T, shapes[1:].mT, table.sizes, frames_for, s.camera, table.dtype
     )
     covariance = reorder_blocks(covariance, order)
     attributes = {"mode_covariance_": (table.unit or 1.0) ** 2 * covariance}
@@ -355,19 +352,15 @@ def _measures(
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
     reference = mean_camera(frames, table.sizes, settings.camera)
+    position = (frames.translation - table.translation) / table.sizes[:, None]
+    fit = np.concatenate([mean_shape[None], basis]).mT, cameras, position, frames.alpha
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
         "rank_floor_": factorised.rest_share,
         "singular_values_": (table.unit or 1.0) * factorised.singular_values,
         "energy_share_": energy / (energy.sum() or 1.0),
-        "inverse_snr_": reprojection_error(
-            table.rows,
-            np.concatenate([mean_shape[None], basis]).mT,
-            cameras,
-            (frames.translation - table.translation) / table.sizes[:, None],
-            frames.alpha,
-        ),
+        "inverse_snr_": reprojection_error(table.rows, *fit),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 

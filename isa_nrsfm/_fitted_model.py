@@ -65,33 +65,36 @@ class TableModel(NamedTuple):
         Weights (n, n_points) are zero where points are missing, by default one.
         """
         dtype = rows.dtype if dtype is None else dtype
-        fit, turns = self.in_virtual_cameras(rows, weights, deviations)
-        if self.pinhole is not None:
-            real = self.pinhole.real(fit.motion, fit.translation, turns)
-            fit = fit._replace(motion=real[0], translation=real[1])
+        fit = self.in_virtual_cameras(rows, weights, deviations)
+        fit = self.in_table_cameras(rows, *fit)
         return Decomposition(*(part.astype(dtype) for part in fit))
 
     def in_virtual_cameras(
         self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
-    ) -> tuple[Decomposition, NDArray]:
-        """Return fits of weak-perspective images, and rotations of their cameras."""
-        rows, turns = self.straightened(rows, weights)
+    ) -> Decomposition:
+        """Return fits of weak-perspective images."""
+        rows = self.straightened(rows, weights)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
-        return Decomposition(*(of_all_rows(part, usable) for part in fit)), turns
+        return Decomposition(*(of_all_rows(part, usable) for part in fit))
 
-    def straightened(
-        self, rows: NDArray, weights: NDArray | None = None
-    ) -> tuple[NDArray, NDArray]:
-        """Return weak-perspective images, and the rotations of virtual cameras.
+    def in_table_cameras(self, rows: NDArray, *fit: NDArray) -> Decomposition:
+        """Return fits of rows in virtual cameras with the cameras of the table."""
+        motion, translation, *rest = fit
+        if self.pinhole is not None:
+            motion, translation = self.pinhole.real(rows, motion, translation)
+        return Decomposition(motion, translation, *rest)
+
+    def straightened(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
+        """Return weak-perspective images.
 
         Depths and fits of a frame are repeated until they agree.
         """
         pinhole = self.pinhole
         if pinhole is None:
-            return rows, np.empty(len(rows))
-        images, turns = pinhole.virtual(rows)
+            return rows
+        images = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
         assert isinstance(self.frames, PosteriorFrames)
         weak = self._replace(frames=self.frames.without_starts, pinhole=None)
@@ -108,7 +111,7 @@ class TableModel(NamedTuple):
             moving = np.unique(moving[large])
             if not len(moving):
                 break
-        return straight, turns
+        return straight
 
     def depths(self, motion: NDArray, alpha: NDArray) -> NDArray:
         """Return the depths (n, J) of points, in units of the table."""
@@ -165,7 +168,7 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None
     ) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
-        rows, _ = self.straightened(rows, weights)
+        rows = self.straightened(rows, weights)
         assert isinstance(self.frames, PosteriorFrames)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
         whole = FramePosterior.unknown(len(rows), len(self.basis))
@@ -177,7 +180,7 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None
     ) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
-        rows, _ = self.straightened(rows, weights)
+        rows = self.straightened(rows, weights)
         assert isinstance(self.frames, PosteriorFrames)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.linearised(centred, sizes, weights)
@@ -218,7 +221,7 @@ class TableModel(NamedTuple):
         """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
         assert isinstance(self.frames, PosteriorFrames)
         dtype = rows.dtype
-        rows, _ = self.straightened(rows, weights)
+        rows = self.straightened(rows, weights)
         weak = self._replace(pinhole=None)
         fit = weak.decompose(rows, weights, deviations=False, dtype=dtype)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
@@ -243,14 +246,6 @@ class TableModel(NamedTuple):
         if self.pinhole is None:
             return project(shapes, motion, translation)
         return self.pinhole.projected(shapes, motion, translation)
-
-    def in_table_cameras(self, rows: FrameBlocks, fit: Decomposition) -> Decomposition:
-        """Return a fit of rows in virtual cameras with the cameras of the table."""
-        if self.pinhole is None:
-            return fit
-        _, turns = rows.joined(self.pinhole.virtual)
-        real = self.pinhole.real(fit.motion, fit.translation, turns)
-        return fit._replace(motion=real[0], translation=real[1])
 
     def distances(self, rows: NDArray, *fitted: NDArray) -> NDArray:
         """Return lengths of residuals (n, n_points), in sizes of their frames.

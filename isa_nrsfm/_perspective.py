@@ -30,7 +30,6 @@ from isa_nrsfm._fit import (
     supported_components,
 )
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import Pinhole, common
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
@@ -38,7 +37,6 @@ from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
 from isa_nrsfm._prepare.scaling import ScaledTable, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import centred_frames
 
 # Effects of the next two lines: docs/benchmarks/README.md, "Thresholds".
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
@@ -187,8 +185,7 @@ class PerspectiveTable(NamedTuple):
                 changes=(*before.changes, abs(change)),
                 earlier=((before.model, before.frames), *before.earlier)[:3],
             )
-        function = partial(_squares, model=fit.model)
-        squares = self.source.map(function, *fit.frames[:3])
+        squares = self.source.map(partial(_squares, model=fit.model), *fit.frames)
         square, counts = np.sum(list(squares), axis=0)
         return fit._replace(energies=square / counts.sum())
 
@@ -225,7 +222,7 @@ class PerspectiveTable(NamedTuple):
 
     def started(self, model: TableModel, n_components: Any) -> PerspectiveFit:
         """Return the fit from the model of a similar table, with its focal length."""
-        frames = self.source.joined(lambda rows: model.in_virtual_cameras(rows)[0])
+        frames = self.source.joined(model.in_virtual_cameras)
         fit = PerspectiveFit(model, frames, True, {"isa_": None})
         return self.settled(fit.pinhole, n_components, fit)[0]
 
@@ -397,7 +394,7 @@ def _straight(
     Cameras and coefficients of the frames follow each other, for one model each. Each
     model has half of the weight of the one before it. Without models depths are equal.
     """
-    images, _ = pinhole.virtual(rows)
+    images = pinhole.virtual(rows)
     if not models:
         return images
     fits = zip(models, by_frame[::2], by_frame[1::2], strict=True)
@@ -406,23 +403,9 @@ def _straight(
     return pinhole.straight(images, np.average(depths, axis=0, weights=weights))
 
 
-def _squares(
-    rows: NDArray,
-    motion: NDArray,
-    translation: NDArray,
-    alpha: NDArray,
-    model: TableModel,
-) -> NDArray:
+def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
-    pinhole = model.pinhole
-    assert pinhole is not None
-    images, _ = pinhole.virtual(rows)
-    shapes = compose(model.mean_shape, model.basis, alpha)
-    flat = project(shapes, motion, translation).swapaxes(1, 2)
-    modelled = pinhole.images(flat, model.depths(motion, alpha))
-    square = np.sum((modelled - images) ** 2, axis=1)
-    size = centred_frames(images)[1].size
-    square /= np.where(size > 0, size, np.nan)[:, None] ** 2
-    if pinhole.robust and isinstance(model.frames, PosteriorFrames):
+    square = model.distances(rows, *model.in_table_cameras(rows, *fit)) ** 2
+    if isinstance(model.frames, PosteriorFrames) and model.frames.loss != "linear":
         square = robust_square(square, model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

@@ -44,8 +44,8 @@ class Pinhole(NamedTuple):
         """The principal point (2, 1)."""
         return np.reshape(self.principal_point, (2, 1))
 
-    def virtual(self, rows: NDArray) -> tuple[NDArray, NDArray]:
-        """Return images (n, 2, J) of virtual cameras, and their rotations H (n, 3, 3).
+    def turns(self, rows: NDArray) -> NDArray:
+        """Return rotations H (n, 3, 3) of virtual cameras.
 
         Their axes go through the middles of the points.
         """
@@ -54,9 +54,12 @@ class Pinhole(NamedTuple):
         if self.robust:
             shown = np.isfinite(middle[:, 0])
             middle[shown] = spatial_median(rows[shown])
-        turns = turns_to(self.rays(middle[..., None])[..., 0])
-        q = turns @ self.rays(rows)
-        return self.focal_length * q[:, :2] / q[:, 2:], turns
+        return turns_to(self.rays(middle[..., None])[..., 0])
+
+    def virtual(self, rows: NDArray) -> NDArray:
+        """Return images (n, 2, J) of virtual cameras."""
+        q = self.turns(rows) @ self.rays(rows)
+        return self.focal_length * q[:, :2] / q[:, 2:]
 
     def rays(self, rows: NDArray) -> NDArray:
         """Return the rays (n, 3, J) of image points, with third coordinate one."""
@@ -66,12 +69,6 @@ class Pinhole(NamedTuple):
     def straight(self, images: NDArray, depths: NDArray) -> NDArray:
         """Return weak-perspective images (n, 2, J), for depths (n, J)."""
         return images * (1.0 + depths / self.focal_length)[:, None]
-
-    def images(self, straight: NDArray, depths: NDArray) -> NDArray:
-        """Return perspective images, the inverse of `straight`."""
-        if not self.near:
-            return straight
-        return straight / (1.0 + depths / self.focal_length)[:, None]
 
     def projected(
         self, shapes: NDArray, motion: NDArray, translation: NDArray
@@ -91,10 +88,10 @@ class Pinhole(NamedTuple):
         return self.focal_length * X[..., :2] / X[..., 2:] + self.centre[:, 0]
 
     def real(
-        self, motion: NDArray, translation: NDArray, turns: NDArray
+        self, rows: NDArray, motion: NDArray, translation: NDArray
     ) -> tuple[NDArray, NDArray]:
         """Return cameras and translations of the real camera, from virtual ones."""
-        f = self.focal_length
+        f, turns = self.focal_length, self.turns(rows)
         R, scales = full_rotations(motion)
         place = np.column_stack([translation, np.full(len(translation), f)])
         place = (turns.mT @ place[..., None])[..., 0]  # s T

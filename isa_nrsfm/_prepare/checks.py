@@ -273,7 +273,7 @@ def _rigid_noise(rows: NDArray) -> float:
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
-    """Return values as a finite array of one of the allowed shapes, or raise."""
+    """Return values as a finite array of the first of the allowed shapes, or raise."""
     array = check_array(
         unmasked(values),
         dtype=[np.float64, np.float32],
@@ -284,7 +284,7 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
     if array.shape not in allowed:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
-    return array
+    return np.broadcast_to(array, allowed[0])
 
 
 def check_camera(model: Any) -> None:

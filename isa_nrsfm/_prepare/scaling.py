@@ -118,19 +118,11 @@ def scaled_table(
     single = dtype == np.float32 and n_points >= 200 and complete and not robust
     unit_rows = partial(_unit_rows, dtype=np.float32 if single else np.float64)
     spacing = np.finfo(dtype).eps * largest.astype(np.float64)
-    return ScaledTable(
-        shown,
-        blocks,
-        blocks.derive(unit_rows, translation, size),
-        size,
-        translation,
-        n_seen,
-        n_points,
-        None if scale_frames else float(size[0]),
-        float(np.sqrt(np.mean((spacing / size) ** 2))),
-        dtype,
-        weights,
-    )
+    precision = float(np.sqrt(np.mean((spacing / size) ** 2)))
+    unit = None if scale_frames else float(size[0])
+    rows = blocks.derive(unit_rows, translation, size)
+    frames = shown, blocks, rows, size, translation, n_seen
+    return ScaledTable(*frames, n_points, unit, precision, dtype, weights)
 
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
