@@ -941,14 +941,16 @@ default="affine"
         if camera is not None and fitted == "affine":
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
-        scaled = metric is not None and camera == "orthographic"
+        scaled, model = metric is not None and camera == "orthographic", self._model
         if decomposed:
-            return self._model.shapes(X, metric, scaled)
+            return model.shapes(X, metric, scaled)
         table, weights = self._opened(X, point_weight)
-        if return_std:
-            return table.collect(self._model.uncertain_shapes, *weights)
-        shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
-        return table.collect(shapes, *weights)
+
+        def shapes(rows: NDArray, weights: NDArray | None = None) -> NDArray:
+            fit = model.decompose(rows, weights, deviations=False)
+            return model.shapes(fit, metric, scaled)
+
+        return table.collect(model.uncertain_shapes if return_std else shapes, *weights)
 
     def mirrored(self) -> Self:
         """

@@ -14,7 +14,7 @@ from isa_nrsfm._frames.models import (
     PosteriorFrames,
     RigidFrames,
 )
-from isa_nrsfm._frames.pinhole import Pinhole, line_of_sight, zoomed
+from isa_nrsfm._frames.pinhole import Pinhole, zoomed
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
@@ -116,7 +116,8 @@ class TableModel(NamedTuple):
     def depths(self, motion: NDArray, alpha: NDArray) -> NDArray:
         """Return the depths (n, J) of points, in units of the table."""
         shapes = compose(self.mean_shape, self.basis, alpha)
-        return np.vecdot(shapes, line_of_sight(motion)[:, None])
+        R, scales = full_rotations(motion)
+        return np.vecdot(shapes, (scales[:, None] * R[:, 2])[:, None])
 
     def mirrored(self) -> "TableModel":
         """Return the model with shapes mirrored in depth."""
@@ -187,26 +188,14 @@ class TableModel(NamedTuple):
         fit = fit._replace(translation=fit.translation + translation)
         return LinearisedFrames(*(of_all_rows(part, usable) for part in fit))
 
-    def reconstruct(
-        self,
-        rows: NDArray,
-        weights: NDArray | None = None,
-        *,
-        metric: DeformationMetric | None,
-        scaled: bool,
+    def shapes(
+        self, fit: Decomposition, metric: DeformationMetric | None, scaled: bool
     ) -> NDArray:
-        """Return the shapes (n, n_points, 3) of frames.
+        """Return the shapes (n, n_points, 3) of frames that are fitted.
 
         A metric of space makes them Euclidean. `scaled` multiplies each by the scale of
         its camera, as orthographic cameras need.
         """
-        fit = self.decompose(rows, weights, deviations=False)
-        return self.shapes(fit, metric, scaled)
-
-    def shapes(
-        self, fit: Decomposition, metric: DeformationMetric | None, scaled: bool
-    ) -> NDArray:
-        """Return the shapes (n, n_points, 3) of frames that are fitted."""
         if metric is None:
             return compose(self.mean_shape, self.basis, fit.alpha)
         frames = euclidean_frames(

@@ -115,7 +115,7 @@ class PerspectiveFit(NamedTuple):
 
         It is negative if the mirror image is nearer.
         """
-        pairs = [(self.depths(part), other.depths(part)) for part in parts]
+        pairs = ((self.depths(part), other.depths(part)) for part in parts)
         sums = [
             [np.nansum(u * v) for u, v in ((z, z), (z, o), (o, o))] for z, o in pairs
         ]
@@ -338,8 +338,12 @@ def fit_perspective(
         total = float(np.hypot(certainty.total, error))
         certainty = certainty._replace(total=total)
         model = model._replace(frames=replace(model.frames, certainty=certainty))
-        least = max(g for g in fits if g < 0)
-        probability = better_than(fits[-least], fits[least])
+        # The mirror image has a larger E: a test over groups of points
+        least = min(abs(g) for g in fits if g < 0)
+        gain = fits[-least].energies - fits[least].energies
+        gain = np.bincount(neighbours(fits[least].model.mean_shape.T), gain)
+        t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
+        probability = float(stdtr(len(gain) - 1, t))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
     # Frames as new tables have them
     weights = () if table.weights is None else (table.weights,)
@@ -376,14 +380,6 @@ def focal_error(
     first, second = sorted((o for o in fits if o >= 0), key=lambda o: abs(o - g))[:2]
     change = abs(fits[first].change(fits[second], parts))
     return float(change * deviation / abs(second - first))
-
-
-def better_than(fit: PerspectiveFit, other: PerspectiveFit) -> float:
-    """Return the probability that E is less than that of another fit, by groups."""
-    groups = neighbours(fit.model.mean_shape.T)
-    gain = np.bincount(groups, other.energies - fit.energies)
-    deviation = gain.std(ddof=1) / np.sqrt(len(gain))
-    return float(stdtr(len(gain) - 1, gain.mean() / deviation))
 
 
 def _straight(

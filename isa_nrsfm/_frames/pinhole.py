@@ -116,12 +116,6 @@ def turns_to(rays: NDArray) -> NDArray:
     return H + 2.0 * axis[:, None] * rays[:, None]
 
 
-def line_of_sight(motion: NDArray) -> NDArray:
-    """Return ``s r_3`` (n, 3) of cameras (n, 2, 3): products with points are depths."""
-    R, scales = full_rotations(motion)
-    return scales[:, None] * R[:, 2]
-
-
 def common(focal_length: Any) -> float:
     """Return a focal length, or the geometric mean of several."""
     if not np.ndim(focal_length):
