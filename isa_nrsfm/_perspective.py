@@ -115,11 +115,9 @@ class PerspectiveFit(NamedTuple):
 
         It is negative if the mirror image is nearer.
         """
-        pairs = ((self.depths(part), other.depths(part)) for part in parts)
-        sums = [
-            [np.nansum(u * v) for u, v in ((z, z), (z, o), (o, o))] for z, o in pairs
-        ]
-        own, common, others = np.sum(sums, axis=0)
+        pairs = (np.nan_to_num([fit.depths(p) for fit in (self, other)]) for p in parts)
+        products = sum(np.einsum("aij,bij->ab", pair, pair) for pair in pairs)
+        (own, common), (_, others) = np.asarray(products)
         square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
         return float(np.copysign(np.sqrt(square), common))
 
@@ -181,10 +179,9 @@ class PerspectiveTable(NamedTuple):
             change = fit.change(before, self.source.slices)
             fit = fit.mirrored() if change < 0 else fit
             fit.attributes["isa_"] = fit.attributes["isa_"] or before.attributes["isa_"]
-            fit = fit._replace(
-                changes=(*before.changes, abs(change)),
-                earlier=((before.model, before.frames), *before.earlier)[:3],
-            )
+            changes = (*before.changes, abs(change))
+            earlier = ((before.model, before.frames), *before.earlier)[:3]
+            fit = fit._replace(changes=changes, earlier=earlier)
         squares = self.source.map(partial(_squares, model=fit.model), *fit.frames)
         square, counts = np.sum(list(squares), axis=0)
         return fit._replace(energies=square / counts.sum())

@@ -55,10 +55,8 @@ def check_table(X: Any, layout: Layout) -> None:
         )
     names = getattr(X, "columns", None)
     if names is not None:
-        check_names(
-            ["_".join(map(str, n)) if isinstance(n, tuple) else n for n in names],
-            layout,
-        )
+        names = ["_".join(map(str, n)) if isinstance(n, tuple) else n for n in names]
+        check_names(names, layout)
 
 
 def validated_table(estimator: Any, X: Any, layout: Layout, reset: bool) -> NDArray:
