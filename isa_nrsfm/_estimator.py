@@ -1044,8 +1044,7 @@ default="affine"
         check_is_fitted(self)
         alpha = unmasked(alpha)
         alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
-        if motion is None:
-            motion = self.reference_motion_
+        motion = self.reference_motion_ if motion is None else motion
         if translation is None:
             translation = self.reference_translation_
         n_frames, n_components = len(alpha), len(self.basis_)

@@ -82,8 +82,7 @@ class Pinhole(NamedTuple):
         turned = shapes @ R.mT
         if not self.near:
             sight = place / np.linalg.norm(place, axis=1, keepdims=True)
-            along = np.vecdot(turned, sight[:, None])
-            turned = turned - along[..., None] * sight[:, None]
+            turned = turned - turned @ (sight[..., None] * sight[:, None])
         X = turned + place[:, None]
         return self.focal_length * X[..., :2] / X[..., 2:] + self.centre[:, 0]
 
