@@ -30,12 +30,7 @@ from isa_nrsfm._compat.scikit_learn import (
     fit_context,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
-from isa_nrsfm._fit import (
-    STEPWISE,
-    fit_table,
-    stages_of,
-    supported_components,
-)
+from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames

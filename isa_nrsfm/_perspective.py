@@ -23,12 +23,7 @@ from scipy.special import stdtr
 
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._fit import (
-    fit_table,
-    mean_camera,
-    mirror_image,
-    supported_components,
-)
+from isa_nrsfm._fit import fit_table, mean_camera, mirror_image, supported_components
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import Pinhole, common
