@@ -33,7 +33,7 @@ from isa_nrsfm._prepare.robust import robust_square
 from isa_nrsfm._prepare.scaling import ScaledTable, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
 
-# Effects of the next two lines: docs/benchmarks/README.md, "Thresholds".
+# Effects of these constants: docs/benchmarks/README.md, "Thresholds".
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
 # tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
 SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
