@@ -30,43 +30,26 @@ from isa_nrsfm._compat.scikit_learn import (
     fit_context,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
-from isa_nrsfm._fit import (
-    STEPWISE,
-    fit_table,
-    ready_table,
-    stages_of,
-    supported_components,
-)
+from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._parameters.choices import (
-    ADAPTED,
-    BLOCK_RECOVERIES,
-    CALIBRATED_CAMERAS,
-    CAMERA_NAMES,
-    INDEPENDENCE,
-    JOINT_REFINEMENTS,
-    LOSSES,
-    REFINEMENTS,
-)
+from isa_nrsfm._other_tables import checked_prior, warn_if_foreign
+from isa_nrsfm._parameters import choices
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (
-    FEWEST_COMPARED,
     check_camera,
     check_frames_kept,
     check_table,
     checked,
     validated_table,
 )
-from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
-    CHECKS,
     StoredTable,
-    checked_range,
     column_sample,
     is_on_dask,
     is_read_later,
@@ -80,9 +63,6 @@ from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa import PooledFastICA
 
-# Misfit of frames that the noise and other people do not reach: docs/depth.md, "Other
-# tables".
-LARGEST_MISFIT = 1.3
 _NEEDS_CALIBRATED = (
     "needs a model with calibrated cameras; got camera='affine'. Fit with "
     "camera='weak_perspective' or camera='orthographic'"
@@ -392,15 +372,15 @@ default="affine"
             StrOptions({"auto"}),
         ],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
-        "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
-        "refinement": [StrOptions(set(REFINEMENTS)), None],
-        "camera": [StrOptions(set(CAMERA_NAMES))],
+        "block_recovery": [StrOptions(set(choices.BLOCK_RECOVERIES))],
+        "refinement": [StrOptions(set(choices.REFINEMENTS)), None],
+        "camera": [StrOptions(set(choices.CAMERA_NAMES))],
         "focal_length": [None, Interval(Real, 0, None, closed="neither"), "array-like"],
         "principal_point": [None, "array-like"],
         "prior": [None, HasMethods(["fit", "get_params"])],
-        "adapt": [StrOptions(set(ADAPTED))],
-        "independence": [StrOptions(set(INDEPENDENCE)), None],
-        "loss": [StrOptions(set(LOSSES))],
+        "adapt": [StrOptions(set(choices.ADAPTED))],
+        "independence": [StrOptions(set(choices.INDEPENDENCE)), None],
+        "loss": [StrOptions(set(choices.LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],
         "scale_frames": ["boolean"],
         "hidden_points": ["boolean"],
@@ -569,9 +549,9 @@ default="affine"
         else:
             if auto:
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
-                    table = ready_table(source, weights, 1, settings)
+                    table = scaled_table(source, weights, 1, settings)
                 n_components, most = supported_components(table, isa, settings)
-            table = ready_table(source, weights, n_components, settings)
+            table = scaled_table(source, weights, n_components, settings)
             fit = fit_table(
                 table, n_components, isa, settings, progress, start, auto, errors
             )
@@ -622,12 +602,12 @@ default="affine"
 
         Returns the table, the weights of its points and the settings.
         """
-        joint = self.refinement in JOINT_REFINEMENTS
+        joint = self.refinement in choices.JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
             only_joint = {
                 "n_components": ["auto"],
-                "loss": [*LOSSES[1:]],
+                "loss": [*choices.LOSSES[1:]],
                 "independence": ["coefficients"],
             }
             for name, values in only_joint.items():
@@ -841,7 +821,9 @@ default="affine"
         camera, limits = CAMERAS[frames.camera], (max_gap, max_iter, tol)
         dtype = table.empty.dtype
         result = smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
-        in_table = self._model.in_table_cameras(table, result.decomposition)
+        if self._model.pinhole is None:
+            return result
+        in_table = table.joined(self._model.in_table_cameras, *result.decomposition)
         return result._replace(decomposition=in_table)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
@@ -946,10 +928,11 @@ default="affine"
         their cameras.
         """
         check_is_fitted(self)
-        own = ("perspective",) * (self.camera_ == "perspective")
-        if camera not in (None, *CALIBRATED_CAMERAS, *own):
+        known = (None, self.camera_, *choices.CALIBRATED_CAMERAS)
+        if camera == "affine" or camera not in known:
             raise ValueError(
-                f"camera must be None or one of {CALIBRATED_CAMERAS}; got {camera!r}"
+                f"camera must be None or one of {choices.CALIBRATED_CAMERAS}; got "
+                f"{camera!r}"
             )
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
         if decomposed and point_weight is not None:
@@ -977,14 +960,16 @@ default="affine"
         if camera is not None and fitted == "affine":
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
-        scaled = metric is not None and camera == "orthographic"
+        scaled, model = metric is not None and camera == "orthographic", self._model
         if decomposed:
-            return self._model.shapes(X, metric, scaled)
+            return model.shapes(X, metric, scaled)
         table, weights = self._opened(X, point_weight)
-        if return_std:
-            return table.collect(self._model.uncertain_shapes, *weights)
-        shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
-        return table.collect(shapes, *weights)
+
+        def shapes(rows: NDArray, weights: NDArray | None = None) -> NDArray:
+            fit = model.decompose(rows, weights, deviations=False)
+            return model.shapes(fit, metric, scaled)
+
+        return table.collect(model.uncertain_shapes if return_std else shapes, *weights)
 
     def mirrored(self) -> Self:
         """
@@ -1078,8 +1063,7 @@ default="affine"
         check_is_fitted(self)
         alpha = unmasked(alpha)
         alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
-        if motion is None:
-            motion = self.reference_motion_
+        motion = self.reference_motion_ if motion is None else motion
         if translation is None:
             translation = self.reference_translation_
         n_frames, n_components = len(alpha), len(self.basis_)
@@ -1087,8 +1071,6 @@ default="affine"
         motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
         translation = checked("translation", translation, (n_frames, 2), (2,))
         shapes = compose(self.mean_shape_, self.basis_, alpha)
-        motion = np.broadcast_to(motion, (n_frames, 2, 3))
-        translation = np.broadcast_to(translation, (n_frames, 2))
         images = self._model.images(shapes, motion, translation)
         return tracks_to_table(images, self._model.layout)
 
@@ -1178,7 +1160,7 @@ default="affine"
         table must match the fit: parameters that are set after it have no effect.
         """
         layout, loss = self.layout, self.loss
-        joint = self.refinement in JOINT_REFINEMENTS
+        joint = self.refinement in choices.JOINT_REFINEMENTS
         if not reset:
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
@@ -1189,9 +1171,7 @@ default="affine"
             check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
         else:
-            least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-            X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
-            checked_range(X)
+            X = validated_table(self, X, layout, reset)
         names = getattr(self, "feature_names_in_", None)
         n_jobs, memory = self.n_jobs, self.working_memory
         table = open_table(
@@ -1203,69 +1183,8 @@ default="affine"
         if point_weight is not None:
             table, weights = weighted_rows(table, point_weight)
         if not reset and joint and not is_on_dask(X):
-            warn_if_foreign(self, table, *weights)
+            warn_if_foreign(self._model, table, *weights)
         return table, weights
-
-
-def warn_if_foreign(
-    model: AffineNRSfM, table: FrameBlocks, weights: NDArray | None = None
-) -> None:
-    """Warn if frames lie farther from the shapes of a model than its noise explains."""
-    if table.n_frames < FEWEST_COMPARED:
-        return
-    some = spread(np.arange(table.n_frames), min(table.n_frames, 100))
-    weights = None if weights is None else weights[some]
-    misfit = model._model.misfit(table.take(some), weights)
-    if misfit > LARGEST_MISFIT:
-        way = "Fit X by itself"
-        if model.camera_ != "affine":
-            way = (
-                "Adapt the model to X: AffineNRSfM(n_components='auto', camera="
-                f"{model.camera_!r}, prior=model).fit(X)"
-            )
-        warn_caller(
-            f"the points of X lie {misfit:.2g} times as far from the shapes of the "
-            "model as its noise explains: they come from another annotator or tracker, "
-            "or move as the fitted table does not show. Shapes, depths and "
-            f"coefficients may be wrong. {way}"
-        )
-
-
-def checked_prior(model: AffineNRSfM) -> TableModel | None:
-    """Return the fitted model that is the prior of an estimator, or raise."""
-    prior, n_components = model.prior, model.n_components
-    if prior is None:
-        return None
-    if model.refinement != "joint" or model.camera == "affine":
-        raise ValueError(
-            "prior needs calibrated cameras and the joint refinement; got camera="
-            f"{model.camera!r}, refinement={model.refinement!r}. Set camera="
-            "'weak_perspective', refinement='joint'"
-        )
-    prior = getattr(prior, "estimator", prior)  # of a FrozenEstimator
-    check_class(prior, "prior")
-    if not hasattr(prior, "_model"):
-        raise ValueError(
-            "prior must be fitted. A search over several priors clones them: give "
-            "them as sklearn.frozen.FrozenEstimator(prior)"
-        )
-    prior._jointly_fitted("prior", calibrated=True)
-    if False and not prior._model.frames.certainty.determined:
-        raise ValueError(
-            "the depth of the prior is not determined, as its diagnostics() say. Fit "
-            "the prior to a table in which the objects turn"
-        )
-    if (prior.camera_ == "orthographic") != (model.camera == "orthographic"):
-        raise ValueError(
-            f"the prior has camera={prior.camera_!r}; got camera={model.camera!r}. "
-            "Set the same"
-        )
-    if n_components not in ("auto", K := len(prior.basis_)):
-        raise ValueError(
-            f"n_components must be that of the prior, {K}, or 'auto'; got "
-            f"{n_components}"
-        )
-    return prior._model
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, compose, distances
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
+from isa_nrsfm._joint.prior import LEAST_NOISE, ROUNDS, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,
     FactorisedTable,
@@ -39,7 +40,6 @@ from isa_nrsfm._joint.problem import (
     JointState,
     regular,
 )
-from isa_nrsfm._joint.prior import LEAST_NOISE, ROUNDS, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import (
     FIXED_STEPS,

@@ -1,8 +1,8 @@
 """A fitted model as the prior of the shapes of another table.
 
-The public shapes, mean shape and basis, are N times the shapes B (K + 1, 3, J) of a fit.
-Those of the table differ by ``E = N (B - A)`` from those of the model, and -2 log L has
-the additional term ::
+The public shapes, mean shape and basis, are N times the shapes B (K + 1, 3, J) of a
+fit. Those of the table differ by ``E = N (B - A)`` from those of the model, and -2 log
+L has the additional term ::
 
     sum_k ||E_k||^2 / v_k,
 

@@ -1,0 +1,117 @@
+"""A fitted model and other tables: as their prior, and whether they fit it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm._joint.prior import LEAST_NOISE, ShapePrior
+from isa_nrsfm._joint.problem import JointState
+from isa_nrsfm._joint.settings import FitSettings
+from isa_nrsfm._prepare.checks import FEWEST_COMPARED
+from isa_nrsfm._prepare.scaling import ScaledTable
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._tables.tracks import seen_points
+
+# Distance of points from the shapes of a prior, in sizes of frames, beyond its noise,
+# from which they are other points; misfit of frames that noise and other people do not
+# reach: docs/benchmarks/README.md, "Thresholds".
+OTHER_POINTS, LARGEST_MISFIT = 0.15, 1.3
+
+
+def warn_if_foreign(
+    model: TableModel, table: FrameBlocks, weights: NDArray | None = None
+) -> None:
+    """Warn if frames lie farther from the shapes of a model than its noise explains."""
+    if table.n_frames < FEWEST_COMPARED:
+        return
+    some = spread(np.arange(table.n_frames), min(table.n_frames, 100))
+    weights = None if weights is None else weights[some]
+    misfit = model.misfit(table.take(some), weights)
+    if misfit > LARGEST_MISFIT:
+        way = "Fit X by itself"
+        if model.frames.camera != "affine":
+            way = (
+                "Adapt the model to X: AffineNRSfM(n_components='auto', camera="
+                f"{model.frames.camera!r}, prior=model).fit(X)"
+            )
+        warn_caller(
+            f"the points of X lie {misfit:.2g} times as far from the shapes of the "
+            "model as its noise explains: they come from another annotator or tracker, "
+            "or move as the fitted table does not show. Shapes, depths and "
+            f"coefficients may be wrong. {way}"
+        )
+
+
+def checked_prior(estimator: Any) -> TableModel | None:
+    """Return the fitted model that is the prior of an estimator, or raise."""
+    prior, n_components = estimator.prior, estimator.n_components
+    if prior is None:
+        return None
+    if estimator.refinement != "joint" or estimator.camera == "affine":
+        raise ValueError(
+            "prior needs calibrated cameras and refinement='joint'; got camera="
+            f"{estimator.camera!r}, refinement={estimator.refinement!r}. Set camera="
+            "'weak_perspective'"
+        )
+    prior = getattr(prior, "estimator", prior)  # of a FrozenEstimator
+    model = getattr(prior, "_model", None)
+    if not isinstance(model, TableModel):
+        raise ValueError(
+            f"prior must be a fitted AffineNRSfM; got {prior!r}. A search over several "
+            "priors clones them: give sklearn.frozen.FrozenEstimator(prior)"
+        )
+    calibrated = isinstance(model.frames, PosteriorFrames) and prior.camera_ != "affine"
+    if not calibrated:
+        raise ValueError(
+            "prior must be fitted with calibrated cameras and the joint refinement; "
+            f"got camera={prior.camera_!r}, refinement={prior.refinement!r}. Fit it "
+            "with camera='weak_perspective'"
+        )
+    if not model.frames.certainty.determined:
+        raise ValueError(
+            "the depth of the prior is not determined: its depth_uncertainty_ is "
+            f"{model.frames.certainty.total:.2g}. Fit it to a table in which the "
+            "objects turn"
+        )
+    if (prior.camera_ == "orthographic") != (estimator.camera == "orthographic"):
+        raise ValueError(
+            f"the prior was fitted with camera={prior.camera_!r}; got camera="
+            f"{estimator.camera!r}. Set the same camera"
+        )
+    if n_components not in ("auto", K := len(model.basis)):
+        raise ValueError(
+            f"n_components must be that of the prior, {K}, or 'auto', which takes it; "
+            f"got {n_components}"
+        )
+    return model
+
+
+def prior_start(
+    table: ScaledTable, settings: FitSettings
+) -> tuple[JointState, ShapePrior, FrameMap]:
+    """Return a start from the shapes of a fitted model, the prior, and its gauge."""
+    model = settings.prior
+    frames = model.frames
+    n_frames = table.rows.n_frames
+    rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
+    fit = replace(frames, camera="weak_perspective").posterior(rows, False)
+    square = np.nanmedian(frames.squares(fit, seen_points(rows).sum(axis=1)))
+    if square > OTHER_POINTS**2 + 2.0 * frames.noise_variance:
+        raise ValueError(
+            "the table does not show the points of the prior: they lie "
+            f"{np.sqrt(square):.0%} of the size of the object from its shapes. Check "
+            "whether the columns have the same points in the same order"
+        )
+    gauge, scale = frames.gauge, 1.0
+    if settings.camera == "orthographic":
+        scale = float(np.nanmedian(full_rotations(fit.motion)[1]))
+        gauge = gauge._replace(space=table.unit / model.unit * gauge.space)
+    noise = max(frames.noise_variance, LEAST_NOISE)
+    start = JointState(scale * frames.shapes, np.empty((0, 2, 3)), noise)
+    return start, ShapePrior.of_model(frames, scale, gauge, settings.adapt), gauge
