@@ -135,6 +135,17 @@ default="affine"
     principal_point : tuple of float (x, y), default=None
         Point of the image on the axis of perspective cameras, which need it: half of
         the image's width and height, if nothing else is known.
+    prior : AffineNRSfM, default=None
+        A fitted model of the same points, with calibrated cameras, that is adapted to
+        the table instead of a fit from nothing: frontal photos and few frames do not
+        determine depths by themselves. `isa_nrsfm.datasets.load_face_prior` is one of
+        faces. `n_components` is that of the prior, or "auto". Rotation, mirror image
+        and mixing of the basis are those of the prior, so that coefficients of all
+        tables with one prior can be compared. The strategy `isa` and `independence`
+        are not used.
+    adapt : {"mean", "shapes"}, default="mean"
+        Shapes that differ from those of the prior, by as much as the table shows
+        (`prior_std_`): only the mean shape, or all of them.
     independence : {"shapes", "coefficients", None}, default="shapes"
         Criterion for the basis of the joint refinement. The likelihood does not depend
         on the mixing of the basis shapes. "shapes" makes them independent of each other
@@ -242,6 +253,10 @@ default="affine"
     focal_length_std_ : float
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
+    prior_std_ : ndarray of shape (2,)
+        Standard deviations of the points of the mean shape and of the basis shapes from
+        those of the prior, in sizes of frames. Zero for a fixed basis. Only with a
+        prior, which also fixes the scale and the signs of shapes and coefficients.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -278,7 +293,7 @@ default="affine"
     reference_translation_ : ndarray of shape (2,)
         Default translation of `inverse_transform`: the mean centroid.
     isa_ : object
-        The fitted strategy, of the paper's pipeline.
+        The fitted strategy, of the paper's pipeline. None with a prior.
     camera_ : str
         The camera model of the fit.
     frames_scaled_ : bool
@@ -335,6 +350,7 @@ default="affine"
     basis_: NDArray
     alpha_: NDArray
     alpha_std_: NDArray
+    prior_std_: NDArray
     motion_: NDArray
     translation_: NDArray
     rotations_: NDArray
