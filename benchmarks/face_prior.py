@@ -98,7 +98,7 @@ def landmarks(dense, weights):
 
 
 def fitted(shapes, cameras):
-    """Return the fit of images of shapes (n, 68, 3), from their principal components."""
+    """Return the fit of images of shapes (n, 68, 3), from principal components."""
     table = (shapes @ cameras.mT).reshape(len(shapes), -1)
     flat = shapes.reshape(len(shapes), -1) / np.sqrt(np.mean(table**2))
     mean_shape = flat.mean(axis=0)

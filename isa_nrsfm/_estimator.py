@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import TransformerMixin, clone
+from sklearn.base import TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import (
     check_array,
-    check_random_state,
     check_scalar,
     estimator_html_repr,
 )
@@ -61,7 +60,7 @@ from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
 from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
-from isa_nrsfm.isa import PooledFastICA
+from isa_nrsfm.isa._strategies import ready_strategy
 
 _NEEDS_CALIBRATED = (
     "needs a model with calibrated cameras; got camera='affine'. Fit with "
@@ -553,7 +552,9 @@ default="affine"
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
-        isa, n_components = self._strategy(settings.joint), self.n_components
+        inherited = self.random_state, self.n_jobs, self.verbose
+        isa = ready_strategy(self.isa, settings.joint, *inherited)
+        n_components = self.n_components
         if settings.prior is not None:
             n_components = len(settings.prior.basis)
         auto, most = n_components == "auto", None
@@ -634,7 +635,6 @@ default="affine"
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
         check_camera(self)
-        prior = checked_prior(self)
         if self.refinement == "consensus" and point_weight is not None:
             raise ValueError(
                 "point_weight is not supported by the fit with refinement='consensus', "
@@ -651,43 +651,18 @@ default="affine"
             silent_isa=joint and self.isa is None,
             limits=self._limits,
         )
+        prior = checked_prior(self, source.empty.shape[2])
         settings = settings._replace(prior=prior)
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
         elif self.camera == "perspective":  # fits of images without perspective
             settings = settings._replace(camera="weak_perspective")
-        if prior is not None and prior.n_points != source.empty.shape[2]:
-            raise ValueError(
-                f"the prior has {prior.n_points} points, the table "
-                f"{source.empty.shape[2]}. Give the table and the prior the same points"
-            )
         return source, weights[0] if weights else None, settings
 
     def _focal_shares(self, table: FrameBlocks) -> tuple[NDArray, ...]:
         """Return the mean focal length over those of frames (n, 1), if they differ."""
         given = getattr(self, "focal_length_", self.focal_length)
         return focal_shares(given, table.n_frames)
-
-    def _strategy(self, joint: bool) -> Any:
-        """Return the unfitted strategy, with parameters inherited where not set."""
-        if self.isa is not None:
-            isa = clone(self.isa)
-        else:
-            isa = PooledFastICA(n_init=2 if joint else 16)
-        params = isa.get_params(deep=False)
-        if params.get("subspace_size", 3) != 3:
-            raise ValueError(
-                "isa must have subspace_size=3, a dimension of space each; got "
-                f"subspace_size={params['subspace_size']}"
-            )
-        if params.get("random_state", 0) is None:
-            random_state = check_random_state(self.random_state)
-            isa.set_params(random_state=random_state.randint(np.iinfo(np.int32).max))
-        if params.get("n_jobs", 0) is None:
-            isa.set_params(n_jobs=self.n_jobs)
-        if params.get("verbose", 1) == 0:
-            isa.set_params(verbose=self.verbose)
-        return isa
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""

@@ -48,8 +48,8 @@ def warn_if_foreign(
         )
 
 
-def checked_prior(estimator: Any) -> TableModel | None:
-    """Return the fitted model that is the prior of an estimator, or raise."""
+def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
+    """Return the fitted model that is the prior of a table's fit, or raise."""
     prior, n_components = estimator.prior, estimator.n_components
     if prior is None:
         return None
@@ -83,6 +83,11 @@ def checked_prior(estimator: Any) -> TableModel | None:
         raise ValueError(
             f"the prior was fitted with camera={prior.camera_!r}; got camera="
             f"{estimator.camera!r}. Set the same camera"
+        )
+    if len(model.mean_shape) != n_points:
+        raise ValueError(
+            f"the prior has {len(model.mean_shape)} points, the table {n_points}. Give "
+            "the table the points of the prior, in the same order"
         )
     if n_components not in ("auto", K := len(model.basis)):
         raise ValueError(

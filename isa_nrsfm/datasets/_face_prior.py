@@ -51,8 +51,9 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     (40, 68, 3)
     >>> model = AffineNRSfM("auto", camera="weak_perspective", prior=prior)
     """
-    with np.load(files("isa_nrsfm.datasets") / "face_prior.npz") as file:
-        stored = {name: file[name].astype(np.float64) for name in file.files}
+    path = files("isa_nrsfm.datasets") / "face_prior.npz"
+    with path.open("rb") as file, np.load(file) as arrays:
+        stored = {name: arrays[name].astype(np.float64) for name in arrays.files}
     most = len(stored["basis"])
     K = most if n_components is None else n_components
     if not 1 <= K <= most:
