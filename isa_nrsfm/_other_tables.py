@@ -10,7 +10,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
-from isa_nrsfm._joint.prior import LEAST_NOISE, ShapePrior
+from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._prepare.checks import FEWEST_COMPARED
@@ -99,8 +99,8 @@ def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
 
 def prior_start(
     table: ScaledTable, settings: FitSettings
-) -> tuple[JointState, ShapePrior, FrameMap]:
-    """Return a start from the shapes of a fitted model, the prior, and its gauge."""
+) -> tuple[JointState, FitSettings, FrameMap]:
+    """Return a start from the shapes of a prior, settings of its fit, and its gauge."""
     model = settings.prior
     frames = model.frames
     n_frames = table.rows.n_frames
@@ -119,4 +119,9 @@ def prior_start(
         gauge = gauge._replace(space=table.unit / model.unit * gauge.space)
     noise = max(frames.noise_variance, LEAST_NOISE)
     start = JointState(scale * frames.shapes, np.empty((0, 2, 3)), noise)
-    return start, ShapePrior.of_model(frames, scale, gauge, settings.adapt), gauge
+    settings = settings._replace(
+        shape_prior=ShapePrior.of_model(frames, scale, gauge, settings.adapt),
+        limits=settings.limits._replace(least_noise=LEAST_NOISE),
+        tol=TOL_SHARE * settings.tol,
+    )
+    return start, settings, gauge
