@@ -12,7 +12,9 @@ them. Only these places come from the photos. Needs ``ict_bu3dfe_like_68.npz``,
 ISA_NRSFM_DATA. Writes ``isa_nrsfm/datasets/face_prior.npz``.
 """
 
+import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.optimize import nnls
@@ -20,14 +22,16 @@ from scipy.spatial import KDTree
 
 from benchmarks._sets import FACES, ICT, Case, load_arrays
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.callbacks import NoProgress
-from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm.io import save_model
 
 DENSE = Case("ICT-FaceKit mesh", "ict_bu3dfe_like_basis", 40)
 # Photos of this source are left out: they serve for checks of the result.
 CHECKED = "ls3dw_aflw2000_reannotated"
 JAW, INNER, N_COMPONENTS = slice(0, 17), slice(17, 68), 40
+NUMBERS = (
+    *("noise_variance_", "inverse_snr_", "rank_floor_", "depth_uncertainty_"),
+    "frames.residual",
+)
 
 
 def main():
@@ -98,44 +102,34 @@ def landmarks(dense, weights):
 
 
 def fitted(shapes, cameras):
-    """Return the fit of images of shapes (n, 68, 3), from principal components."""
+    """Return the arrays of a model file of the fit of images of shapes (n, 68, 3)."""
     table = (shapes @ cameras.mT).reshape(len(shapes), -1)
-    flat = shapes.reshape(len(shapes), -1) / np.sqrt(np.mean(table**2))
-    mean_shape = flat.mean(axis=0)
-    _, deviations, axes = np.linalg.svd(flat - mean_shape, full_matrices=False)
-    basis = deviations[:, None] / np.sqrt(len(flat)) * axes
-    kept = np.vstack([mean_shape, basis[:N_COMPONENTS]]).reshape(-1, 68, 3)
-    noise = np.sum(basis[N_COMPONENTS:] ** 2) / flat.shape[1]
-    gauge, none = FrameMap.identity(N_COMPONENTS), np.zeros((0, N_COMPONENTS))
-    B = np.ascontiguousarray(kept.mT)
-    frames = PosteriorFrames(B, noise, none, "linear", gauge, "weak_perspective")
-    start = TableModel(frames, kept[0], kept[1:], "interleaved", None)
-    model = AffineNRSfM(
-        N_COMPONENTS, camera="weak_perspective", independence=None, max_iter=3
-    )
-    model._fit(table, None, NoProgress(), start=start, errors=True)
-    return model
+    model = AffineNRSfM(N_COMPONENTS, camera="weak_perspective", independence=None)
+    model.fit(table)
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "face_prior.npz")
+        save_model(model, path)
+        with np.load(path) as file:
+            return dict(file)
 
 
 def stored(model):
     """Return what `isa_nrsfm.datasets.load_face_prior` reads, in single precision."""
-    frames = model._model.frames
-    M = model.motion_ / model._frame_sizes[:, None, None]
+    header = json.loads(model["header"].tobytes())
+    frames = {f"frames.{name}": value for name, value in header["frames"].items()}
+    model = {**header["attributes"], **frames, **model}
+    M = model["motion_"] / model["frames.sizes"][:, None, None]
     single = {
-        "mean_shape": model.mean_shape_,
-        "basis": model.basis_,
-        "view": model.reference_motion_,
+        "mean_shape": model["mean_shape_"],
+        "basis": model["basis_"],
+        "view": model["reference_motion_"],
         "moments": np.mean(M.mT @ M, axis=0),
-        "singular_values": model.singular_values_,
-        "reliability": model.reliability_,
-        "energy_share": model.energy_share_,
-        "turns": frames.certainty.turns,
-        "points": frames.certainty.points,
-        "numbers": [
-            *(frames.noise_variance, model.inverse_snr_, model.rank_floor_),
-            *(frames.certainty.total, frames.certainty.residual),
-            *frames.certainty.images,
-        ],
+        "singular_values": model["singular_values_"],
+        "reliability": model["reliability_"],
+        "energy_share": model["energy_share_"],
+        "turns": model["frames.turns"],
+        "points": model["frames.depth_variances"],
+        "numbers": [*(model[n] for n in NUMBERS), *model["frames.image_errors"]],
     }
     return {name: np.float32(values) for name, values in single.items()}
 
