@@ -83,9 +83,10 @@ def fit_jointly(
     if prior is None:
         fit, least_noise, sufficient = judged(first, table, fit, start)
     else:
-        fit, prior = widened(first, fit)
-        problems = [replace(problem, prior=prior) for problem in problems]
         least_noise, sufficient = LEAST_NOISE, False
+        if table.outliers is None:
+            fit = widened(first, fit)
+            problems = [replace(problem, prior=fit.prior) for problem in problems]
     if sufficient:
         problems = [replace(problem, penalty=0.0) for problem in problems]
         if not sampled:  # for a sufficient model a smaller tolerance is safe
@@ -112,6 +113,7 @@ def fit_jointly(
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
     if sampled:
         state = state._replace(motion=state.motion[table.parts[0]])
+    prior = problem.prior if table.outliers is None else fit.prior
     unknowns = None if prior is None else prior.n_determined
     noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose, unknowns)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
@@ -323,9 +325,9 @@ def _freedom_correction(
     return float(n_numbers / max(freedom, 0.1 * n_numbers))
 
 
-def widened(problem: JointProblem, fit: JointFit) -> tuple[JointFit, ShapePrior]:
+def widened(problem: JointProblem, fit: JointFit) -> JointFit:
     """Return the fit with the widths of the prior that follow from the table."""
-    prior = problem.prior
+    prior = fit.prior or problem.prior
     assert prior is not None
     for _ in range(ROUNDS):
         shapes, _, noise = fit.state
@@ -333,7 +335,7 @@ def widened(problem: JointProblem, fit: JointFit) -> tuple[JointFit, ShapePrior]
         prior = prior.updated(shapes, curvature, noise)
         problem = replace(problem, prior=prior)
         fit = problem.unreversed(fit.state, problem.cameras, least_noise=LEAST_NOISE)
-    return fit, prior
+    return fit._replace(prior=prior)
 
 
 def reweighted(
@@ -373,7 +375,10 @@ def reweighted(
         weighted = rows.derive(new, *model)
         weights = new(few_rows, M, t, a, few_sizes)[1]
         problem = replace(problem, frames=JointFrames.from_weighted(weighted))
-        fit = problem.refined(fit.state, least_noise=least_noise)
+        if problem.prior is None:
+            fit = problem.refined(fit.state, least_noise=least_noise)
+        else:  # without outliers the widths are others
+            fit = widened(problem, fit)
     return fit, deviation**2
 
 
