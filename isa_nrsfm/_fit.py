@@ -130,7 +130,8 @@ def fit_table(
     given = prior = None
     if settings.prior is not None:
         isa = None
-        given, prior, gauge = prior_start(table, settings)
+        # Perspective images are right for the last fit, which has errors.
+        given, prior, gauge = prior_start(table, settings, checked=errors)
         shapes = given.shapes
         if start is not None:
             given = _started(table, start, n_components)
@@ -416,6 +417,6 @@ def mirror_image(
     """Return the mirror image in depth of a fit."""
     model, signs = model.mirrored(), np.tile(MIRROR, len(model.basis))
     shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis}
-    covariance = attributes["mode_covariance_"] * np.outer(signs, signs)
+    covariance = attributes.get("mode_covariance_", 0.0) * np.outer(signs, signs)
     attributes = attributes | shapes | {"mode_covariance_": covariance}
     return model, frames._replace(motion=frames.motion * MIRROR), attributes

@@ -93,16 +93,19 @@ def checked_prior(estimator: Any) -> TableModel | None:
 
 
 def prior_start(
-    table: ScaledTable, settings: FitSettings
+    table: ScaledTable, settings: FitSettings, checked: bool
 ) -> tuple[JointState, ShapePrior, FrameMap]:
-    """Return a start from the shapes of a fitted model, the prior, and its gauge."""
+    """Return a start from the shapes of a fitted model, the prior, and its gauge.
+
+    `checked`: raise if the table does not show the points of the model.
+    """
     model = settings.prior
     frames = model.frames
     n_frames = table.rows.n_frames
     rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
     fit = replace(frames, camera="weak_perspective").posterior(rows, False)
     square = np.nanmedian(frames.squares(fit, seen_points(rows).sum(axis=1)))
-    if square > OTHER_POINTS**2 + 2.0 * frames.noise_variance:
+    if checked and square > OTHER_POINTS**2 + 2.0 * frames.noise_variance:
         raise ValueError(
             "the table does not show the points of the prior: they lie "
             f"{np.sqrt(square):.0%} of the size of the object from its shapes. Check "
