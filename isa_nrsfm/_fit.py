@@ -128,8 +128,11 @@ def fit_table(
     # 3. and 4. The paper's pipeline
     given, gauge = None, FrameMap.identity(n_components)
     if settings.prior is not None:
-        given, settings, gauge = prior_start(table, settings)
+        # Perspective images are right for the last fit, which has errors.
+        given, settings, gauge = prior_start(table, settings, checked=errors)
         isa, shapes = None, given.shapes
+        if start is not None:
+            given = _started(table, start, n_components)
     elif start is None:
         isa = clone(isa)
         shapes, covariance, n_iter, converged = run_paper_pipeline(
@@ -407,6 +410,6 @@ def mirror_image(
     """Return the mirror image in depth of a fit."""
     model, signs = model.mirrored(), np.tile(MIRROR, len(model.basis))
     shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis}
-    covariance = attributes["mode_covariance_"] * np.outer(signs, signs)
+    covariance = attributes.get("mode_covariance_", 0.0) * np.outer(signs, signs)
     attributes = attributes | shapes | {"mode_covariance_": covariance}
     return model, frames._replace(motion=frames.motion * MIRROR), attributes

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.camera_models import distances, full_rotations
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._prepare.checks import FEWEST_COMPARED
+from isa_nrsfm._prepare.robust import median_noise
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import seen_points
@@ -98,16 +99,24 @@ def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
 
 
 def prior_start(
-    table: ScaledTable, settings: FitSettings
+    table: ScaledTable, settings: FitSettings, checked: bool
 ) -> tuple[JointState, FitSettings, FrameMap]:
-    """Return a start from the shapes of a prior, settings of its fit, and its gauge."""
+    """Return a start from the shapes of a prior, settings of its fit, and its gauge.
+
+    `checked`: raise if the table does not show the points of the prior.
+    """
     model = settings.prior
     frames = model.frames
     n_frames = table.rows.n_frames
     rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
-    fit = replace(frames, camera="weak_perspective").posterior(rows, False)
-    square = np.nanmedian(frames.squares(fit, seen_points(rows).sum(axis=1)))
-    if square > OTHER_POINTS**2 + 2.0 * frames.noise_variance:
+    frames = replace(frames, camera="weak_perspective", loss=settings.loss)
+    fit = frames.posterior(rows, False)
+    if settings.loss == "linear":
+        square = np.nanmedian(frames.squares(fit, seen_points(rows).sum(axis=1)))
+    else:  # without outliers
+        distance = distances(rows, frames.shapes, *fit[:3])
+        square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2
+    if checked and square > OTHER_POINTS**2 + 2.0 * frames.noise_variance:
         raise ValueError(
             "the table does not show the points of the prior: they lie "
             f"{np.sqrt(square):.0%} of the size of the object from its shapes. Check "

@@ -206,6 +206,13 @@ class PerspectiveTable(NamedTuple):
         agrees = change < SETTLED * self.settings.tol / JOINT_TOL
         return agrees or n_repeats >= (2 if fit.energy > WORSE * best else most)
 
+    def of_prior(self, f: float) -> PerspectiveFit:
+        """Return the frames of the prior's shapes."""
+        model = self.settings.prior._replace(pinhole=self.pinhole(f))
+        frames = self.source.joined(model.in_virtual_cameras)
+        squares = np.full(len(model.mean_shape), np.inf)
+        return PerspectiveFit(model, frames, True, {"isa_": None}, energies=squares)
+
     def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
         """Return the fits for 1/f and -1/f from a first fit."""
         images, pinhole = (first, first.mirrored()), self.pinhole(f)
@@ -288,17 +295,21 @@ def fit_perspective(
     has the mean of several. A fit from the model of a similar table has that of it.
     """
     fits: dict[float, PerspectiveFit] = {}
-    deviation, why = 0.0, ""
+    deviation, why, with_prior = 0.0, "", table.settings.prior is not None
     with warnings.catch_warnings(action="ignore"):  # the last fit warns
         if start is not None:
             best = table.started(start, n_components)
         elif given is not None:
             f = common(given)
-            virtual = table.pinhole(f, near=False)
-            first = table.fit(virtual, n_components, progress=progress)
+            if with_prior:
+                first = table.of_prior(f)
+            else:
+                virtual = table.pinhole(f, near=False)
+                first = table.fit(virtual, n_components, progress=progress)
             fits = {0.0: first, **table.images(first, f)}
             best = fits[1.0 / f]
-            if best.changes[-1] > UNSETTLED or best.energy > first.energy:
+            unsteady = best.changes[-1] > UNSETTLED or best.energy > first.energy
+            if unsteady and not with_prior:
                 why = UNSTEADY
             elif errors:  # neighbours tell how far a focal length contradicts the table
                 places = 0.8 / f, 1.25 / f

@@ -138,7 +138,7 @@ only_joint = only(refinement=["joint"])
 def fitted_variant(number):
     """Return a fitted model, its training table and another table."""
     fitted = estimator(**(VARIANTS + SLOW_VARIANTS)[number])
-    table, new = TABLE, make_face_tracks(30, n_components=5, random_state=1).data
+    table, new = TABLE, make_face_tracks(30, n_components=K, random_state=1).data
     if fitted.layout == "planar":
         table, new = planar(table), planar(new)
     with warnings.catch_warnings():

@@ -108,6 +108,7 @@ def frames_with_outliers(n_frames=24):
     ),
 )
 @pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")
+@pytest.mark.filterwarnings("ignore:the points of X lie")
 def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     X, Y = frames_with_outliers()
     model = AffineNRSfM(1, loss=loss, camera=camera, random_state=0).fit(X)

@@ -1,0 +1,336 @@
+"""A fitted model as the prior of another table, and tables that do not fit a model."""
+
+import pickle
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused, warned
+from scenes import likelihood_of, random_scene, with_gaps
+from scipy.spatial.transform import Rotation
+from sklearn.base import clone
+from sklearn.frozen import FrozenEstimator
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer
+
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._fit import prior_start
+from isa_nrsfm._frames.models import FrameMap
+from isa_nrsfm._joint.fit import widened
+from isa_nrsfm._joint.likelihood import JointFrames
+from isa_nrsfm._joint.prior import ShapePrior
+from isa_nrsfm._joint.problem import JointProblem
+from isa_nrsfm._parameters.choices import ADAPTED
+from isa_nrsfm._prepare.scaling import scaled_table
+from isa_nrsfm.metrics import mean_shape_error_3d
+
+N_POINTS = 16
+BOTH = pytest.mark.parametrize("adapt", ADAPTED)
+PERSPECTIVE = {"camera": "perspective", "principal_point": (0, 0)}
+
+
+def study(seed, n_frames, degrees, *, change=0.0, noise=0.3, focal=np.inf, spread=0.3):
+    """Return a table of objects within some degrees of frontal, and its truth.
+
+    change: RMS difference of its mean shape from that of other tables, whose
+    coordinates are about 0.6.
+    """
+    rng = np.random.default_rng(7)
+    mean_shape = rng.normal(size=(N_POINTS, 3)) * (0.6, 0.7, 0.5)
+    basis = 0.1 * rng.normal(size=(2, N_POINTS, 3))
+    rng = np.random.default_rng(seed)
+    mean_shape = mean_shape + change * rng.normal(size=mean_shape.shape)
+    S = mean_shape + np.tensordot(rng.normal(size=(n_frames, 2)), basis, 1)
+    S -= S.mean(axis=1, keepdims=True)
+    angles = degrees * rng.uniform(-1, 1, (n_frames, 3))
+    R = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+    scales = 100 * np.exp(spread * rng.uniform(-1, 1, (n_frames, 1, 1)))
+    points = scales * S @ R.mT
+    X = points[..., :2] + rng.uniform(-80, 80, (n_frames, 1, 2))
+    X = X / (1 + points[..., 2:] / focal) + noise * rng.normal(size=X.shape)
+    return SimpleNamespace(X=X.reshape(n_frames, -1), S=S, depths=points[..., 2])
+
+
+def fitted(X, prior=None, **params):
+    """Return a weak-perspective fit, by default with a prior."""
+    given = {"camera": "weak_perspective", "random_state": 0}
+    given |= {"n_components": 2, "prior": prior}
+    return AffineNRSfM(**given | params).fit(X)
+
+
+def error(model, S, X):
+    """Return the relative error of shapes, after a rotation and scale of each frame."""
+    return mean_shape_error_3d(S, model.reconstruct(X), convention="frame")
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """A table that determines its shapes, and its fit."""
+    table = study(0, 60, 30)
+    table.model = fitted(table.X)
+    return table
+
+
+@pytest.fixture(scope="module")
+def frontal(turned):
+    """A table of other objects, nearly frontal, and its fit with the prior."""
+    table = study(1, 40, 4, change=0.04)
+    table.prior = turned.model
+    table.model = fitted(table.X, turned.model)
+    table.error = error(table.model, table.S, table.X)
+    return table
+
+
+# --- objective ------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("kind", ["complete", "missing"])
+def test_gradient_against_differences(rng, adapt, kind):
+    scene = random_scene(0, 11, 9, noise=0.2, kind=kind)
+    gauge = FrameMap(np.eye(4) + 0.2 * rng.normal(size=(4, 4)), np.eye(3))
+    prior = scene.shapes + 0.1 * rng.normal(size=scene.shapes.shape)
+    prior = ShapePrior(prior, gauge, adapt == "mean", 0.0, (0.3, 0.2))
+    likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)._replace(prior=prior)
+    gradient = likelihood(scene.shapes, scene.motion, 0.05).shape_gradient
+    for _ in range(5):
+        change = 1e-5 * rng.normal(size=gradient.shape)
+        above, below = (
+            likelihood(scene.shapes + s * change, scene.motion, 0.05) for s in (1, -1)
+        )
+        slope = (above.value - below.value) / 2
+        assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
+
+
+def problem_of(table, adapt):
+    """Return the problem of a fit with the prior of a table, and its start."""
+    model = clone(table.model).set_params(adapt=adapt)
+    source, _, settings = model._ready(table.X)
+    scaled = scaled_table(source, None, 2, settings)
+    start, prior, _ = prior_start(scaled, settings, checked=True)
+    frames = JointFrames.from_points(scaled.rows, True)
+    settings = settings._replace(tol=1e-4)
+    problem = JointProblem(frames, settings, True, 0.0, prior)
+    return problem, problem.aligned(start, problem.cameras)
+
+
+@BOTH
+def test_widths_of_zero_give_the_shapes_of_the_prior(frontal, adapt):
+    problem, start = problem_of(frontal, adapt)
+    # Also in float64 the mean shape moves by the square of the width.
+    prior = problem.prior._replace(widths=(1e-5, 1e-5))
+    problem = JointProblem(problem.frames, problem.settings, True, 0.0, prior)
+    shapes = problem.unreversed(start, problem.cameras).state.shapes
+    assert_allclose(shapes, prior.shapes, atol=1e-6)
+
+
+@BOTH
+def test_first_widths_make_no_difference(frontal, adapt):
+    ends = []
+    for widths in ((0.01, 0.003), (0.05, 0.01), (0.2, 0.03)):
+        problem, start = problem_of(frontal, adapt)
+        prior = problem.prior._replace(widths=widths)
+        problem = JointProblem(problem.frames, problem.settings, True, 0.0, prior)
+        fit = widened(problem, problem.unreversed(start, problem.cameras))
+        ends.append((fit.prior.widths, fit.state.shapes))
+    for widths, shapes in ends[1:]:
+        assert widths[0] == pytest.approx(ends[0][0][0], rel=0.02)
+        assert_allclose(shapes, ends[0][1], atol=0.005)
+
+
+# --- shapes ---------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("degrees", [3, 20])
+def test_accuracy(turned, adapt, degrees):
+    table = study(2, 40, degrees, change=0.04, noise=0.6)
+    with warnings.catch_warnings(action="ignore"):  # of depth, and of other objects
+        own, prior = fitted(table.X), turned.model
+        others = [error(model, table.S, table.X) for model in (own, prior)]
+    model = fitted(table.X, prior, adapt=adapt)
+    reached = error(model, table.S, table.X)
+    assert reached < 0.6 * others[1]
+    assert reached < (0.65 if degrees == 3 else 1.2) * others[0]
+    z = np.vecdot(model.reconstruct(table.X), model.rotations_[:, 2][:, None])
+    z = model.scales_[:, None] * z
+    square = min(np.mean((sign * z - table.depths) ** 2) for sign in (1, -1))
+    off = np.sqrt(square / np.mean(table.depths**2))
+    assert off / 3 < model.depth_uncertainty_ < 3 * off
+    tau, rho = model.prior_std_
+    assert 0.03 < tau < 0.1
+    if adapt == "mean":
+        assert rho == 0
+        assert_allclose(model.basis_, prior.basis_, atol=1e-12)
+    else:
+        assert 0 < rho < 0.01
+
+
+def test_invariances(frontal):
+    X, model, prior = frontal.X, frontal.model, frontal.prior
+    order = np.random.default_rng(0).permutation(len(X))
+    planar = X.reshape(len(X), -1, 2).swapaxes(1, 2).reshape(X.shape)
+    same = {
+        "order": (fitted(X[order], prior), order),
+        "units": (fitted(1000 * X, prior), slice(None)),
+        "mirrored": (fitted(X, prior.mirrored()).mirrored(), slice(None)),
+        "planar": (fitted(planar, prior, layout="planar"), slice(None)),
+        "threads": (fitted(X, prior, n_jobs=2), slice(None)),
+        "float32": (fitted(X.astype(np.float32), prior), slice(None)),
+    }
+    for name, (other, rows) in same.items():
+        tol = {"order": 1e-10, "units": 1e-10, "float32": 1e-5}.get(name, 0.0)
+        for found, expected in (
+            (other.mean_shape_, model.mean_shape_),
+            (other.alpha_, model.alpha_[rows]),
+            (other.prior_std_, model.prior_std_),
+        ):
+            assert_allclose(found, expected, rtol=0, atol=tol, err_msg=name)
+    assert_array_equal(model.transform(X), model.alpha_)
+
+
+def test_missing_points_weights_and_few_frames(frontal):
+    X, S, prior = frontal.X, frontal.S, frontal.prior
+
+    def reached(table, point_weight=None):
+        model = AffineNRSfM("auto", camera="weak_perspective", prior=prior)
+        model.fit(table, point_weight=point_weight)
+        assert np.isfinite(model.alpha_).all()
+        return error(model, S[: len(table)], table) / frontal.error
+
+    unseen = X.copy()
+    unseen[:, 10:12] = np.nan
+    weights = np.random.default_rng(0).uniform(0.3, 2, (len(X), N_POINTS))
+    assert reached(with_gaps(X, 0.2)) < 1.5
+    assert reached(X, weights) < 1.3
+    assert reached(unseen) < 1.6
+    assert reached(X[:20]) < 1.7
+    assert reached(X[:3]) < 2.5
+
+
+@pytest.mark.parametrize(("loss", "adapt"), [("huber", "shapes"), ("cauchy", "mean")])
+def test_outliers(frontal, loss, adapt):
+    rng = np.random.default_rng(3)
+    X = frontal.X.reshape(len(frontal.X), -1, 2).copy()
+    wrong = rng.random(X.shape[:2]) < 0.05
+    X[wrong] += 100 * rng.normal(size=(wrong.sum(), 2))
+    X[:, 5] = np.nan
+    X = X.reshape(frontal.X.shape)
+    model = fitted(X, frontal.prior, adapt=adapt, loss=loss)
+    assert error(model, frontal.S, frontal.X) < 1.5 * frontal.error
+    assert model.prior_std_[0] == pytest.approx(frontal.model.prior_std_[0], rel=0.2)
+    assert model.prior_std_[1] < 0.01
+
+
+def test_orthographic_cameras():
+    prior = fitted(study(0, 60, 30, spread=0).X / 50, camera="orthographic")
+    refused("prior was fitted with camera='orthographic'", fitted, prior.alpha_, prior)
+    table = study(1, 40, 4, change=0.04, spread=0)
+    model = fitted(table.X, prior, adapt="shapes", camera="orthographic")
+    assert error(model, table.S, table.X) < 0.05
+    size = np.sqrt(np.mean((100 * table.S) ** 2))
+    assert np.sqrt(np.mean(model.reconstruct(table.X) ** 2)) == pytest.approx(size, 0.1)
+
+
+@pytest.mark.parametrize(
+    "focal_length", [800.0, pytest.param(None, marks=pytest.mark.slow)]
+)
+def test_perspective_cameras(turned, focal_length):
+    """The prior may be the mirror image of the objects."""
+    table = study(1, 20, 4, change=0.04, focal=800)
+    model = fitted(table.X, turned.model, focal_length=focal_length, **PERSPECTIVE)
+    assert error(model, table.S, table.X) < 0.04
+    assert model.focal_length_ == pytest.approx(800, rel=0.05)
+    assert model.mirror_certainty_ > 0.9
+    sign = np.sign(np.sum(model.basis_ * turned.model.basis_, axis=(0, 1)))
+    assert_allclose(model.basis_ * sign, turned.model.basis_, atol=1e-12)
+
+
+# --- refusals -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("of_prior", "params", "message"),
+    [
+        (None, {}, "prior must be a fitted AffineNRSfM"),
+        ({"camera": "affine"}, {}, "fitted with calibrated cameras"),
+        ({"refinement": None}, {}, "fitted with calibrated cameras and the joint"),
+        ({}, {"camera": "orthographic"}, "was fitted with camera='weak_perspective'"),
+        ({}, {"camera": "affine"}, "prior needs calibrated cameras"),
+        ({}, {"refinement": "consensus"}, "prior needs calibrated cameras"),
+        ({}, {"n_components": 3}, "must be that of the prior, 2, or 'auto'"),
+    ],
+)
+def test_refused(turned, frontal, of_prior, params, message):
+    prior = AffineNRSfM()
+    if of_prior is not None:
+        prior = fitted(turned.X, **of_prior) if of_prior else turned.model
+    refused(message, fitted, frontal.X, prior, **params)
+
+
+def test_other_points_are_refused(turned, frontal):
+    X = frontal.X
+    refused("the prior has 16 points, the table 15", fitted, X[:, 2:], turned.model)
+    order = np.random.default_rng(0).permutation(N_POINTS)
+    other = X.reshape(len(X), -1, 2)[:, order].reshape(X.shape)
+    refused("the same points in the same order", fitted, other, turned.model)
+    frontal_only = warned("depth of the shapes is not determined", fitted, X)
+    refused("depth of the prior is not determined", fitted, X, frontal_only)
+
+
+# --- as an estimator ------------------------------------------------------------------
+
+
+def test_searches_pipelines_and_copies(turned, frontal):
+    X, model, prior = frontal.X, frontal.model, turned.model
+    assert clone(model).prior is prior
+    for copied in (clone(model).fit(X), pickle.loads(pickle.dumps(model))):
+        assert_array_equal(copied.transform(X), model.alpha_)
+    piped = make_pipeline(FunctionTransformer(), clone(model))
+    assert_array_equal(piped.fit_transform(X), model.alpha_)
+    priors = [FrozenEstimator(prior), FrozenEstimator(prior.mirrored())]
+    grid = [{"adapt": ["shapes"], "prior": priors}, {"adapt": ["mean"]}]
+    search = GridSearchCV(clone(model), grid, cv=2).fit(X[:20])
+    assert np.isfinite(search.cv_results_["mean_test_score"]).all()
+    assert search.best_estimator_.prior_std_.shape == (2,)
+    refused("prior", AffineNRSfMCV((1, 2), estimator=clone(model)).fit, X)
+
+
+# --- tables that do not fit a model ---------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_new_frames_fit_their_model(turned, seed):
+    model = turned.model
+    for noise in (0.3, 0.0):  # a warning would be an error
+        model.transform(study(seed, 40, 30, noise=noise).X)
+    model.transform(turned.X)
+    model.transform(turned.X[:3])
+
+
+@pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
+@pytest.mark.parametrize("other", ["order", "object"])
+def test_foreign_tables_are_warned_of_once(turned, camera, other):
+    model = turned.model if camera != "affine" else fitted(turned.X, camera=camera)
+    X = study(3, 40, 30, change=0.1 * (other == "object")).X
+    if other == "order":
+        X = np.roll(X, 2, axis=1)
+    remedy = "Fit X by itself" if camera == "affine" else r"prior=model\).fit\(X\)"
+    methods = (model.transform, model.decompose, model.reconstruct, model.score)
+    if camera == "affine":
+        methods = methods[:2]
+    for method in methods:
+        with warnings.catch_warnings(record=True, action="always") as messages:
+            method(X)
+        assert len(messages) == 1, method
+        with pytest.warns(UserWarning, match=remedy):
+            warnings.warn_explicit(messages[0].message, UserWarning, "", 0)
+    model.transform(X[:9])  # too few frames to tell
+
+
+def test_diagnostics_of_foreign_tables(turned):
+    X = study(3, 60, 30, change=0.1).X
+    warned("times as far from the shapes", turned.model.diagnostics, X)
