@@ -435,8 +435,8 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
                 return random
         case {"object": {"class": str(name), **parts}} if name in STORED:
             return with_parts(STORED[name], parts, arrays)
-        case {"model": dict(parts)}:
-            return _restored(parts, arrays)
+        case {"model": model}:
+            return _restored(model, arrays)
     raise ValueError(f"its header has a value that is not known: {str(value)[:60]}")
 
 
