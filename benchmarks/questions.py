@@ -343,7 +343,6 @@ def studies(options):
             right.append(100 * classifier.score(Z, names[1 - learnt]))
         print(f"{title:44}{right[0]:8.1f}{right[1]:8.1f}", flush=True)
 
-    first, second = tables
     print(f"{'learnt on':44}{'first':>8}{'second':>8}")
     aligned = [AlignedFrames().fit(X) for X in tables]
     points = [[each.transform(X) for X in tables] for each in aligned]

@@ -31,9 +31,6 @@ GROSS = 8.0
 # size of a face, it is 0.06 to 0.13 %.
 MOST_GROSS = 5e-4
 MOST_MESSAGES = 3
-# The way to depths that a table does not determine, with a prior.
-PRIOR = 'use prior={}, n_components="auto"'
-FACE_PRIOR = "isa_nrsfm.datasets.load_face_prior()"
 
 
 class Facts(NamedTuple):
@@ -129,7 +126,7 @@ def _messages(facts: Facts) -> Iterator[str]:
             f"not interpret the coefficients{outliers * (facts.loss == 'linear')}"
         )
         return
-    if n_supported < n_components and not facts.prior:
+    if n_supported < n_components and not (facts.prior or "prior=" in depth):
         yield (
             f"the table does not support n_components={n_components}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
@@ -166,12 +163,14 @@ def depth_advice(facts: Facts) -> str:
     why, remedy = "parts of the points lead to different depths", "fit more points"
     if turned := certainty.deformation > LARGEST_SHARE**2:
         why = "deformation explains the images as well as rotations do"
+    auto = "" if facts.auto else ', n_components="auto"'
     if facts.prior:
         remedy = "fit more frames, best of objects that turn further"
     elif facts.n_points == 68 and facts.camera != "orthographic":
-        remedy = f"if these are the 68 points of faces, {PRIOR.format(FACE_PRIOR)}"
+        face = f"prior=isa_nrsfm.datasets.load_face_prior(){auto}"
+        remedy = f"if these are the 68 points of faces, use {face}"
     elif turned:
-        remedy = f"fit a table in which the objects turn, then {PRIOR.format('model')}"
+        remedy = f"fit a table in which the objects turn, then use prior=model{auto}"
     elif most < len(facts.reliability):
         remedy = f"use at most n_components={most}"
     elif not facts.auto:

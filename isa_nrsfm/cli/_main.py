@@ -73,8 +73,8 @@ def _with_options(text: str, args: Namespace) -> str:
     model = f"--prior {getattr(args, 'model', 'model.npz')}"
     for way, option in (
         (r"AffineNRSfM\([^)]*prior=model\)\.fit\(X\)", f"{PROGRAM} fit TABLE {model}"),
-        (r"prior=model, n_components=.auto.", model),
-        (r"prior=[\w.]+\(\), n_components=.auto.", f"--prior {FACE_PRIOR}"),
+        (r"prior=model(, n_components=.auto.)?", model),
+        (r"prior=[\w.]+\(\)(, n_components=.auto.)?", f"--prior {FACE_PRIOR}"),
     ):
         text = re.sub(way, option.replace("\\", r"\\"), text)
     for name in filter(partial(hasattr, args), _PARAMETERS):
