@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import TransformerMixin, clone
+from sklearn.base import TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import (
     check_array,
-    check_random_state,
     check_scalar,
     estimator_html_repr,
 )
@@ -61,7 +60,7 @@ from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
 from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
-from isa_nrsfm.isa import PooledFastICA
+from isa_nrsfm.isa._strategies import ready_strategy
 
 _NEEDS_CALIBRATED = (
     "needs a model with calibrated cameras; got camera='affine'. Fit with "
@@ -135,6 +134,17 @@ default="affine"
     principal_point : tuple of float (x, y), default=None
         Point of the image on the axis of perspective cameras, which need it: half of
         the image's width and height, if nothing else is known.
+    prior : AffineNRSfM, default=None
+        A fitted model of the same points, with calibrated cameras, that is adapted to
+        the table instead of a fit from nothing: frontal photos and few frames do not
+        determine depths by themselves. `isa_nrsfm.datasets.load_face_prior` is one of
+        faces. `n_components` is that of the prior, or "auto". Rotation, mirror image
+        and mixing of the basis are those of the prior, so that coefficients of all
+        tables with one prior can be compared. The strategy `isa` and `independence`
+        are not used.
+    adapt : {"mean", "shapes"}, default="mean"
+        Shapes that differ from those of the prior, by as much as the table shows
+        (`prior_std_`): only the mean shape, or all of them.
     independence : {"shapes", "coefficients", None}, default="shapes"
         Criterion for the basis of the joint refinement. The likelihood does not depend
         on the mixing of the basis shapes. "shapes" makes them independent of each other
@@ -242,6 +252,10 @@ default="affine"
     focal_length_std_ : float
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
+    prior_std_ : ndarray of shape (2,)
+        Standard deviations of the points of the mean shape and of the basis shapes from
+        those of the prior, in sizes of frames. Zero for a fixed basis. Only with a
+        prior, which also fixes the scale and the signs of shapes and coefficients.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -278,7 +292,7 @@ default="affine"
     reference_translation_ : ndarray of shape (2,)
         Default translation of `inverse_transform`: the mean centroid.
     isa_ : object
-        The fitted strategy, of the paper's pipeline.
+        The fitted strategy, of the paper's pipeline. None with a prior.
     camera_ : str
         The camera model of the fit.
     frames_scaled_ : bool
@@ -335,6 +349,7 @@ default="affine"
     basis_: NDArray
     alpha_: NDArray
     alpha_std_: NDArray
+    prior_std_: NDArray
     motion_: NDArray
     translation_: NDArray
     rotations_: NDArray
@@ -537,7 +552,9 @@ default="affine"
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
-        isa, n_components = self._strategy(settings.joint), self.n_components
+        inherited = self.random_state, self.n_jobs, self.verbose
+        isa = ready_strategy(self.isa, settings.joint, *inherited)
+        n_components = self.n_components
         if settings.prior is not None:
             n_components = len(settings.prior.basis)
         auto, most = n_components == "auto", None
@@ -618,7 +635,6 @@ default="affine"
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
         check_camera(self)
-        prior = checked_prior(self)
         if self.refinement == "consensus" and point_weight is not None:
             raise ValueError(
                 "point_weight is not supported by the fit with refinement='consensus', "
@@ -635,43 +651,18 @@ default="affine"
             silent_isa=joint and self.isa is None,
             limits=self._limits,
         )
+        prior = checked_prior(self, source.empty.shape[2])
         settings = settings._replace(prior=prior)
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
         elif self.camera == "perspective":  # fits of images without perspective
             settings = settings._replace(camera="weak_perspective")
-        if prior is not None and prior.n_points != source.empty.shape[2]:
-            raise ValueError(
-                f"the prior has {prior.n_points} points, the table "
-                f"{source.empty.shape[2]}. Give the table and the prior the same points"
-            )
         return source, weights[0] if weights else None, settings
 
     def _focal_shares(self, table: FrameBlocks) -> tuple[NDArray, ...]:
         """Return the mean focal length over those of frames (n, 1), if they differ."""
         given = getattr(self, "focal_length_", self.focal_length)
         return focal_shares(given, table.n_frames)
-
-    def _strategy(self, joint: bool) -> Any:
-        """Return the unfitted strategy, with parameters inherited where not set."""
-        if self.isa is not None:
-            isa = clone(self.isa)
-        else:
-            isa = PooledFastICA(n_init=2 if joint else 16)
-        params = isa.get_params(deep=False)
-        if params.get("subspace_size", 3) != 3:
-            raise ValueError(
-                "isa must have subspace_size=3, a dimension of space each; got "
-                f"subspace_size={params['subspace_size']}"
-            )
-        if params.get("random_state", 0) is None:
-            random_state = check_random_state(self.random_state)
-            isa.set_params(random_state=random_state.randint(np.iinfo(np.int32).max))
-        if params.get("n_jobs", 0) is None:
-            isa.set_params(n_jobs=self.n_jobs)
-        if params.get("verbose", 1) == 0:
-            isa.set_params(verbose=self.verbose)
-        return isa
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""

@@ -53,7 +53,6 @@ from isa_nrsfm._gauge import (
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames
-from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import FactorisedTable, JointState
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
@@ -127,13 +126,10 @@ def fit_table(
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
-    given = prior = None
+    given, gauge = None, FrameMap.identity(n_components)
     if settings.prior is not None:
-        isa = None
-        given, prior, gauge = prior_start(table, settings)
-        shapes = given.shapes
-        if start is not None:
-            given = _started(table, start, n_components)
+        given, settings, gauge = prior_start(table, settings)
+        isa, shapes = None, given.shapes
     elif start is None:
         isa = clone(isa)
         shapes, covariance, n_iter, converged = run_paper_pipeline(
@@ -145,11 +141,9 @@ def fit_table(
     # 5. Refinement, gauge and frames
     if settings.joint:
         settings = settings._replace(on_step=progress.step)
-        fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given, prior)
+        fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
         (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
-        prior = fit.prior
-        if prior is None:
-            gauge = FrameMap.identity(n_components)
+        settings = settings._replace(shape_prior=fit.prior)
         model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
         progress(JOINT_STAGE)
         attributes = {
@@ -160,7 +154,7 @@ def fit_table(
         }
         if errors and camera != "affine":
             certainty = depth_certainty(
-                model, table.rows, table.weights, settings.limits, prior
+                model, table.rows, table.weights, settings.limits, fit.prior
             )
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
@@ -171,9 +165,9 @@ def fit_table(
                 model = consensus(model, table.rows, settings, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
-        fitted, frames, measures = _joint_frames(table, model, tracks, settings, prior)
-        if prior is not None:
-            attributes["prior_std_"] = np.array(prior.widths)
+        fitted, frames, measures = _joint_frames(table, model, tracks, settings)
+        if fit.prior is not None:
+            attributes["prior_std_"] = np.array(fit.prior.widths)
         if errors and camera != "affine":
             attributes["depth_uncertainty_"] = fitted.frames.certainty.total
         converged = fit.converged
@@ -191,7 +185,7 @@ def fit_table(
         attributes = {"n_iter_": n_iter}
     # The mirror image in depth
     probability = np.nan
-    if prior is None and settings.hidden_points and not table.complete:
+    if settings.hidden_points and not table.complete and settings.prior is None:
         probability = fitted.mirror_certainty(table.rows, frames)
     if probability < 0.5:
         probability = 1.0 - probability
@@ -314,11 +308,7 @@ def _paper_frames(
 
 
 def _joint_frames(
-    table: ScaledTable,
-    model: PosteriorFrames,
-    tracks: JointFrames,
-    s: FitSettings,
-    prior: ShapePrior | None,
+    table: ScaledTable, model: PosteriorFrames, tracks: JointFrames, s: FitSettings
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of a joint fit in the independent gauge."""
     fits = fitted_frames(model, tracks, table.rows)
@@ -332,6 +322,7 @@ def _joint_frames(
             "these rows"
         )
     # Gauge of shapes, cameras and coefficients
+    prior, noise = s.shape_prior, model.noise_variance
     unit = table.unit if s.camera == "orthographic" else None
     if prior is None:
         mean_shape, basis, gauge = independent_gauge(
@@ -346,7 +337,7 @@ def _joint_frames(
     if prior is None:
         uncertainty = np.linalg.pinv(information, hermitian=True)
     else:
-        uncertainty = prior.inverse(information[None], model.noise_variance)[0]
+        uncertainty = prior.inverse(information[None], noise)[0]
     certainty = frame_certainty(model, fits, table.n_seen, weight, prior)
     model = replace(model, gauge=gauge, certainty=certainty)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
@@ -358,7 +349,7 @@ def _joint_frames(
     cameras = frames.motion / table.sizes[:, None, None]
     if prior is not None:
         R, scales = full_rotations(cameras)
-        sight, noise = scales[:, None] * R[:, 2], model.noise_variance
+        sight = scales[:, None] * R[:, 2]
         errors = prior.depth_errors(information, noise, sight, frames.alpha)
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         certainty = certainty.of_prior(errors.mean(), np.mean(depths**2))
@@ -366,7 +357,7 @@ def _joint_frames(
     square = (table.unit or 1.0) ** 2
     attributes = {
         "mode_covariance_": square * mode_covariance(cameras, frames.alpha),
-        "noise_variance_": square * model.noise_variance,
+        "noise_variance_": square * noise,
         "reliability_": reliabilities(
             alpha, covariance, *(sum(part) for part in chance)
         ),

@@ -55,11 +55,6 @@ class TableModel(NamedTuple):
     unit: float | None
     pinhole: Pinhole | None = None
 
-    @property
-    def n_points(self) -> int:
-        """Number of points."""
-        return len(self.mean_shape)
-
     def decompose(
         self,
         rows: NDArray,

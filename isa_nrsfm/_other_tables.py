@@ -10,7 +10,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
-from isa_nrsfm._joint.prior import LEAST_NOISE, ShapePrior
+from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._prepare.checks import FEWEST_COMPARED
@@ -48,8 +48,8 @@ def warn_if_foreign(
         )
 
 
-def checked_prior(estimator: Any) -> TableModel | None:
-    """Return the fitted model that is the prior of an estimator, or raise."""
+def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
+    """Return the fitted model that is the prior of a table's fit, or raise."""
     prior, n_components = estimator.prior, estimator.n_components
     if prior is None:
         return None
@@ -84,6 +84,11 @@ def checked_prior(estimator: Any) -> TableModel | None:
             f"the prior was fitted with camera={prior.camera_!r}; got camera="
             f"{estimator.camera!r}. Set the same camera"
         )
+    if len(model.mean_shape) != n_points:
+        raise ValueError(
+            f"the prior has {len(model.mean_shape)} points, the table {n_points}. Give "
+            "the table the points of the prior, in the same order"
+        )
     if n_components not in ("auto", K := len(model.basis)):
         raise ValueError(
             f"n_components must be that of the prior, {K}, or 'auto', which takes it; "
@@ -94,8 +99,8 @@ def checked_prior(estimator: Any) -> TableModel | None:
 
 def prior_start(
     table: ScaledTable, settings: FitSettings
-) -> tuple[JointState, ShapePrior, FrameMap]:
-    """Return a start from the shapes of a fitted model, the prior, and its gauge."""
+) -> tuple[JointState, FitSettings, FrameMap]:
+    """Return a start from the shapes of a prior, settings of its fit, and its gauge."""
     model = settings.prior
     frames = model.frames
     n_frames = table.rows.n_frames
@@ -114,4 +119,9 @@ def prior_start(
         gauge = gauge._replace(space=table.unit / model.unit * gauge.space)
     noise = max(frames.noise_variance, LEAST_NOISE)
     start = JointState(scale * frames.shapes, np.empty((0, 2, 3)), noise)
-    return start, ShapePrior.of_model(frames, scale, gauge, settings.adapt), gauge
+    settings = settings._replace(
+        shape_prior=ShapePrior.of_model(frames, scale, gauge, settings.adapt),
+        limits=settings.limits._replace(least_noise=LEAST_NOISE),
+        tol=TOL_SHARE * settings.tol,
+    )
+    return start, settings, gauge

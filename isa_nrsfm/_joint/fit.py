@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, compose, distances
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
-from isa_nrsfm._joint.prior import LEAST_NOISE, ROUNDS, TOL_SHARE, ShapePrior
+from isa_nrsfm._joint.prior import ROUNDS
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,
     FactorisedTable,
@@ -59,7 +59,6 @@ def fit_jointly(
     paper_shapes: NDArray,
     settings: FitSettings,
     start: JointState | None = None,
-    prior: ShapePrior | None = None,
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
@@ -69,7 +68,7 @@ def fit_jointly(
     are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
     of freedom.
     """
-    problems, seen = _problems(table, paper_shapes, settings, prior)
+    problems, seen = _problems(table, paper_shapes, settings)
     first, sampled = problems[0], len(problems) > 1
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is None:
@@ -77,15 +76,14 @@ def fit_jointly(
     else:
         shapes = first.frames.coordinates(start.shapes)
         start = first.aligned(start._replace(shapes=shapes), first.cameras)
-        least: Any = {} if prior is None else {"least_noise": LEAST_NOISE}
-        fit = first.unreversed(start, first.cameras, **least)
+        fit = first.unreversed(start, first.cameras)
     ratio = fit.camera_noise_ratio
-    if prior is None:
+    if fit.prior is None:
         fit, least_noise, sufficient = judged(first, table, fit, start)
     else:
-        fit, prior = widened(first, fit)
-        problems = [replace(problem, prior=prior) for problem in problems]
-        least_noise, sufficient = LEAST_NOISE, False
+        least_noise, sufficient = settings.limits.least_noise, False
+        fit = widened(first, fit)
+        problems = [problem.with_prior(fit.prior) for problem in problems]
     if sufficient:
         problems = [replace(problem, penalty=0.0) for problem in problems]
         if not sampled:  # for a sufficient model a smaller tolerance is safe
@@ -112,10 +110,10 @@ def fit_jointly(
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
     if sampled:
         state = state._replace(motion=state.motion[table.parts[0]])
-    unknowns = None if prior is None else prior.n_determined
+    unknowns = None if fit.prior is None else fit.prior.n_determined
     noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose, unknowns)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
-    fit = fit._replace(state=end, camera_noise_ratio=ratio, prior=prior)
+    fit = fit._replace(state=end, camera_noise_ratio=ratio)
     return fit, problem.frames, first.likelihood(*state).alpha
 
 
@@ -172,10 +170,7 @@ def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
 
 
 def _problems(
-    table: FactorisedTable,
-    paper_shapes: NDArray,
-    settings: FitSettings,
-    prior: ShapePrior | None = None,
+    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings
 ) -> tuple[list[JointProblem], JointFrames | None]:
     """Return the problems of growing samples and of all frames.
 
@@ -184,7 +179,7 @@ def _problems(
     points.
     """
     n_shapes, _, n_points = paper_shapes.shape
-    limits, seen = settings.limits, None
+    limits, prior, seen = settings.limits, settings.shape_prior, None
     if prior is None and n_points > max(24 * n_shapes, limits.many_points):
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
@@ -196,9 +191,7 @@ def _problems(
         frames = _visible_frames(table)
     thorough = frames.n_frames <= limits.few_frames
     penalty = 0.0 if prior else frames.basis_penalty(limits.basis_std)
-    if prior is not None:
-        settings = settings._replace(tol=TOL_SHARE * settings.tol)
-    problem = JointProblem(frames, settings, thorough, penalty, prior)
+    problem = JointProblem(frames, settings, thorough, penalty)
     # Each parameter that fits noise only lowers -2 log L by about one. Steps on a
     # sample end when they gain less than 3 % of the number of shape parameters.
     chance = 0.03 * frames.coordinates(paper_shapes).size
@@ -323,17 +316,15 @@ def _freedom_correction(
     return float(n_numbers / max(freedom, 0.1 * n_numbers))
 
 
-def widened(problem: JointProblem, fit: JointFit) -> tuple[JointFit, ShapePrior]:
+def widened(problem: JointProblem, fit: JointFit, rounds: int = ROUNDS) -> JointFit:
     """Return the fit with the widths of the prior that follow from the table."""
-    prior = problem.prior
-    assert prior is not None
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
+        assert fit.prior is not None
         shapes, _, noise = fit.state
         curvature = problem.likelihood(*fit.state).shape_curvature
-        prior = prior.updated(shapes, curvature, noise)
-        problem = replace(problem, prior=prior)
-        fit = problem.unreversed(fit.state, problem.cameras, least_noise=LEAST_NOISE)
-    return fit, prior
+        problem = problem.with_prior(fit.prior.updated(shapes, curvature, noise))
+        fit = problem.unreversed(fit.state, problem.cameras)
+    return fit
 
 
 def reweighted(
@@ -373,7 +364,10 @@ def reweighted(
         weighted = rows.derive(new, *model)
         weights = new(few_rows, M, t, a, few_sizes)[1]
         problem = replace(problem, frames=JointFrames.from_weighted(weighted))
-        fit = problem.refined(fit.state, least_noise=least_noise)
+        if fit.prior is None:
+            fit = problem.refined(fit.state, least_noise=least_noise)
+        else:  # widths of the first fit are those of its outliers
+            fit = widened(problem, fit, rounds=1)
     return fit, deviation**2
 
 

@@ -30,8 +30,6 @@ from isa_nrsfm._linalg.small_matrices import centred
 FIRST_WIDTHS, ROUNDS = (0.05, 0.01), 3
 # Floor of the noise variance, as a share of the mean square; share of the tolerance.
 LEAST_NOISE, TOL_SHARE = 5e-4, 0.1
-# How much more tables differ in the depth of their shapes than in x and y.
-DEPTHS = 2.0
 
 
 class ShapePrior(NamedTuple):
@@ -121,12 +119,10 @@ class ShapePrior(NamedTuple):
 
         Information (3 (K + 1), 3 (K + 1)) of a point of the shapes, for noise of
         variance one; public lines of sight (I, 3), times the scales, and coefficients.
-        Depths of the model have errors, and differ more between tables than x and y do.
-        A fixed basis keeps the errors of the model.
+        Depths of the model have errors; a fixed basis keeps them.
         """
-        free = np.arange(len(self.shapes)) < len(self.variances)
-        v = np.where(free, self.variances if free.all() else self.variances[0], 0.0)
-        variances = np.maximum(np.outer(v, [1.0, 1.0, DEPTHS**2]), OF_DISTANCES**2)
+        variances = np.full((len(self.shapes), 3), OF_DISTANCES**2)
+        variances[: len(self.variances)] += self.variances[:, None]
         variances[:, 2] += self.depth_error
         along = np.kron(self.gauge.mixing.T, self.gauge.rotation.T)
         known = along.T @ information @ along / noise

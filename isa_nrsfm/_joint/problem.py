@@ -9,7 +9,7 @@ maximisation.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -123,19 +123,21 @@ class JointProblem:
 
     thorough: whether many starts are compared, as for small tables.
     penalty: factor of the prior of the basis shapes, or one (K,) for each.
-    prior: that of a fitted model, instead of the other priors.
     """
 
     frames: JointFrames
     settings: FitSettings
     thorough: bool = False
     penalty: NDArray | float = 0.0
-    prior: ShapePrior | None = None
 
     def part(self, chosen: NDArray, tol: float) -> "JointProblem":
         """Return the problem of a sample of the frames, with another tolerance."""
         frames, settings = self.frames.take(chosen), self.settings._replace(tol=tol)
-        return JointProblem(frames, settings, False, self.penalty, self.prior)
+        return JointProblem(frames, settings, False, self.penalty)
+
+    def with_prior(self, prior: ShapePrior | None) -> "JointProblem":
+        """Return the problem with another prior of the shapes."""
+        return replace(self, settings=self.settings._replace(shape_prior=prior))
 
     @property
     def cameras(self) -> CameraModel:
@@ -151,7 +153,8 @@ class JointProblem:
     @cached_property
     def likelihood(self) -> MarginalLikelihood:
         """The objective."""
-        return MarginalLikelihood(self.frames, self.penalty, prior=self.prior)
+        prior = self.settings.shape_prior
+        return MarginalLikelihood(self.frames, self.penalty, prior=prior)
 
     def aligned(self, state: JointState, cameras: CameraModel) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes."""
@@ -169,7 +172,7 @@ class JointProblem:
     ) -> JointFit:
         """Refine a state jointly, within the limits of the settings or other ones."""
         cameras, settings = cameras or self.cameras, self.settings
-        free = cameras.name == "affine" or self.prior is not None
+        free = cameras.name == "affine" or settings.shape_prior is not None
         extents = 0.0 if free else EXTENT_WEIGHT
         given = {
             "least_noise": settings.limits.least_noise,
@@ -269,7 +272,8 @@ def refine_joint(
     slope = iterate.gradient @ iterate.precondition(iterate.gradient)
     norm = float(np.sqrt(max(slope, 0.0) / n_seen))
     converged = small_steps >= 2 and bool(np.isfinite(iterate.value))
-    return JointFit(iterate.state, np.array(history), norm, converged, iterate.misfit)
+    values = np.array(history), norm, converged, iterate.misfit
+    return JointFit(iterate.state, *values, prior=likelihood.prior)
 
 
 class _Iterate:

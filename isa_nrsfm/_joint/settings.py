@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
+from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._paper.pipeline import DENSE
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.tracks import Layout
@@ -70,7 +71,7 @@ class FitSettings(NamedTuple):
     """The parameters of `AffineNRSfM` of the same names, and limits.
 
     scale_frames: False with orthographic cameras. names: those of the columns, if any.
-    prior: the `TableModel` of the estimator, or None.
+    prior: the `TableModel` of the estimator, or None; shape_prior: made from it.
     silent_isa: whether a strategy that only starts the joint fit may end early.
     on_step: called before each step of the joint fit.
     """
@@ -89,6 +90,7 @@ class FitSettings(NamedTuple):
     names: NDArray | None = None
     prior: Any = None
     adapt: str = "mean"
+    shape_prior: ShapePrior | None = None
     silent_isa: bool = True
     limits: Limits = LIMITS
     on_step: Callable[[], None] | None = None

@@ -157,6 +157,7 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
     target, hidden = _start_of_hiding(rows)
     seen = seen_points(target)
+    shown = np.asarray(seen.any(axis=0))
     filled = np.where(hidden[:, None], 0.0, target)
     for _ in range(100):
         # Rigid factorisation, rank 3, of the filled rows
@@ -166,7 +167,8 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         # Typical distances, of the table and of each point
         distance = np.linalg.norm(target - rigid, axis=1)
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
-        of_point = np.nanmedian(distance, axis=0) / MEDIAN_DISTANCE
+        of_point = np.zeros(len(shown))  # of points in no frame, too
+        of_point[shown] = np.nanmedian(distance[:, shown], axis=0) / MEDIAN_DISTANCE
         limit = 4.5 * np.maximum(typical, of_point)
         # Hide points that are too far, and fill them in
         previous, hidden = hidden, ~(distance <= limit)

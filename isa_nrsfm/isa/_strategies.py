@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import NDArray
+from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_random_state
 from sklearn.utils.parallel import Parallel, delayed
@@ -426,3 +427,27 @@ def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
     if not np.allclose(covariance, covariance.T, atol=1e-8 * np.abs(covariance).max()):
         raise ValueError("covariance must be symmetric; got a matrix that is not")
     return covariance
+
+
+def ready_strategy(
+    isa: Any, joint: bool, random_state: Any, n_jobs: int | None, verbose: int
+) -> Any:
+    """Return the unfitted strategy, or the default one, with parameters that it lacks.
+
+    `joint`: whether its result is only a start.
+    """
+    isa = PooledFastICA(n_init=2 if joint else 16) if isa is None else clone(isa)
+    params = isa.get_params(deep=False)
+    if params.get("subspace_size", 3) != 3:
+        raise ValueError(
+            "isa must have subspace_size=3, a dimension of space each; got "
+            f"subspace_size={params['subspace_size']}"
+        )
+    if params.get("random_state", 0) is None:
+        random_state = check_random_state(random_state)
+        isa.set_params(random_state=random_state.randint(np.iinfo(np.int32).max))
+    if params.get("n_jobs", 0) is None:
+        isa.set_params(n_jobs=n_jobs)
+    if params.get("verbose", 1) == 0:
+        isa.set_params(verbose=verbose)
+    return isa
