@@ -28,6 +28,7 @@ from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
 from isa_nrsfm.cli._sections import fit_text, write_report
+from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 
@@ -148,8 +149,6 @@ def _load_prior(args: Namespace) -> None:
     """Load the prior, and set the options that it determines unless they are given."""
     camera, n_components, asked = "affine", 3, args.n_components
     if args.prior is not None:
-        from isa_nrsfm.datasets import load_face_prior  # not needed without
-
         face = args.prior == FACE_PRIOR
         args.prior = load_face_prior() if face else load_model(args.prior)
         n_components = len(args.prior.basis_)
