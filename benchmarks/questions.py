@@ -5,10 +5,15 @@ Run ``python -m benchmarks.questions [section ...] [--seeds N]``: about two minu
 ten for ``chance``. The figures of docs/questions.md are those of the first seed.
 """
 
+import warnings
+
 import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from benchmarks._run import run_sections
 from benchmarks._sets import (
@@ -17,6 +22,7 @@ from benchmarks._sets import (
     ICT,
     PICKUP,
     YOGA,
+    Case,
     as_table,
     centred_tracks,
     load_arrays,
@@ -34,11 +40,14 @@ from isa_nrsfm.analysis import (
     predictability,
 )
 from isa_nrsfm.calibration import view_angles
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.export import frame_poses
 
 # Numbers of basis shapes of motion capture.
 K_OF_BODIES = (6, 12)
+# Expressions of other people by another annotator, and its names of the same ones.
+OTHER_EXPRESSIONS = Case("other expressions", "expressions_ewan_68", 9)
+SAME_NAMES = {"joy": "happy", "suprise": "surprise"}
 # Noise and share of the points that are missing there.
 NOISE, MISSING = 0.02, 0.3
 # The y axis of ICT-68 points up and its z axis to the viewer; angles are told of images
@@ -309,7 +318,56 @@ def poses(options):
             )
 
 
-SECTIONS = {each.__name__: each for each in (labels, chance, people, smoothing, poses)}
+def studies(options):
+    """Labels that are learnt on one table and predicted on the other, percent right."""
+    tables, names = [], []
+    for case in (EXPRESSIONS, OTHER_EXPRESSIONS):
+        arrays = load_arrays(case)
+        if arrays is None:
+            return
+        y = np.array([SAME_NAMES.get(name, name) for name in arrays["labels"]])
+        tables.append(load_table(case))
+        names.append(y)
+    common = [np.isin(y, names[1 - i]) for i, y in enumerate(names)]
+    names = [y[used] for y, used in zip(names, common, strict=True)]
+
+    def show(title, of_first, of_second=None):
+        """Print the accuracy in both directions; features may differ in these."""
+        right = []
+        for learnt, features in enumerate((of_first, of_second or of_first)):
+            X, Z = (each[used] for each, used in zip(features, common, strict=True))
+            if learnt:
+                X, Z = Z, X
+            classifier = make_pipeline(StandardScaler(), LinearDiscriminantAnalysis())
+            classifier.fit(X, names[learnt])
+            right.append(100 * classifier.score(Z, names[1 - learnt]))
+        print(f"{title:44}{right[0]:8.1f}{right[1]:8.1f}", flush=True)
+
+    print(f"{'learnt on':44}{'first':>8}{'second':>8}")
+    aligned = [AlignedFrames().fit(X) for X in tables]
+    points = [[each.transform(X) for X in tables] for each in aligned]
+    for n in (9, 18, 30):
+        pca = [PCA(n, random_state=0).fit(points[i][i]) for i in (0, 1)]
+        both = [[pca[i].transform(X) for X in points[i]] for i in (0, 1)]
+        show(f"PCA of aligned points, {n}", *both)
+    calibrated = {"camera": "weak_perspective", "random_state": 0}
+    with warnings.catch_warnings(action="ignore"):  # of depths, and of other tables
+        own = [AffineNRSfM(9, **calibrated).fit(X) for X in tables]
+        show("own fits, K=9", [model.alpha_ for model in own])
+        both = [[model.transform(X) for X in tables] for model in own]
+        show("transform, model of the first table, K=9", *both)
+        for K in (9, 40):
+            prior = load_face_prior(K)
+            show(f"transform, face prior, K={K}", [prior.transform(X) for X in tables])
+            for adapt in ("mean", "shapes"):
+                model = AffineNRSfM(K, prior=prior, adapt=adapt, **calibrated)
+                both = [model.fit_transform(X) for X in tables]
+                show(f"face prior, {adapt}, K={K}", both)
+
+
+SECTIONS = {
+    each.__name__: each for each in (labels, chance, people, smoothing, poses, studies)
+}
 
 if __name__ == "__main__":
     run_sections(__doc__, SECTIONS)

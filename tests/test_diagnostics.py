@@ -372,7 +372,18 @@ class TestAdvice:
     @pytest.mark.parametrize(
         ("known", "expected"),
         [
-            ({"certainty": UNKNOWN["deformation"]}, "table in which the objects turn"),
+            (
+                {"certainty": UNKNOWN["deformation"]},
+                'objects turn, then use prior=model, n_components="auto". If',
+            ),
+            (
+                {"certainty": UNKNOWN["parts"], "n_points": 68, "auto": True},
+                "68 points of faces, use prior=isa_nrsfm.datasets.load_face_prior(). I",
+            ),
+            (
+                {"certainty": UNKNOWN["parts"], "n_points": 68, "prior": True},
+                "Fit more frames, best of objects that turn further",
+            ),
             ({"certainty": UNKNOWN["parts"]}, 'Use n_components="auto"'),
             (
                 {"certainty": UNKNOWN["parts"], "noise_ratio": 20.0},
@@ -397,6 +408,11 @@ class TestAdvice:
         assert advice(facts(**known, reliability=np.array([0.9, 0.8, 0.0]))) == ()
         (message,) = advice(facts(**known, reliability=np.zeros(3)))
         assert "no deformation was found" in message
+
+    def test_a_prior_determines_the_number_of_basis_shapes(self):
+        few = facts(reliability=np.array([0.9, 0.8, 0.0]))
+        assert "at most n_components=2" in advice(few)[0]
+        assert advice(few._replace(prior=True)) == ()
 
     @pytest.mark.parametrize("ratio", [1.0, 1.5, 100.0])
     def test_on_cameras_does_not_lead_back(self, ratio):

@@ -265,7 +265,7 @@ def test_variables_of_matlab_are_the_model(sequence):
 WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
 REFERENCE = (
     *("conventions", "depth", "export", "formats", "large_tables", "perspective"),
-    "skeletons",
+    *("skeletons", "two_studies"),
 )
 # Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
 OF_OTHERS = ("from_movement", "dask")
@@ -305,6 +305,7 @@ def test_code_of_reference_pages_runs(page, fitted):
     names |= {"write_viewer": write_viewer, "canonical_pose": canonical_pose}
     names |= {"X": faces.data, "stream": faces.data[:2], "weights": np.ones((60, 68))}
     names |= {"points": pd.DataFrame(faces.data, columns=columns), "model": model}
+    names |= {"new_points": names["points"][:20]}
     names |= {"expressions": ["a", "b"] * 30, "shape": bodies.mean_shape_}
     others = {"coco-17": bodies, "mouse.html": mice}
     with sklearn.config_context():

@@ -461,7 +461,7 @@ def error_of_depths(model, X, points):
 def frontal():
     X, *_ = faces_turned_by(2)
     model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
-    with pytest.warns(UserWarning, match="transform this one with that model"):
+    with pytest.warns(UserWarning, match="use prior=isa_nrsfm.datasets.load_f"):
         return X, model.fit(X)
 
 

@@ -69,6 +69,7 @@ CASES = {
     "folder": {"frames_folder": "folder"},
     "path of a folder": {"frames_folder": Path("folder")},
     "mirrored": CALIBRATED | {"mirror": True},
+    "prior": CALIBRATED | {"n_components": "auto", "prior": "a model"},
     "numbers of numpy": {"n_components": np.int64(2), "tol": np.float32(0.05)}
     | {"scale_frames": np.bool_(True), "loss": np.str_("linear")},
     "OwnISA": {"refinement": None, "isa": OWN["OwnISA"]},
@@ -102,6 +103,10 @@ def fitted(tmp_path_factory):
             kind = type(parameters["frames_folder"])
             folder = tmp_path_factory.mktemp("frames")
             parameters["frames_folder"] = folder if kind is not str else str(folder)
+        if "prior" in parameters:
+            faces = make_face_tracks(200, n_components=2, random_state=1)
+            prior = AffineNRSfM(2, camera="weak_perspective", random_state=0)
+            parameters["prior"] = prior.fit(faces.data[:, :28])
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "no point is visible in 1 of 20")
             model = AffineNRSfM(**parameters).fit(table)
@@ -175,7 +180,7 @@ def assert_same(loaded, saved):
             assert found[name].dtype == value.dtype
         else:
             assert type(found[name]) is type(value)
-    for name in {"isa", "isa_", "density"} & vars(saved).keys():
+    for name in {"isa", "isa_", "density", "prior"} & vars(saved).keys():
         part = getattr(saved, name)
         if hasattr(part, "get_params") and not type(part).__name__.startswith("Own"):
             assert_same(getattr(loaded, name), part)
@@ -206,7 +211,9 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
         assert sorted(["header", *header["arrays"]]) == sorted(file)
 
 
-@pytest.mark.parametrize("case", slow_after(1, ["not refined", "names", "alternating"]))
+@pytest.mark.parametrize(
+    "case", slow_after(2, ["prior", "not refined", "names", "alternating"])
+)
 def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     model, table = fitted(case)
     save_model(model, path)
@@ -342,7 +349,9 @@ def test_files_that_unpack_to_more_than_they_have_are_refused(rewritten):
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize("case", slow_after(1, ["alternating", "weak perspective"]))
+@pytest.mark.parametrize(
+    "case", slow_after(1, ["prior", "alternating", "weak perspective"])
+)
 def test_damaged_contents_with_a_right_digest_are_loaded_or_refused(case, rewritten):
     rng = np.random.default_rng(0)
 

@@ -57,6 +57,8 @@ class Facts(NamedTuple):
         those that the pose predicts; empty if there are none.
     perspective : str
         Message if perspective explains the table better, otherwise empty.
+    n_points, prior : int, bool
+        Number of points, and whether a fitted model was the prior.
     """
 
     camera: str
@@ -72,6 +74,8 @@ class Facts(NamedTuple):
     few: str = ""
     pose: str = ""
     perspective: str = ""
+    n_points: int = 0
+    prior: bool = False
 
     @property
     def bent(self) -> bool:
@@ -94,6 +98,7 @@ def facts_of(model: Any, **found: Any) -> Facts:
     frames, ratio = model._model.frames, getattr(model, "camera_noise_ratio_", np.nan)
     consensus, auto = model.refinement == "consensus", model.n_components == "auto"
     known = frames.certainty, model.reliability_, ratio
+    found |= {"n_points": len(model.mean_shape_), "prior": model.prior is not None}
     return Facts(model.camera_, frames.loss, consensus, auto, *known, **found)
 
 
@@ -121,7 +126,7 @@ def _messages(facts: Facts) -> Iterator[str]:
             f"not interpret the coefficients{outliers * (facts.loss == 'linear')}"
         )
         return
-    if n_supported < n_components:
+    if n_supported < n_components and not (facts.prior or "prior=" in depth):
         yield (
             f"the table does not support n_components={n_components}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
@@ -156,12 +161,16 @@ def depth_advice(facts: Facts) -> str:
     if facts.bent:
         return f"{text}. The outliers may be the reason"
     why, remedy = "parts of the points lead to different depths", "fit more points"
-    if certainty.deformation > LARGEST_SHARE**2:
+    if turned := certainty.deformation > LARGEST_SHARE**2:
         why = "deformation explains the images as well as rotations do"
-        remedy = (
-            "fit a table in which the objects turn further, and transform this one "
-            "with that model"
-        )
+    auto = "" if facts.auto else ', n_components="auto"'
+    if facts.prior:
+        remedy = "fit more frames, best of objects that turn further"
+    elif facts.n_points == 68 and facts.camera != "orthographic":
+        face = f"prior=isa_nrsfm.datasets.load_face_prior(){auto}"
+        remedy = f"if these are the 68 points of faces, use {face}"
+    elif turned:
+        remedy = f"fit a table in which the objects turn, then use prior=model{auto}"
     elif most < len(facts.reliability):
         remedy = f"use at most n_components={most}"
     elif not facts.auto:

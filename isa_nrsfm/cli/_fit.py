@@ -23,12 +23,13 @@ from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
-from isa_nrsfm.cli._options import AUTO, NONE, flag_of
+from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, NONE, flag_of
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
 from isa_nrsfm.cli._sections import fit_text, write_report
-from isa_nrsfm.io import write_table
+from isa_nrsfm.datasets import load_face_prior
+from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
@@ -37,7 +38,7 @@ N_PARTS = 3
 # Options that are parameters of the same name; none stands for None.
 _PARAMETERS = (
     *("block_recovery", "refinement", "camera", "focal_length", "independence"),
-    *("loss", "random_state", "n_jobs"),
+    *("prior", "adapt", "loss", "random_state", "n_jobs"),
 )
 
 
@@ -59,6 +60,8 @@ def fit_table(
     far, and grows. Functions of the model and its table make `extra` entries of the
     report.
     """
+    prior = args.prior
+    _load_prior(args)
     _check_options(args)
     folder, clock = Path(args.output), {"": args.since}
     frames = read_frames(args, table=table)
@@ -81,6 +84,8 @@ def fit_table(
         inputs.append(args.table)
     else:
         results = results | {Path(args.table).name: "the table"}
+    if prior not in (None, FACE_PRIOR):
+        inputs.append(prior)
     with whole_files.folder_for_writing(folder):
         files = [*results, *figures, _outputs.REPORT]
         _outputs.refuse_overwriting(inputs, [folder / name for name in files])
@@ -106,6 +111,8 @@ def fit_table(
                 )[1]
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
             _outputs.write_results(new, estimator, frames, smooth, drawn, unit, **shown)
+            if prior is not None:
+                answers["prior"] = {"name": prior, "std": estimator.prior_std_}
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
@@ -136,6 +143,22 @@ def fit_table(
             report |= {"seconds": _seconds(clock), "files": results | captions}
             report = write_report(new, report)
     return report
+
+
+def _load_prior(args: Namespace) -> None:
+    """Load the prior, and set the options that it determines unless they are given."""
+    camera, n_components, asked = "affine", 3, args.n_components
+    if args.prior is not None:
+        face = args.prior == FACE_PRIOR
+        args.prior = load_face_prior() if face else load_model(args.prior)
+        n_components = len(args.prior.basis_)
+        asked = None if asked == (AUTO,) else asked
+        if (camera := args.prior.camera_) == "affine":
+            camera = "weak_perspective"  # such a prior is refused
+    elif args.adapt == "shapes":
+        raise ValueError("--adapt shapes needs --prior")
+    args.camera = args.camera or camera
+    args.n_components = asked or (n_components,)
 
 
 def _check_options(args: Namespace) -> None:

@@ -11,7 +11,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-from isa_nrsfm.cli._options import PROGRAM, build_parser, flag_of
+from isa_nrsfm.cli._options import FACE_PRIOR, PROGRAM, build_parser, flag_of
 from isa_nrsfm.cli._progress import show_stage, shown_progress
 
 # Parameters that messages name, as options of the same names.
@@ -70,6 +70,13 @@ def _message(error: Exception, args: Namespace) -> str:
 def _with_options(text: str, args: Namespace) -> str:
     """Join the lines of a message, and name options instead of parameters of Python."""
     text = " ".join(text.split())
+    model = f"--prior {getattr(args, 'model', 'model.npz')}"
+    for way, option in (
+        (r"AffineNRSfM\([^)]*prior=model\)\.fit\(X\)", f"{PROGRAM} fit TABLE {model}"),
+        (r"prior=model(, n_components=.auto.)?", model),
+        (r"prior=[\w.]+\(\)(, n_components=.auto.)?", f"--prior {FACE_PRIOR}"),
+    ):
+        text = re.sub(way, option.replace("\\", r"\\"), text)
     for name in filter(partial(hasattr, args), _PARAMETERS):
         value = r"=(?P<quote>['\"]?)(?P<value>[\w.-]*\w)(?P=quote)"
         option = rf"{flag_of(name)} \g<value>"

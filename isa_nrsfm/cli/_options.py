@@ -21,6 +21,8 @@ AUTO = "auto"
 NONE = "none"
 # Configuration files of DeepLabCut.
 CONFIGURATIONS = (".yaml", ".yml")
+# The prior of the package.
+FACE_PRIOR = "face-68"
 # What export writes, and the suffixes of the files.
 SUFFIXES = {
     "viewer": (".html", ".htm"),
@@ -220,17 +222,23 @@ HELP = {
     "fps NUMBER": "instead of --time, the frames per second of a video; frames have "
     "the numbers of the column frame, or of the rows",
     # The method.
-    "n_components K": "number of basis shapes (default: 3). Of several, such as 1-8 or "
-    "3,6,9, the best in cross-validation is used; auto uses as many as the table "
-    "determines, at most twelve",
+    "n_components K": "number of basis shapes (default: 3, or that of the prior). Of "
+    "several, such as 1-8 or 3,6,9, the best in cross-validation is used; auto uses as "
+    "many as the table determines, at most twelve",
     "camera": "camera model: affine (no assumption), weak_perspective (a rotation and "
     "a scale per frame), orthographic (one scale), or perspective (for objects near "
-    "the camera, as before a webcam). All but affine estimate depth and proportions",
+    "the camera, as before a webcam). All but affine estimate depth and proportions "
+    "(default: affine, or that of the prior)",
     "focal_length NUMBER": "of perspective cameras, in pixels (default: estimated). "
     "For images of width w and height h OpenFace assumes 500 w / 640, and MediaPipe "
     "0.816 h (63 degrees vertically)",
     "principal_point X Y": "of perspective cameras: the point of the image on the axis "
     "of the camera, in pixels (default: the middle of the images)",
+    "prior MODEL": "a fitted model of a table in which the objects turn, such as "
+    f"model.npz, or {FACE_PRIOR} for faces with 68 points: with it frontal photos and "
+    "few frames have true depths",
+    "adapt": "what differs from the prior: the mean shape, so that coefficients of "
+    "several studies can be compared, or all shapes",
     "export.camera": "camera model for a model with affine cameras; none exports "
     "affine shapes, whose angles and depth are not true (default: weak_perspective)",
     "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
@@ -265,6 +273,7 @@ CHOICES: dict[str, Sequence[str]] = {
     "part": choices.OPENPOSE_PARTS,
     "origin": ("auto", "upper", "lower"),
     "camera": choices.CAMERA_NAMES,
+    "adapt": choices.ADAPTED,
     "export.camera": ("weak_perspective", NONE),
     "isa": ("pooled", "fast"),
     "block_recovery": choices.BLOCK_RECOVERIES,
@@ -274,10 +283,10 @@ CHOICES: dict[str, Sequence[str]] = {
     "content": tuple(SUFFIXES),
 }
 # Options whose first choice is their value by default, which the help states.
-FIRST = ("camera", "isa", "block_recovery", "refinement", "independence", "loss")
+FIRST = ("adapt", "isa", "block_recovery", "refinement", "independence", "loss")
 DEFAULTS = {
     **{name: CHOICES[name][0] for name in ("format", *FIRST)},
-    **{"length": 1.0, "n_components": "3", "random_state": 0},
+    **{"length": 1.0, "random_state": 0},
     "demo.output": "isa-nrsfm-demo",
 }
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
@@ -318,6 +327,7 @@ examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
   isa-nrsfm fit faces.csv --n-components 1-12 --output results
   isa-nrsfm fit body.csv --camera weak_perspective -k auto --output results
+  isa-nrsfm fit photos.csv --prior face-68 --output results
   isa-nrsfm fit webcam.csv --camera perspective --image-size 1280x720 --output results
   isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
       --n-components 9 --output muct
@@ -335,6 +345,7 @@ coefficients. The results replace those of an earlier run in the output folder."
             ),
             "method": (
                 *("n_components", "camera", "focal_length", "principal_point"),
+                *("prior", "adapt"),
                 *("isa", "n_init", "block_recovery"),
                 *("refinement", "independence", "loss", "no_scale_frames"),
                 *("no_hidden_points", "random_state", "n_jobs"),

@@ -163,7 +163,7 @@ def _perspective_advice(
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
     X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
     weights = {name: values[rows] for name, values in frames.weighting.items()}
-    fixed = {"n_components": K, "refinement": "joint"}
+    fixed = {"n_components": K, "refinement": "joint", "prior": None}
     params = estimator.get_params(deep=False) | fixed
     seen = {"camera": "perspective", "principal_point": point}
     errors = []

@@ -267,6 +267,8 @@ def _fit(report: dict[str, Any]) -> Section:
         if not model["frames_scaled"]:
             size = f"{noise:.3g} in the units of the table"
         parts.append(f"noise {size} (standard deviation of a coordinate)")
+    if "prior" in report:
+        parts.append(_prior(report["prior"], model["parameters"]["adapt"]))
     if model["outliers"] is not None and model["outliers"]["message"]:
         parts.append(_sentence(model["outliers"]["message"]))
     fit = seconds["fit"] + seconds.get("choose", 0.0)
@@ -283,6 +285,19 @@ def _fit(report: dict[str, Any]) -> Section:
             + ". If they are upside down, y points up in the table: use --origin lower."
         )
     return parts
+
+
+def _prior(prior: dict[str, Any], adapt: str) -> str:
+    """Return how far the shapes are from those of the prior, and what that means."""
+    mean_shape, basis = (f"{100 * width:.2g} %" for width in prior["std"])
+    whose = "the prior, so that studies with the same prior can be compared"
+    if adapt != "mean":
+        whose = "adapted basis shapes: compare studies with --adapt mean"
+    return (
+        f"prior {prior['name']}: the mean shape differs by {mean_shape} of the size of "
+        f"the object from that of the prior, the basis shapes by {basis} (standard "
+        f"deviations of a coordinate). Coefficients are those of {whose}."
+    )
 
 
 def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Section:

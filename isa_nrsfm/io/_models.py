@@ -44,7 +44,7 @@ ENTRIES = (
     *("parameters", "attributes", "set_output", "frames"),
 )
 NEEDED = (
-    *("mean_shape_", "basis_", "isa_", "inverse_snr_", "rank_floor_", "n_iter_"),
+    *("mean_shape_", "basis_", "inverse_snr_", "rank_floor_", "n_iter_"),
     *("energy_share_", "mode_covariance_", "singular_values_", "n_features_in_"),
     *("reference_motion_", "reference_translation_"),
 )
@@ -128,14 +128,11 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
         )
     check_is_fitted(estimator)
     arrays: Arrays = {}
-    config = vars(estimator).get("_sklearn_output_config", {})
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "package_version": __version__,
-        **packed_parts(estimator, "", arrays),
-        "set_output": config.get("transform"),
-        "frames": packed_all(_frame_entries(estimator), "frames.", arrays),
+        **packed_model(estimator, "", arrays),
         "arrays": sorted(arrays),
     }
     header["digest"] = _digest(header, arrays)
@@ -264,7 +261,8 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((P,), ["depth_variances"]),
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
-        ((2,), ["reference_translation_", "certainty", "image_errors"]),
+        ((2,), ["reference_translation_", "prior_std_"]),
+        ((2,), ["certainty", "image_errors"]),
         ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_"]),
@@ -377,6 +375,8 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
     elif type(value) in STORED.values():
         parts = packed_parts(value, f"{name}.", arrays)
         return {"object": {"class": type(value).__name__, **parts}}
+    elif type(model := getattr(value, "estimator", value)) is AffineNRSfM:
+        return {"model": packed_model(model, f"{name}.", arrays)}  # the prior
     elif name.rpartition(".")[2] in ("isa", "isa_", "density"):
         named = NamedStrategy(full_name(type(value)))
         for key, item in fitted_attributes(value).items():
@@ -386,6 +386,16 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
     raise ValueError(
         f"{name} is of type {full_name(type(value))}, which a model file cannot hold"
     )
+
+
+def packed_model(estimator: AffineNRSfM, prefix: str, arrays: Arrays) -> dict[str, Any]:
+    """Return the parts of a fitted estimator as JSON values."""
+    config = vars(estimator).get("_sklearn_output_config", {})
+    return {
+        **packed_parts(estimator, prefix, arrays),
+        "set_output": config.get("transform"),
+        "frames": packed_all(_frame_entries(estimator), f"{prefix}frames.", arrays),
+    }
 
 
 def packed_parts(held: Any, prefix: str, arrays: Arrays) -> dict[str, Any]:
@@ -425,6 +435,8 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
                 return random
         case {"object": {"class": str(name), **parts}} if name in STORED:
             return with_parts(STORED[name], parts, arrays)
+        case {"model": model}:
+            return _restored(model, arrays)
     raise ValueError(f"its header has a value that is not known: {str(value)[:60]}")
 
 
