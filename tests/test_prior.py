@@ -17,12 +17,12 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._fit import prior_start
 from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._joint.fit import widened
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem
+from isa_nrsfm._other_tables import prior_start
 from isa_nrsfm._parameters.choices import ADAPTED
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm.metrics import mean_shape_error_3d
@@ -110,10 +110,9 @@ def problem_of(table, adapt):
     model = clone(table.model).set_params(adapt=adapt)
     source, _, settings = model._ready(table.X)
     scaled = scaled_table(source, None, 2, settings)
-    start, prior, _ = prior_start(scaled, settings, checked=True)
+    start, settings, _ = prior_start(scaled, settings, checked=True)
     frames = JointFrames.from_points(scaled.rows, True)
-    settings = settings._replace(tol=1e-4)
-    problem = JointProblem(frames, settings, True, 0.0, prior)
+    problem = JointProblem(frames, settings._replace(tol=1e-4), True)
     return problem, problem.aligned(start, problem.cameras)
 
 
@@ -121,8 +120,8 @@ def problem_of(table, adapt):
 def test_widths_of_zero_give_the_shapes_of_the_prior(frontal, adapt):
     problem, start = problem_of(frontal, adapt)
     # Also in float64 the mean shape moves by the square of the width.
-    prior = problem.prior._replace(widths=(1e-5, 1e-5))
-    problem = JointProblem(problem.frames, problem.settings, True, 0.0, prior)
+    prior = problem.settings.shape_prior._replace(widths=(1e-5, 1e-5))
+    problem = problem.with_prior(prior)
     shapes = problem.unreversed(start, problem.cameras).state.shapes
     assert_allclose(shapes, prior.shapes, atol=1e-6)
 
@@ -132,8 +131,8 @@ def test_first_widths_make_no_difference(frontal, adapt):
     ends = []
     for widths in ((0.01, 0.003), (0.05, 0.01), (0.2, 0.03)):
         problem, start = problem_of(frontal, adapt)
-        prior = problem.prior._replace(widths=widths)
-        problem = JointProblem(problem.frames, problem.settings, True, 0.0, prior)
+        prior = problem.settings.shape_prior._replace(widths=widths)
+        problem = problem.with_prior(prior)
         fit = widened(problem, problem.unreversed(start, problem.cameras))
         ends.append((fit.prior.widths, fit.state.shapes))
     for widths, shapes in ends[1:]:

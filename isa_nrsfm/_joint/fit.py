@@ -82,8 +82,9 @@ def fit_jointly(
         fit, least_noise, sufficient = judged(first, table, fit, start)
     else:
         least_noise, sufficient = settings.limits.least_noise, False
-        fit = widened(first, fit)
-        problems = [problem.with_prior(fit.prior) for problem in problems]
+        if table.outliers is None:  # with them the widths follow the weights
+            fit = widened(first, fit)
+            problems = [problem.with_prior(fit.prior) for problem in problems]
     if sufficient:
         problems = [replace(problem, penalty=0.0) for problem in problems]
         if not sampled:  # for a sufficient model a smaller tolerance is safe
@@ -316,9 +317,9 @@ def _freedom_correction(
     return float(n_numbers / max(freedom, 0.1 * n_numbers))
 
 
-def widened(problem: JointProblem, fit: JointFit, rounds: int = ROUNDS) -> JointFit:
+def widened(problem: JointProblem, fit: JointFit) -> JointFit:
     """Return the fit with the widths of the prior that follow from the table."""
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         assert fit.prior is not None
         shapes, _, noise = fit.state
         curvature = problem.likelihood(*fit.state).shape_curvature
@@ -366,8 +367,8 @@ def reweighted(
         problem = replace(problem, frames=JointFrames.from_weighted(weighted))
         if fit.prior is None:
             fit = problem.refined(fit.state, least_noise=least_noise)
-        else:  # widths of the first fit are those of its outliers
-            fit = widened(problem, fit, rounds=1)
+        else:
+            fit = widened(problem, fit)
     return fit, deviation**2
 
 
