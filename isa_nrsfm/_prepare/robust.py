@@ -167,7 +167,7 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         # Typical distances, of the table and of each point
         distance = np.linalg.norm(target - rigid, axis=1)
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
-        of_point = np.zeros(len(shown))  # of points in no frame, too
+        of_point = np.zeros(rows.shape[2])  # of points in no frame, too
         of_point[shown] = np.nanmedian(distance[:, shown], axis=0) / MEDIAN_DISTANCE
         limit = 4.5 * np.maximum(typical, of_point)
         # Hide points that are too far, and fill them in
