@@ -412,7 +412,7 @@ class TestAdvice:
     def test_a_prior_determines_the_number_of_basis_shapes(self):
         few = facts(reliability=np.array([0.9, 0.8, 0.0]))
         assert "at most n_components=2" in advice(few)[0]
-        assert advice(few._replace(prior=True)) == ()
+        assert advice(few._replace(prior=True, pose="the outline")) == ()
 
     @pytest.mark.parametrize("ratio", [1.0, 1.5, 100.0])
     def test_on_cameras_does_not_lead_back(self, ratio):
