@@ -167,7 +167,8 @@ class FrameMap(NamedTuple):
         # d new / d alpha, times scale
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)
-        return cameras, new, np.sqrt(variance) / np.abs(scale)[:, None]
+        deviation = np.sqrt(np.maximum(variance, 0.0))  # less than zero by rounding
+        return cameras, new, deviation / np.abs(scale)[:, None]
 
 
 class LinearisedFrames(NamedTuple):
