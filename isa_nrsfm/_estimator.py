@@ -1003,7 +1003,7 @@ default="affine"
                 setattr(mirror, name, getattr(self, name) * factor)
         return mirror
 
-    def reproject(self, X: Any) -> NDArray:
+    def reproject(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """
         Return the images of the fitted shapes, including missing points.
 
@@ -1011,6 +1011,8 @@ default="affine"
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
 
         Returns
         -------
@@ -1018,8 +1020,11 @@ default="affine"
             Points of the fitted shapes in the fitted cameras. NaN for rows with too
             few visible points.
         """
-        table, _ = self._opened(X)
-        return table.collect(self._model.reproject, *self._focal_shares(table))
+        table, weights = self._opened(X, point_weight)
+        shares = self._focal_shares(table)
+        if weights and not shares:
+            shares = (np.ones((table.n_frames, 1)),)
+        return table.collect(self._model.reproject, *shares, *weights)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None

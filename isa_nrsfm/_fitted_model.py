@@ -228,9 +228,15 @@ class TableModel(NamedTuple):
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         return shapes, deviations / scales[:, None]
 
-    def reproject(self, rows: NDArray, share: NDArray | None = None) -> NDArray:
+    def reproject(
+        self,
+        rows: NDArray,
+        share: NDArray | None = None,
+        weights: NDArray | None = None,
+    ) -> NDArray:
         """Return images of the fitted shapes, as a table; with a share, zoomed back."""
-        motion, translation, alpha, _ = self.decompose(rows, deviations=False)
+        fit = self.decompose(rows, weights, deviations=False)
+        motion, translation, alpha, _ = fit
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation)
         if self.pinhole is not None and share is not None:
