@@ -224,7 +224,7 @@ class TestPosteriorFrames:
         frames, tracks = posterior_frames(0, loss)
         tracks[:, 7] = np.nan
         expected = frames.posterior(tracks.transpose(0, 2, 1))
-        for far in [1e3, 1e8, 1e16, 1e140]:
+        for far in [1e3, 1e8, 1e16, 2e153]:
             tracks[:, 7] = far
             fitted = frames.posterior(tracks.transpose(0, 2, 1))
             assert_allclose(fitted.alpha, expected.alpha, atol=1e-6)
