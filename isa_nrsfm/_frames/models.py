@@ -436,7 +436,7 @@ class PosteriorFrames:
         variances += self.certainty.variances(fit.alpha)
         # Frames that the model explains less well than those of the fit
         squares = fit.objective - self.noise_variance * np.vecdot(fit.alpha, fit.alpha)
-        excess = squares / weights.sum(axis=1) / self.certainty.residual
+        excess = squares / weights.sum(axis=1) / (self.certainty.residual or np.nan)
         excess = np.fmax(excess, 1.0)
         return sizes[:, None] * np.sqrt(variances * excess[:, None])
 
