@@ -500,7 +500,15 @@ default="affine"
         with kept_arrays(self.frames_folder) as keep:
             stages = stages_of(self.refinement)
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
-            self._fit(X, point_weight, progress, keep=keep, errors=True)
+            try:
+                self._fit(X, point_weight, progress, keep=keep, errors=True)
+            except np.linalg.LinAlgError as error:
+                raise ValueError(
+                    f"the table does not determine shapes with camera={self.camera!r}: "
+                    "its frames differ too little, or their points are on few lines. "
+                    "Add frames that show the object from other sides, or set "
+                    "camera='affine'"
+                ) from error
         progress.end()
         return self
 
