@@ -144,8 +144,8 @@ def permuted_energies(
     if energy > OF_DIFFERENCES * total:
         centres = _standard(means, weights)
         orders = (rng.permutation(len(means)) for _ in range(n_permutations))
-        shuffled = (centres[i] for i in orders)
-        energies += _energies(centres, between, shuffled, along)
+        permuted_centres = (centres[i] for i in orders)
+        energies += _energies(centres, between, permuted_centres, along)
         permuted.append("groups")
     if square - np.sum(sizes.T @ of_labels.power(2)) > OF_DIFFERENCES * total:
         rest = unexplained(alpha, labels, order)

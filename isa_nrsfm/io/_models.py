@@ -34,6 +34,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._tables.sources import LARGEST, SMALLEST
 from isa_nrsfm._tables.tracks import LAYOUTS
 
 FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
@@ -226,7 +227,10 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     for name, choices in (("camera", CAMERAS), ("layout", LAYOUTS), ("loss", LOSSES)):
         if name in entries and entries[name] not in choices:
             raise ValueError(f"its {name} is not known: {entries[name]}")
-    _check_shapes({**vars(estimator), **entries})
+    values = {**vars(estimator), **entries}
+    if "focal_length_" in values:
+        values["focal_length_"] = np.ravel(values["focal_length_"])
+    _check_shapes(values)
     estimator._model = TableModel(
         _frame_model(entries),
         estimator.mean_shape_,
@@ -272,7 +276,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((2,), ["reference_translation_", "certainty", "image_errors"]),
         ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
-        ((None,), ["objective_history_"]),
+        ((None,), ["objective_history_", "focal_length_"]),
         ((N, 2, 3), ["motion_"]),
         ((N, 2), ["translation_"]),
         ((N, K), ["alpha_", "alpha_std_"]),
@@ -283,8 +287,11 @@ def _check_shapes(values: dict[str, Any]) -> None:
     )
     for shape, name in ((shape, name) for shape, names in shapes for name in names):
         if (value := values.get(name)) is None:
+            if name in FINITE and name in values:
+                raise ValueError(f"{name} is missing")
             continue
-        found, kinds = np.shape(value), "O" if name == "feature_names_in_" else "iuf"
+        found, kinds = np.shape(value), "f" if shape else "iuf"
+        kinds = "O" if name == "feature_names_in_" else kinds
         fits = len(found) == len(shape) and all(
             n in (None, m) for n, m in zip(shape, found, strict=True)
         )
@@ -293,12 +300,22 @@ def _check_shapes(values: dict[str, Any]) -> None:
             raise ValueError(f"{name} should be of shape {shape}; it has {found}")
         if numbers.dtype.kind == "f" and numbers.dtype.itemsize not in (4, 8):
             raise ValueError(f"{name} is of type {numbers.dtype}")
-        if name in (*FINITE, *POSITIVE) and not np.isfinite(numbers).all():
+        if (
+            name in (*FINITE, *POSITIVE)
+            and not (np.abs(numbers.astype(float)) < 100 * LARGEST).all()
+        ):
             raise ValueError(f"{name} is not finite")
         if name in POSITIVE and (numbers < 0).any():
             raise ValueError(f"{name} is negative")
     if not K or values["n_features_in_"] != 2 * P:
         raise ValueError(f"it has {K} basis shapes of {P} points")
+    for name in {"mixing", "space"} & values.keys():
+        if np.linalg.matrix_rank(values[name]) < len(values[name]):
+            raise ValueError(f"{name} has no inverse")
+    focal, *centre = values.get("pinhole", (1.0,))[:3]
+    small = values["unit"] is not None and values["unit"] < SMALLEST
+    if small or not (focal > 0 and np.isfinite(centre).all()):
+        raise ValueError("its unit, or its pinhole camera, is not possible")
 
 
 def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
