@@ -57,6 +57,7 @@ from isa_nrsfm._prepare.checks import (
     check_frames_kept,
     check_table,
     checked,
+    undetermined,
     validated_table,
 )
 from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
@@ -497,18 +498,10 @@ default="affine"
             table much better, or if a refinement has not converged.
         """
         self._forget()
-        with kept_arrays(self.frames_folder) as keep:
+        with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
             stages = stages_of(self.refinement)
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
-            try:
-                self._fit(X, point_weight, progress, keep=keep, errors=True)
-            except np.linalg.LinAlgError as error:
-                raise ValueError(
-                    f"the table does not determine shapes with camera={self.camera!r}: "
-                    "its frames differ too little, or their points are on few lines. "
-                    "Add frames that show the object from other sides, or set "
-                    "camera='affine'"
-                ) from error
+            self._fit(X, point_weight, progress, keep=keep, errors=True)
         progress.end()
         return self
 
@@ -662,10 +655,8 @@ default="affine"
 
     def _strategy(self, joint: bool) -> Any:
         """Return the unfitted strategy, with parameters inherited where not set."""
-        if self.isa is not None:
-            isa = clone(self.isa)
-        else:
-            isa = PooledFastICA(n_init=2 if joint else 16)
+        pooled = PooledFastICA(n_init=2 if joint else 16)
+        isa = pooled if self.isa is None else clone(self.isa)
         params = isa.get_params(deep=False)
         if params.get("subspace_size", 3) != 3:
             raise ValueError(
@@ -1029,10 +1020,8 @@ default="affine"
             few visible points.
         """
         table, weights = self._opened(X, point_weight)
-        shares = self._focal_shares(table)
-        if weights and not shares:
-            shares = (np.ones((table.n_frames, 1)),)
-        return table.collect(self._model.reproject, *shares, *weights)
+        own = *self._focal_shares(table), *weights
+        return table.collect(self._model.reproject, *own)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1063,10 +1052,10 @@ default="affine"
         check_is_fitted(self)
         alpha = unmasked(alpha)
         alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
-        if motion is None:
-            motion = self.reference_motion_
-        if translation is None:
-            translation = self.reference_translation_
+        motion = self.reference_motion_ if motion is None else motion
+        translation = (
+            self.reference_translation_ if translation is None else translation
+        )
         n_frames, n_components = len(alpha), len(self.basis_)
         alpha = checked("alpha", alpha, (n_frames, n_components))
         motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
@@ -1136,9 +1125,9 @@ default="affine"
         check_is_fitted(self)
         self._jointly_fitted("diagnostics")
         check_frames_kept(self, "diagnostics")
-        distance = None
-        if X is not None:
-            distance = self._opened(X)[0].joined(self._model.distances)
+        distance = (
+            None if X is None else self._opened(X)[0].joined(self._model.distances)
+        )
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
         return diagnose(self, distance, rows)
 

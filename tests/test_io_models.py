@@ -307,7 +307,7 @@ def with_entry(value, *place):
         (with_entry([1.0], "attributes", "n_iter_"), "value that is not known"),
         (with_entry(None, "attributes", "n_iter_"), "lacks attributes: n_iter_"),
         (with_entry("fish-eye", "frames", "camera"), "camera is not known: fish-eye"),
-        (changed("frames.shapes", lambda x: x.astype("f2")), "shapes is of type float16"),
+        (changed("frames.shapes", lambda x: x.astype("f2")), "shapes is of type"),
         (changed("frames.shapes", lambda x: x * np.nan), "shapes is not finite"),
         (changed("mean_shape_", lambda x: x * np.inf), "mean_shape_ is not finite"),
         (changed("basis_", lambda x: 1e300 * x), "basis_ is not finite"),
@@ -353,7 +353,9 @@ def test_files_that_unpack_to_more_than_they_have_are_refused(rewritten):
             file.writestr(name, whole.read(name), zipfile.ZIP_DEFLATED)
     assert path.stat().st_size < 100_000
     tracemalloc.start()
-    refused("are compressed. Load them, and save them with numpy.savez", load_model, path)
+    refused(
+        "are compressed. Load them, and save them with numpy.savez", load_model, path
+    )
     assert tracemalloc.get_traced_memory()[1] < 4_000_000
     tracemalloc.stop()
     np.savez(path, **np.load(path))
