@@ -30,27 +30,13 @@ from isa_nrsfm._compat.scikit_learn import (
     fit_context,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
-from isa_nrsfm._fit import (
-    STEPWISE,
-    fit_table,
-    ready_table,
-    stages_of,
-    supported_components,
-)
+from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._parameters.choices import (
-    BLOCK_RECOVERIES,
-    CALIBRATED_CAMERAS,
-    CAMERA_NAMES,
-    INDEPENDENCE,
-    JOINT_REFINEMENTS,
-    LOSSES,
-    REFINEMENTS,
-)
+from isa_nrsfm._parameters import choices
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (
     check_camera,
@@ -60,12 +46,10 @@ from isa_nrsfm._prepare.checks import (
     undetermined,
     validated_table,
 )
-from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
+from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
-    CHECKS,
     StoredTable,
-    checked_range,
     column_sample,
     is_on_dask,
     is_read_later,
@@ -388,13 +372,13 @@ default="affine"
             StrOptions({"auto"}),
         ],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
-        "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
-        "refinement": [StrOptions(set(REFINEMENTS)), None],
-        "camera": [StrOptions(set(CAMERA_NAMES))],
+        "block_recovery": [StrOptions(set(choices.BLOCK_RECOVERIES))],
+        "refinement": [StrOptions(set(choices.REFINEMENTS)), None],
+        "camera": [StrOptions(set(choices.CAMERA_NAMES))],
         "focal_length": [None, Interval(Real, 0, None, closed="neither"), "array-like"],
         "principal_point": [None, "array-like"],
-        "independence": [StrOptions(set(INDEPENDENCE)), None],
-        "loss": [StrOptions(set(LOSSES))],
+        "independence": [StrOptions(set(choices.INDEPENDENCE)), None],
+        "loss": [StrOptions(set(choices.LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],
         "scale_frames": ["boolean"],
         "hidden_points": ["boolean"],
@@ -557,9 +541,9 @@ default="affine"
         else:
             if auto:
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
-                    table = ready_table(source, weights, 1, settings)
+                    table = scaled_table(source, weights, 1, settings)
                 n_components, most = supported_components(table, isa, settings)
-            table = ready_table(source, weights, n_components, settings)
+            table = scaled_table(source, weights, n_components, settings)
             fit = fit_table(
                 table, n_components, isa, settings, progress, start, auto, errors
             )
@@ -610,12 +594,12 @@ default="affine"
 
         Returns the table, the weights of its points and the settings.
         """
-        joint = self.refinement in JOINT_REFINEMENTS
+        joint = self.refinement in choices.JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
             only_joint = {
                 "n_components": ["auto"],
-                "loss": [*LOSSES[1:]],
+                "loss": [*choices.LOSSES[1:]],
                 "independence": ["coefficients"],
             }
             for name, values in only_joint.items():
@@ -812,7 +796,9 @@ default="affine"
         camera, limits = CAMERAS[frames.camera], (max_gap, max_iter, tol)
         dtype = table.empty.dtype
         result = smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
-        in_table = self._model.in_table_cameras(table, result.decomposition)
+        if self._model.pinhole is None:
+            return result
+        in_table = table.joined(self._model.in_table_cameras, *result.decomposition)
         return result._replace(decomposition=in_table)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
@@ -917,10 +903,11 @@ default="affine"
         their cameras.
         """
         check_is_fitted(self)
-        own = ("perspective",) * (self.camera_ == "perspective")
-        if camera not in (None, *CALIBRATED_CAMERAS, *own):
+        known = (None, self.camera_, *choices.CALIBRATED_CAMERAS)
+        if camera == "affine" or camera not in known:
             raise ValueError(
-                f"camera must be None or one of {CALIBRATED_CAMERAS}; got {camera!r}"
+                f"camera must be None or one of {choices.CALIBRATED_CAMERAS}; got "
+                f"{camera!r}"
             )
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
         if decomposed and point_weight is not None:
@@ -948,14 +935,16 @@ default="affine"
         if camera is not None and fitted == "affine":
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
-        scaled = metric is not None and camera == "orthographic"
+        scaled, model = metric is not None and camera == "orthographic", self._model
         if decomposed:
-            return self._model.shapes(X, metric, scaled)
+            return model.shapes(X, metric, scaled)
         table, weights = self._opened(X, point_weight)
-        if return_std:
-            return table.collect(self._model.uncertain_shapes, *weights)
-        shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
-        return table.collect(shapes, *weights)
+
+        def shapes(rows: NDArray, weights: NDArray | None = None) -> NDArray:
+            fit = model.decompose(rows, weights, deviations=False)
+            return model.shapes(fit, metric, scaled)
+
+        return table.collect(model.uncertain_shapes if return_std else shapes, *weights)
 
     def mirrored(self) -> Self:
         """
@@ -1053,16 +1042,13 @@ default="affine"
         alpha = unmasked(alpha)
         alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
         motion = self.reference_motion_ if motion is None else motion
-        translation = (
-            self.reference_translation_ if translation is None else translation
-        )
+        if translation is None:
+            translation = self.reference_translation_
         n_frames, n_components = len(alpha), len(self.basis_)
         alpha = checked("alpha", alpha, (n_frames, n_components))
         motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
         translation = checked("translation", translation, (n_frames, 2), (2,))
         shapes = compose(self.mean_shape_, self.basis_, alpha)
-        motion = np.broadcast_to(motion, (n_frames, 2, 3))
-        translation = np.broadcast_to(translation, (n_frames, 2))
         images = self._model.images(shapes, motion, translation)
         return tracks_to_table(images, self._model.layout)
 
@@ -1152,7 +1138,7 @@ default="affine"
         table must match the fit: parameters that are set after it have no effect.
         """
         layout, loss = self.layout, self.loss
-        joint = self.refinement in JOINT_REFINEMENTS
+        joint = self.refinement in choices.JOINT_REFINEMENTS
         if not reset:
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
@@ -1163,9 +1149,7 @@ default="affine"
             check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
         else:
-            least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-            X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
-            checked_range(X)
+            X = validated_table(self, X, layout, reset)
         names = getattr(self, "feature_names_in_", None)
         n_jobs, memory = self.n_jobs, self.working_memory
         table = open_table(

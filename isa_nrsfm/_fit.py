@@ -16,7 +16,6 @@ Stages 1, 5 and 6 use all frames, the other stages those of the sample. No funct
 has an estimator: `AffineNRSfM.fit` sets the attributes that `fit_table` returns.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -25,7 +24,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
@@ -76,8 +74,8 @@ from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
-from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
+from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import of_all_rows
 
 JOINT_STAGE = "joint refinement"
@@ -95,23 +93,6 @@ def stages_of(refinement: str | None) -> list[str]:
     if refinement == "consensus":
         stages.append(CONSENSUS_STAGE)
     return [*stages, "gauge and coefficients"]
-
-
-@one_blas_thread
-def ready_table(
-    source: FrameBlocks, weights: NDArray | None, n_components: int, s: FitSettings
-) -> ScaledTable:
-    """Return a table centred, scaled and checked for fits of at most K basis shapes."""
-    return scaled_table(
-        source,
-        n_components,
-        layout=s.layout,
-        names=s.names,
-        scale_frames=s.scale_frames,
-        robust=s.loss != "linear",
-        camera=s.camera if s.joint else None,
-        weights=weights,
-    )
 
 
 @one_blas_thread
@@ -144,7 +125,7 @@ def fit_table(
     given = None
     if start is None:
         isa = clone(isa)
-        shapes, covariance, n_iter, converged = _paper_result(
+        shapes, covariance, n_iter, converged = run_paper_pipeline(
             factorised.factors, n_components, isa, settings, progress
         )
     else:
@@ -225,7 +206,7 @@ def supported_components(
     quiet = NoProgress()
     factorised = _factorised(table, most, settings, quiet)
     factors = factorised.factors
-    shapes, *_ = _paper_result(factors, most, clone(isa), settings, quiet)
+    shapes, *_ = run_paper_pipeline(factors, most, clone(isa), settings, quiet)
     supported = count_components(factorised, shapes, settings)
     # Down-weighted outliers look like basis shapes of the joint fit of a consensus.
     if consensus and settings.loss != "linear":
@@ -286,32 +267,6 @@ def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointS
     return JointState(shapes, np.empty((0, 2, 3)), noise)
 
 
-def _paper_result(
-    factors: Factorisation,
-    n_components: int,
-    isa: Any,
-    settings: FitSettings,
-    report: Callable[[str], None],
-) -> tuple[NDArray, NDArray, int, bool]:
-    """Return the result of the paper's pipeline, and fit its strategy."""
-    max_iter, tol = settings.max_iter if settings.refinement else 0, settings.tol
-    with warnings.catch_warnings():
-        if settings.joint:  # it only starts from this result
-            max_iter, tol = 200, 1e-5
-            if settings.silent_isa:
-                message = "PooledFastICA did not"
-                warnings.filterwarnings("ignore", message, ConvergenceWarning)
-        return run_paper_pipeline(
-            factors,
-            n_components,
-            isa,
-            block_recovery=settings.block_recovery,
-            max_iter=max_iter,
-            tol=tol,
-            report=report,
-        )
-
-
 def _paper_frames(
     table: ScaledTable,
     factors: Factorisation,
@@ -329,15 +284,12 @@ def _paper_frames(
         return TableModel(frames, mean_shape, basis, s.layout, table.unit)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
+    def frames_for(mean_shape: NDArray, basis: NDArray) -> Any:
+        decompose = partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
+        return table.source.joined(decompose)
+
     mean_shape, basis, order, frames = rigid_gauge(
-        shapes[0].T,
-        shapes[1:].mT,
-        table.sizes,
-        lambda mean_shape, basis: table.source.joined(
-            partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
-        ),
-        camera=s.camera,
-        dtype=table.dtype,
+        shapes[0].T, shapes[1:].mT, table.sizes, frames_for, s.camera, table.dtype
     )
     covariance = reorder_blocks(covariance, order)
     attributes = {"mode_covariance_": (table.unit or 1.0) ** 2 * covariance}
@@ -400,19 +352,15 @@ def _measures(
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
     reference = mean_camera(frames, table.sizes, settings.camera)
+    position = (frames.translation - table.translation) / table.sizes[:, None]
+    fit = np.concatenate([mean_shape[None], basis]).mT, cameras, position, frames.alpha
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
         "rank_floor_": factorised.rest_share,
         "singular_values_": (table.unit or 1.0) * factorised.singular_values,
         "energy_share_": energy / (energy.sum() or 1.0),
-        "inverse_snr_": reprojection_error(
-            table.rows,
-            np.concatenate([mean_shape[None], basis]).mT,
-            cameras,
-            (frames.translation - table.translation) / table.sizes[:, None],
-            frames.alpha,
-        ),
+        "inverse_snr_": reprojection_error(table.rows, *fit),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 

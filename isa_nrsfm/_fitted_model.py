@@ -14,7 +14,7 @@ from isa_nrsfm._frames.models import (
     PosteriorFrames,
     RigidFrames,
 )
-from isa_nrsfm._frames.pinhole import Pinhole, line_of_sight, zoomed
+from isa_nrsfm._frames.pinhole import Pinhole, zoomed
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
@@ -34,7 +34,7 @@ from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 MIRROR_LEVEL = 0.01
 # Depths and fit of a perspective frame agree if a repeat changes depths by less than
 # this share: docs/benchmarks/README.md, "Thresholds".
-SETTLED, MOST_REPEATS = 1e-3, 30
+FRAME_SETTLED, MOST_FRAME_REPEATS = 1e-3, 30
 
 
 class TableModel(NamedTuple):
@@ -65,38 +65,41 @@ class TableModel(NamedTuple):
         Weights (n, n_points) are zero where points are missing, by default one.
         """
         dtype = rows.dtype if dtype is None else dtype
-        fit, turns = self.in_virtual_cameras(rows, weights, deviations)
-        if self.pinhole is not None:
-            real = self.pinhole.real(fit.motion, fit.translation, turns)
-            fit = fit._replace(motion=real[0], translation=real[1])
+        fit = self.in_virtual_cameras(rows, weights, deviations)
+        fit = self.in_table_cameras(rows, *fit)
         return Decomposition(*(part.astype(dtype) for part in fit))
 
     def in_virtual_cameras(
         self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
-    ) -> tuple[Decomposition, NDArray]:
-        """Return fits of weak-perspective images, and rotations of their cameras."""
-        rows, turns = self.straightened(rows, weights)
+    ) -> Decomposition:
+        """Return fits of weak-perspective images."""
+        rows = self.straightened(rows, weights)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
-        return Decomposition(*(of_all_rows(part, usable) for part in fit)), turns
+        return Decomposition(*(of_all_rows(part, usable) for part in fit))
 
-    def straightened(
-        self, rows: NDArray, weights: NDArray | None = None
-    ) -> tuple[NDArray, NDArray]:
-        """Return weak-perspective images, and the rotations of virtual cameras.
+    def in_table_cameras(self, rows: NDArray, *fit: NDArray) -> Decomposition:
+        """Return fits of rows in virtual cameras with the cameras of the table."""
+        motion, translation, *rest = fit
+        if self.pinhole is not None:
+            motion, translation = self.pinhole.real(rows, motion, translation)
+        return Decomposition(motion, translation, *rest)
+
+    def straightened(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
+        """Return weak-perspective images.
 
         Depths and fits of a frame are repeated until they agree.
         """
         pinhole = self.pinhole
         if pinhole is None:
-            return rows, np.empty(len(rows))
-        images, turns = pinhole.virtual(rows)
+            return rows
+        images = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
         assert isinstance(self.frames, PosteriorFrames)
         weak = self._replace(frames=self.frames.without_starts, pinhole=None)
         moving = np.arange(len(rows))
-        for _ in range(MOST_REPEATS if pinhole.near else 0):
+        for _ in range(MOST_FRAME_REPEATS if pinhole.near else 0):
             moving = padded(moving) if len(rows) > 1 else moving
             own = None if weights is None else weights[moving]
             fit = weak.decompose(straight[moving], own, deviations=False)
@@ -104,16 +107,17 @@ class TableModel(NamedTuple):
             depths[moving] = self.depths(fit.motion, fit.alpha)
             straight[moving] = pinhole.straight(images[moving], depths[moving])
             change = np.square(depths[moving] - before).sum(axis=1)
-            large = change > SETTLED**2 * np.square(depths[moving]).sum(axis=1)
+            large = change > FRAME_SETTLED**2 * np.square(depths[moving]).sum(axis=1)
             moving = np.unique(moving[large])
             if not len(moving):
                 break
-        return straight, turns
+        return straight
 
     def depths(self, motion: NDArray, alpha: NDArray) -> NDArray:
         """Return the depths (n, J) of points, in units of the table."""
         shapes = compose(self.mean_shape, self.basis, alpha)
-        return np.vecdot(shapes, line_of_sight(motion)[:, None])
+        R, scales = full_rotations(motion)
+        return np.vecdot(shapes, (scales[:, None] * R[:, 2])[:, None])
 
     def mirrored(self) -> "TableModel":
         """Return the model with shapes mirrored in depth."""
@@ -165,7 +169,7 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None
     ) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
-        rows, _ = self.straightened(rows, weights)
+        rows = self.straightened(rows, weights)
         assert isinstance(self.frames, PosteriorFrames)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
         whole = FramePosterior.unknown(len(rows), len(self.basis))
@@ -177,33 +181,21 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None
     ) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
-        rows, _ = self.straightened(rows, weights)
+        rows = self.straightened(rows, weights)
         assert isinstance(self.frames, PosteriorFrames)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.linearised(centred, sizes, weights)
         fit = fit._replace(translation=fit.translation + translation)
         return LinearisedFrames(*(of_all_rows(part, usable) for part in fit))
 
-    def reconstruct(
-        self,
-        rows: NDArray,
-        weights: NDArray | None = None,
-        *,
-        metric: DeformationMetric | None,
-        scaled: bool,
+    def shapes(
+        self, fit: Decomposition, metric: DeformationMetric | None, scaled: bool
     ) -> NDArray:
-        """Return the shapes (n, n_points, 3) of frames.
+        """Return the shapes (n, n_points, 3) of frames that are fitted.
 
         A metric of space makes them Euclidean. `scaled` multiplies each by the scale of
         its camera, as orthographic cameras need.
         """
-        fit = self.decompose(rows, weights, deviations=False)
-        return self.shapes(fit, metric, scaled)
-
-    def shapes(
-        self, fit: Decomposition, metric: DeformationMetric | None, scaled: bool
-    ) -> NDArray:
-        """Return the shapes (n, n_points, 3) of frames that are fitted."""
         if metric is None:
             return compose(self.mean_shape, self.basis, fit.alpha)
         frames = euclidean_frames(
@@ -218,7 +210,7 @@ class TableModel(NamedTuple):
         """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
         assert isinstance(self.frames, PosteriorFrames)
         dtype = rows.dtype
-        rows, _ = self.straightened(rows, weights)
+        rows = self.straightened(rows, weights)
         weak = self._replace(pinhole=None)
         fit = weak.decompose(rows, weights, deviations=False, dtype=dtype)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
@@ -251,14 +243,6 @@ class TableModel(NamedTuple):
         if self.pinhole is None:
             return project(shapes, motion, translation)
         return self.pinhole.projected(shapes, motion, translation)
-
-    def in_table_cameras(self, rows: FrameBlocks, fit: Decomposition) -> Decomposition:
-        """Return a fit of rows in virtual cameras with the cameras of the table."""
-        if self.pinhole is None:
-            return fit
-        _, turns = rows.joined(self.pinhole.virtual)
-        real = self.pinhole.real(fit.motion, fit.translation, turns)
-        return fit._replace(motion=real[0], translation=real[1])
 
     def distances(self, rows: NDArray, *fitted: NDArray) -> NDArray:
         """Return lengths of residuals (n, n_points), in sizes of their frames.

@@ -102,7 +102,6 @@ def rigid_gauge(
     basis: NDArray,
     sizes: NDArray,
     fitted: Callable[[NDArray, NDArray], Decomposition],
-    *,
     camera: str,
     dtype: Any,
 ) -> tuple[NDArray, NDArray, NDArray, Decomposition]:

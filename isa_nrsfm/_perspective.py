@@ -6,9 +6,9 @@ images determine depths up to their sign, so both mirror images are continued.
 
 Let E be the mean squared distance of points from their images, in sizes of frames. As a
 function of g = 1/f it is least for the focal length f. g = 0 is the weak-perspective
-fit, and -g the mirror image of the fit for g. Minima of parabolas through the three
-best fits lead to an unknown f. Without one of several groups of points the minimum
-moves, which gives its deviation (jackknife).
+fit, and -g the mirror image of the fit for g. For an unknown f, steps up and down lead
+to the best fit: f is the minimum of the parabola through the best three. Without one of
+several groups of points it moves, which gives its deviation (jackknife).
 """
 
 import warnings
@@ -23,25 +23,17 @@ from scipy.special import stdtr
 
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._fit import (
-    fit_table,
-    mean_camera,
-    mirror_image,
-    ready_table,
-    supported_components,
-)
+from isa_nrsfm._fit import fit_table, mean_camera, mirror_image, supported_components
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import Pinhole, common
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
-from isa_nrsfm._prepare.scaling import ScaledTable
+from isa_nrsfm._prepare.scaling import ScaledTable, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import centred_frames
 
-# Effects of the next two lines: docs/benchmarks/README.md, "Thresholds".
+# Effects of these constants: docs/benchmarks/README.md, "Thresholds".
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
 # tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
 SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
@@ -50,8 +42,9 @@ WORSE = 1.3
 # Focal lengths of the weak-perspective fit and of the first perspective one, in largest
 # distances from the principal point, and how much longer the next one is if that fails.
 ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
-# The search ends if the minimum is that near to a fit, as a share of 1/f.
-NEAR, MOST_FITS = 0.01, 10
+# Factors of the steps of the search for the minimum, from the best fit up and down; its
+# error, as a share of 1/f; and the largest number of fits.
+STEPS, NEAR, MOST_FITS = (1.5, 1.1), 0.01, 16
 
 UNSTEADY = (
     "the fit of perspective has not settled: depths and fit do not agree. The focal "
@@ -67,22 +60,21 @@ NO_PERSPECTIVE = (
 
 class PerspectiveFit(NamedTuple):
     """
-    A fit with a known focal length.
+    A fit with a known focal length, of weak-perspective images in virtual cameras.
 
-    model: that of weak-perspective images. frames: in virtual cameras. converged,
-    attributes: as `fit_table` returns them. changes: shares by which repeats have
-    changed the depths. energies (J,): contributions of the points to E. earlier: at
-    most three fits before, the last one first.
+    model: with the perspective camera. frames, converged, attributes: as `fit_table`
+    returns them. changes: shares by which repeats have changed the depths. energies
+    (J,): contributions of the points to E. earlier: models and frames of at most three
+    repeats before, the last one first.
     """
 
-    pinhole: Pinhole
     model: TableModel
     frames: Decomposition
     converged: bool
     attributes: dict[str, Any]
     changes: tuple[float, ...] = ()
     energies: NDArray = np.zeros(0)
-    earlier: tuple["PerspectiveFit", ...] = ()
+    earlier: tuple[tuple[TableModel, Decomposition], ...] = ()
 
     @property
     def energy(self) -> float:
@@ -90,19 +82,39 @@ class PerspectiveFit(NamedTuple):
         return float(self.energies.sum())
 
     @property
+    def pinhole(self) -> Pinhole:
+        """The perspective camera."""
+        assert self.model.pinhole is not None
+        return self.model.pinhole
+
+    @property
     def n_components(self) -> int:
         """Number of basis shapes."""
         return len(self.model.basis)
+
+    @property
+    def for_depths(self) -> list[tuple[TableModel, Decomposition]]:
+        """Models and frames whose depths correct the next images.
+
+        They are several if depths oscillate.
+        """
+        slow = any(new > 0.5 * old for old, new in pairwise(self.changes))
+        return [(self.model, self.frames), *(self.earlier if slow else ())]
 
     def depths(self, part: slice) -> NDArray:
         """Return depths (n, J) of the points of some frames."""
         return self.model.depths(self.frames.motion[part], self.frames.alpha[part])
 
-    @property
-    def for_depths(self) -> list["PerspectiveFit"]:
-        """The fits whose depths correct the next images: several if they oscillate."""
-        slow = any(new > 0.5 * old for old, new in pairwise(self.changes))
-        return [self, *self.earlier] if slow else [self]
+    def change(self, other: "PerspectiveFit", parts: list[slice]) -> float:
+        """Return the distance of depths from others, relative to these.
+
+        It is negative if the mirror image is nearer.
+        """
+        pairs = (np.nan_to_num([fit.depths(p) for fit in (self, other)]) for p in parts)
+        products = sum(np.einsum("aij,bij->ab", pair, pair) for pair in pairs)
+        (own, common), (_, others) = np.asarray(products)
+        square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
+        return float(np.copysign(np.sqrt(square), common))
 
     def mirrored(self) -> "PerspectiveFit":
         """Return the mirror image in depth."""
@@ -128,52 +140,46 @@ class PerspectiveTable(NamedTuple):
         self, pinhole: Pinhole, n_components: int, fit: PerspectiveFit | None
     ) -> ScaledTable:
         """Return weak-perspective images, for the depths of a fit, or equal ones."""
-        if fit is None:
-            rows = self.source.derive(lambda rows: pinhole.virtual(rows)[0])
-        else:
-            fits = fit.for_depths
-            by_frame = [v for f in fits for v in (f.frames.motion, f.frames.alpha)]
-            models = [f.model for f in fits]
-            function = partial(_straight, pinhole=pinhole, models=models)
-            rows = self.source.derive(function, *by_frame)
-        rows.empty = self.source.empty
-        return ready_table(rows, self.weights, n_components, self.settings)
+        fits = [] if fit is None else fit.for_depths
+        by_frame = [values for _, f in fits for values in (f.motion, f.alpha)]
+        models = [model for model, _ in fits]
+        function = partial(_straight, pinhole=pinhole, models=models)
+        rows = self.source.derive(function, *by_frame)
+        return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
         self,
         pinhole: Pinhole,
-        n_components: int,
+        n_components: int | None,
         before: PerspectiveFit | None = None,
-        progress: FitProgress | NoProgress | None = None,
         **options: Any,
     ) -> PerspectiveFit:
         """Return the fit of images that are corrected for the depths of another fit.
 
-        It has the mirror image with those depths. Options are those of `fit_table`.
+        It has the mirror image with those depths. None stands for as many basis shapes
+        as are relevant. Options are those of `fit_table`.
         """
-        table, settings = self.straight(pinhole, n_components, before), self.settings
-        progress = progress or NoProgress()
-        result = fit_table(table, n_components, self.isa, settings, progress, **options)
-        fit = PerspectiveFit(pinhole, *result)
+        isa, settings = self.isa, self.settings
+        options["free"] = n_components is None
+        options.setdefault("progress", NoProgress())
+        if n_components is None:
+            table = self.straight(pinhole, 1, before)
+            n_components, _ = supported_components(table, isa, settings)
+            if before is not None and n_components == before.n_components:
+                return before
+        table = self.straight(pinhole, n_components, before)
+        fit = PerspectiveFit(*fit_table(table, n_components, isa, settings, **options))
+        fit = fit._replace(model=fit.model._replace(pinhole=pinhole))
         if before is not None:
-            parts = [(before.depths(p), fit.depths(p)) for p in self.source.slices]
-            same, other, total = (
-                sum(float(np.nansum((z - sign * old) ** 2)) for old, z in parts)
-                for sign in (1.0, -1.0, 0.0)
-            )
-            change = float(np.sqrt(min(same, other) / (total or 1.0)))
-            fit = fit.mirrored() if other < same else fit
+            change = fit.change(before, self.source.slices)
+            fit = fit.mirrored() if change < 0 else fit
             fit.attributes["isa_"] = fit.attributes["isa_"] or before.attributes["isa_"]
-            earlier = (before._replace(earlier=()), *before.earlier)[:3]
-            fit = fit._replace(changes=(*before.changes, change), earlier=earlier)
-        squares = self.source.map(partial(_squares, fit=fit), *fit.frames[:3])
+            changes = (*before.changes, abs(change))
+            earlier = ((before.model, before.frames), *before.earlier)[:3]
+            fit = fit._replace(changes=changes, earlier=earlier)
+        squares = self.source.map(partial(_squares, model=fit.model), *fit.frames)
         square, counts = np.sum(list(squares), axis=0)
         return fit._replace(energies=square / counts.sum())
-
-    def quick_fit(self, *args: Any, **options: Any) -> PerspectiveFit:
-        """Return a fit without warnings: the last fit warns."""
-        with warnings.catch_warnings(action="ignore"):
-            return self.fit(*args, **options)
 
     def settled(
         self, pinhole: Pinhole, n_components: int, *fits: PerspectiveFit
@@ -186,8 +192,7 @@ class PerspectiveTable(NamedTuple):
         ended: list[PerspectiveFit] = []
         while running:
             running = [
-                self.quick_fit(pinhole, n_components, fit, start=fit.model)
-                for fit in running
+                self.fit(pinhole, n_components, fit, start=fit.model) for fit in running
             ]
             best = min(fit.energy for fit in [*running, *ended])
             ended += [fit for fit in running if self._ends(fit, best)]
@@ -201,70 +206,40 @@ class PerspectiveTable(NamedTuple):
         agrees = change < SETTLED * self.settings.tol / JOINT_TOL
         return agrees or n_repeats >= (2 if fit.energy > WORSE * best else most)
 
-    def first(
-        self,
-        focal_length: float,
-        n_components: int | None,
-        progress: FitProgress | NoProgress,
-    ) -> PerspectiveFit:
-        """Return the fit for equal depths, of as many basis shapes as are relevant."""
-        pinhole, auto = self.pinhole(focal_length, near=False), n_components is None
-        if n_components is None:
-            n_components = self.supported(pinhole, None)
-        return self.quick_fit(pinhole, n_components, None, progress, free=auto)
-
-    def supported(self, pinhole: Pinhole, fit: PerspectiveFit | None) -> int:
-        """Return the number of relevant basis shapes, for the depths of a fit."""
-        with warnings.catch_warnings(action="ignore"):
-            table = self.straight(pinhole, 1, fit)
-        return supported_components(table, self.isa, self.settings)[0]
-
-    def corrected_number(self, fit: PerspectiveFit) -> PerspectiveFit:
-        """Return a fit with as many basis shapes as images without perspective have."""
-        supported = self.supported(fit.pinhole, fit)
-        if supported == fit.n_components:
-            return fit
-        fit = self.quick_fit(fit.pinhole, supported, fit, free=True)
-        return self.settled(fit.pinhole, fit.n_components, fit)[0]
-
-    def started(self, start: TableModel, n_components: int) -> PerspectiveFit:
-        """Return the fit from the model of a similar table, with its focal length."""
-        assert start.pinhole is not None
-        frames = self.source.joined(lambda rows: start.in_virtual_cameras(rows)[0])
-        model, pinhole = start._replace(pinhole=None), start.pinhole
-        fit = PerspectiveFit(pinhole, model, frames, True, {"isa_": None})
-        return self.settled(pinhole, n_components, fit)[0]
-
     def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
         """Return the fits for 1/f and -1/f from a first fit."""
         images, pinhole = (first, first.mirrored()), self.pinhole(f)
         better, worse = self.settled(pinhole, first.n_components, *images)
         return {1.0 / f: better, -1.0 / f: worse}
 
+    def started(self, model: TableModel, n_components: Any) -> PerspectiveFit:
+        """Return the fit from the model of a similar table, with its focal length."""
+        frames = self.source.joined(model.in_virtual_cameras)
+        fit = PerspectiveFit(model, frames, True, {"isa_": None})
+        return self.settled(fit.pinhole, n_components, fit)[0]
+
+    def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
+        """Return the fit for g, from that with the nearest one."""
+        fit = fits[min((g for g in fits if g > 0), key=lambda g: abs(g - place))]
+        return self.settled(self.pinhole(1.0 / place), fit.n_components, fit)[0]
+
     def searched(
         self, n_components: int | None, progress: FitProgress | NoProgress
     ) -> dict[float, PerspectiveFit]:
         """Return fits around the minimum of E; 0 is the weak-perspective fit."""
         f = FIRST * max(self.source.map(self._reach))
-        first = self.first(f, n_components, progress)
-        far = self.first(ENDLESS * f, first.n_components, NoProgress())
+        first = self.fit(self.pinhole(f, near=False), n_components, progress=progress)
+        far = self.fit(self.pinhole(ENDLESS * f, near=False), first.n_components)
         fits = {0.0: far, **self.images(first, f)}
         if far.energy < fits[1.0 / f].energy:  # a long focal length, or none
             fits |= self.images(far, LONGER * f)
-        while len(fits) < MOST_FITS and (lowest := best_of(fits)) > 0:
-            below = max(g for g in fits if g < lowest)
-            above = min((g for g in fits if g > lowest), default=0.0)
-            place, _ = minimum(fits)
-            if not above:
-                place = 1.5 * lowest
-            elif not below < place < above:
-                place = float(np.sqrt(lowest * above))
-            elif min(abs(g - place) for g in fits) < NEAR * place:
-                # A parabola through distant fits is biased.
-                place = 0.9 * lowest
-                if sum(abs(g / lowest - 1.0) < 0.15 for g in fits) > 1:
+        for step in STEPS:
+            while len(fits) < MOST_FITS and (lowest := best_of(fits)) > 0:
+                places = lowest * step, lowest / step
+                new = [p for p in places if min(abs(g / p - 1) for g in fits) > NEAR]
+                if not new:
                     break
-            fits[place] = self.near(fits, place)
+                fits[new[0]] = self.near(fits, new[0])
         return fits
 
     def _reach(self, rows: NDArray) -> float:
@@ -272,11 +247,6 @@ class PerspectiveTable(NamedTuple):
         centre = self.pinhole(1.0).centre
         largest = np.fmax.reduce(np.abs(rows - centre), axis=None, initial=0.0)
         return float(max(largest, *np.abs(centre[:, 0])))
-
-    def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
-        """Return the fit for g, from that with the nearest one."""
-        fit = fits[min((g for g in fits if g > 0), key=lambda g: abs(g - place))]
-        return self.settled(self.pinhole(1.0 / place), fit.n_components, fit)[0]
 
 
 def best_of(fits: dict[float, PerspectiveFit]) -> float:
@@ -292,9 +262,8 @@ def minimum(fits: dict[float, PerspectiveFit]) -> tuple[float, float]:
 
     def vertex(kept: NDArray) -> float:
         """Return the minimum for some of the points, or infinity if there is none."""
-        unit = np.max(np.abs(g))
-        square, slope, _ = np.polyfit(g / unit, energies[:, kept].sum(axis=1), 2)
-        return float(-0.5 * slope / square * unit) if square > 0 else np.inf
+        square, slope, _ = np.polyfit(g, energies[:, kept].sum(axis=1), 2)
+        return float(-0.5 * slope / square) if square > 0 else np.inf
 
     every = vertex(groups >= 0)
     parts = np.array([vertex(groups != group) for group in range(N_GROUPS)])
@@ -318,96 +287,91 @@ def fit_perspective(
     `n_components` and the given focal length are estimated if they are None; the table
     has the mean of several. A fit from the model of a similar table has that of it.
     """
-    focal_length = None if given is None else common(given)
     fits: dict[float, PerspectiveFit] = {}
     deviation, why = 0.0, ""
-    if start is not None and n_components is not None:
-        best = table.started(start, n_components)
-    elif focal_length is not None:
-        first = table.first(focal_length, n_components, progress)
-        fits = table.images(first, focal_length)
-        best = fits[1.0 / focal_length]
-        if best.changes[-1] > UNSETTLED or best.energy > first.energy:
-            best, why = first, UNSTEADY
-        elif errors:  # neighbours tell how far a focal length contradicts the table
-            places = [share / focal_length for share in (0.8, 1.25)]
-            fits |= {place: table.near(fits, place) for place in places}
-    else:
-        fits = table.searched(n_components, progress)
-        place, deviation = minimum(fits)
-        deviation = float(np.hypot(deviation, 0.5 * NEAR * place))  # of the search
-        if best_of(fits) > 0 and place > 2.0 * deviation:
-            best = table.near(fits, place)
+    with warnings.catch_warnings(action="ignore"):  # the last fit warns
+        if start is not None:
+            best = table.started(start, n_components)
+        elif given is not None:
+            f = common(given)
+            virtual = table.pinhole(f, near=False)
+            first = table.fit(virtual, n_components, progress=progress)
+            fits = {0.0: first, **table.images(first, f)}
+            best = fits[1.0 / f]
+            if best.changes[-1] > UNSETTLED or best.energy > first.energy:
+                why = UNSTEADY
+            elif errors:  # neighbours tell how far a focal length contradicts the table
+                places = 0.8 / f, 1.25 / f
+                fits |= {place: table.near(fits, place) for place in places}
         else:
-            best, why = fits[0.0], NO_PERSPECTIVE
-    if n_components is None and not why:
-        best = table.corrected_number(best)
+            fits = table.searched(n_components, progress)
+            place, deviation = minimum(fits)
+            deviation = float(np.hypot(deviation, 0.5 * NEAR * place))  # of the search
+            if best_of(fits) > 0 and place > 2.0 * deviation:
+                best = table.near(fits, place)
+            else:
+                why = NO_PERSPECTIVE
+        if why:
+            best = fits[0.0]
+        elif n_components is None:
+            best = table.fit(best.pinhole, None, best)
+            best = table.settled(best.pinhole, best.n_components, best)[0]
     # The last fit, with warnings and errors of depths
-    fit = table.fit(
-        best.pinhole,
-        best.n_components,
-        None if why else best,
-        start=best.model,
-        errors=errors,
-    )
-    f, attributes = best.pinhole.focal_length, fit.attributes
-    model = fit.model._replace(pinhole=best.pinhole)
+    before = None if why else best
+    options = {"start": best.model, "errors": errors}
+    fit = table.fit(best.pinhole, best.n_components, before, **options)
+    model, _, converged, attributes, *_ = fit
+    f = best.pinhole.focal_length
     if why:
         warn_caller(why)
     elif errors and isinstance(model.frames, PosteriorFrames):
         certainty = model.frames.certainty
-        total = float(np.hypot(certainty.total, focal_error(fits, f, deviation)))
+        error = focal_error(fits, 1.0 / f, deviation, table.source.slices)
+        total = float(np.hypot(certainty.total, error))
         certainty = certainty._replace(total=total)
         model = model._replace(frames=replace(model.frames, certainty=certainty))
-        least = max(g for g in fits if g < 0)
-        probability = better_than(fits[-least], fits[least])
+        # The mirror image has a larger E: a test over groups of points
+        least = min(abs(g) for g in fits if g < 0)
+        gain = fits[-least].energies - fits[least].energies
+        gain = np.bincount(neighbours(fits[least].model.mean_shape.T), gain)
+        t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
+        probability = float(stdtr(len(gain) - 1, t))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
     # Frames as new tables have them
     weights = () if table.weights is None else (table.weights,)
     decompose = partial(model.decompose, dtype=np.float64)
     frames: Decomposition = table.source.joined(decompose, *weights)
-    shown = np.isfinite(frames.motion).all(axis=(1, 2))
-    seen, sizes = Decomposition(*(v[shown] for v in frames)), attributes["_frame_sizes"]
     dtype = table.source.empty.dtype
-    for name, value in mean_camera(seen, sizes[shown], "perspective").items():
-        attributes[name] = value.astype(dtype)
-    known = not deviation or model.frames.certainty.determined
-    if why == NO_PERSPECTIVE:
-        f = np.inf
+    sizes, known = attributes["_frame_sizes"], model.frames.certainty.determined
+    shown = np.isfinite(sizes)
+    seen = Decomposition(*(values[shown] for values in frames))
+    view = mean_camera(seen, sizes[shown], "perspective")
+    attributes |= {name: value.astype(dtype) for name, value in view.items()}
     attributes |= {
         "isa_": best.attributes["isa_"],
         "focal_length_": f if given is None else np.array(given, dtype=float)[()],
-        "focal_length_std_": deviation * f**2 if known else np.inf,
+        "focal_length_std_": deviation * f**2 if known or not deviation else np.inf,
     }
+    if why == NO_PERSPECTIVE:
+        attributes["focal_length_"] = np.inf
     frames = Decomposition(*(part.astype(dtype) for part in frames))
-    return model, frames, fit.converged, attributes
+    return model, frames, converged, attributes
 
 
 def focal_error(
-    fits: dict[float, PerspectiveFit], focal_length: float, deviation: float
+    fits: dict[float, PerspectiveFit], g: float, deviation: float, parts: list[slice]
 ) -> float:
     """Return the relative error of the depths due to that of the focal length.
 
     The error of 1/f is its deviation. For a given f it is the distance of the minimum
     of E, as far as the deviation of the minimum does not explain it.
     """
-    g = 1.0 / focal_length
     if not deviation:
         place, other = minimum(fits)
         deviation = np.sqrt(np.fmax((place - g) ** 2 - other**2, 0.0))
-    first, second = sorted((g for g in fits if g >= 0), key=lambda o: abs(o - g))[:2]
-    z, moved = (fits[place].depths(slice(None)) for place in (first, second))
-    change = np.sqrt(np.nansum((moved - z) ** 2) / np.nansum(z**2))
+    first, second = sorted((o for o in fits if o >= 0), key=lambda o: abs(o - g))[:2]
+    change = abs(fits[first].change(fits[second], parts))
     return float(change * deviation / abs(second - first))
-
-
-def better_than(fit: PerspectiveFit, other: PerspectiveFit) -> float:
-    """Return the probability that E is less than that of another fit, by groups."""
-    gain = np.bincount(
-        neighbours(fit.model.mean_shape.T), other.energies - fit.energies
-    )
-    deviation = gain.std(ddof=1) / np.sqrt(len(gain))
-    return float(stdtr(len(gain) - 1, gain.mean() / deviation))
 
 
 def _straight(
@@ -416,30 +380,20 @@ def _straight(
     """Return weak-perspective images (n, 2, J) of rows, for weighted means of depths.
 
     Cameras and coefficients of the frames follow each other, for one model each. Each
-    model has half of the weight of the one before it.
+    model has half of the weight of the one before it. Without models depths are equal.
     """
+    images = pinhole.virtual(rows)
+    if not models:
+        return images
     fits = zip(models, by_frame[::2], by_frame[1::2], strict=True)
     depths = [model.depths(motion, alpha) for model, motion, alpha in fits]
     weights = 0.5 ** np.arange(len(depths))
-    mean = np.average(depths, axis=0, weights=weights)
-    return pinhole.straight(pinhole.virtual(rows)[0], mean)
+    return pinhole.straight(images, np.average(depths, axis=0, weights=weights))
 
 
-def _squares(
-    rows: NDArray,
-    motion: NDArray,
-    translation: NDArray,
-    alpha: NDArray,
-    fit: PerspectiveFit,
-) -> NDArray:
+def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
-    images, _ = fit.pinhole.virtual(rows)
-    shapes = compose(fit.model.mean_shape, fit.model.basis, alpha)
-    flat = project(shapes, motion, translation).swapaxes(1, 2)
-    depths = fit.model.depths(motion, alpha)
-    square = np.sum((fit.pinhole.images(flat, depths) - images) ** 2, axis=1)
-    size = centred_frames(images)[1].size
-    square /= np.where(size > 0, size, np.nan)[:, None] ** 2
-    if fit.pinhole.robust and isinstance(fit.model.frames, PosteriorFrames):
-        square = robust_square(square, fit.model.frames.noise_variance)
+    square = model.distances(rows, *model.in_table_cameras(rows, *fit)) ** 2
+    if isinstance(model.frames, PosteriorFrames) and model.frames.loss != "linear":
+        square = robust_square(square, model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

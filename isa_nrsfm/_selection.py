@@ -34,11 +34,11 @@ from isa_nrsfm._compat.scikit_learn import (
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._fit import ready_table
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._joint.settings import JOINT_TOL
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 
 # For held-out errors of 100 % and more.
@@ -467,7 +467,7 @@ def check_rows(
         with warnings.catch_warnings(action="ignore"):  # the last fit warns
             try:
                 source, weights, settings = clone(estimator)._ready(rows)
-                ready_table(source, weights, k, settings)
+                scaled_table(source, weights, k, settings)
             except ValueError as error:
                 return error
         return None

@@ -339,17 +339,15 @@ class PosteriorFrames:
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""
-        covariance = posterior.covariance
+        motion, translation, alpha, covariance, *_ = posterior
         known = covariance.shape[1] == len(self.shapes) - 1
-        motion, alpha, deviation = self.gauge.apply(
-            posterior.motion,
-            posterior.alpha,
-            self.widened(posterior.alpha, covariance)[0] if known else None,
+        widened = self.widened(alpha, covariance)[0] if known else None
+        motion, alpha, deviation = self.gauge.apply(motion, alpha, widened)
+        motion, translation = (
+            motion * sizes[:, None, None],
+            translation * sizes[:, None],
         )
-        translation = posterior.translation * sizes[:, None]
-        return Decomposition(
-            motion * sizes[:, None, None], translation, alpha, deviation
-        )
+        return Decomposition(motion, translation, alpha, deviation)
 
     def widened(self, alpha: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
         """Return covariances (n, K, K) with the errors of the shapes.
@@ -393,14 +391,8 @@ class PosteriorFrames:
         precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         covariance, ratio = self.widened(fit.alpha, fit.covariance)
-        return LinearisedFrames(
-            motion,
-            fit.translation * sizes[:, None],
-            fit.alpha,
-            covariance,
-            precision / ratio,
-            slope,
-        )
+        posterior = motion, fit.translation * sizes[:, None], fit.alpha, covariance
+        return LinearisedFrames(*posterior, precision / ratio, slope)
 
     def depth_deviations(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None

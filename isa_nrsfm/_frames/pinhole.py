@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._prepare.robust import spatial_median
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables.tracks import centred_frames
 
 
 class Pinhole(NamedTuple):
@@ -44,21 +44,22 @@ class Pinhole(NamedTuple):
         """The principal point (2, 1)."""
         return np.reshape(self.principal_point, (2, 1))
 
-    def virtual(self, rows: NDArray) -> tuple[NDArray, NDArray]:
-        """Return images (n, 2, J) of virtual cameras, and their rotations H (n, 3, 3).
+    def turns(self, rows: NDArray) -> NDArray:
+        """Return rotations H (n, 3, 3) of virtual cameras.
 
         Their axes go through the middles of the points.
         """
         rows = rows.astype(np.float64, copy=False)
-        shown = seen_points(rows).any(axis=1)
-        middle = np.full((len(rows), 2, 1), np.nan)
+        middle = centred_frames(rows)[1].translation
         if self.robust:
-            middle[shown, :, 0] = spatial_median(rows[shown])
-        else:
-            middle[shown] = np.nanmean(rows[shown], axis=2, keepdims=True)
-        turns = turns_to(self.rays(middle)[..., 0])
-        q = turns @ self.rays(rows)
-        return self.focal_length * q[:, :2] / q[:, 2:], turns
+            shown = np.isfinite(middle[:, 0])
+            middle[shown] = spatial_median(rows[shown])
+        return turns_to(self.rays(middle[..., None])[..., 0])
+
+    def virtual(self, rows: NDArray) -> NDArray:
+        """Return images (n, 2, J) of virtual cameras."""
+        q = self.turns(rows) @ self.rays(rows)
+        return self.focal_length * q[:, :2] / q[:, 2:]
 
     def rays(self, rows: NDArray) -> NDArray:
         """Return the rays (n, 3, J) of image points, with third coordinate one."""
@@ -68,12 +69,6 @@ class Pinhole(NamedTuple):
     def straight(self, images: NDArray, depths: NDArray) -> NDArray:
         """Return weak-perspective images (n, 2, J), for depths (n, J)."""
         return images * (1.0 + depths / self.focal_length)[:, None]
-
-    def images(self, straight: NDArray, depths: NDArray) -> NDArray:
-        """Return perspective images, the inverse of `straight`."""
-        if not self.near:
-            return straight
-        return straight / (1.0 + depths / self.focal_length)[:, None]
 
     def projected(
         self, shapes: NDArray, motion: NDArray, translation: NDArray
@@ -87,16 +82,15 @@ class Pinhole(NamedTuple):
         turned = shapes @ R.mT
         if not self.near:
             sight = place / np.linalg.norm(place, axis=1, keepdims=True)
-            along = np.vecdot(turned, sight[:, None])
-            turned = turned - along[..., None] * sight[:, None]
+            turned = turned - turned @ (sight[..., None] * sight[:, None])
         X = turned + place[:, None]
         return self.focal_length * X[..., :2] / X[..., 2:] + self.centre[:, 0]
 
     def real(
-        self, motion: NDArray, translation: NDArray, turns: NDArray
+        self, rows: NDArray, motion: NDArray, translation: NDArray
     ) -> tuple[NDArray, NDArray]:
         """Return cameras and translations of the real camera, from virtual ones."""
-        f = self.focal_length
+        f, turns = self.focal_length, self.turns(rows)
         R, scales = full_rotations(motion)
         place = np.column_stack([translation, np.full(len(translation), f)])
         place = (turns.mT @ place[..., None])[..., 0]  # s T
@@ -114,19 +108,11 @@ class Pinhole(NamedTuple):
 
 def turns_to(rays: NDArray) -> NDArray:
     """Return the smallest rotations (n, 3, 3) of rays (n, 3) to the third axis."""
-    x, y, z = (rays / np.linalg.norm(rays, axis=1)[:, None]).T
-    share = 1.0 / (1.0 + z)
-    H = np.empty((len(rays), 3, 3))
-    H[:, 0] = np.stack([1.0 - share * x * x, -share * x * y, -x], axis=1)
-    H[:, 1] = np.stack([-share * x * y, 1.0 - share * y * y, -y], axis=1)
-    H[:, 2] = np.stack([x, y, z], axis=1)
-    return H
-
-
-def line_of_sight(motion: NDArray) -> NDArray:
-    """Return ``s r_3`` (n, 3) of cameras (n, 2, 3): products with points are depths."""
-    R, scales = full_rotations(motion)
-    return scales[:, None] * R[:, 2]
+    axis = np.eye(3)[2]
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    sums = (rays + axis)[:, None]
+    H = np.eye(3) - sums.mT @ sums / (1.0 + rays[:, 2, None, None])
+    return H + 2.0 * axis[:, None] * rays[:, None]
 
 
 def common(focal_length: Any) -> float:
@@ -159,6 +145,4 @@ def zoomed(rows: NDArray, share: NDArray, centre: NDArray) -> NDArray:
 def zoomed_table(table: FrameBlocks, shares: NDArray, centre: Any) -> FrameBlocks:
     """Return the rows (n, 2, J) that cameras with the mean focal length would show."""
     middle = np.reshape(centre, (2, 1))
-    rows = table.derive(lambda r, share: zoomed(r, share[..., None], middle), shares)
-    rows.empty = table.empty
-    return rows
+    return table.derive(lambda r, share: zoomed(r, share[..., None], middle), shares)

@@ -24,14 +24,8 @@ UNKNOWN = np.full((3, 3), np.nan)
 class _Camera:
     """A calibrated camera M (2, 3), its objective, and the coefficients' posterior."""
 
-    def __init__(
-        self,
-        search: "SingleSearch",
-        M: NDArray,
-        P: NDArray,
-        energy: float,
-        noise: float,
-    ):
+    def __init__(self, search: "SingleSearch", M: NDArray, frame: "_Frame"):
+        P, energy, noise = frame
         H = (search.pairs @ (M.T @ M).ravel()).reshape(search.K + 1, -1)
         seen = P.reshape(-1, 6) @ M.ravel()
         damped = H[1:, 1:].copy()
@@ -43,6 +37,8 @@ class _Camera:
         self.value = square + noise * self.log_determinant
 
 
+# ``P_k^T`` (K + 1, 2, 3) of `newton`, energy and noise variance
+_Frame = tuple[NDArray, float, float]
 _Moments = tuple[NDArray, NDArray, NDArray]
 # Camera (2, 3), alpha (K,), covariances of alpha and rotation, objective
 _Fit = tuple[NDArray, NDArray, NDArray, NDArray, float]
@@ -79,7 +75,7 @@ class SingleSearch:
         search = self._calibrated if self.model.calibrated else self._affine
         try:
             with np.errstate(all="ignore"):
-                fit = search(P, energy, noise)
+                fit = search((P, energy, noise))
         except np.linalg.LinAlgError:
             return None
         if fit is None or not fit[-1] <= largest:
@@ -89,8 +85,9 @@ class SingleSearch:
         parts = motion, centre, alpha, covariance, turns, objective, True
         return FramePosterior(*(np.array(part)[None] for part in parts))
 
-    def _affine(self, P: NDArray, energy: float, noise: float) -> _Fit | None:
+    def _affine(self, frame: _Frame) -> _Fit | None:
         """Minimise over the coefficients, with the best camera for them."""
+        P, energy, noise = frame
         K, alpha, before, ended = self.K, np.zeros(self.K), np.inf, False
         tol = 1e-12 * (energy + noise)
         for n_steps in range(MAX_STEPS):
@@ -120,21 +117,22 @@ class SingleSearch:
             before, alpha, ended = value, alpha + step, slope @ step <= tol
         return None
 
-    def _calibrated(self, P: NDArray, energy: float, noise: float) -> _Fit | None:
+    def _calibrated(self, frame: _Frame) -> _Fit | None:
         """Minimise over cameras, with the coefficients integrated out."""
+        P, energy, noise = frame
         affine = P[0] @ np.linalg.inv(0.5 * self.sums[:9, 0].reshape(3, 3))
         starts = calibrated_starts(self.model, affine[..., None])
-        cameras = [_Camera(self, M[..., 0], P, energy, noise) for M in starts]
+        cameras = [_Camera(self, M[..., 0], frame) for M in starts]
         start = min(cameras, key=lambda camera: camera.value)
-        minimum = self._minimum(start, P, energy, noise)
+        minimum = self._minimum(start, frame)
         if minimum is None:
             return None
         moments = self._moments(minimum, P, noise)
         if not self._rise(minimum, moments) > LARGE_RISE * minimum.value:
             # A lower minimum from the reversed camera is left to the other search.
-            other = _Camera(self, minimum.M * REVERSED.T, P, energy, noise)
+            other = _Camera(self, minimum.M * REVERSED.T, frame)
             limit = minimum.value - 1e-10 * (energy + noise)
-            if self._minimum(other, P, energy, noise, minimum, limit) is not None:
+            if self._minimum(other, frame, minimum, limit) is not None:
                 return None
         _, hessian, _, through = self._derivatives(minimum, P, moments)
         turns = np.linalg.inv(hessian)
@@ -184,13 +182,12 @@ class SingleSearch:
     def _minimum(
         self,
         camera: _Camera,
-        P: NDArray,
-        energy: float,
-        noise: float,
+        frame: _Frame,
         known: _Camera | None = None,
         limit: float = np.inf,
     ) -> _Camera | None:
         """Return a minimum; None if not found, or if it will not be below the limit."""
+        P, energy, noise = frame
         tol, damping = 1e-12 * (energy + noise), 0.0
         radius = SAME_WELL * np.linalg.norm(camera.M - known.M) if known else 0.0
         for _ in range(MAX_STEPS):
@@ -208,7 +205,7 @@ class SingleSearch:
             ):
                 return None
             M = self.model.moved(camera.M, self.model.limited(step))
-            moved = _Camera(self, M, P, energy, noise)
+            moved = _Camera(self, M, frame)
             if damping == 0 and gain <= tol:
                 return moved if moved.value < limit else None
             if moved.value <= camera.value + tol:

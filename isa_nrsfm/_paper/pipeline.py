@@ -26,6 +26,7 @@ A step takes the best alpha for E, then ``E = A^-1 R`` with ``A = sum_i alpha_i^
 M_0^i`` and ``R = sum_i alpha_i M_0^iT M_ik``. It never lowers f.
 """
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -33,6 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh, null_space
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import has_fit_parameter
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
@@ -198,13 +200,10 @@ def run_paper_pipeline(
     factors: Factorisation,
     n_components: int,
     isa: Any,
-    *,
-    block_recovery: str,
-    max_iter: int,
-    tol: float,
+    settings: Any,
     report: Callable[[str], None],
 ) -> tuple[NDArray, NDArray, int, bool]:
-    """Fit the strategy `isa`, recover blocks and refine them unless max_iter is 0.
+    """Fit the strategy `isa`, recover blocks and refine them, by `FitSettings`.
 
     Returns shapes (K + 1, 3, J): B_0 of the rigid factorisation, and ``B_k = E_k
     B_ISA,k``, zero for subspaces without motion. The mode covariance (3K, 3K) ``(J /
@@ -215,16 +214,24 @@ def run_paper_pipeline(
     products = motion_products(factors.rigid_motion, factors.motion)
     moments, (cross, rigid, gram) = lifted_moments(products), products
     covariance = gram * (n_points / n_rows)
-    components = _independent_subspaces(isa, factors.signals, covariance, moments)
+    with warnings.catch_warnings():
+        if settings.joint and settings.silent_isa:
+            message = "PooledFastICA did not"
+            warnings.filterwarnings("ignore", message, ConvergenceWarning)
+        components = _independent_subspaces(isa, factors.signals, covariance, moments)
     report("independent subspaces")
 
     # Block structure, for the motion ``M' A`` with ``A^T = components``. E_k is the
     # inverse of D_k.
     gram = components @ gram @ components.T
     products = cross @ components.T, rigid, gram
-    E = np.linalg.pinv(recover_blocks(products, block_recovery), rcond=OF_RANKS)
+    D = recover_blocks(products, settings.block_recovery)
+    E = np.linalg.pinv(D, rcond=OF_RANKS)
     n_iter, converged = 1, True
-    if max_iter:
+    if settings.refinement:
+        # The joint refinement only starts from this result.
+        joint_start, own = (200, 1e-5), (settings.max_iter, settings.tol)
+        max_iter, tol = joint_start if settings.joint else own
         lifted = leading_blocks(moments, components.reshape(len(E), 3, -1))
         plain = np.broadcast_to(np.eye(3), (len(E), 1, 3, 3))
         starts = np.concatenate([E[:, None], lifted, plain], axis=1)

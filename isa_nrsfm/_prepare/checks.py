@@ -14,7 +14,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.sources import CHECKS, checked_range, unmasked
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     LAYOUTS,
@@ -56,21 +56,21 @@ def check_table(X: Any, layout: Layout) -> None:
         )
     names = getattr(X, "columns", None)
     if names is not None:
-        check_names(
-            ["_".join(map(str, n)) if isinstance(n, tuple) else n for n in names],
-            layout,
-        )
+        names = ["_".join(map(str, n)) if isinstance(n, tuple) else n for n in names]
+        check_names(names, layout)
 
 
-def validated_table(estimator: Any, X: Any, layout: Layout, **options: Any) -> NDArray:
+def validated_table(estimator: Any, X: Any, layout: Layout, reset: bool) -> NDArray:
     """Return a table as an array of numbers, checked by scikit-learn and by name."""
     check_table(X, layout)
+    least = dict.fromkeys(("ensure_min_samples", "ensure_min_features"), 1 + reset)
     try:
-        return np.asarray(validate_data(estimator, unmasked(X), **options))
+        X = validate_data(estimator, unmasked(X), reset=reset, **least, **CHECKS)
     except ValueError as error:
         if "could not convert" in str(error):
             raise ValueError(f"X has texts: {error}. {ONLY_POINTS}") from error
         raise
+    return checked_range(np.asarray(X))
 
 
 def check_names(names: Sequence[Hashable], layout: Layout) -> None:
@@ -272,7 +272,7 @@ def _rigid_noise(rows: NDArray) -> float:
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
-    """Return values as a finite array of one of the allowed shapes, or raise."""
+    """Return values as a finite array of the first of the allowed shapes, or raise."""
     array = check_array(
         unmasked(values),
         dtype=[np.float64, np.float32],
@@ -283,7 +283,7 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
     if array.shape not in allowed:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
-    return array
+    return np.broadcast_to(array, allowed[0])
 
 
 def check_camera(model: Any) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import check_array
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.checks import check_points, check_size, warn_if_other_layout
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
@@ -14,7 +15,6 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import is_read_later, unmasked
 from isa_nrsfm._tables.tracks import (
     FrameReport,
-    Layout,
     centred_frames,
     check_frames,
     seen_points,
@@ -63,21 +63,19 @@ class ScaledTable(NamedTuple):
         return bool((self.n_seen == self.n_points).all())
 
 
+@one_blas_thread
 def scaled_table(
-    blocks: FrameBlocks,
-    n_components: int,
-    *,
-    layout: Layout,
-    names: NDArray | None,
-    scale_frames: bool,
-    robust: bool,
-    camera: str | None = None,
-    weights: NDArray | None = None,
+    blocks: FrameBlocks, weights: NDArray | None, n_components: int, settings: Any
 ) -> ScaledTable:
-    """Check an opened table, centre and scale its frames, robustly if `robust`.
+    """Check an opened table for K basis shapes; centre and scale its frames.
 
-    Weights (n_rows, J) are zero where points are missing, None where all are one.
+    With a robust loss that is robust. Weights (n_rows, J) are zero where points are
+    missing, None where all are one. The settings are `FitSettings`.
     """
+    layout, names, scale_frames = settings.layout, settings.names, settings.scale_frames
+    robust, camera = settings.loss != "linear", settings.camera
+    if not settings.joint:  # basis shapes are those of the factorisation
+        camera = None
     n_points, dtype = blocks.empty.shape[2], blocks.empty.dtype
     check_size(blocks.n_frames, n_points, n_components, camera)
     n_half, first, visible, largest, *rest = blocks.joined(
@@ -123,19 +121,11 @@ def scaled_table(
     single = dtype == np.float32 and n_points >= 200 and complete and not robust
     unit_rows = partial(_unit_rows, dtype=np.float32 if single else np.float64)
     spacing = np.finfo(dtype).eps * largest.astype(np.float64)
-    return ScaledTable(
-        shown,
-        blocks,
-        blocks.derive(unit_rows, translation, size),
-        size,
-        translation,
-        n_seen,
-        n_points,
-        None if scale_frames else float(size[0]),
-        float(np.sqrt(np.mean((spacing / size) ** 2))),
-        dtype,
-        weights,
-    )
+    precision = float(np.sqrt(np.mean((spacing / size) ** 2)))
+    unit = None if scale_frames else float(size[0])
+    rows = blocks.derive(unit_rows, translation, size)
+    frames = shown, blocks, rows, size, translation, n_seen
+    return ScaledTable(*frames, n_points, unit, precision, dtype, weights)
 
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
@@ -218,7 +208,6 @@ def weighted_rows(
         )
     nan = rows.empty.dtype.type(np.nan)
     visible = rows.derive(lambda r, w: np.where(w[:, None] == 0, nan, r), weights)
-    visible.empty = rows.empty
     seen = visible.joined(seen_points)
     weights = np.where(seen, weights, 0.0)
     least = LEAST_WEIGHT * weights.max(axis=1, keepdims=True, initial=0.0)

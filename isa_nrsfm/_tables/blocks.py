@@ -30,10 +30,11 @@ class FrameBlocks:
     `lengths` are the numbers of frames, `n_frames` their sum. Derived blocks are
     computed once if `cached`, and otherwise at each reading. `n_threads` threads work
     on blocks at the same time.
-    `empty` is a block without frames, known for blocks of `open_table`.
+    `empty` is a block without frames of the table, known for blocks of `open_table` and
+    those derived from them.
     """
 
-    empty: NDArray
+    empty: Any = None
 
     def __init__(
         self,
@@ -82,11 +83,12 @@ class FrameBlocks:
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return blocks of the results of a function of each block (see `map`)."""
-        if self.cached:
-            blocks = list(self.map(function, *by_frame))
-            return self.of_blocks(blocks, self.lengths, self.n_threads)
         read = self._results(function, by_frame)
-        return type(self)(read, self.lengths, False, self.n_threads)
+        if self.cached:
+            read = list(self.map(function, *by_frame)).__getitem__
+        derived = type(self)(read, self.lengths, self.cached, self.n_threads)
+        derived.empty = self.empty
+        return derived
 
     def _results(
         self, function: Callable[..., Any], by_frame: Sequence[NDArray]
@@ -188,7 +190,9 @@ class DaskBlocks(FrameBlocks):
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return new blocks, the results of a function of each of these."""
         tasks = self._tasks(function, *by_frame)
-        return type(self)(self._run("persist", tasks), self.lengths)
+        derived = type(self)(self._run("persist", tasks), self.lengths)
+        derived.empty = self.empty
+        return derived
 
     def subset(self, frames: NDArray) -> Self:
         """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""

@@ -30,8 +30,6 @@ GROSS = 8.0
 # motion, photos of faces, K = 3 and 9. With one wrong point in a thousand, at half the
 # size of a face, it is 0.06 to 0.13 %.
 MOST_GROSS = 5e-4
-# Perspective is advised if it lowers the error of held-out points to this share.
-MUCH_LOWER = 0.9
 MOST_MESSAGES = 3
 
 
@@ -58,7 +56,7 @@ class Facts(NamedTuple):
         Descriptions of outliers, of coefficients that a few frames determine, and of
         those that the pose predicts; empty if there are none.
     perspective : str
-        Result of `perspective_advice`.
+        Message if perspective explains the table better, otherwise empty.
     """
 
     camera: str
@@ -176,16 +174,6 @@ def depth_advice(facts: Facts) -> str:
         f"{text}, because {why}. {remedy[0].upper()}{remedy[1:]}. If coefficients "
         'suffice, use affine cameras (camera="affine"). See "How reliable is the '
         'depth?" in the documentation'
-    )
-
-
-def perspective_advice(error: float, weak: float) -> str:
-    """Return the message on held-out errors with perspective and without; or none."""
-    if not error < MUCH_LOWER * weak:
-        return ""
-    return (
-        f"perspective explains the table better: error of held-out points "
-        f'{100 * error:.2g} % instead of {100 * weak:.2g} %. Use camera="perspective"'
     )
 
 

@@ -25,10 +25,11 @@ from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._gauge import canonical_rotation
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.sources import CHECKS, checked_range, open_table
+from isa_nrsfm._tables.sources import open_table
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
@@ -117,14 +118,14 @@ class ShapeSequenceNRSfM(
             column names that contradict `layout`.
         """
         X = self._checked(X, reset=True)
-        table = scaled_table(
-            open_table(X, self.layout),
-            self.n_components,
+        settings = FitSettings(
+            refinement=None,
             layout=self.layout,
             names=getattr(self, "feature_names_in_", None),
             scale_frames=self.scale_frames,
-            robust=False,
         )
+        rows = open_table(X, self.layout)
+        table = scaled_table(rows, None, self.n_components, settings)
         W = table.rows.whole().reshape(2 * len(X), -1).astype(np.float64)
 
         cameras, shapes = self._factorise(W)
@@ -260,17 +261,7 @@ class ShapeSequenceNRSfM(
 
     def _checked(self, X: Any, reset: bool) -> NDArray:
         """Return a valid table without missing points."""
-        fewest = 2 if reset else 1
-        X = validated_table(
-            self,
-            X,
-            self.layout,
-            **CHECKS,
-            ensure_min_samples=fewest,
-            ensure_min_features=fewest,
-            reset=reset,
-        )
-        checked_range(X)
+        X = validated_table(self, X, self.layout, reset)
         rows = np.flatnonzero(np.isnan(X).any(axis=1))
         if len(rows):
             raise ValueError(

@@ -104,10 +104,11 @@ def column_results(
         names = [f"distance_{a}_{b}" for a, b in args.distance]
         a, b = args.unit or EYES
         try:
+            pairs = [*args.distance, (a, b)]  # the unit of positions as well
             found = point_distances(
-                estimator, args.distance or [(a, b)], unit=args.unit, length=args.length
+                estimator, pairs, unit=args.unit, length=args.length
             )
-            columns |= zip(names, found.T, strict=False)
+            columns |= zip(names, found.T[:-1], strict=True)
             if has_positions:
                 size = np.linalg.norm(np.subtract(*estimator.mean_shape_[[a, b]]))
                 report["position_unit"] = {

@@ -15,13 +15,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis._advice import (
-    MOST_GROSS,
-    advice,
-    camera_meaning,
-    facts_of,
-    perspective_advice,
-)
+from isa_nrsfm.analysis._advice import MOST_GROSS, advice, camera_meaning, facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics, outlier_text
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
@@ -34,6 +28,9 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 MOST_LISTED, MOST_CLASSES = 10, 12
 # Rows and basis shapes of fits that are compared, at most.
 MOST_ROWS, MOST_SHAPES = 300, 12
+# Perspective is advised if it lowers the error of held-out points to this share:
+# docs/benchmarks/README.md, "Thresholds".
+MUCH_LOWER = 0.9
 
 
 def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
@@ -178,8 +175,13 @@ def _perspective_advice(
                 return ""
     except ValueError:  # too few of the rows show a point
         return ""
-    perspective = np.isfinite(model.focal_length_)
-    return perspective_advice(errors[-1], errors[0]) if perspective else ""
+    weak, *_, error = errors
+    if not error < MUCH_LOWER * weak or np.isinf(model.focal_length_):
+        return ""
+    return (
+        f"perspective explains the table better: error of held-out points "
+        f'{100 * error:.2g} % instead of {100 * weak:.2g} %. Use camera="perspective"'
+    )
 
 
 def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
