@@ -43,6 +43,7 @@ from isa_nrsfm._prepare.checks import (
     check_frames_kept,
     check_table,
     checked,
+    undetermined,
     validated_table,
 )
 from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
@@ -503,7 +504,7 @@ default="affine"
             table much better, or if a refinement has not converged.
         """
         self._forget()
-        with kept_arrays(self.frames_folder) as keep:
+        with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
             stages = stages_of(self.refinement, self.prior is not None)
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, errors=True)
@@ -1007,7 +1008,7 @@ default="affine"
                 setattr(mirror, name, getattr(self, name) * factor)
         return mirror
 
-    def reproject(self, X: Any) -> NDArray:
+    def reproject(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """
         Return the images of the fitted shapes, including missing points.
 
@@ -1015,6 +1016,8 @@ default="affine"
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
 
         Returns
         -------
@@ -1022,8 +1025,9 @@ default="affine"
             Points of the fitted shapes in the fitted cameras. NaN for rows with too
             few visible points.
         """
-        table, _ = self._opened(X)
-        return table.collect(self._model.reproject, *self._focal_shares(table))
+        table, weights = self._opened(X, point_weight)
+        own = *self._focal_shares(table), *weights
+        return table.collect(self._model.reproject, *own)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1124,9 +1128,9 @@ default="affine"
         check_is_fitted(self)
         self._jointly_fitted("diagnostics")
         check_frames_kept(self, "diagnostics")
-        distance = None
-        if X is not None:
-            distance = self._opened(X)[0].joined(self._model.distances)
+        distance = (
+            None if X is None else self._opened(X)[0].joined(self._model.distances)
+        )
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
         return diagnose(self, distance, rows)
 

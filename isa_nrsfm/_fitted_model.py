@@ -237,9 +237,17 @@ class TableModel(NamedTuple):
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         return shapes, deviations / scales[:, None]
 
-    def reproject(self, rows: NDArray, share: NDArray | None = None) -> NDArray:
-        """Return images of the fitted shapes, as a table; with a share, zoomed back."""
-        motion, translation, alpha, _ = self.decompose(rows, deviations=False)
+    def reproject(self, rows: NDArray, *own: NDArray) -> NDArray:
+        """Return images of the fitted shapes, as a table.
+
+        With shares (n, 1) they are zoomed back. There may be weights (n, J) of points.
+        """
+        share, weights = (
+            next((part for part in own if (part.shape[1] == 1) == is_share), None)
+            for is_share in (True, False)
+        )
+        fit = self.decompose(rows, weights, deviations=False)
+        motion, translation, alpha, _ = fit
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation)
         if self.pinhole is not None and share is not None:

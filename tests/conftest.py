@@ -159,7 +159,7 @@ def transforms(succeeds, tmp_path):
 
     def results(model, table, *options):
         path = tmp_path / "transformed.csv"
-        out, err = succeeds("transform", model, table, "-o", path, *options)
+        out, err = succeeds("transform", model, table, "-o", path, "--force", *options)
         return pd.read_csv(path), out, err
 
     return results

@@ -480,7 +480,7 @@ def test_transform_knows_missing_points(
 def test_transform_of_no_usable_row_is_empty(succeeds, fitted, faces, tmp_path):
     path, output = tmp_path / "new.csv", tmp_path / "alpha.tsv"
     faces.assign(**dict.fromkeys(LANDMARKS, "")).to_csv(path, index=False)
-    transform = ["transform", fitted.path, path, "-o", output]
+    transform = ["transform", fitted.path, path, "-o", output, "--force"]
     out, _ = succeeds(*transform)
     assert "60  without coefficients: all points missing" in out
     assert "no frame was fitted" in out

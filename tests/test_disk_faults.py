@@ -299,8 +299,11 @@ class TestFit:
 class TestRunsThatAreMixed:
     def warned(self, succeeds, folder, landmarks, model="model.npz"):
         model = folder / model
-        _, err = succeeds("transform", model, landmarks, "-o", folder / "new.csv")
-        assert succeeds("export", model, "-o", folder / "new.npz")[1] == err
+        _, err = succeeds(
+            "transform", model, landmarks, "-o", folder / "new.csv", "--force"
+        )
+        export = ["export", model, "-o", folder / "new.npz", "--force"]
+        assert succeeds(*export)[1] == err
         return err
 
     def test_files_of_one_run(self, succeeds, folder, landmarks):

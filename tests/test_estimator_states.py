@@ -346,7 +346,7 @@ def test_frames_that_are_equal_support_one_basis_shape():
 def test_how_far_a_wrong_point_is_makes_no_difference_to_a_robust_fit(seed, parameters):
     X = table("one far point", seed)
     alphas = []
-    for far in [1e3, 1e6, 1e16, 1e30, 1e140]:
+    for far in [1e3, 1e6, 1e16, 1e30, 2e153]:
         X[0, :2] = far
         model = AffineNRSfM(**parameters, random_state=1)
         with only_own_warnings():

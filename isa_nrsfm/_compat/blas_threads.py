@@ -1,8 +1,9 @@
 """One BLAS thread, in all functions of small matrices."""
 
+import os
 from functools import wraps
 from operator import attrgetter
-from threading import Lock
+from threading import RLock, get_ident
 from typing import Any, ClassVar, cast
 from weakref import WeakSet
 
@@ -20,10 +21,11 @@ class OneBlasThread:
     Python thread that leaves restores it. With OpenMP each Python thread has its own.
 
     The users are held by weak references: an interrupt while a block is entered or left
-    does not leave a user behind.
+    does not leave a user behind. A process that is forked meanwhile has no other Python
+    threads, and none of their blocks.
     """
 
-    _lock = Lock()
+    _lock = RLock()
     _users: ClassVar["WeakSet[OneBlasThread]"] = WeakSet()
     # Numbers of threads before the first user; empty if they are restored.
     _of_process: ClassVar[list[int]] = []
@@ -34,6 +36,7 @@ class OneBlasThread:
         with self._lock:
             # From Python 3.12 on, a tracer that stops a comprehension keeps the lock.
             self._before = list(map(attrgetter("num_threads"), pools))
+            self._thread = get_ident()
             if not self._of_process:
                 self._of_process[:] = self._before
             self._users.add(self)
@@ -55,6 +58,21 @@ class OneBlasThread:
                     _set_threads(pool, first)
             if last:
                 self._of_process.clear()
+
+    @classmethod
+    def _forked(cls) -> None:
+        """Leave the blocks of other Python threads in a forked process."""
+        for user in [user for user in cls._users if user._thread != get_ident()]:
+            user.__exit__()
+        cls._lock.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=OneBlasThread._lock.acquire,
+        after_in_parent=OneBlasThread._lock.release,
+        after_in_child=OneBlasThread._forked,
+    )
 
 
 def one_blas_thread(function: Function) -> Function:

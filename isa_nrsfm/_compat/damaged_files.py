@@ -1,8 +1,10 @@
 """Errors that name their file, and one kind of error for damaged files."""
 
 import contextlib
+import errno
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 
 @contextlib.contextmanager
@@ -14,6 +16,7 @@ def reading(
     Damaged content makes h5py, pyarrow, zipfile, json and others raise errors of many
     undocumented kinds. `what` is the kind of file, `expected` its required content.
     """
+    refuse_special(path)
     try:
         yield
     except (ImportError, MemoryError):
@@ -30,6 +33,13 @@ def reading(
             f"{os.fspath(path)} cannot be read as {what}: {said}"
             + (f". Expected {expected}" if expected else "")
         ) from error
+
+
+def refuse_special(path: str | os.PathLike[str]) -> None:
+    """Raise if a path is a pipe or a device: readers open a file several times."""
+    if Path(path).exists() and not (Path(path).is_file() or Path(path).is_dir()):
+        reason = "is a pipe or a device. Save its content as a file"
+        raise OSError(errno.EINVAL, reason, os.fspath(path))
 
 
 @contextlib.contextmanager

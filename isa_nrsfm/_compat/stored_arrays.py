@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
-from zipfile import ZipFile
+from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,26 @@ def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray]) -> None:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, array, allow_pickle=False)
+
+
+def read_arrays(path: str | os.PathLike[str]) -> dict[str, NDArray]:
+    """Return the arrays of a file that `write_arrays` or `numpy.savez` has written.
+
+    Compressed arrays are refused: a small file can hold very large ones.
+    """
+    with ZipFile(path) as archive:
+        found = archive.infolist()
+        if any(member.compress_type != ZIP_STORED for member in found):
+            raise ValueError(
+                "its contents are compressed. Load them, and save them with numpy.savez"
+            )
+        size = Path(path).stat().st_size
+        if sum(member.file_size for member in found) > size:
+            raise ValueError(f"its contents need more than the {size} bytes it has")
+        return {
+            member.filename.removesuffix(".npy"): array_in(archive.read(member))
+            for member in found
+        }
 
 
 def array_in(content: bytes) -> NDArray:

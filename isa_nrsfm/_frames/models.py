@@ -180,7 +180,8 @@ class FrameMap(NamedTuple):
         # d new / d alpha, times scale
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)
-        return cameras, new, np.sqrt(variance) / np.abs(scale)[:, None]
+        deviation = np.sqrt(np.maximum(variance, 0.0))  # less than zero by rounding
+        return cameras, new, deviation / np.abs(scale)[:, None]
 
 
 class LinearisedFrames(NamedTuple):
@@ -439,7 +440,8 @@ class PosteriorFrames:
             variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
         variances += self.certainty.variances(fit.alpha)
         # Frames that the model explains less well than those of the fit
-        excess = self.squares(fit, weights.sum(axis=1)) / self.certainty.residual
+        excess = self.squares(fit, weights.sum(axis=1))
+        excess /= self.certainty.residual or np.nan
         excess = np.fmax(excess, 1.0)
         return sizes[:, None] * np.sqrt(variances * excess[:, None])
 

@@ -106,6 +106,18 @@ class JointFrames:
         n_seen, square = np.sum(list(self.blocks.map(of_block)), axis=0)
         return float(n_seen), float(square)
 
+    @cached_property
+    def point_shares(self) -> NDArray | None:
+        """Observations of each point (J,) over their mean; one if not `repeated`.
+
+        Zero for points that no frame shows. None without weights.
+        """
+        blocks = [block.weights for block in self.blocks.map(lambda block: block)]
+        if blocks[0] is None:
+            return None
+        weights = sum(block.sum(axis=1) for block in blocks)
+        return weights / weights.mean() if self.repeated else (weights > 0) * 1.0
+
     def basis_penalty(self, basis_std: float) -> float:
         """Compute the factor of ``sum_i ||M_i B_k||^2`` in the prior of basis shapes.
 
@@ -237,13 +249,9 @@ class MarginalLikelihood(NamedTuple):
         shape_gradient = shape_gradient + (2 / noise) * pulled
         if self.extent_weight:
             weight = self.extent_weight * n_seen
-            # With one curvature for all points the shapes are centred already.
-            penalty, slope = extent_penalty(shapes, centred=len(curvature) == 1)
+            penalty, slope = extent_penalty(shapes, self.frames.point_shares)
             value += weight * penalty
-            # Points that are visible in no frame stay in place: their curvature is
-            # zero.
-            seen = curvature.any(axis=(1, 2))
-            shape_gradient = shape_gradient + weight * np.where(seen, slope, 0.0)
+            shape_gradient = shape_gradient + weight * slope
         if self.prior is not None:
             term, slope = self.prior.term(shapes)
             value, shape_gradient = value + term, shape_gradient + slope
@@ -320,8 +328,13 @@ def _terms(
     return sums, ((2 / noise) * G, motion_curvature, alpha)
 
 
-def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArray]:
+def extent_penalty(
+    shapes: NDArray, shares: NDArray | None = None
+) -> tuple[float, NDArray]:
     """Compute the penalty of shapes (n, 3, J) and its gradient, for N weight 1.
+
+    Points count by their shares (J,): otherwise the penalty would move those of tiny
+    weights far away. Without shares the shapes are centred already.
 
     If an object hardly turns, its images determine the depth only to second order.
     Depths c times as large with rotations c times smaller give nearly the same images
@@ -335,7 +348,10 @@ def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArra
     penalty is zero for equal extents in all directions, and grows with N like the
     misfit.
     """
-    B = shapes if centred else shapes - shapes.mean(axis=2, keepdims=True)
+    B = shapes
+    if shares is not None:
+        mean = (shares * B).mean(axis=2, keepdims=True) / shares.mean()
+        B = np.sqrt(shares) * (B - mean)
     G = np.einsum("kaj,kbj->ab", B, B)
     mean = np.trace(G) / 3
     if not mean > 0:
@@ -349,4 +365,6 @@ def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArra
     slope = -((axes * (thick / square)) @ axes.T) / 3
     slope += (np.sum(thick) / 9) * np.eye(3)
     gradient = np.tensordot(slope, B, axes=(1, 1)).swapaxes(0, 1)
+    if shares is not None:
+        gradient = np.sqrt(shares) * gradient
     return ratio - 1.0, (2.0 * ratio / mean) * gradient

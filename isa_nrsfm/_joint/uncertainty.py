@@ -335,7 +335,7 @@ def differences(
     mean squares of the depths (n,).
     """
     z = centred(whole_depths)
-    mirror = np.array([1.0, 1.0, np.sign(np.sum(depths * z))])
+    mirror = np.array([1.0, 1.0, np.copysign(1.0, np.sum(depths * z))])
     off = mirror[2] * depths - z
     # Rotations up to a common rotation of the object
     turned = Rotation.from_matrix(mirror[:, None] * rotations * mirror)
@@ -343,7 +343,9 @@ def differences(
     w = (turned * (turned.inv() * whole).mean() * whole.inv()).as_rotvec()
     turns = w.T @ w / len(w)
     turns[2, :2] = turns[:2, 2] = 0.0  # the mirror image has the other sign
-    return float(np.sum(off**2) / np.sum(z**2)), turns, np.mean(off**2, axis=0)
+    # Without any depths the difference is as large as they are.
+    square = np.sum(off**2) / np.sum(z**2) if z.any() else 1.0
+    return float(square), turns, np.mean(off**2, axis=0)
 
 
 def far_state(state: JointState, camera: CameraModel) -> JointState:

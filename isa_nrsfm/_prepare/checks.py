@@ -1,6 +1,7 @@
 """Checks of a table before it is factorised, and their messages."""
 
-from collections.abc import Hashable, Sequence
+import contextlib
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -317,6 +318,19 @@ def check_camera(model: Any) -> None:
             "coordinates have focal_length=1, principal_point=(0, 0); got "
             f"principal_point={centre!r}"
         )
+
+
+@contextlib.contextmanager
+def undetermined(camera: str) -> Iterator[None]:
+    """Raise an error of tables that determine no shapes in place of those of LAPACK."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            f"the table does not determine shapes with camera={camera!r}: its frames "
+            "differ too little, or their points are on few lines. Add frames that show "
+            "the object from other sides, or set camera='affine'"
+        ) from error
 
 
 def check_frames_kept(estimator: Any, what: str) -> None:

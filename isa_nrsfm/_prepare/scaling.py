@@ -24,7 +24,10 @@ from isa_nrsfm._tables.tracks import (
 )
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
-LARGEST_WEIGHT = 1e100
+LARGEST_WEIGHT = 1e30
+# Smallest weight of a point, as a share of the largest of its frame. Such points have
+# no effect on others, and curvatures of their shapes exceed rounding errors.
+LEAST_WEIGHT = 1e-8
 
 
 class ScaledTable(NamedTuple):
@@ -212,6 +215,8 @@ def weighted_rows(
     visible = rows.derive(lambda r, w: np.where(w[:, None] == 0, nan, r), weights)
     seen = visible.joined(seen_points)
     weights = np.where(seen, weights, 0.0)
+    least = LEAST_WEIGHT * weights.max(axis=1, keepdims=True, initial=0.0)
+    weights = np.where(weights > 0, np.maximum(weights, least), 0.0)
     return visible, () if (weights == seen).all() else (weights,)
 
 

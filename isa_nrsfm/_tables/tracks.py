@@ -220,10 +220,10 @@ def weighted_sizes(rows: NDArray, weights: NDArray) -> NDArray:
     not weighted.
     """
     centred, report = centred_frames(rows)
-    rows, total = np.nan_to_num(centred), weights.sum(axis=1)
-    place = np.vecdot(rows, (weights / total[:, None])[:, None])
+    rows, shares = np.nan_to_num(centred), weights / weights.sum(axis=1)[:, None]
+    place = np.vecdot(rows, shares[:, None])
     off = np.where(weights[:, None] > 0, rows - place[..., None], 0.0)
-    square = np.vecdot(weights, (off**2).sum(axis=1)) / (2 * total)
+    square = np.vecdot(shares, (off**2).sum(axis=1)) / 2
     eps = 4 * np.finfo(float).eps
     enough = square > (eps * report.size) ** 2
     return np.where(enough, np.sqrt(square), report.size)

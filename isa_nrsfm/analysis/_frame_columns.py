@@ -1,5 +1,7 @@
 """Columns with one entry for each frame, such as labels, groups and times."""
 
+import contextlib
+from datetime import UTC
 from typing import Any, Literal
 
 import numpy as np
@@ -86,6 +88,11 @@ def checked_times(time: Any, n_rows: int) -> NDArray:
     """Return finite times of rows (n_rows,) in seconds; row numbers for None."""
     if time is None:
         return np.arange(n_rows, dtype=float)
+    with contextlib.suppress(AttributeError, TypeError, StopIteration):  # no dates
+        # In UTC: differences within a time zone ignore the change to summer time.
+        times = [t.astimezone(UTC) if getattr(t, "tzinfo", 0) else t for t in time]
+        first = next(each for each in times if each == each)
+        time = [(each - first).total_seconds() for each in times]
     time = checked_column("time", time, n_rows)
     if time.dtype.kind in "mM":
         return np.asarray((time - time.min()) / np.timedelta64(1, "s"))

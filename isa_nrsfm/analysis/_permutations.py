@@ -10,6 +10,7 @@ random walks.
 """
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from scipy.sparse.linalg import lsmr
 from scipy.stats import norm
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
-from isa_nrsfm.analysis._within_groups import between_share
 
 # Why a label cannot be tested.
 ONE_EVENT = (
@@ -127,20 +127,27 @@ def permuted_energies(
     n_components = alpha.shape[1]
     sizes = order.sizes[:, None]
     means = order.means(alpha)
-    of_labels = (indicators(order.groups).T @ labels).toarray() / sizes
+    # Sparse: there may be as many classes as groups.
+    of_labels = (indicators(order.groups).T @ labels).multiply(1.0 / sizes).tocsr()
     alpha = alpha - means[order.groups]
     square = np.sum(labels.data**2)
     total = square - len(alpha) * np.sum((sizes.T @ of_labels / len(alpha)) ** 2)
     energies, permuted = np.zeros((n_permutations + 1, n_components)), []
     untested = ""
-    weights = _weights(labels, order)
-    between = _standard(of_labels, weights)
-    if np.sum(between**2) > OF_DIFFERENCES * total:
+    weights = _weights(labels, of_labels, order)
+    between = of_labels.multiply(weights).tocsr()
+    # Less the mean of the labels: a part along the weights, and one along ones
+    along = weights / np.sqrt(np.sum(weights**2))
+    part = along.T @ between
+    mean = between.sum(axis=0) - np.sum(along) * part
+    energy = np.sum(between.data**2) - np.sum(part**2) - np.sum(mean**2) / len(means)
+    if energy > OF_DIFFERENCES * total:
         centres = _standard(means, weights)
         orders = (rng.permutation(len(means)) for _ in range(n_permutations))
-        energies += _energies(centres, between, (centres[i] for i in orders))
+        permuted_centres = (centres[i] for i in orders)
+        energies += _energies(centres, between, permuted_centres, along)
         permuted.append("groups")
-    if square - np.sum(sizes * of_labels**2) > OF_DIFFERENCES * total:
+    if square - np.sum(sizes.T @ of_labels.power(2)) > OF_DIFFERENCES * total:
         rest = unexplained(alpha, labels, order)
         length, in_runs = independent_length(rest), _are_sorted(labels, order)
         units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
@@ -220,14 +227,22 @@ def _waves(
         yield order.spectrum(factors * spectrum, inverse=True)
 
 
-def _weights(labels: csr_array, order: FrameOrder) -> NDArray:
-    """Return weights (n_groups, 1) with which means of labels have equal variances."""
+def _weights(labels: csr_array, means: csr_array, order: FrameOrder) -> NDArray:
+    """Return weights (n_groups, 1) with which means of labels have equal variances.
+
+    The shares of the variance are those of `isa_nrsfm.analysis.between_share`.
+    """
     sizes = order.sizes[:, None]
     if (sizes == sizes[0]).all():
         return np.ones(sizes.shape)
-    values = labels.toarray()
-    share = between_share(values, order.groups).between
-    share = np.average(share, weights=np.var(values, axis=0))
+    (n_frames, _), n_groups = labels.shape, len(sizes)
+    square, of_means = labels.power(2).sum(axis=0), (sizes.T @ means.power(2))[0]
+    total = square - labels.sum(axis=0) ** 2 / n_frames
+    within = (square - of_means) / (n_frames - n_groups)
+    apart = (of_means - square + total) / (n_groups - 1)
+    size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
+    between = np.maximum(apart - within, 0.0) / size
+    share = np.average(between / (between + within), weights=total)
     return np.asarray(1.0 / np.sqrt(share + (1.0 - share) / sizes))
 
 
@@ -239,12 +254,14 @@ def _standard(means: NDArray, weights: NDArray) -> NDArray:
 
 
 def _energies(
-    alpha: NDArray, labels: NDArray | csr_array, permuted: Iterable[NDArray]
+    alpha: NDArray, labels: csr_array, permuted: Iterable[NDArray], without: Any = 0.0
 ) -> NDArray:
-    """Return squared covariances (n_permutations + 1, n_components) of mean one."""
+    """Return squared covariances (n_permutations + 1, n_components) of mean one.
+
+    The part of the labels along a column `without` (n, 1) of norm one does not count.
+    """
     energy = np.sum(alpha**2, axis=0)
-    energies = np.array(
-        [np.sum((labels.T @ a) ** 2, axis=0) for a in (alpha, *permuted)]
-    )
+    rests = (a - without * np.sum(without * a, axis=0) for a in (alpha, *permuted))
+    energies = np.array([np.sum((labels.T @ a) ** 2, axis=0) for a in rests])
     energies /= np.where(energy > 0, energy, 1.0)
     return np.asarray(energies / (energies.mean() or 1.0))

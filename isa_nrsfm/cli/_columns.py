@@ -231,6 +231,7 @@ def _label_report(
         "kind": found.kind,
         "n_frames": found.n_frames,
         "n_without_label": np.sum(~known),
+        "n_copies": np.sum(known) - found.n_frames,
         "statistic": "eta_squared" if classes else "spearman",
         "values": found.statistic,
         "p_values": found.p_value,

@@ -1,7 +1,18 @@
 """The entry of the program: nearly all imports are inside it."""
 
+import os
+import signal
 import sys
 from collections.abc import Sequence
+from typing import Any, NoReturn
+
+# Signals after which hidden files and new empty folders are removed.
+STOPPING = ("SIGTERM", "SIGHUP")
+
+
+def _stop(number: int, _frame: Any) -> NoReturn:
+    """End the process as shells report its signal."""
+    raise SystemExit(128 + number)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,8 +38,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     ------
     SystemExit
         With code 2 if the arguments are wrong, with 0 after ``--help`` and
-        ``--version``.
+        ``--version``, with 143 or 129 if the process is stopped by SIGTERM or SIGHUP.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed, as in services
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+    if argv is None:  # the process is this program
+        for number in filter(None, (getattr(signal, n, None) for n in STOPPING)):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, _stop)
     try:
         # Within the try block: an interruption may come while modules are imported.
         from isa_nrsfm.cli._main import run

@@ -7,7 +7,7 @@ from typing import Any
 from isa_nrsfm import export
 from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
-from isa_nrsfm.cli._outputs import read_model, refuse_overwriting
+from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, refuse_replacing
 from isa_nrsfm.cli._report import table_report
 from isa_nrsfm.cli._sections import table_section, text_of
 from isa_nrsfm.skeletons._column_names import names_of_points
@@ -30,6 +30,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     estimator = read_model(args)
     sources = filter(None, (args.model, args.table, *_reading.drawing_files(args)))
     refuse_overwriting(sources, [output])
+    if not args.force:
+        refuse_replacing([output])
     sections: dict[str, Any] = {"Model": [args.model]}
     stored = None
     if args.table is not None:

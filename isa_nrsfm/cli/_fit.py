@@ -92,7 +92,9 @@ def fit_table(
         for name in files:
             whole_files.check_replaceable(folder / name)
         if not args.force:
-            _outputs.refuse_replacing(folder, files)
+            earlier = _outputs.entry_of_report(folder, "sha256")
+            own = {*earlier, _outputs.REPORT} if earlier else ()
+            _outputs.refuse_replacing([folder / name for name in files], own)
         removed = {*_old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
         estimator, search = _fitted(args, frames, clock)

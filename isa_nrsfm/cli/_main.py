@@ -10,6 +10,7 @@ import warnings
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import TextIO
 
 from isa_nrsfm.cli._options import FACE_PRIOR, PROGRAM, build_parser, flag_of
 from isa_nrsfm.cli._progress import show_stage, shown_progress
@@ -32,9 +33,7 @@ def run(argv: Sequence[str] | None = None) -> int:
         encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
         print(report.encode(encoding, "backslashreplace").decode(encoding), flush=True)
     except BrokenPipeError:
-        # Python flushes the standard output once more at exit.
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return 141
     except (ValueError, OSError, ImportError) as error:
         _say(f"error: {_message(error, args)}")
@@ -87,5 +86,14 @@ def _with_options(text: str, args: Namespace) -> str:
 
 
 def _say(text: str) -> None:
-    """Write a line to the standard error."""
-    print(f"{PROGRAM}: {text}", file=sys.stderr, flush=True)
+    """Write a line to the standard error, if that is possible."""
+    try:
+        print(f"{PROGRAM}: {text}", file=sys.stderr, flush=True)
+    except OSError:
+        _silence(sys.stderr)
+
+
+def _silence(stream: TextIO) -> None:
+    """Write to nowhere from now on: Python flushes a stream once more at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

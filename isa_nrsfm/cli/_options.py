@@ -190,7 +190,7 @@ HELP = {
     "transform.output FILE": "the .csv, .tsv or .parquet file to write",
     "export.output FILE": "the file to write",
     "demo.output DIR": "folder for the results (default: ./isa-nrsfm-demo)",
-    "force": "replace files in the folder that are of no earlier run",
+    "force": "replace existing files (fit and demo: also those of no earlier run)",
     "no_figures": "write no figures (png), and remove those of an earlier run",
     "std": "add the standard deviation of each coefficient, in columns such as "
     "alpha_1_std; with calibrated cameras the viewer has error bars of the depths",
@@ -364,7 +364,7 @@ every row of the table; rows with too few points have empty coefficients.""",
         {
             "model": ("model",),
             "table": ("table", *TABLE_OPTIONS, "weights"),
-            "output": ("output", "std", "viewer", *DRAWING),
+            "output": ("output", "force", "std", "viewer", *DRAWING),
         },
     ),
     "export": (
@@ -389,8 +389,8 @@ proportions.""",
         {
             "model": ("model",),
             "output": (
-                *("output", "content", "n_modes", *DRAWING, "names", "label"),
-                *("n_frames", "camera", "mirrored"),
+                *("output", "force", "content", "n_modes", *DRAWING, "names"),
+                *("label", "n_frames", "camera", "mirrored"),
             ),
             "table": ("table", *TABLE_OPTIONS),
         },

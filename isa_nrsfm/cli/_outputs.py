@@ -62,16 +62,13 @@ def refuse_overwriting(sources: Iterable[str], targets: Iterable[Path]) -> None:
             )
 
 
-def refuse_replacing(folder: Path, names: Iterable[str]) -> None:
-    """Raise if files would be replaced that the report of a run does not list."""
-    earlier = entry_of_report(folder, "sha256")
-    own = {*earlier, REPORT} if earlier else {}
-    others = [name for name in names if name not in own and (folder / name).exists()]
+def refuse_replacing(targets: Iterable[Path], own: Iterable[str] = ()) -> None:
+    """Raise if files would be replaced, but for those of the command by their names."""
+    others = [str(path) for path in targets if path.is_file() and path.name not in own]
     if others:
         raise ValueError(
-            f"{folder} has files that are of no complete earlier run and would be "
-            f"replaced: {', '.join(others)}. Choose another --output, or replace them "
-            "with --force"
+            f"existing files would be replaced: {', '.join(others)}. Choose another "
+            "--output, or replace them with --force"
         )
 
 

@@ -98,7 +98,7 @@ def read_frames(
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
-        given = ((name, getattr(args, name)) for name in _OF_FORMATS)
+        given = ((name, getattr(args, name)) for name in (*_OF_FORMATS, "columns"))
         known = FORMATS[args.format].options
         options = {n: value for n, value in given if value is not None and n in known}
         found = read_landmarks(
@@ -203,7 +203,7 @@ def _format(args: Namespace) -> str:
     found: str = args.format
     if found == "auto":
         found = TABLE if args.columns is not None else find_format(args.table)
-    if args.columns is not None and found != TABLE:
+    if args.columns is not None and "columns" not in FORMATS[found].options:
         raise ValueError(f"--columns needs --format table; got --format {found}")
     for name, of in _OF_FORMATS.items():
         if getattr(args, name) is None or name in FORMATS[found].options:

@@ -411,6 +411,8 @@ def _label(label: dict[str, Any]) -> Section:
     title = f"{label['column']}: {label['n_frames']} frames"
     if "classes" in label:
         title += f" of {len(label['classes'])} classes"
+    if label["n_copies"]:
+        title += f"; {label['n_copies']} copies of other frames count once with them"
     if label["n_without_label"]:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))

@@ -10,7 +10,12 @@ import numpy as np
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.cli import _reading
-from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, write_alpha
+from isa_nrsfm.cli._outputs import (
+    read_model,
+    refuse_overwriting,
+    refuse_replacing,
+    write_alpha,
+)
 from isa_nrsfm.cli._report import quality_report, table_report
 from isa_nrsfm.cli._sections import quality_section, table_section, text_of
 from isa_nrsfm.io._tables import table_suffix
@@ -33,6 +38,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     drawn = _reading.drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]
     refuse_overwriting([args.table, args.model, *_reading.drawing_files(args)], outputs)
+    if not args.force:
+        refuse_replacing(outputs)
     X, n_components = _reading.as_fitted(estimator, frames.X), len(estimator.basis_)
     alpha = std = np.empty((0, n_components))
     quality: Any = ["no frame was fitted"]

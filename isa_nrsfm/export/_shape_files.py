@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Self
-from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
-from isa_nrsfm._compat.stored_arrays import array_in, write_arrays
+from isa_nrsfm._compat.stored_arrays import read_arrays, write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._linalg.small_matrices import procrustes
@@ -371,10 +370,7 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
     with reading(path, "a point distribution model"):
         if suffix == ".npz":
             names = PointDistributionModel._fields
-            with ZipFile(path) as archive:
-                stored = {*names} & {name[:-4] for name in archive.namelist()}
-                found = {name: array_in(archive.read(f"{name}.npy")) for name in stored}
-            pdm = PointDistributionModel(*_numbers(found, names))
+            pdm = PointDistributionModel(*_numbers(read_arrays(path), names))
         elif suffix == ".mat":
             pdm = _from_matrices(*_numbers(loadmat(path), "MVE"))
         else:

@@ -65,15 +65,25 @@ def root_groups(path: Path) -> set[str]:
         return set(file)
 
 
+def own_member(group: Any, name: str) -> Any:
+    """Return a member of a group, or None; raise for links, also to other files."""
+    link = group.get(name, getlink=True)
+    if link is not None and type(link).__name__ != "HardLink":
+        raise ValueError(f"{name} is a link; copy what it links to into the file")
+    return group.get(name)
+
+
 def content_of(group: Any, name: str) -> Any:
     """Return the content of a dataset: an array, a number or a text.
 
-    Raise if there is none, or if it claims to hold more than the file can: HDF5 has no
-    data of the parts of an array that nobody wrote.
+    Raise if there is none, if other files hold it, or if it claims to hold more than
+    the file can: HDF5 has no data of the parts of an array that nobody wrote.
     """
-    dataset = group.get(name)
+    dataset = own_member(group, name)
     if dataset is None or not hasattr(dataset, "nbytes"):
         raise ValueError(f"it has no dataset {name}")
+    if dataset.external or dataset.is_virtual:
+        raise ValueError(f"the dataset {name} is stored in another file")
     stored = dataset.id.get_storage_size()
     if dataset.nbytes > LARGEST_RATIO * stored:
         raise ValueError(
@@ -219,9 +229,9 @@ def _read_h5(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     """
     h5py = import_optional("h5py", extra="h5")
     with h5py.File(path, "r") as file:
-        if _KEY not in file:
+        group = own_member(file, _KEY)
+        if not hasattr(group, "attrs"):
             raise ValueError(f"it has no group {_KEY}")
-        group = file[_KEY]
         kind = _text(group.attrs.get("pandas_type", ""))
         if kind not in ("frame_table", "frame"):
             raise ValueError(f"{_KEY} is no table of pandas")
@@ -422,9 +432,10 @@ def _named_dims(dataset: Any) -> list[str] | None:
 
 def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
     """Return the skeleton of the dataset of edges; None if it is empty or absent."""
-    if "edge_names" not in file or not file["edge_names"].size:
+    if "edge_names" not in file or not np.size(
+        content := content_of(file, "edge_names")
+    ):
         return None
-    content = content_of(file, "edge_names")
     size = np.shape(content)
     if len(size) != 2 or 2 not in size:
         raise ValueError(f"edge_names should hold pairs of names; got the shape {size}")

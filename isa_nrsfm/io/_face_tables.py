@@ -90,7 +90,9 @@ def is_mediapipe(path: Path) -> bool:
 
 
 def read_mediapipe(
-    path: Path, image_size: tuple[float, float] | None = None
+    path: Path,
+    image_size: tuple[float, float] | None = None,
+    columns: str | None = None,
 ) -> Landmarks:
     """Read a csv file with the points of MediaPipe.
 
@@ -98,7 +100,7 @@ def read_mediapipe(
     ``image_size``, or the columns ``image_width`` and ``image_height``.
     """
     names = header_names(path)
-    found = find_landmark_columns(names)
+    found = find_landmark_columns(names, columns)
     sizes = [name for name in ("image_width", "image_height") if name in names]
     numbers = [*found.interleaved, *sizes]
     text = {*names}.difference(numbers, found.z)

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from isa_nrsfm._compat.damaged_files import errors_of, reading
+from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
 
 if TYPE_CHECKING:
     from isa_nrsfm.io._landmarks import Landmarks
@@ -75,6 +75,7 @@ class LandmarkFormat:
             If the file cannot be opened.
         """
         path = Path(path)
+        _check_exists(path)
         return _suffix(path) in self.suffixes and self._function("is")(path)
 
     def _function(self, kind: str) -> Callable[..., Any]:
@@ -147,8 +148,8 @@ def read_landmarks(
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
         pixels, for coordinates in shares of the image's size; ``category`` of "coco",
         the name of the category to read; ``part`` of "openpose", one of "pose", "face",
-        "hand_left" and "hand_right"; ``columns`` and ``missing`` of "table", as in
-        `landmark_table`.
+        "hand_left" and "hand_right"; ``columns`` (also of "mediapipe") and ``missing``
+        of "table", as in `landmark_table`.
 
     Returns
     -------
@@ -265,6 +266,7 @@ def _suffix(path: Path) -> str:
 
 def _check_exists(path: Path) -> None:
     """Raise the error of opening a file where there is none."""
+    refuse_special(path)
     if not path.is_dir():
         with path.open("rb"):
             pass
@@ -299,7 +301,7 @@ _ALL = (
         "named columns x and y of each point (468 or 478, where it is recognised)",
         _TABLES,
         "_face_tables.mediapipe",
-        ("image_size",),
+        ("image_size", "columns"),
     ),
     LandmarkFormat(
         "pts",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.damaged_files import errors_of
+from isa_nrsfm._compat.damaged_files import errors_of, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm._parameters.choices import OPENPOSE_PARTS
 from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
@@ -292,6 +292,7 @@ def _each_file(
             raise ValueError(absent)
     contents = []
     for file in files:
+        refuse_special(file)
         with errors_of(file.name):
             contents.append(read(file))
     return [file.name for file in files], contents

@@ -10,7 +10,6 @@ name}`` for an array.
 import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -22,7 +21,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm import __version__, isa
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.stored_arrays import array_in, write_arrays
+from isa_nrsfm._compat.stored_arrays import read_arrays, write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
@@ -35,6 +34,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._tables.sources import LARGEST, SMALLEST
 from isa_nrsfm._tables.tracks import LAYOUTS
 
 FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
@@ -49,6 +49,15 @@ NEEDED = (
     *("reference_motion_", "reference_translation_"),
 )
 Arrays = dict[str, NDArray]
+OUTPUTS = ["default", "pandas", "polars"]
+# Numbers that results depend on, and those of them that are not negative. Others can be
+# NaN or infinite, such as results of rows without points.
+FINITE = (
+    *("mean_shape_", "basis_", "mean_shape", "basis", "shapes", "mixing", "space"),
+    *("coefficient_starts", "reference_motion_", "reference_translation_"),
+    *("n_iter_", "energy_share_", "mode_covariance_", "singular_values_"),
+)
+POSITIVE = ("noise_variance", "noise_variance_", "unit", "depth_variances", "leverage")
 # Attributes that the model of a frame implies.
 IMPLIED = ("camera_", "frames_scaled_")
 
@@ -178,14 +187,7 @@ def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
 
 def _read(path: Path) -> tuple[dict[str, Any], Arrays]:
     """Return the header and the arrays of a file whose digest is right."""
-    with zipfile.ZipFile(path) as archive:
-        size, found = path.stat().st_size, archive.infolist()
-        if sum(member.file_size for member in found) > size:
-            raise ValueError(f"its contents need more than the {size} bytes it has")
-        arrays = {
-            member.filename.removesuffix(".npy"): array_in(archive.read(member))
-            for member in found
-        }
+    arrays = read_arrays(path)
     if HEADER not in arrays or arrays[HEADER].dtype != np.uint8:
         raise ValueError("it has no header")
     header = json.loads(arrays.pop(HEADER).tobytes())
@@ -222,7 +224,10 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     for name, choices in (("camera", CAMERAS), ("layout", LAYOUTS), ("loss", LOSSES)):
         if name in entries and entries[name] not in choices:
             raise ValueError(f"its {name} is not known: {entries[name]}")
-    _check_shapes({**vars(estimator), **entries})
+    values = {**vars(estimator), **entries}
+    if "focal_length_" in values:
+        values["focal_length_"] = np.ravel(values["focal_length_"])
+    _check_shapes(values)
     estimator._model = TableModel(
         _frame_model(entries),
         estimator.mean_shape_,
@@ -237,8 +242,10 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     estimator.frames_scaled_ = entries["unit"] is None
     if entries["sizes"] is not None:
         estimator._frame_sizes = entries["sizes"]
-    if header["set_output"] is not None:
-        estimator.set_output(transform=header["set_output"])
+    if (output := header["set_output"]) is not None:
+        if output not in OUTPUTS:
+            raise ValueError(f"its set_output is not known: {output}")
+        estimator.set_output(transform=output)
     return estimator
 
 
@@ -249,6 +256,8 @@ def _check_shapes(values: dict[str, Any]) -> None:
     K, P = (*np.shape(values["basis_"]), 0, 0)[:2]
     N = (*np.shape(values.get("sizes", ())), 0)[0]
     single = "noise_variance unit n_features_in_ n_iter_ inverse_snr_ leverage".split()
+    single += "noise_variance_ rank_floor_ camera_noise_ratio_ gradient_norm_".split()
+    single += "depth_uncertainty_ focal_length_std_".split()
     shapes: tuple[tuple[tuple[int | None, ...], list[str]], ...] = (
         ((K, P, 3), ["basis_", "basis"]),
         ((P, 3), ["mean_shape_", "mean_shape"]),
@@ -265,7 +274,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((2,), ["certainty", "image_errors"]),
         ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
-        ((None,), ["objective_history_"]),
+        ((None,), ["objective_history_", "focal_length_"]),
         ((N, 2, 3), ["motion_"]),
         ((N, 2), ["translation_"]),
         ((N, K), ["alpha_", "alpha_std_"]),
@@ -276,13 +285,35 @@ def _check_shapes(values: dict[str, Any]) -> None:
     )
     for shape, name in ((shape, name) for shape, names in shapes for name in names):
         if (value := values.get(name)) is None:
+            if name in FINITE and name in values:
+                raise ValueError(f"{name} is missing")
             continue
-        found, kinds = np.shape(value), "O" if name == "feature_names_in_" else "iuf"
+        found, kinds = np.shape(value), "f" if shape else "iuf"
+        kinds = "O" if name == "feature_names_in_" else kinds
         fits = len(found) == len(shape) and all(
             n in (None, m) for n, m in zip(shape, found, strict=True)
         )
-        if not fits or np.asarray(value).dtype.kind not in kinds:
+        numbers = np.asarray(value)
+        if not fits or numbers.dtype.kind not in kinds:
             raise ValueError(f"{name} should be of shape {shape}; it has {found}")
+        if numbers.dtype.kind == "f" and numbers.dtype.itemsize not in (4, 8):
+            raise ValueError(f"{name} is of type {numbers.dtype}")
+        if (
+            name in (*FINITE, *POSITIVE)
+            and not (np.abs(numbers.astype(float)) < 100 * LARGEST).all()
+        ):
+            raise ValueError(f"{name} is not finite")
+        if name in POSITIVE and (numbers < 0).any():
+            raise ValueError(f"{name} is negative")
+    if not K or values["n_features_in_"] != 2 * P:
+        raise ValueError(f"it has {K} basis shapes of {P} points")
+    for name in {"mixing", "space"} & values.keys():
+        if np.linalg.matrix_rank(values[name]) < len(values[name]):
+            raise ValueError(f"{name} has no inverse")
+    focal, *centre = values.get("pinhole", (1.0,))[:3]
+    small = values["unit"] is not None and values["unit"] < SMALLEST
+    if small or not (focal > 0 and np.isfinite(centre).all()):
+        raise ValueError("its unit, or its pinhole camera, is not possible")
 
 
 def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
@@ -448,6 +479,12 @@ def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     defaults = kind().get_params(deep=False)
     check_names({**defaults, **parameters}, defaults, "parameters")
     created = kind(**parameters)
+    if hasattr(kind, "_parameter_constraints"):
+        try:
+            created._validate_params()
+        except ValueError as error:
+            name = str(error).split("'")[1]
+            raise ValueError(f"its {name} is not valid") from error
     for name, value in parts["attributes"].items():
         if name.startswith("_") or not name.endswith("_"):
             raise ValueError(f"it has an unknown attribute: {name}")

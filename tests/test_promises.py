@@ -1,0 +1,186 @@
+"""What is promised of files, outputs and tables that others bring or forge."""
+
+import bz2
+import datetime
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pandas as pd
+import pytest
+from layers import slow_after
+from refusals import refused, warned
+
+from isa_nrsfm import AffineNRSfM, association
+from isa_nrsfm.analysis._frame_columns import checked_times
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.io import load_model, open_table, read_landmarks, read_table
+
+N, J = 40, 12
+X = make_nonrigid_tracks(N, J, 1, noise=0.01, random_state=0).data
+NAMES = [f"{axis}_{j}" for j in range(J) for axis in "xy"]
+PROGRAM = [sys.executable, "-m", "isa_nrsfm"]
+
+
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "a.csv"
+    pd.DataFrame(X, columns=NAMES).to_csv(path, index=False)
+    return path
+
+
+def test_commands_replace_files_only_by_force(table, succeeds, fails, tmp_path):
+    folder, page = tmp_path / "o", tmp_path / "thesis.html"
+    succeeds("fit", table, "-k", 1, "--no-figures", "-o", folder)
+    transform = ["transform", folder / "model.npz", table, "-o"]
+    export = ["export", folder / "model.npz", "-o"]
+    for argv in (
+        [*transform[:-1], "--std", "-o", folder / "alpha.csv"],
+        [*transform, tmp_path / "new.csv", "--viewer", page],
+        [*export, page],
+        [*export, folder / "report.html"],
+    ):
+        path = argv[-1]
+        if path == page:
+            page.write_text("mine")
+        before = path.read_bytes()
+        message = fails(*argv)
+        assert f"would be replaced: {path}. Choose another --output, or" in message
+        assert path.read_bytes() == before
+        succeeds(*argv, *message.split()[-1:])  # --force
+        assert path.read_bytes() != before
+
+
+@pytest.mark.parametrize("streams", ["2>&- <&-", "2>/dev/full"])
+def test_commands_need_no_standard_error(streams, table, tmp_path):
+    argv = f"fit {table} -k 1 --no-figures -o {tmp_path}/o {streams} >&-"
+    run = subprocess.run(" ".join([*PROGRAM, argv]), shell=True, check=False)
+    assert (run.returncode, (tmp_path / "o" / "alpha.csv").exists()) == (0, True)
+
+
+@pytest.mark.parametrize("name", slow_after(1, ["SIGTERM", "SIGHUP"]))
+def test_a_stopped_fit_leaves_no_folder(name, table, tmp_path):
+    folder = tmp_path / "new" / "results"
+    argv = [*PROGRAM, "fit", table, "-k", "1-4", "-o", folder]
+    with subprocess.Popen(argv, stderr=subprocess.PIPE, start_new_session=True) as run:
+        while not folder.exists():
+            time.sleep(0.01)
+        run.send_signal(number := getattr(signal, name))
+        assert run.wait(60) == 128 + number
+    assert not folder.parent.exists()
+
+
+@pytest.mark.parametrize("read", [read_landmarks, read_table, load_model, open_table])
+def test_pipes_and_devices_are_refused_at_once(read, tmp_path):
+    pipe, link, name = tmp_path / "a.parquet", tmp_path / "b.parquet", "a.pts"
+    os.mkfifo(pipe)
+    link.symlink_to("/dev/zero")
+    for path in (pipe, link):
+        refused("is a pipe or a device. Save its content", read, path, error=OSError)
+    os.mkfifo(tmp_path / name)
+    refused("is a pipe", read_landmarks, tmp_path, "pts", error=OSError)
+
+
+def test_contents_of_other_files_are_refused(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    other, path = tmp_path / "other.h5", tmp_path / "a.h5"
+    names = {"node_names": np.array([b"a", b"b"]), "track_names": np.array([b"t"])}
+    with h5py.File(other, "w") as file:
+        file["tracks"] = np.ones((1, 2, 2, 5))
+    layout = h5py.VirtualLayout((1, 2, 2, 5), float)
+    layout[:] = h5py.VirtualSource(other, "tracks", (1, 2, 2, 5))
+    stored = {"shape": (1, 2, 2, 5), "dtype": float, "external": [(other, 0, 160)]}
+    for message, add in {
+        "tracks is a link": lambda f: f.update(
+            tracks=h5py.ExternalLink(other, "/tracks")
+        ),
+        "is stored in another file": lambda f: f.create_dataset("tracks", **stored),
+        "tracks is stored": lambda f: f.create_virtual_dataset("tracks", layout),
+    }.items():
+        with h5py.File(path, "w") as file:
+            file.update(names)
+            add(file)
+        refused(message, read_landmarks, path)
+
+
+def test_an_entry_that_lies_about_its_size_is_not_unpacked(tmp_path):
+    path = tmp_path / "model.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("header.npy", bz2.compress(bytes(10**7)))
+    for at in (8, path.read_bytes().rfind(b"PK\x01\x02") + 10):  # the method
+        content = bytearray(path.read_bytes())
+        content[at : at + 2] = b"\x0c\x00"
+        path.write_bytes(content)
+    refused("its contents are compressed", load_model, path)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_forks_while_other_threads_transform_do_not_hang():
+    model, stop = AffineNRSfM(1, random_state=0).fit(X), threading.Event()
+
+    def work():
+        while not stop.is_set():
+            model.transform(X[:3])
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    status = []
+    for _ in range(10):
+        if not (child := os.fork()):
+            signal.alarm(20)
+            model.transform(X[:3])
+            os._exit(0)
+        status.append(os.waitpid(child, 0)[1])
+    stop.set()
+    for thread in threads:
+        thread.join()
+    assert status == [0] * 10
+
+
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+@pytest.mark.parametrize("weight", [1e-4, 1e-8, 1e-20])
+def test_points_of_any_weight_converge(camera, weight):
+    table = make_nonrigid_tracks(60, 20, 1, noise=0.02, random_state=0).data
+    weights = np.where(np.arange(20) < 5, weight, 1.0) * np.ones((60, 1))
+    model = AffineNRSfM(1, camera=camera, random_state=0)
+    model.fit(table, point_weight=weights)
+    rest = model.reproject(table, point_weight=weights) - table
+    tiny, others = np.square(rest[:, :10]).mean(), np.square(rest[:, 10:]).mean()
+    assert tiny < 4 * others
+
+
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+@pytest.mark.parametrize("kind", ["equal", "shifted", "line"])
+def test_tables_without_turning_warn_of_the_depth(camera, kind, rng):
+    table = np.repeat(X[:1], N, axis=0).reshape(N, J, 2)
+    if kind == "shifted":
+        table = table + rng.normal(size=(N, 1, 2))
+    elif kind == "line":
+        table = table[:, :, :1] * [1.0, 0.5]
+    model = AffineNRSfM(1, camera=camera, random_state=0)
+    warned("depth of the shapes is not determined", model.fit, table.reshape(N, -1))
+    assert np.isfinite(model.basis_).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6])
+def test_copies_of_a_frame_count_once_in_any_group(noise, rng):
+    copies = rng.permutation(np.repeat(np.arange(60), 6))
+    alpha, y = rng.normal(size=(60, 2)), rng.integers(0, 2, 60)
+    alpha = alpha[copies] + noise * rng.normal(size=(360, 2))
+    found = association(alpha, y[copies], rng.integers(0, 3, 360), random_state=0)
+    assert 60 <= found.n_frames <= 62
+
+
+def test_times_with_a_zone():
+    zone = ZoneInfo("Europe/Berlin")
+    hours = [datetime.datetime(2024, 3, 31, h, tzinfo=zone) for h in (0, 1, 3, 4)]
+    for times in (hours, pd.Series(hours), pd.DatetimeIndex(hours)):
+        assert checked_times(times, 4).tolist() == [0.0, 3600.0, 7200.0, 10800.0]
