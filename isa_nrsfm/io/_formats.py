@@ -147,8 +147,8 @@ def read_landmarks(
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
         pixels, for coordinates in shares of the image's size; ``category`` of "coco",
         the name of the category to read; ``part`` of "openpose", one of "pose", "face",
-        "hand_left" and "hand_right"; ``columns`` and ``missing`` of "table", as in
-        `landmark_table`.
+        "hand_left" and "hand_right"; ``columns`` and ``missing`` of "table" and
+        "mediapipe", as in `landmark_table`.
 
     Returns
     -------
@@ -164,6 +164,12 @@ def read_landmarks(
         required content.
     OSError
         If the file cannot be opened.
+
+    Warns
+    -----
+    UserWarning
+        If points are probably missing, such as those at (0, 0), or coordinates are
+        probably shares of the width and height of an image.
 
     See Also
     --------
@@ -198,10 +204,14 @@ def read_landmarks(
         )
     name = find_format(path) if format == "auto" else format
     landmarks = FORMATS[name].read(path, **options)
-    if min_confidence is None:
-        return landmarks
-    with errors_of(str(path)):
-        return landmarks.without_unsure_points(min_confidence)
+    if min_confidence is not None:
+        with errors_of(str(path)):
+            landmarks = landmarks.without_unsure_points(min_confidence)
+    tracks = landmarks.points.to_numpy().reshape(len(landmarks.points), -1, 2)
+    import_module("isa_nrsfm._prepare.coordinates").warn_of_places(
+        tracks, landmarks.confidence
+    )
+    return landmarks
 
 
 def find_format(path: str | os.PathLike[str]) -> str:
@@ -299,7 +309,7 @@ _ALL = (
         "named columns x and y of each point (468 or 478, where it is recognised)",
         _TABLES,
         "_face_tables.mediapipe",
-        ("image_size",),
+        ("image_size", "columns", "missing"),
     ),
     LandmarkFormat(
         "pts",

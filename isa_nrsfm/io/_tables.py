@@ -29,6 +29,9 @@ _MISSING = (
 )
 
 
+Missing = Literal["zeros"] | float | Sequence[float] | None
+
+
 class LandmarkTable(NamedTuple):
     """
     A table split into its landmarks and its other columns.
@@ -145,7 +148,7 @@ def landmark_table(
     frame: "pd.DataFrame",
     *,
     columns: str | Sequence[str] | None = None,
-    missing: Literal["zeros"] | float | None = None,
+    missing: Missing = None,
 ) -> LandmarkTable:
     """
     Take the landmark columns out of a table, in the order x0, y0, x1, y1, ....
@@ -162,9 +165,9 @@ def landmark_table(
         The landmark columns, if their names are ambiguous: patterns of x and
         y columns in turn, such as ``"x_#,y_#"``, with ``#`` for a number and ``*`` for
         any text.
-    missing : {"zeros"} or float, optional
+    missing : {"zeros"}, float or sequence of float, optional
         The x and y of missing points, such as -1, exactly; they become NaN. "zeros" is
-        the number 0.
+        the number 0. Of several numbers, a point has one.
 
     Returns
     -------
@@ -196,14 +199,7 @@ def landmark_table(
             f"a pandas DataFrame is needed; got {type(frame).__name__} "
             "(polars tables have a method to_pandas)"
         )
-    code = 0.0 if missing == "zeros" else missing
-    if code is not None and (
-        isinstance(code, bool | str) or not np.isfinite(np.float64(code))
-    ):
-        raise ValueError(
-            f'missing must be None, "zeros" or a finite number; got {missing!r}'
-        )
-    codes = [] if code is None else [float(code)]
+    codes = codes_of(missing)
     names = find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, codes).reshape(len(frame), len(names))
@@ -211,6 +207,18 @@ def landmark_table(
         pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
         frame.drop(columns=names),
     )
+
+
+def codes_of(missing: Missing) -> list[float]:
+    """Return the numbers of missing points, or raise."""
+    given = [] if missing is None else [0.0] if isinstance(missing, str) else missing
+    codes = np.atleast_1d(np.asarray(given))
+    wrong = isinstance(missing, str) and missing != "zeros"
+    if wrong or codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
+        raise ValueError(
+            f'missing must be None, "zeros" or finite numbers; got {missing!r}'
+        )
+    return [float(code) for code in codes]
 
 
 def tracks_in(
@@ -235,7 +243,7 @@ def is_named_columns(_path: Path) -> bool:
 def read_named_columns(
     path: Path,
     columns: str | None = None,
-    missing: Literal["zeros"] | float | None = None,
+    missing: Missing = None,
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
     points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
