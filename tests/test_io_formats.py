@@ -462,7 +462,7 @@ def test_coco_categories_are_not_mixed(tmp_path):
     assert_array_equal(tracks_of(people), TRACKS)
     hands = read_landmarks(path, category="hand")
     assert hands.failed.sum() == 11
-    assert_array_equal(tracks_of(hands)[0], [[1, 2], [3, 4]])
+    assert_array_equal(tracks_of(hands)[1], [[1, 2], [3, 4]])
     message = "no category 'cat'.* there are person, hand"
     refused(message, read_landmarks, path, category="cat")
 
@@ -501,8 +501,8 @@ def test_coco_results_have_confidences(tmp_path):
         ([{"keypoints": [1, 2, 10**400]}], "a list of finite numbers; got"),
         ([{"keypoints": [1] * 6}, {"keypoints": [1] * 9}], "have 2 keypoints; got 3"),
         (
-            {"images": [], "annotations": [{"image_id": 1}], "categories": [{}]},
-            "no category has keypoints",
+            {"images": [{"id": 1}], "annotations": [{"image_id": 1}]},
+            "no category has keypoints, and no annotation",
         ),
         (
             files.coco_annotations(TRACKS) | {"images": [{"id": 1}]},

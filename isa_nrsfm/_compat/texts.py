@@ -12,7 +12,7 @@ def first_items(items: Iterable[Any], most: int = 4) -> str:
     return ", ".join(texts[:most]) + ", ..." * (len(texts) > most)
 
 
-def by_number(path: Path) -> tuple[list[str | int], str]:
+def by_number(path: Path | str) -> tuple[list[str | int], str]:
     """
     Return a key that sorts files by name, and numbers in names by size.
 
@@ -21,8 +21,9 @@ def by_number(path: Path) -> tuple[list[str | int], str]:
     >>> [file.name for file in sorted(map(Path, ["f10", "f9", "f1"]), key=by_number)]
     ['f1', 'f9', 'f10']
     """
-    parts = re.split("([0-9]+)", path.name)
-    return [int(each) if i % 2 else each for i, each in enumerate(parts)], path.name
+    name = path if isinstance(path, str) else path.name
+    parts = re.split("([0-9]+)", name)
+    return [int(each) if i % 2 else each for i, each in enumerate(parts)], name
 
 
 def as_utf8(text: str) -> str:

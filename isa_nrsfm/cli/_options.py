@@ -178,8 +178,9 @@ HELP = {
     "fit.image_size WIDTHxHEIGHT": "size of the images in pixels, such as 1920x1080: "
     "for MediaPipe, for perspective cameras, and with weak_perspective ones to say "
     "whether perspective explains the table better",
-    "part PART": "the points of OpenPose to read, if the files have several: "
-    f"{', '.join(choices.OPENPOSE_PARTS)}",
+    "part PART": "the points to read, if the files have several: of OpenPose "
+    f"{', '.join(choices.OPENPOSE_PARTS)}; of whole bodies of COCO and MMPose "
+    f"{', '.join(choices.WHOLE_PARTS)}",
     "points POINTS": "fit some of the points: inner (without the visible outline of a "
     "face, which slides over the surface as the head turns), or names, numbers and "
     "ranges such as nose,36-47 or without:0-16",
@@ -262,7 +263,7 @@ HELP = {
 CHOICES: dict[str, Sequence[str]] = {
     "format": ("auto", *FORMATS),
     "weights": ("confidence",),
-    "part": choices.OPENPOSE_PARTS,
+    "part": tuple(dict.fromkeys((*choices.OPENPOSE_PARTS, *choices.WHOLE_PARTS))),
     "origin": ("auto", "upper", "lower"),
     "camera": choices.CAMERA_NAMES,
     "export.camera": ("weak_perspective", NONE),

@@ -347,7 +347,7 @@ _ALL = (
         "write json of other programs as a table",
         (".json",),
         "_keypoints.coco",
-        ("category",),
+        ("category", "part"),
     ),
     LandmarkFormat(
         "openpose",

@@ -9,15 +9,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
-from isa_nrsfm._compat.texts import as_utf8, by_number
-from isa_nrsfm._parameters.choices import OPENPOSE_PARTS
+from isa_nrsfm._compat.texts import as_utf8, by_number, first_items
+from isa_nrsfm._parameters.choices import OPENPOSE_PARTS, WHOLE_PARTS
 from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
 from isa_nrsfm.io._tables import first_lines
 
-# Entries of an instance beside its image and its points.
-_OF_INSTANCE = ("id", "score", "iscrowd", "area", "category")
-_OF_IMAGE = ("file_name", "width", "height")
+# Entries of images and instances that are no columns under their own name.
+_LEFT_OUT = (
+    *("id", "image_id", "category_id", "num_keypoints"),
+    *("license", "coco_url", "flickr_url", "date_captured"),
+)
+# COCO-WholeBody: the lists of an instance, and their numbers of points.
+_LISTS = {
+    "keypoints": 17,
+    "foot_kpts": 6,
+    "face_kpts": 68,
+    "lefthand_kpts": 21,
+    "righthand_kpts": 21,
+}
+# The places of parts in whole bodies of so many points: COCO-WholeBody, Halpe.
+_PLACES = {
+    133: ((0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)),
+    136: ((0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)),
+}
 _NAME = re.compile(r"(?!\.).*?(\d*)_keypoints\.json", re.IGNORECASE)
 _OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
 _PTS = re.compile(
@@ -44,22 +60,50 @@ def _beginning(path: Path) -> bytes:
         return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
 
 
-def read_coco(path: Path, category: str | None = None) -> Landmarks:
+def read_coco(
+    path: Path, category: str | None = None, part: str | None = None
+) -> Landmarks:
     """Read keypoints of COCO, annotations or results of a detector.
 
     Annotations are an object with ``images``, ``annotations`` and ``categories``; the
     third number of a keypoint is 0 if not labelled, 1 if hidden and 2 if visible.
     Results are a list of objects with ``image_id``, ``category_id``, ``keypoints`` and
     ``score``; the third number is a confidence. Each instance has a row, and each image
-    without any has one without points. ``category`` chooses one of several with
-    different keypoints.
+    without any has one without points, in the order of the numbers in their names.
+    ``category`` chooses one of several with different keypoints, ``part`` a part of
+    whole bodies.
     """
-    content = _read_json(path)
-    if isinstance(content, list):
-        if category is not None:
-            raise ValueError("results of a detector do not name their categories")
-        return _results(content)
-    return _annotations(content, category)
+    content, images, names = _read_json(path), {}, None
+    if results := isinstance(content, list):
+        entries = _results(content, category)
+    else:
+        entries, images, names = _annotations(content, category)
+    values, names = _keypoints(
+        entries, names, part, "result" if results else "annotation"
+    )
+    # Detectors that find no point write zeros, as annotators do.
+    absent = (values[..., :2] == 0).all(axis=2) if results else values[..., 2] == 0
+    tracks = np.where(absent[..., None], np.nan, values[..., :2])
+    shown = {entry.get("image_id") for entry in entries}
+    empty = [{"image_id": image} for image in images if image not in shown]
+    gaps = np.full((len(empty), *tracks.shape[1:]), np.nan)
+    order = {image: number for number, image in enumerate(images)}
+    rows, places = [], []
+    for entry in (*entries, *empty):
+        image = entry.get("image_id")
+        of_image = _scalars(images.get(image, {}))
+        name = of_image.get("file_name", image if results else "")
+        places.append((by_number(str(name)), order.get(image, 0)))
+        number = {} if entry.get("id") is None else {"annotation_id": entry["id"]}
+        rows.append({"image_id": image} | of_image | number | _scalars(entry))
+    sequence = sorted(range(len(rows)), key=places.__getitem__)
+    return assemble(
+        np.concatenate([tracks, gaps])[sequence],
+        names,
+        _columns([rows[i] for i in sequence]),
+        format="coco",
+        confidence=values[sequence, :, 2] if results else None,
+    )
 
 
 def _read_json(path: Path) -> Any:
@@ -71,8 +115,10 @@ def _read_json(path: Path) -> Any:
         raise ValueError(f"it is not json: {error}") from error
 
 
-def _results(entries: list[Any]) -> Landmarks:
-    """Return the landmarks of a list of results."""
+def _results(entries: list[Any], category: str | None) -> list[dict[str, Any]]:
+    """Return the entries of a list of results, which must be of one category."""
+    if category is not None:
+        raise ValueError("results of a detector do not name their categories")
     _refuse_non_objects(entries, "results")
     if not all(isinstance(entry.get("image_id", 0), int | str) for entry in entries):
         raise ValueError("the image_id of a result must be a number or a text")
@@ -82,21 +128,16 @@ def _results(entries: list[Any]) -> Landmarks:
             "the results are of more than one category_id: "
             f"{', '.join(sorted(categories))}"
         )
-    values = _keypoints(entries, "result")
-    # Detectors that find no point write zeros, as annotators do.
-    tracks = np.where((values == 0).all(axis=2, keepdims=True), np.nan, values)
-    return assemble(
-        tracks[..., :2],
-        None,
-        _columns(entries, {}),
-        format="coco",
-        confidence=values[..., 2],
-    )
+    return entries
 
 
-def _annotations(content: Any, category: str | None) -> Landmarks:
-    """Return the landmarks of an object with annotations."""
+def _annotations(
+    content: Any, category: str | None
+) -> tuple[list[dict[str, Any]], dict[Any, dict[str, Any]], list[str] | None]:
+    """Return annotations with keypoints, images by their ids, and names of points."""
     lists = ("images", "annotations", "categories")
+    if isinstance(content, dict):
+        content = {"categories": []} | content
     if not isinstance(content, dict) or not all(
         isinstance(content.get(part), list) for part in lists
     ):
@@ -106,9 +147,9 @@ def _annotations(content: Any, category: str | None) -> Landmarks:
         )
     for part in lists:
         _refuse_non_objects(content[part], part)
-    chosen, point_names = _chosen_categories(content["categories"], category)
+    chosen, names = _chosen_categories(content["categories"], category)
     images = _by_id(content["images"], "images")
-    entries = []
+    entries, others = [], []
     for entry in content["annotations"]:
         where, of = entry.get("image_id"), entry.get("category_id")
         if not isinstance(where, int | str) or where not in images:
@@ -116,47 +157,55 @@ def _annotations(content: Any, category: str | None) -> Landmarks:
                 f"annotation {entry.get('id')!r} is of image {where!r}, which is not "
                 "among the images"
             )
-        if isinstance(of, int | str) and of in chosen and "keypoints" in entry:
+        if not entry.get("keypoints"):
+            continue
+        if not content["categories"]:
+            entries.append(entry)
+        elif isinstance(of, int | str) and of in chosen:
             entries.append({**entry, "category": str(chosen[of].get("name"))})
-    order = {image: i for i, image in enumerate(images)}
-    entries.sort(key=lambda entry: order[entry["image_id"]])
-    values = _keypoints(entries, "annotation", len(point_names))
-    tracks = np.where(values[..., 2:] == 0, np.nan, values)[..., :2]
-    shown = {entry["image_id"] for entry in entries}
-    empty = [{"image_id": image} for image in images if image not in shown]
-    gaps = np.full((len(empty), *tracks.shape[1:]), np.nan)
-    return assemble(
-        np.concatenate([tracks, gaps]),
-        point_names,
-        _columns([*entries, *empty], images),
-        format="coco",
-    )
+        else:
+            others.append(of)
+    if others and category is None:
+        text = (
+            f"{len(others)} of {len(entries) + len(others)} annotations are of the "
+            f"category {first_items(dict.fromkeys(map(str, others)))}, which is not "
+            "among the categories with names of keypoints in the file"
+        )
+        if not entries:
+            raise ValueError(text)
+        warn_caller(f"{text}. They are left out")
+    if not entries and names is None:
+        raise ValueError("no category has keypoints, and no annotation")
+    return entries, images, names
 
 
 def _chosen_categories(
     categories: list[dict[str, Any]], name: str | None
-) -> tuple[dict[Any, dict[str, Any]], tuple[str, ...]]:
-    """Return the categories to read by their ids, and their common keypoints."""
-    with_points = [entry for entry in categories if entry.get("keypoints")]
-    names = [str(entry.get("name")) for entry in with_points]
+) -> tuple[dict[Any, dict[str, Any]], list[str] | None]:
+    """Return the categories to read by their ids, and their common keypoints.
+
+    Where no category has names of keypoints, all are read.
+    """
+    named = [entry for entry in categories if entry.get("keypoints")] or categories
+    names = [str(entry.get("name")) for entry in named]
     if name is not None:
-        with_points = [e for e in with_points if str(e.get("name")) == name]
-    if not with_points:
-        raise ValueError(
-            "no category has keypoints"
-            if not names
-            else f"no category {name!r} has keypoints; there are {', '.join(names)}"
-        )
-    for entry in with_points:
-        points = entry["keypoints"]
-        if not isinstance(points, list) or not all(isinstance(p, str) for p in points):
+        named = [entry for entry in named if str(entry.get("name")) == name]
+        if not named:
+            raise ValueError(
+                f"no category {name!r} has keypoints; there are {', '.join(names)}"
+            )
+    points: list[str] = []
+    for entry in named:
+        found = entry.get("keypoints") or []
+        if not isinstance(found, list) or not all(isinstance(p, str) for p in found):
             raise ValueError("the keypoints of a category must be a list of names")
-        if points != with_points[0]["keypoints"]:
+        if found != (points or found):
             raise ValueError(
                 f"the categories {', '.join(names)} have different keypoints: choose "
                 "one with category"
             )
-    return _by_id(with_points, "categories"), tuple(with_points[0]["keypoints"])
+        points = found
+    return _by_id(named, "categories"), points or None
 
 
 def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]]:
@@ -167,19 +216,53 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
 
 
 def _keypoints(
-    entries: Sequence[dict[str, Any]], what: str, n_points: int | None = None
-) -> NDArray[np.float64]:
-    """Return the keypoints of instances, (n_instances, n_points, 3)."""
+    entries: Sequence[dict[str, Any]],
+    names: list[str] | None,
+    part: str | None,
+    what: str,
+) -> tuple[NDArray[np.float64], list[str] | None]:
+    """Return keypoints of instances (n_instances, n_points, 3) and names, of a part."""
+    further = [key for key in _LISTS if any(key in entry for entry in entries)][1:]
+    if further and part is None:
+        part = "body"
+        warn_caller(
+            f"the points of bodies are read, and those in {', '.join(further)} are "
+            f"left out: choose with part, one of {', '.join(WHOLE_PARTS)} (command "
+            "line: --part)"
+        )
+    n_lists = len(_LISTS) if further and part != "body" else 1
+    n_points = len(names) if names and n_lists == 1 else None
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
         name = f"{what} {number} (counted from 0)"
-        found.append(_triples(entry.get("keypoints"), f"keypoints of {name}", True))
+        lists = [
+            _triples(entry.get(key, [0] * 3 * size), f"{key} of {name}", True)
+            for key, size in [*_LISTS.items()][:n_lists]
+        ]
+        found.append(np.concatenate(lists))
         n_points = n_points or len(found[0])
         if len(found[-1]) != max(n_points, 1):
             raise ValueError(
                 f"{name} should have {max(n_points, 1)} keypoints; got {len(found[-1])}"
             )
-    return np.reshape(found, (len(entries), n_points or 0, 3))
+    return of_part(np.reshape(found, (len(entries), n_points or 0, 3)), names, part)
+
+
+def of_part(
+    values: NDArray[np.float64], names: Sequence[str] | None, part: str | None
+) -> tuple[NDArray[np.float64], list[str] | None]:
+    """Return a part of whole bodies (n_instances, n_points, 3), and its names."""
+    n_points = values.shape[1]
+    places: dict[str, tuple[int, int]] = dict.fromkeys(("body", "all"), (0, n_points))
+    places |= zip(WHOLE_PARTS, _PLACES.get(n_points, ()), strict=False)
+    if part is not None and part not in places:
+        raise ValueError(
+            f"part={part!r} is none of {', '.join(places)}, the parts of {n_points} "
+            f"points; whole bodies have {' or '.join(map(str, _PLACES))}"
+        )
+    chosen = slice(*places[part or "all"])
+    of_all = names if names and len(names) == n_points else None
+    return values[:, chosen], of_all and list(of_all[chosen])
 
 
 def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
@@ -200,24 +283,32 @@ def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
     return np.array(numbers, dtype=np.float64).reshape(-1, 3)
 
 
-def _columns(
-    rows: list[dict[str, Any]], images: dict[Any, dict[str, Any]]
-) -> dict[str, list[Any]]:
-    """Return the columns of rows: image, instance and its scores."""
-    of_image = [images.get(row.get("image_id"), {}) for row in rows]
-    columns = {"image_id": [row.get("image_id") for row in rows]}
-    for names, sources in ((_OF_IMAGE, of_image), (_OF_INSTANCE, rows)):
-        for name in names:
-            if any(name in source for source in sources):
-                column = "annotation_id" if name == "id" else name
-                columns[column] = [source.get(name) for source in sources]
-    return columns
+def _scalars(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of an instance or image that are one number or text.
+
+    Those of ``attributes`` are among them, as people and videos are told apart there.
+    """
+    found, further = {}, entry.get("attributes")
+    for name, value in {
+        **(further if isinstance(further, dict) else {}),
+        **entry,
+    }.items():
+        value = value[0] if isinstance(value, list) and len(value) == 1 else value
+        if isinstance(value, str | int | float) and name not in _LEFT_OUT:
+            found[name] = value
+    return found
 
 
 def _refuse_non_objects(entries: list[Any], what: str) -> None:
     """Raise if a list has something else than objects."""
     if not all(isinstance(entry, dict) for entry in entries):
         raise ValueError(f"all {what} must be objects")
+
+
+def _columns(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
+    """Return the columns of rows, which may lack some."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name) for row in rows] for name in names}
 
 
 def is_openpose(path: Path) -> bool:
