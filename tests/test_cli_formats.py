@@ -109,7 +109,7 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
         (write_openface, "--focal-length 1000", "--focal-length needs --camera persp"),
         (write_openface, "--principal-point 1 2", "--principal-point needs --camera"),
         (write_openface, "--camera perspective", "needs the size of the images, with"),
-        (write_openface, "--part face", "--part needs --format openpose"),
+        (write_openface, "--part face", "--part needs --format coco or openpose"),
         (write_openpose, "", "has points of pose, face: choose one with part"),
         (
             write_openface,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
-from isa_nrsfm._compat.texts import as_utf8, by_number, first_items
+from isa_nrsfm._compat.texts import as_utf8, by_number, first_items, frame_numbers
 from isa_nrsfm._parameters.choices import OPENPOSE_PARTS, WHOLE_PARTS
 from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
 from isa_nrsfm.io._tables import first_lines
@@ -34,7 +34,8 @@ _PLACES = {
     133: ((0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)),
     136: ((0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)),
 }
-_NAME = re.compile(r"(?!\.).*?(\d*)_keypoints\.json", re.IGNORECASE)
+_JSON = re.compile(r"(?is)(?!\.).*\.json")
+_NAME = re.compile(r"(?is)(?!\.).*_keypoints\.json")
 _OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
@@ -57,7 +58,7 @@ def is_coco(path: Path) -> bool:
 def _beginning(path: Path) -> bytes:
     """Return the first bytes of a file, without byte order mark and leading blanks."""
     with path.open("rb") as file:
-        return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+        return file.read(256).removeprefix(b"\xef\xbb\xbf").lstrip()
 
 
 def read_coco(
@@ -312,10 +313,8 @@ def _columns(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
 
 
 def is_openpose(path: Path) -> bool:
-    """Return whether a file begins as those of OpenPose, or a folder has such names."""
-    if path.is_dir():
-        return any(_NAME.fullmatch(file.name) for file in path.iterdir())
-    return _OPENPOSE.match(_beginning(path)) is not None
+    """Return whether a file begins as those of OpenPose, or a folder has such files."""
+    return bool(_openpose_files(path))
 
 
 def read_openpose(path: Path, part: str | None = None) -> Landmarks:
@@ -330,9 +329,10 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         raise ValueError(
             f"part must be one of {', '.join(OPENPOSE_PARTS)}; got {part!r}"
         )
-    absent = "the folder has no files with names ..._keypoints.json"
-    names, people = _each_file(path, _NAME, absent, _people_in)
-    known = {name for persons in people for person in persons for name in person}
+    files = _openpose_files(path) if path.is_dir() else [path]
+    absent = "the folder has no files with names ..._keypoints.json, or of people"
+    names, people = _each_file(files, absent, _people_in)
+    known = {name for persons in people for _, parts in persons for name in parts}
     found = ", ".join(name for name in OPENPOSE_PARTS if name in known)
     if not known:
         raise ValueError(
@@ -347,7 +347,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     if part not in known:
         raise ValueError(f"it has no points of {part}, but of {found}")
     chosen = [
-        {k: person[part] for k, person in enumerate(persons) if part in person}
+        {k: parts[part] for k, (_, parts) in enumerate(persons) if part in parts}
         for persons in people
     ]
     image, numbers, values = stacked(chosen, names)
@@ -359,8 +359,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             "the coordinates are shares of the image's size, which stretch the shapes. "
             "Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    matches = map(_NAME.fullmatch, names)
-    of_files = [int(match[1]) for match in matches if match and match[1]]
+    of_files = frame_numbers(names) or []
     if len(set(of_files)) < len(names):
         of_files = list(range(len(names)))
     frames = {
@@ -368,19 +367,19 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         "frame": [of_files[i] for i in image],
         "person": numbers,
     }
+    ids = {(i, k): p[0] for i, each in enumerate(people) for k, p in enumerate(each)}
+    who = [ids.get(row) for row in zip(image, numbers, strict=True)]
+    if who.count(None) < len(who):
+        frames["person_id"] = who
     return assemble(tracks, None, frames, format="openpose", confidence=scores[..., 0])
 
 
 def _each_file(
-    path: Path, pattern: re.Pattern[str], absent: str, read: Callable[[Path], Any]
+    files: Sequence[Path], absent: str, read: Callable[[Path], Any]
 ) -> tuple[list[str], list[Any]]:
-    """Read a file, or those of a folder whose names match, in the order of numbers."""
-    files = [path]
-    if path.is_dir():
-        matching = (file for file in path.iterdir() if pattern.fullmatch(file.name))
-        files = sorted(matching, key=by_number)
-        if not files:
-            raise ValueError(absent)
+    """Read files; return their names and what they hold."""
+    if not files:
+        raise ValueError(absent)
     contents = []
     for file in files:
         with errors_of(file.name):
@@ -388,8 +387,27 @@ def _each_file(
     return [file.name for file in files], contents
 
 
-def _people_in(file: Path) -> list[dict[str, NDArray[np.float64]]]:
-    """Return the visible parts of each person in a file, (n_points, 3) each."""
+def _files_of(
+    path: Path, names: re.Pattern[str], begins: re.Pattern[bytes] | None = None
+) -> list[Path]:
+    """Return a file, or those of a folder, that have such a name and beginning."""
+    files = sorted(path.iterdir(), key=by_number) if path.is_dir() else [path]
+    return [
+        file
+        for file in files
+        if names.fullmatch(file.name)
+        and (begins is None or (file.is_file() and begins.match(_beginning(file))))
+    ]
+
+
+def _openpose_files(path: Path) -> list[Path]:
+    """Return the files of OpenPose in a folder, by their names or beginnings."""
+    named = _files_of(path, _NAME) if path.is_dir() else []
+    return named or _files_of(path, _JSON, _OPENPOSE)
+
+
+def _people_in(file: Path) -> list[tuple[Any, dict[str, NDArray[np.float64]]]]:
+    """Return the id of each person in a file, and the visible parts (n_points, 3)."""
     content = _read_json(file)
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list) or not all(isinstance(p, dict) for p in people):
@@ -399,13 +417,15 @@ def _people_in(file: Path) -> list[dict[str, NDArray[np.float64]]]:
         {part: _triples(person.get(key, []), key, False) for part, key in keys.items()}
         for person in people
     ]
-    return [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
+    shown = [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
+    ids = [_scalars(person).get("person_id", -1) for person in people]
+    return [*zip([None if i == -1 else i for i in ids], shown, strict=True)]
 
 
 def is_pts(path: Path) -> bool:
     """Return whether a file begins as .pts files do, or a folder has such files."""
     if path.is_dir():
-        return any(_PTS_NAME.fullmatch(file.name) for file in path.iterdir())
+        return bool(_files_of(path, _PTS_NAME))
     return "".join(first_lines(path, 1)).lstrip().startswith("version")
 
 
@@ -417,7 +437,8 @@ def read_pts(path: Path) -> Landmarks:
     Coordinates are as they are written; iBUG counts pixels from 1.
     """
     absent = "there are no .pts files in the folder"
-    names, points = _each_file(path, _PTS_NAME, absent, _points_of)
+    files = _files_of(path, _PTS_NAME) if path.is_dir() else [path]
+    names, points = _each_file(files, absent, _points_of)
     *_, tracks = stacked([{0: each} for each in points], names)
     return assemble(tracks, None, {"file": [*map(as_utf8, names)]}, format="pts")
 
