@@ -147,8 +147,9 @@ def read_landmarks(
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
         pixels, for coordinates in shares of the image's size; ``category`` of "coco",
         the name of the category to read; ``part`` of "openpose", one of "pose", "face",
-        "hand_left" and "hand_right"; ``columns`` and ``missing`` of "table" and
-        "mediapipe", as in `landmark_table`.
+        "hand_left" and "hand_right"; ``part`` of whole bodies of "coco" and "mmpose",
+        one of "body", "feet", "face", "left_hand", "right_hand" and "all"; ``columns``
+        and ``missing`` of "table" and "mediapipe", as in `landmark_table`.
 
     Returns
     -------
@@ -357,6 +358,21 @@ _ALL = (
         (".json", _FOLDER),
         "_keypoints.openpose",
         ("part",),
+    ),
+    LandmarkFormat(
+        "mmpose",
+        "MMPose predictions",
+        "instances with keypoints and keypoint_scores, or frames with such instances",
+        (".json", _FOLDER),
+        "_keypoints.mmpose",
+        ("part",),
+    ),
+    LandmarkFormat(
+        "tps",
+        "tps of morphometrics",
+        "LM=N, N lines 'x y', and lines such as IMAGE=a.jpg, for each specimen",
+        (".tps",),
+        "_keypoints.tps",
     ),
     LandmarkFormat(
         TABLE,

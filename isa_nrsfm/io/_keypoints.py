@@ -1,4 +1,4 @@
-"""Read landmarks in images: COCO, OpenPose, iBUG's .pts files and the lists of WFLW."""
+"""Read landmarks in images: COCO, OpenPose, MMPose, .pts, .tps and lists of WFLW."""
 
 import json
 import re
@@ -37,6 +37,13 @@ _PLACES = {
 _JSON = re.compile(r"(?is)(?!\.).*\.json")
 _NAME = re.compile(r"(?is)(?!\.).*_keypoints\.json")
 _OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
+_MMPOSE = re.compile(
+    rb'\s*(\{\s*"(meta_info|instance_info|predictions|visualization)"|\[\s*(\]|'
+    rb'\{\s*"(frame_id"\s*:\s*\d+\s*,\s*"instances|keypoints"\s*:\s*\[\s*\[)))'
+)
+_TPS = re.compile(r"(?i)LM\s*=\s*\d+")
+# The columns of a specimen.
+_TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
     r"\{(?P<points>[^{}]*)\}\s*"
@@ -50,9 +57,9 @@ _WFLW_LENGTHS = (197, 207)
 
 
 def is_coco(path: Path) -> bool:
-    """Return whether a file begins as a json object or list, not of OpenPose."""
+    """Return whether a file begins as a json object or list, of no other format."""
     begins = _beginning(path)[:1] in (b"{", b"[")
-    return begins and not is_openpose(path)
+    return begins and not is_openpose(path) and not is_mmpose(path)
 
 
 def _beginning(path: Path) -> bytes:
@@ -422,6 +429,82 @@ def _people_in(file: Path) -> list[tuple[Any, dict[str, NDArray[np.float64]]]]:
     return [*zip([None if i == -1 else i for i in ids], shown, strict=True)]
 
 
+def is_mmpose(path: Path) -> bool:
+    """Return whether a file, or one of a folder, begins as predictions of MMPose."""
+    return bool(_files_of(path, _JSON, _MMPOSE))
+
+
+def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
+    """Read predictions of MMPose of a video or an image, or of a folder of images.
+
+    A file has a list of instances, or of objects with ``frame_id`` and ``instances``,
+    or such a list as ``instance_info`` or ``predictions``. An instance has
+    ``keypoints``, [x, y] of each point, and ``keypoint_scores``. ``part`` chooses a
+    part of whole bodies. An image without instances has one row without points.
+    """
+    files = _files_of(path, _JSON, _MMPOSE) if path.is_dir() else [path]
+    names, contents = _each_file(files, "no .json file of it is of MMPose", _frames_in)
+    images = [(i, *frame) for i, frames in enumerate(contents) for frame in frames]
+    chosen = [{k: v for k, (_, v) in enumerate(found)} for *_, found in images]
+    if not any(chosen):
+        raise ValueError("there are no instances in it")
+    image, numbers, values = stacked(chosen, [names[i] for i, *_ in images])
+    values, _ = of_part(values, None, part)
+    rows = []
+    for i, number in zip(image, numbers, strict=True):
+        file, frame, found = images[i]
+        row = {"file": as_utf8(names[file]), "frame": frame, "person": number}
+        rows.append(row | (found[number][0] if found else {}))
+    if all(row["frame"] is None for row in rows):
+        rows = [{k: v for k, v in row.items() if k != "frame"} for row in rows]
+    return assemble(
+        values[..., :2],
+        None,
+        _columns(rows),
+        format="mmpose",
+        confidence=values[..., 2],
+    )
+
+
+def _frames_in(file: Path) -> list[tuple[Any, list[tuple[dict[str, Any], NDArray]]]]:
+    """Return the numbers of frames in a file, and the instances of each."""
+    content = _read_json(file)
+    if isinstance(content, dict):
+        content = content.get("instance_info", content.get("predictions"))
+    if not isinstance(content, list):
+        raise ValueError("expected a list of instances, or of frames with instances")
+    if all(isinstance(each, dict) and "keypoints" in each for each in content):
+        content = [{"instances": content}]
+    frames = []
+    for number, frame in enumerate(content):
+        if not isinstance(frame, dict):
+            frame = {"frame_id": number, "instances": frame}
+        instances = frame.get("instances")
+        if not isinstance(instances, list):
+            raise ValueError(
+                f"frame {number} (counted from 0) has no list of instances"
+            )
+        _refuse_non_objects(instances, "instances")
+        found = [(_scalars(each), _scored(each)) for each in instances]
+        frames.append((_scalars(frame).get("frame_id"), found))
+    return frames
+
+
+def _scored(instance: dict[str, Any]) -> NDArray[np.float64]:
+    """Return x, y and score (n_points, 3) of an instance of MMPose."""
+    try:
+        points = np.array(instance["keypoints"], dtype=np.float64)
+        scores = np.array(instance["keypoint_scores"], dtype=np.float64)
+        if points.shape != (len(scores), 2):
+            raise ValueError(f"got the shapes {points.shape} and {scores.shape}")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            "an instance should have keypoints, [x, y] of each point, and as many "
+            f"keypoint_scores: {error}"
+        ) from error
+    return np.column_stack([points, scores])
+
+
 def is_pts(path: Path) -> bool:
     """Return whether a file begins as .pts files do, or a folder has such files."""
     if path.is_dir():
@@ -441,6 +524,40 @@ def read_pts(path: Path) -> Landmarks:
     names, points = _each_file(files, absent, _points_of)
     *_, tracks = stacked([{0: each} for each in points], names)
     return assemble(tracks, None, {"file": [*map(as_utf8, names)]}, format="pts")
+
+
+def is_tps(path: Path) -> bool:
+    """Return whether a file begins with a number of landmarks."""
+    return _TPS.match("".join(first_lines(path, 1)).strip()) is not None
+
+
+def read_tps(path: Path) -> Landmarks:
+    """Read a tps file of morphometrics, with a row for each specimen.
+
+    ``LM=12`` and twelve lines ``x y`` are followed by lines such as ``IMAGE=a.jpg``,
+    ``ID=1`` and ``SCALE=0.1``, the columns of the frames. y points up. Points of curves
+    are left out.
+    """
+    text = path.read_text(encoding="utf-8-sig")
+    head, *parts = re.split(r"(?im)^\s*LM\s*=", text)
+    if head.strip() or not parts:
+        raise ValueError(f"expected LM= and a number of landmarks; got {text[:40]!r}")
+    tracks, rows, n_left = [], [], 0
+    for number, part in enumerate(parts):
+        with errors_of(f"specimen {number} (counted from 0)"):
+            count, *lines = filter(None, map(str.strip, part.splitlines()))
+            points = " ".join(lines[: int(count)]).replace("NA", "nan")
+            tracks.append({0: _floats(points.split()).reshape(int(count), 2)})
+            entries = [line.partition("=") for line in lines[int(count) :]]
+            if entries and not entries[0][1]:
+                raise ValueError(f"there are more than {count} landmarks")
+        n_left += sum(not equals for _, equals, _ in entries)
+        known = {name.strip().lower(): value.strip() for name, _, value in entries}
+        rows.append({name: known[name] for name in _TPS_ENTRIES if name in known})
+    if n_left:
+        warn_caller(f"{n_left} points of curves are left out")
+    *_, values = stacked(tracks, [f"specimen {i}" for i in range(len(tracks))])
+    return assemble(values, None, _columns(rows), format="tps")
 
 
 def is_wflw(path: Path) -> bool:
