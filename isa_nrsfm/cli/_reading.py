@@ -35,12 +35,12 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
-from isa_nrsfm.io._tables import confidences_in, tracks_in
+from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 
 # Options of some formats.
-_OF_FORMATS = ("image_size", "columns", "part")
+_OF_FORMATS = ("image_size", "columns", "individuals", "part")
 INNER, WITHOUT = "inner", "without:"
 # The columns of the size of an image, in pixels, by format.
 _SIZES = {"coco": ("width", "height"), "pyfeat": ("FrameWidth", "FrameHeight")}
@@ -108,7 +108,7 @@ def read_frames(
         chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
         layout = found.skeleton
     elif table is None:
-        table = read_table(args.table)
+        table = individuals_as_rows(read_table(args.table), args.individuals)
         if args.columns is not None:
             chosen = find_landmark_columns(table.columns, args.columns)
     if estimator is not None:

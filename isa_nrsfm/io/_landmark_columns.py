@@ -4,8 +4,9 @@ In patterns ``#`` is a number and ``*`` is any text.
 """
 
 import re
+import shlex
 from collections import Counter
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -13,9 +14,21 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
 
 # What stands for the axis letter in the names of confidences: nose_conf, conf_0.
-CONFIDENCES = ("confidence", "conf", "likelihood", "score", "visibility", "c")
+CONFIDENCES = (
+    *("confidence", "conf", "likelihood", "score", "visibility", "c"),
+    *("p", "prob", "probability", "v", "vis", "presence"),
+)
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
+
+
+# Parts of names, with the separator after them: words, or numbers in words.
+_SEPARATORS = " _.-"
+_PARTS = (rf"[^{_SEPARATORS}]+[{_SEPARATORS}]*", r"\d+|\D+")
+# Words that tell parts of one body apart, and letters of axes.
+_SIDES = frozenset(
+    "x left right l r upper lower front hind fore rear top bottom inner outer".split()
+)
 
 
 class LandmarkColumns(NamedTuple):
@@ -90,6 +103,7 @@ def find_landmark_columns(
             f"{small}; {_first_columns(names)}. If they have other names, give columns "
             f"(command line: --columns), such as {_likely_pattern(names)!r}"
         )
+    _refuse_individuals(names, candidates)
     if len(candidates) > 1:
         raise ValueError(_several_found(names, candidates))
     (pattern,) = candidates
@@ -165,11 +179,93 @@ def confidence_columns(
         same = [a == b for a, b in zip(*pair, strict=False)]
         place = [*same, False].index(False)  # of the axis letter
         parts.append((pair[0][:place], pair[0][place + 1 :]))
-    for word in CONFIDENCES:
+    words = ((w, w.capitalize(), w.upper()) for w in CONFIDENCES)
+    for word in chain.from_iterable(words):
         found = [f"{before}{word}{after}" for before, after in parts]
         if by_name.keys() >= {*found}:
             return [by_name[name] for name in found]
     return []
+
+
+def _divisions(names: Iterable[Hashable]) -> Iterator[dict[str, dict[str, Hashable]]]:
+    """Yield names by one of their parts, and by the rest: {"1": {"nose_x": name}}."""
+    for expression in _PARTS:
+        split = [(re.findall(expression, str(name).strip()), name) for name in names]
+        for place in (0, 1, 2, -1, -2, -3):
+            found: dict[str, dict[str, Hashable]] = {}
+            for parts, name in split:
+                if len(parts) > max(place, -place - 1, 1):
+                    others = [*parts]
+                    key = others.pop(place).strip(_SEPARATORS)
+                    rest = "".join(others).rstrip(_SEPARATORS)
+                    found.setdefault(key, {})[rest] = name
+            yield found
+
+
+def individuals_in(names: Sequence[Hashable]) -> list[str]:
+    """
+    Return what tells individuals apart in the names of x columns, if anything does.
+
+    All have points of the same names. Points of one body differ by its sides.
+
+    >>> from isa_nrsfm.io._landmark_columns import individuals_in
+    >>> individuals_in([f"p{point}_{mouse}_x" for point in range(8) for mouse in "ab"])
+    ['a', 'b']
+    """
+    found: list[list[str]] = []
+    for division in _divisions(names):
+        sizes = {len(rests) for rests in division.values()}
+        alike = len({frozenset(rests) for rests in division.values()}) == 1
+        n_all, n_points = len(division), max(sizes, default=0)
+        enough = n_points >= MIN_POINTS or (n_points >= 4 and n_all < 4)
+        sides = _SIDES.issuperset(key.lower() for key in division)
+        whole = alike and n_all * n_points == len(names)
+        if n_all > 1 and whole and enough and not sides:
+            found.append(list(division))
+    return min(found, key=len, default=[])
+
+
+def columns_of_individuals(
+    names: Iterable[Hashable], individuals: str | Sequence[str]
+) -> dict[str, dict[Hashable, str]]:
+    """Return the columns of each individual, with their names without it."""
+    listed = individuals.split(",") if isinstance(individuals, str) else individuals
+    who, names = [str(name).strip() for name in listed], list(names)
+    best: dict[str, dict[Hashable, str]] = {}
+    for division in _divisions(names):
+        own = [division.get(name, {}) for name in who]
+        common = [rest for rest in own[0] if all(rest in each for each in own)]
+        if len(common) > max(map(len, best.values()), default=0):
+            pairs = zip(who, own, strict=True)
+            best = {name: {each[rest]: rest for rest in common} for name, each in pairs}
+    if not best:
+        raise ValueError(
+            f"no columns have the same names but for {', '.join(who)} (individuals)"
+        )
+    return best
+
+
+def _refuse_individuals(names: Sequence[Hashable], candidates: dict[str, int]) -> None:
+    """Raise if the points of sets of landmarks are those of several individuals."""
+    patterns = [pattern.split(",")[0] for pattern in candidates]
+    lists = [_columns_matching(names, pattern).values() for pattern in patterns]
+    x = list(dict.fromkeys(chain.from_iterable(lists)))
+    if not (who := individuals_in(x)):
+        return
+    largest = max(candidates, key=candidates.__getitem__)
+    whole = largest if candidates[largest] == len(x) else ",".join(candidates)
+    listed, n_points = ",".join(who), len(x) // len(who)
+    way = f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
+    if n_points >= MIN_POINTS:
+        way = (
+            f"For a row for each individual, use individuals={listed!r} (command line: "
+            f"--individuals {shlex.quote(listed)})"
+        )
+    raise ValueError(
+        f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
+        f"of several individuals in one row. {way}. If all are points of one body, use "
+        f"columns={whole!r} (command line: --columns {shlex.quote(whole)})"
+    )
 
 
 def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:

@@ -14,7 +14,11 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
+from isa_nrsfm.io._landmark_columns import (
+    columns_of_individuals,
+    confidence_columns,
+    find_landmark_columns,
+)
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
 from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
 
@@ -149,6 +153,7 @@ def landmark_table(
     *,
     columns: str | Sequence[str] | None = None,
     missing: Missing = None,
+    individuals: str | Sequence[str] | None = None,
 ) -> LandmarkTable:
     """
     Take the landmark columns out of a table, in the order x0, y0, x1, y1, ....
@@ -168,6 +173,10 @@ def landmark_table(
     missing : {"zeros"}, float or sequence of float, optional
         The x and y of missing points, such as -1, exactly; they become NaN. "zeros" is
         the number 0. Of several numbers, a point has one.
+    individuals : str or sequence of str, optional
+        The individuals in one row, such as ``"1,2"`` for nose_1_x and nose_2_x: the
+        parts by which their columns differ. Each has a row of its own, and the other
+        columns have ``frame``, the number of the row, and ``individual``.
 
     Returns
     -------
@@ -177,8 +186,9 @@ def landmark_table(
     Raises
     ------
     ValueError
-        If there is no set of landmark columns or more than one, if a point has only
-        one of two coordinates, or if a cell is neither a finite number nor empty.
+        If there is no set of landmark columns or more than one, if the points are
+        probably of several individuals, if a point has only one of two coordinates, or
+        if a cell is neither a finite number nor empty.
 
     Examples
     --------
@@ -199,7 +209,7 @@ def landmark_table(
             f"a pandas DataFrame is needed; got {type(frame).__name__} "
             "(polars tables have a method to_pandas)"
         )
-    codes = codes_of(missing)
+    codes, frame = codes_of(missing), individuals_as_rows(frame, individuals)
     names = find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, codes).reshape(len(frame), len(names))
@@ -207,6 +217,25 @@ def landmark_table(
         pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
         frame.drop(columns=names),
     )
+
+
+def individuals_as_rows(
+    frame: "pd.DataFrame", individuals: str | Sequence[str] | None
+) -> "pd.DataFrame":
+    """Return a table with a row for each individual of each row, if there are any."""
+    if individuals is None:
+        return frame
+    own = columns_of_individuals(frame.columns, individuals)
+    common = frame.drop(columns=[name for names in own.values() for name in names])
+    common = common.reset_index(drop=True)
+    if "frame" not in common:
+        common.insert(0, "frame", common.index)
+    parts = []
+    for name, columns in own.items():
+        rows = frame[[*columns]].set_axis([*columns.values()], axis=1)
+        rows = rows.set_axis(common.index, axis=0)
+        parts.append(pd.concat([common.assign(individual=name), rows], axis=1))
+    return pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
 
 
 def codes_of(missing: Missing) -> list[float]:
@@ -244,9 +273,12 @@ def read_named_columns(
     path: Path,
     columns: str | None = None,
     missing: Missing = None,
+    individuals: str | Sequence[str] | None = None,
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
-    points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
+    points, other = landmark_table(
+        parse_table(path), columns=columns, missing=missing, individuals=individuals
+    )
     confidence = confidences_in(other, points.columns[::2], points.columns[1::2])
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
