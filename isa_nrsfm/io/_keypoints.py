@@ -38,9 +38,11 @@ _JSON = re.compile(r"(?is)(?!\.).*\.json")
 _NAME = re.compile(r"(?is)(?!\.).*_keypoints\.json")
 _OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
 _MMPOSE = re.compile(
-    rb'\s*(\{\s*"(meta_info|instance_info|predictions|visualization)"|\[\s*(\]|'
-    rb'\{\s*"(frame_id"\s*:\s*\d+\s*,\s*"instances|keypoints"\s*:\s*\[\s*\[)))'
+    rb'\s*(\{\s*"(meta_info|instance_info|predictions|visualization)"|'
+    rb'\[\s*\{\s*"(frame_id"\s*:\s*\d+\s*,\s*"instances|keypoints"\s*:\s*\[\s*\[))'
 )
+# An image without instances has an empty list.
+_MMPOSE_ALSO = re.compile(_MMPOSE.pattern + rb"|\s*\[\s*\]")
 _TPS = re.compile(r"(?i)LM\s*=\s*\d+")
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
@@ -442,7 +444,7 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     ``keypoints``, [x, y] of each point, and ``keypoint_scores``. ``part`` chooses a
     part of whole bodies. An image without instances has one row without points.
     """
-    files = _files_of(path, _JSON, _MMPOSE) if path.is_dir() else [path]
+    files = _files_of(path, _JSON, _MMPOSE_ALSO) if path.is_dir() else [path]
     names, contents = _each_file(files, "no .json file of it is of MMPose", _frames_in)
     images = [(i, *frame) for i, frames in enumerate(contents) for frame in frames]
     chosen = [{k: v for k, (_, v) in enumerate(found)} for *_, found in images]

@@ -22,6 +22,11 @@ CONFIDENCES = (
 MIN_POINTS = 7
 
 
+# Columns that name points, and frames or people, in tables with a row for each point.
+_POINT = "point|landmark|joint|marker|node|part(?!ic)"
+_FRAME = "frame|time|image|video|file|person|people|face|hand|subject|track|animal"
+# The sizes of boxes, named like the x of their corner.
+_BOX = (("w", "h"), ("W", "H"), ("width", "height"), ("Width", "Height"))
 # Parts of names, with the separator after them: words, or numbers in words.
 _SEPARATORS = " _.-"
 _PARTS = (rf"[^{_SEPARATORS}]+[{_SEPARATORS}]*", r"\d+|\D+")
@@ -79,17 +84,13 @@ def find_landmark_columns(
                 f"got {columns!r}"
             )
         return _select(names, patterns)
+    names = _without_boxes(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
     if not candidates:
         x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
         if x and y:
-            raise ValueError(
-                "the table has one row for each point, with columns x and y; one row "
-                "for each frame is needed. In pandas: wide = table.pivot("
-                f"index='frame', columns='point', values={[x[0], y[0]]}), and "
-                "wide.columns = [f'{axis}_{j}' for axis, j in wide.columns]"
-            )
+            raise ValueError(_pivoted(names, [x[0], y[0]]))
         if any(isinstance(name, tuple) for name in names):
             raise ValueError(
                 "the names of the columns have several levels: join them to names such "
@@ -114,6 +115,37 @@ def find_landmark_columns(
             "the same names: give every point a name of its own, such as x0, y0, x1, y1"
         )
     return _select(names, pattern.split(","))
+
+
+def _without_boxes(names: list[Hashable]) -> list[Hashable]:
+    """Leave out columns with the corner of a box: x beside w and h, x_min and x_max."""
+    texts = {str(name).strip() for name in names}
+    corners = set()
+    for name, (i, letter) in ((n, each) for n in texts for each in enumerate(n)):
+        for sizes in _BOX if letter in "xyXY" else ():
+            if texts.issuperset(f"{name[:i]}{size}{name[i + 1 :]}" for size in sizes):
+                corners.add(name)
+    ends = [(name, name.replace("min", "max")) for name in texts if "min" in name]
+    corners.update(chain.from_iterable(each for each in ends if each[1] in texts))
+    return [name for name in names if str(name).strip() not in corners]
+
+
+def _pivoted(names: Sequence[Hashable], values: list[Hashable]) -> str:
+    """Return how a table with a row for each point gets one for each frame."""
+    aside = {"x", "y", "z", "", *CONFIDENCES}
+    keys = [name for name in names if str(name).strip().lower() not in aside]
+    points = [name for name in keys if re.search(_POINT, str(name), re.IGNORECASE)]
+    last = [name for name in keys if not re.search(_FRAME, str(name), re.IGNORECASE)]
+    points = points or last[-1:] or ["point"]
+    frames = [name for name in keys if name not in points] or ["frame"]
+    absent = [str(name) for name in (*frames, *points) if name not in names]
+    first = f"; add the columns {', '.join(absent)} first" if absent else ""
+    return (
+        "the table has one row for each point, with columns x and y; one row for each "
+        f"frame is needed{first}. In pandas: wide = table.pivot(index={frames}, "
+        f"columns={points[0]!r}, values={values}), and wide.columns = "
+        "[f'{axis}_{j}' for axis, j in wide.columns], and wide = wide.reset_index()"
+    )
 
 
 def _likely_pattern(names: Iterable[Hashable]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
@@ -25,6 +26,7 @@ from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
+_DECIMAL_COMMA = r"^(\s*[+-]?\d*),(\d+(?:[eE][+-]?\d+)?\s*)$"
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = (
     *("", "na", "nan", "n/a", "null", "none"),
@@ -115,7 +117,7 @@ def parse_table(path: Path) -> "pd.DataFrame":
                 "it is a spreadsheet or a compressed file, in spite of its name: save "
                 f"it as {suffix}, or unpack it"
             )
-    return _read_text(path, SEPARATORS[suffix])
+    return _read_text(path, separator_of(path))
 
 
 def write_table(frame: "pd.DataFrame", path: str | os.PathLike[str]) -> None:
@@ -324,12 +326,17 @@ def first_lines(path: Path, n_lines: int) -> list[str]:
     return lines
 
 
+def separator_of(path: Path) -> str:
+    """Return what separates the cells of a text, or semicolons if it has only these."""
+    usual, first = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 1)
+    return ";" if any(";" in line and usual not in line for line in first) else usual
+
+
 def header_rows(path: Path, n_rows: int) -> list[list[str]]:
     """Return the cells of the first rows of a file; fewer if it is no csv file."""
     try:
-        separator = SEPARATORS.get(path.suffix.lower(), ",")
         lines = first_lines(path, n_rows)
-        return list(csv.reader(lines, delimiter=separator, strict=True))
+        return list(csv.reader(lines, delimiter=separator_of(path), strict=True))
     except csv.Error:
         return []
 
@@ -354,6 +361,11 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     lines.
     """
     n_rows, n_columns = 0, 0
+    if separator == ";":
+        warn_caller(
+            f"the cells of {path.name} end with semicolons, and its decimal commas are "
+            "read as points"
+        )
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = csv.reader(_without_nulls(file), delimiter=separator)
         for row in rows:
@@ -420,11 +432,12 @@ def read_columns(
             {n: frame[n] if n in text else _numbers_if_all(frame[n]) for n in frame}
         )
     else:
-        separator = SEPARATORS[path.suffix.lower()]
+        separator = separator_of(path)
         if sum(1 for _ in checked_rows(path, separator)) <= n_header:
             raise ValueError("it has a header but no rows")
         given: dict[str, Any] = {
             "sep": separator,
+            "decimal": "," if separator == ";" else ".",
             "header": None,
             "names": names,
             "skiprows": n_header,
@@ -487,8 +500,10 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     second = [cell.strip().lower() for cell in next(rows)]
     if second.count("x") == second.count("y") > 1:
         index = "" if second[0] in ("x", "y") else ", index_col=0"
+        decimal = ", decimal=','" if separator == ";" else ""
         way = (
-            f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}), "
+            f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}, "
+            f"sep={separator!r}{decimal}), "
             "and table.columns = ['_'.join(name) for name in table.columns]"
         )
         raise ValueError(
@@ -507,6 +522,8 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         keep_default_na=False,
         encoding="utf-8-sig",
     )
+    if separator == ";":
+        frame = frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
     frame.columns = pd.Index(header)
     for name in header:
         if parse_coordinate(name) is not None:
@@ -524,7 +541,7 @@ def _refuse_one_column(path: Path, separator: str, line: str) -> None:
         if other in line:
             raise ValueError(f"its columns end with {other!r}: rename it to *{suffix}")
     following = first_lines(path, 2)[-1]
-    for other, pattern in ((";", "';'"), ("|", "'|'"), (" ", r"r'\s+'")):
+    for other, pattern in (("|", "'|'"), (" ", r"r'\s+'")):
         if 0 < line.count(other) == following.count(other):
             raise ValueError(
                 f"its columns are separated by {other!r}; {separator!r} is needed. In "
