@@ -214,7 +214,7 @@ def test_openpose_parts_are_chosen(tmp_path):
         ({"people": {}}, "b_keypoints.json: expected an object with a list of obj"),
         ({"people": [3]}, "b_keypoints.json: expected an object with a list of obj"),
         ([], "b_keypoints.json: expected an object with a list of objects called"),
-        (points_of_openpose(4), "a_keypoints.json has 5 points, b_.* has 4"),
+        (points_of_openpose(4), "person 1 .* of b_.* should have 5 keypoints; got 4"),
         ([[1, 2]], "b_keypoints.json: pose_keypoints_2d .* each point; got 2 numbers"),
         ([["1", 2, 3]], r"b_.*: pose_keypoints_2d should be .* got \['1', 2, 3\]"),
         ([[1, 2, np.inf]], "b_.*: pose_keypoints_2d should be a list of finite"),
@@ -502,7 +502,7 @@ def test_coco_results_have_confidences(tmp_path):
         ([{"keypoints": [1] * 6}, {"keypoints": [1] * 9}], "have 2 keypoints; got 3"),
         (
             {"images": [{"id": 1}], "annotations": [{"image_id": 1}]},
-            "no category has keypoints, and no annotation",
+            "no frames in it: no annotation has keypoints",
         ),
         (
             files.coco_annotations(TRACKS) | {"images": [{"id": 1}]},

@@ -47,7 +47,7 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> None:
     for some in (shown, shown[shown.real == shown.imag]):
         if len(some):
             values, counts = np.unique(some, return_counts=True)
-            found |= {*values[[0, counts.argmax(), -1]]}
+            found |= {*values[[0, int(counts.argmax()), -1]]}
     for place in sorted(found, key=lambda place: (place.real, place.imag)):
         there = places == place
         counts, n_rows = there.sum(axis=0), there.any(axis=1).sum()

@@ -94,7 +94,7 @@ def read_frames(
     The format in the options becomes the one found, and the coordinates of missing
     points become those of all options.
     """
-    found = chosen = layout = None
+    found = chosen = layout = known = None
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
@@ -107,6 +107,8 @@ def read_frames(
         x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
         chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
         layout = found.skeleton
+        if found.confidence is not None:
+            known = found.confidence.set_axis(x, axis=1)
     elif table is None:
         table = individuals_as_rows(read_table(args.table), args.individuals)
         if args.columns is not None:
@@ -115,7 +117,7 @@ def read_frames(
         columns = _columns_of_model(estimator, table, chosen)
     else:
         columns = chosen or find_landmark_columns(table.columns)
-    table, known, not_used = _with_confidences(args, table, columns, found)
+    table, known, not_used = _with_confidences(args, table, columns, known)
     kept, left_out = _rows_to_keep(args, table)
     if estimator is not None and chosen is not None:
         layout = _part_of_layout(layout, [chosen.x.index(name) for name in columns.x])
@@ -240,41 +242,43 @@ def _principal_point(
 
 
 def _with_confidences(
-    args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns, found: Any
+    args: Namespace,
+    table: "pd.DataFrame",
+    columns: LandmarkColumns,
+    known: "pd.DataFrame | None",
 ) -> tuple["pd.DataFrame", "pd.DataFrame | None", dict[str, int]]:
     """Take confidences out of a table, and leave out the points that are not sure.
 
-    Returns the table, the confidences by the names of x if there are any, and those
-    of a plain table that are not used.
+    Those of other formats are known, by the names of x. Returns the table, the
+    confidences if there are any, and those of a plain table that are not used.
     """
-    asked, names, known = args.min_confidence is not None, [], None
-    if found is None:
+    option = "" if args.weights is None else "--weights"
+    option = option if args.min_confidence is None else "--min-confidence"
+    names = []
+    if known is None:
         names = confidence_columns(table.columns, columns.x, columns.y)
         # Texts are no confidences, unless these are asked for.
-        with contextlib.suppress(*[] if asked or args.weights else [ValueError]):
+        with contextlib.suppress(*() if option else (ValueError,)):
             known = confidences_in(table, columns.x, columns.y)
-        table = table.drop(columns=names)
-    elif found.confidence is not None:
-        known = found.confidence.set_axis(list(found.points)[::2], axis=1)
-        known = known[list(columns.x)]
-    if known is not None:
-        known = known.set_axis(list(columns.x), axis=1)
-    elif asked or args.weights is not None:
-        what = (
-            "of all points. Their columns need the names of the x columns, with one of "
-            f"the words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
-        )
+    if known is None and option:
         raise ValueError(
-            f"{'--min-confidence' if asked else '--weights'}: {args.table} "
-            f"({args.format}) has no confidences {what * (found is None)}".rstrip()
+            f"{option}: {args.table} ({args.format}) has no confidences of all points. "
+            "In tables, their columns need the names of the x columns, with one of the "
+            f"words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
         )
-    if asked:
-        unsure = np.repeat(known.to_numpy() < args.min_confidence, 2, axis=1)
-        points = table[columns.interleaved].mask(unsure)
-        return table.assign(**points), known, {}
-    if args.weights is not None or not names:
-        return table, known, {}
-    return table, known, {f"{names[0].strip()}, ... (confidences)": len(names)}
+    rest = table.drop(columns=names)
+    if known is not None and names:
+        known = known.set_axis(list(columns.x), axis=1)
+    if known is not None and args.min_confidence is not None:
+        unsure = known[list(columns.x)].to_numpy() < args.min_confidence
+        points = table[columns.interleaved]
+        rest[columns.interleaved] = points.mask(np.repeat(unsure, 2, axis=1))
+    unused = names and not option
+    return (
+        rest,
+        known,
+        {f"{names[0].strip()}, ... (confidences)": len(names)} if unused else {},
+    )
 
 
 def _rows_to_keep(

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from isa_nrsfm.io._tables import first_lines
 
 # Entries of images and instances that are no columns under their own name.
 _LEFT_OUT = (
-    *("id", "image_id", "category_id", "num_keypoints"),
+    *("id", "category_id", "num_keypoints"),
     *("license", "coco_url", "flickr_url", "date_captured"),
 )
 # COCO-WholeBody: the lists of an instance, and their numbers of points.
@@ -31,8 +32,8 @@ _LISTS = {
 }
 # The places of parts in whole bodies of so many points: COCO-WholeBody, Halpe.
 _PLACES = {
-    133: ((0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)),
-    136: ((0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)),
+    133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
+    136: [(0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)],
 }
 _JSON = re.compile(r"(?is)(?!\.).*\.json")
 _NAME = re.compile(r"(?is)(?!\.).*_keypoints\.json")
@@ -83,36 +84,42 @@ def read_coco(
     ``category`` chooses one of several with different keypoints, ``part`` a part of
     whole bodies.
     """
-    content, images, names = _read_json(path), {}, None
-    if results := isinstance(content, list):
+    content = _read_json(path)
+    if isinstance(content, list):
         entries = _results(content, category)
-    else:
-        entries, images, names = _annotations(content, category)
-    values, names = _keypoints(
-        entries, names, part, "result" if results else "annotation"
-    )
-    # Detectors that find no point write zeros, as annotators do.
-    absent = (values[..., :2] == 0).all(axis=2) if results else values[..., 2] == 0
-    tracks = np.where(absent[..., None], np.nan, values[..., :2])
-    shown = {entry.get("image_id") for entry in entries}
-    empty = [{"image_id": image} for image in images if image not in shown]
-    gaps = np.full((len(empty), *tracks.shape[1:]), np.nan)
-    order = {image: number for number, image in enumerate(images)}
-    rows, places = [], []
-    for entry in (*entries, *empty):
-        image = entry.get("image_id")
-        of_image = _scalars(images.get(image, {}))
-        name = of_image.get("file_name", image if results else "")
-        places.append((by_number(str(name)), order.get(image, 0)))
-        number = {} if entry.get("id") is None else {"annotation_id": entry["id"]}
-        rows.append({"image_id": image} | of_image | number | _scalars(entry))
-    sequence = sorted(range(len(rows)), key=places.__getitem__)
+        return _landmarks(entries, None, part, "coco", "result")
+    entries, names = _annotations(content, category)
+    found = _landmarks(entries, names, part, "coco", "annotation")
+    return replace(found, confidence=None)
+
+
+def _landmarks(
+    entries: Sequence[dict[str, Any]],
+    names: list[str] | None,
+    part: str | None,
+    format: str,
+    what: str,
+) -> Landmarks:
+    """Return landmarks of entries with ``keypoints``; of images without any, too.
+
+    A point is missing if x and y, or its third number, are zero.
+    """
+    seen = [bool(entry.get("keypoints")) for entry in entries]
+    if names is None and not any(seen):
+        raise ValueError(f"there are no frames in it: no {what} has keypoints")
+    given = [entry for entry in entries if entry.get("keypoints")]
+    found, names = _keypoints(given, names, part, what)
+    values = np.full((len(entries), *found.shape[1:]), np.nan)
+    values[seen] = found
+    absent = (values[..., :2] == 0).all(axis=2) | (values[..., 2] == 0)
+    rows = [_scalars(entry) for entry in entries]
+    columns = dict.fromkeys(name for row in rows for name in row)
     return assemble(
-        np.concatenate([tracks, gaps])[sequence],
+        np.where(absent[..., None], np.nan, values[..., :2]),
         names,
-        _columns([rows[i] for i in sequence]),
-        format="coco",
-        confidence=values[sequence, :, 2] if results else None,
+        {name: [row.get(name) for row in rows] for name in columns},
+        format=format,
+        confidence=values[..., 2],
     )
 
 
@@ -138,19 +145,16 @@ def _results(entries: list[Any], category: str | None) -> list[dict[str, Any]]:
             "the results are of more than one category_id: "
             f"{', '.join(sorted(categories))}"
         )
-    return entries
+    return sorted(entries, key=lambda entry: by_number(str(entry.get("image_id"))))
 
 
 def _annotations(
     content: Any, category: str | None
-) -> tuple[list[dict[str, Any]], dict[Any, dict[str, Any]], list[str] | None]:
-    """Return annotations with keypoints, images by their ids, and names of points."""
+) -> tuple[list[dict[str, Any]], list[str] | None]:
+    """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
-    if isinstance(content, dict):
-        content = {"categories": []} | content
-    if not isinstance(content, dict) or not all(
-        isinstance(content.get(part), list) for part in lists
-    ):
+    content = {"categories": []} | content if isinstance(content, dict) else {}
+    if not all(isinstance(content.get(part), list) for part in lists):
         raise ValueError(
             "expected an object with the lists images, annotations and categories, or "
             "a list of results"
@@ -159,7 +163,8 @@ def _annotations(
         _refuse_non_objects(content[part], part)
     chosen, names = _chosen_categories(content["categories"], category)
     images = _by_id(content["images"], "images")
-    entries, others = [], []
+    of_images: dict[Any, list[dict[str, Any]]] = {image: [] for image in images}
+    others = []
     for entry in content["annotations"]:
         where, of = entry.get("image_id"), entry.get("category_id")
         if not isinstance(where, int | str) or where not in images:
@@ -167,26 +172,30 @@ def _annotations(
                 f"annotation {entry.get('id')!r} is of image {where!r}, which is not "
                 "among the images"
             )
-        if not entry.get("keypoints"):
+        known = {"annotation_id": entry.get("id")}
+        if isinstance(of, int | str) and of in chosen:
+            known["category"] = str(chosen[of].get("name"))
+        elif content["categories"] and entry.get("keypoints"):
+            others.append(str(of))
             continue
-        if not content["categories"]:
-            entries.append(entry)
-        elif isinstance(of, int | str) and of in chosen:
-            entries.append({**entry, "category": str(chosen[of].get("name"))})
-        else:
-            others.append(of)
+        if entry.get("keypoints"):
+            of_images[where].append(known | entry)
     if others and category is None:
         text = (
-            f"{len(others)} of {len(entries) + len(others)} annotations are of the "
-            f"category {first_items(dict.fromkeys(map(str, others)))}, which is not "
-            "among the categories with names of keypoints in the file"
+            f"{len(others)} annotations are of the category "
+            f"{first_items(dict.fromkeys(others))}, which has no names of keypoints in "
+            "the file"
         )
-        if not entries:
+        if not any(of_images.values()):
             raise ValueError(text)
         warn_caller(f"{text}. They are left out")
-    if not entries and names is None:
-        raise ValueError("no category has keypoints, and no annotation")
-    return entries, images, names
+    entries = [
+        {"image_id": image} | _scalars(images[image]) | entry
+        for image, found in of_images.items()
+        for entry in found or [{}]
+    ]
+    names_of = {image: str(each.get("file_name", "")) for image, each in images.items()}
+    return sorted(entries, key=lambda e: by_number(names_of[e["image_id"]])), names
 
 
 def _chosen_categories(
@@ -232,7 +241,8 @@ def _keypoints(
     what: str,
 ) -> tuple[NDArray[np.float64], list[str] | None]:
     """Return keypoints of instances (n_instances, n_points, 3) and names, of a part."""
-    further = [key for key in _LISTS if any(key in entry for entry in entries)][1:]
+    gap = {key: [0] * 3 * n for key, n in _LISTS.items()} | {"keypoints": None}
+    further = [key for key in gap if any(key in entry for entry in entries)][1:]
     if further and part is None:
         part = "body"
         warn_caller(
@@ -241,13 +251,14 @@ def _keypoints(
             "line: --part)"
         )
     n_lists = len(_LISTS) if further and part != "body" else 1
-    n_points = len(names) if names and n_lists == 1 else None
+    n_points = len(names) if names and n_lists == 1 else 0
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
-        name = f"{what} {number} (counted from 0)"
+        of_file = f" of {entry['file']}" if "file" in entry else ""
+        name = f"{what} {number} (counted from 0){of_file}"
         lists = [
-            _triples(entry.get(key, [0] * 3 * size), f"{key} of {name}", True)
-            for key, size in [*_LISTS.items()][:n_lists]
+            _triples(entry.get(key, gap[key]), f"{key} of {name}", True)
+            for key in [*_LISTS][:n_lists]
         ]
         found.append(np.concatenate(lists))
         n_points = n_points or len(found[0])
@@ -255,24 +266,18 @@ def _keypoints(
             raise ValueError(
                 f"{name} should have {max(n_points, 1)} keypoints; got {len(found[-1])}"
             )
-    return of_part(np.reshape(found, (len(entries), n_points or 0, 3)), names, part)
-
-
-def of_part(
-    values: NDArray[np.float64], names: Sequence[str] | None, part: str | None
-) -> tuple[NDArray[np.float64], list[str] | None]:
-    """Return a part of whole bodies (n_instances, n_points, 3), and its names."""
-    n_points = values.shape[1]
+    values = np.reshape(found, (len(entries), n_points, 3))
     places: dict[str, tuple[int, int]] = dict.fromkeys(("body", "all"), (0, n_points))
-    places |= zip(WHOLE_PARTS, _PLACES.get(n_points, ()), strict=False)
+    places |= zip(WHOLE_PARTS, _PLACES.get(n_points, []), strict=False)
     if part is not None and part not in places:
         raise ValueError(
             f"part={part!r} is none of {', '.join(places)}, the parts of {n_points} "
             f"points; whole bodies have {' or '.join(map(str, _PLACES))}"
         )
     chosen = slice(*places[part or "all"])
-    of_all = names if names and len(names) == n_points else None
-    return values[:, chosen], of_all and list(of_all[chosen])
+    return values[:, chosen], names[chosen] if names and len(
+        names
+    ) == n_points else None
 
 
 def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
@@ -315,12 +320,6 @@ def _refuse_non_objects(entries: list[Any], what: str) -> None:
         raise ValueError(f"all {what} must be objects")
 
 
-def _columns(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
-    """Return the columns of rows, which may lack some."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: [row.get(name) for row in rows] for name in names}
-
-
 def is_openpose(path: Path) -> bool:
     """Return whether a file begins as those of OpenPose, or a folder has such files."""
     return bool(_openpose_files(path))
@@ -342,7 +341,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     absent = "the folder has no files with names ..._keypoints.json, or of people"
     names, people = _each_file(files, absent, _people_in)
     known = {name for persons in people for _, parts in persons for name in parts}
-    found = ", ".join(name for name in OPENPOSE_PARTS if name in known)
+    listed = ", ".join(name for name in OPENPOSE_PARTS if name in known)
     if not known:
         raise ValueError(
             "it has no visible points in the lists pose_keypoints_2d, "
@@ -350,37 +349,31 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         )
     if len(known) > 1 and part is None:
         raise ValueError(
-            f"it has points of {found}: choose one with part (command line: --part)"
+            f"it has points of {listed}: choose one with part (command line: --part)"
         )
-    part = part or found
+    part = part or listed
     if part not in known:
-        raise ValueError(f"it has no points of {part}, but of {found}")
-    chosen = [
-        {k: parts[part] for k, (_, parts) in enumerate(persons) if part in parts}
-        for persons in people
-    ]
-    image, numbers, values = stacked(chosen, names)
-    tracks, scores = np.split(values, [2], axis=2)
-    tracks = np.where(scores == 0, np.nan, tracks)
+        raise ValueError(f"it has no points of {part}, but of {listed}")
+    of_files = frame_numbers(names) or []
+    if len(set(of_files)) < len(names):
+        of_files = list(range(len(names)))
+    entries: list[dict[str, Any]] = []
+    for name, number, persons in zip(names, of_files, people, strict=True):
+        of_file = {"file": as_utf8(name), "frame": number}
+        shown = [
+            of_file | {"person": k, "keypoints": p[part].ravel().tolist()} | each
+            for k, (each, p) in enumerate(persons)
+            if part in p
+        ]
+        entries += shown or [of_file]
+    found = _landmarks(entries, None, None, "openpose", "person")
     # Points that are cut off can be outside of the image.
-    if np.nanmedian(np.abs(tracks)) <= 1:
+    if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
             "the coordinates are shares of the image's size, which stretch the shapes. "
             "Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    of_files = frame_numbers(names) or []
-    if len(set(of_files)) < len(names):
-        of_files = list(range(len(names)))
-    frames = {
-        "file": [as_utf8(names[i]) for i in image],
-        "frame": [of_files[i] for i in image],
-        "person": numbers,
-    }
-    ids = {(i, k): p[0] for i, each in enumerate(people) for k, p in enumerate(each)}
-    who = [ids.get(row) for row in zip(image, numbers, strict=True)]
-    if who.count(None) < len(who):
-        frames["person_id"] = who
-    return assemble(tracks, None, frames, format="openpose", confidence=scores[..., 0])
+    return found
 
 
 def _each_file(
@@ -428,7 +421,9 @@ def _people_in(file: Path) -> list[tuple[Any, dict[str, NDArray[np.float64]]]]:
     ]
     shown = [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
     ids = [_scalars(person).get("person_id", -1) for person in people]
-    return [*zip([None if i == -1 else i for i in ids], shown, strict=True)]
+    return [
+        *zip([{"person_id": i} if i != -1 else {} for i in ids], shown, strict=True)
+    ]
 
 
 def is_mmpose(path: Path) -> bool:
@@ -445,66 +440,34 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     part of whole bodies. An image without instances has one row without points.
     """
     files = _files_of(path, _JSON, _MMPOSE_ALSO) if path.is_dir() else [path]
-    names, contents = _each_file(files, "no .json file of it is of MMPose", _frames_in)
-    images = [(i, *frame) for i, frames in enumerate(contents) for frame in frames]
-    chosen = [{k: v for k, (_, v) in enumerate(found)} for *_, found in images]
-    if not any(chosen):
-        raise ValueError("there are no instances in it")
-    image, numbers, values = stacked(chosen, [names[i] for i, *_ in images])
-    values, _ = of_part(values, None, part)
-    rows = []
-    for i, number in zip(image, numbers, strict=True):
-        file, frame, found = images[i]
-        row = {"file": as_utf8(names[file]), "frame": frame, "person": number}
-        rows.append(row | (found[number][0] if found else {}))
-    if all(row["frame"] is None for row in rows):
-        rows = [{k: v for k, v in row.items() if k != "frame"} for row in rows]
-    return assemble(
-        values[..., :2],
-        None,
-        _columns(rows),
-        format="mmpose",
-        confidence=values[..., 2],
-    )
+    _, contents = _each_file(files, "no .json file of it is of MMPose", _instances_in)
+    entries = [entry for found in contents for entry in found]
+    return _landmarks(entries, None, part, "mmpose", "instance")
 
 
-def _frames_in(file: Path) -> list[tuple[Any, list[tuple[dict[str, Any], NDArray]]]]:
-    """Return the numbers of frames in a file, and the instances of each."""
+def _instances_in(file: Path) -> list[dict[str, Any]]:
+    """Return the instances in a file as those of COCO; one without points if none."""
     content = _read_json(file)
     if isinstance(content, dict):
         content = content.get("instance_info", content.get("predictions"))
     if not isinstance(content, list):
         raise ValueError("expected a list of instances, or of frames with instances")
-    if all(isinstance(each, dict) and "keypoints" in each for each in content):
+    if all("keypoints" in each for each in content):
         content = [{"instances": content}]
-    frames = []
+    entries = []
     for number, frame in enumerate(content):
         if not isinstance(frame, dict):
             frame = {"frame_id": number, "instances": frame}
-        instances = frame.get("instances")
-        if not isinstance(instances, list):
-            raise ValueError(
-                f"frame {number} (counted from 0) has no list of instances"
-            )
-        _refuse_non_objects(instances, "instances")
-        found = [(_scalars(each), _scored(each)) for each in instances]
-        frames.append((_scalars(frame).get("frame_id"), found))
-    return frames
-
-
-def _scored(instance: dict[str, Any]) -> NDArray[np.float64]:
-    """Return x, y and score (n_points, 3) of an instance of MMPose."""
-    try:
-        points = np.array(instance["keypoints"], dtype=np.float64)
-        scores = np.array(instance["keypoint_scores"], dtype=np.float64)
-        if points.shape != (len(scores), 2):
-            raise ValueError(f"got the shapes {points.shape} and {scores.shape}")
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            "an instance should have keypoints, [x, y] of each point, and as many "
-            f"keypoint_scores: {error}"
-        ) from error
-    return np.column_stack([points, scores])
+        known = {"file": as_utf8(file.name)}
+        if "frame_id" in frame:
+            known["frame"] = frame["frame_id"]
+        for person, each in enumerate(frame["instances"]):
+            pairs = zip(each["keypoints"], each["keypoint_scores"], strict=True)
+            values = [float(v) for (x, y), score in pairs for v in (x, y, score)]
+            entries.append(known | each | {"person": person, "keypoints": values})
+        if not frame["instances"]:
+            entries.append(known)
+    return entries
 
 
 def is_pts(path: Path) -> bool:
@@ -559,7 +522,7 @@ def read_tps(path: Path) -> Landmarks:
     if n_left:
         warn_caller(f"{n_left} points of curves are left out")
     *_, values = stacked(tracks, [f"specimen {i}" for i in range(len(tracks))])
-    return assemble(values, None, _columns(rows), format="tps")
+    return assemble(values, None, rows, format="tps")
 
 
 def is_wflw(path: Path) -> bool:

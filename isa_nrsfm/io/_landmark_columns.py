@@ -6,12 +6,17 @@ In patterns ``#`` is a number and ``*`` is any text.
 import re
 import shlex
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
+from isa_nrsfm.skeletons._column_names import (
+    individuals_in,
+    parse_coordinate,
+    point_names,
+    without_boxes,
+)
 
 # What stands for the axis letter in the names of confidences: nose_conf, conf_0.
 CONFIDENCES = (
@@ -25,15 +30,6 @@ MIN_POINTS = 7
 # Columns that name points, and frames or people, in tables with a row for each point.
 _POINT = "point|landmark|joint|marker|node|part(?!ic)"
 _FRAME = "frame|time|image|video|file|person|people|face|hand|subject|track|animal"
-# The sizes of boxes, named like the x of their corner.
-_BOX = (("w", "h"), ("W", "H"), ("width", "height"), ("Width", "Height"))
-# Parts of names, with the separator after them: words, or numbers in words.
-_SEPARATORS = " _.-"
-_PARTS = (rf"[^{_SEPARATORS}]+[{_SEPARATORS}]*", r"\d+|\D+")
-# Words that tell parts of one body apart, and letters of axes.
-_SIDES = frozenset(
-    "x left right l r upper lower front hind fore rear top bottom inner outer".split()
-)
 
 
 class LandmarkColumns(NamedTuple):
@@ -84,7 +80,7 @@ def find_landmark_columns(
                 f"got {columns!r}"
             )
         return _select(names, patterns)
-    names = _without_boxes(names)
+    names = without_boxes(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
     if not candidates:
@@ -115,19 +111,6 @@ def find_landmark_columns(
             "the same names: give every point a name of its own, such as x0, y0, x1, y1"
         )
     return _select(names, pattern.split(","))
-
-
-def _without_boxes(names: list[Hashable]) -> list[Hashable]:
-    """Leave out columns with the corner of a box: x beside w and h, x_min and x_max."""
-    texts = {str(name).strip() for name in names}
-    corners = set()
-    for name, (i, letter) in ((n, each) for n in texts for each in enumerate(n)):
-        for sizes in _BOX if letter in "xyXY" else ():
-            if texts.issuperset(f"{name[:i]}{size}{name[i + 1 :]}" for size in sizes):
-                corners.add(name)
-    ends = [(name, name.replace("min", "max")) for name in texts if "min" in name]
-    corners.update(chain.from_iterable(each for each in ends if each[1] in texts))
-    return [name for name in names if str(name).strip() not in corners]
 
 
 def _pivoted(names: Sequence[Hashable], values: list[Hashable]) -> str:
@@ -219,70 +202,12 @@ def confidence_columns(
     return []
 
 
-def _divisions(names: Iterable[Hashable]) -> Iterator[dict[str, dict[str, Hashable]]]:
-    """Yield names by one of their parts, and by the rest: {"1": {"nose_x": name}}."""
-    for expression in _PARTS:
-        split = [(re.findall(expression, str(name).strip()), name) for name in names]
-        for place in (0, 1, 2, -1, -2, -3):
-            found: dict[str, dict[str, Hashable]] = {}
-            for parts, name in split:
-                if len(parts) > max(place, -place - 1, 1):
-                    others = [*parts]
-                    key = others.pop(place).strip(_SEPARATORS)
-                    rest = "".join(others).rstrip(_SEPARATORS)
-                    found.setdefault(key, {})[rest] = name
-            yield found
-
-
-def individuals_in(names: Sequence[Hashable]) -> list[str]:
-    """
-    Return what tells individuals apart in the names of x columns, if anything does.
-
-    All have points of the same names. Points of one body differ by its sides.
-
-    >>> from isa_nrsfm.io._landmark_columns import individuals_in
-    >>> individuals_in([f"p{point}_{mouse}_x" for point in range(8) for mouse in "ab"])
-    ['a', 'b']
-    """
-    found: list[list[str]] = []
-    for division in _divisions(names):
-        sizes = {len(rests) for rests in division.values()}
-        alike = len({frozenset(rests) for rests in division.values()}) == 1
-        n_all, n_points = len(division), max(sizes, default=0)
-        enough = n_points >= MIN_POINTS or (n_points >= 4 and n_all < 4)
-        sides = _SIDES.issuperset(key.lower() for key in division)
-        whole = alike and n_all * n_points == len(names)
-        if n_all > 1 and whole and enough and not sides:
-            found.append(list(division))
-    return min(found, key=len, default=[])
-
-
-def columns_of_individuals(
-    names: Iterable[Hashable], individuals: str | Sequence[str]
-) -> dict[str, dict[Hashable, str]]:
-    """Return the columns of each individual, with their names without it."""
-    listed = individuals.split(",") if isinstance(individuals, str) else individuals
-    who, names = [str(name).strip() for name in listed], list(names)
-    best: dict[str, dict[Hashable, str]] = {}
-    for division in _divisions(names):
-        own = [division.get(name, {}) for name in who]
-        common = [rest for rest in own[0] if all(rest in each for each in own)]
-        if len(common) > max(map(len, best.values()), default=0):
-            pairs = zip(who, own, strict=True)
-            best = {name: {each[rest]: rest for rest in common} for name, each in pairs}
-    if not best:
-        raise ValueError(
-            f"no columns have the same names but for {', '.join(who)} (individuals)"
-        )
-    return best
-
-
 def _refuse_individuals(names: Sequence[Hashable], candidates: dict[str, int]) -> None:
     """Raise if the points of sets of landmarks are those of several individuals."""
     patterns = [pattern.split(",")[0] for pattern in candidates]
     lists = [_columns_matching(names, pattern).values() for pattern in patterns]
     x = list(dict.fromkeys(chain.from_iterable(lists)))
-    if not (who := individuals_in(x)):
+    if not (who := individuals_in(x, MIN_POINTS)):
         return
     largest = max(candidates, key=candidates.__getitem__)
     whole = largest if candidates[largest] == len(x) else ",".join(candidates)

@@ -290,15 +290,15 @@ def from_mediapipe(
     array([False,  True])
     """
     results = list(results)
-    known = dict.fromkeys(each for result in results for each in _parts(result))
-    if part is not None and part not in known:
-        raise ValueError(f"part must be one of {', '.join(known)}; got {part!r}")
-    if len(known) > 1 and part is None:
+    known = list(dict.fromkeys(each for result in results for each in _parts(result)))
+    if part is None and len(known) > 1:
         raise ValueError(
             f"the results are of more than one kind, {', '.join(known)}: choose one "
-            f"with part, such as part={next(iter(known))!r}"
+            f"with part, such as part={known[0]!r}"
         )
-    part = part or next(iter(known), None)
+    part = part or "".join(known)
+    if part not in known and results:
+        raise ValueError(f"part must be one of {', '.join(known)}; got {part!r}")
     sizes = checked_sizes("image_sizes", image_sizes, len(results))
     names = [f"result {i} (counted from 0)" for i in range(len(results))]
     persons = [
@@ -308,19 +308,20 @@ def from_mediapipe(
     if not any(len(values) for each in persons for values in each.values()):
         raise ValueError(f"none of the {len(results)} results has any landmarks")
     frame, individual, values = stacked(persons, names)
-    sides = {
-        (i, k): _side(hand)
-        for i, result in enumerate(results if part == "hand" else ())
-        for k, hand in enumerate(_entry(result, "handedness") or ())
-    }
-    side = [sides.get(row) for row in zip(frame, individual, strict=True)]
+    frames = {"frame": frame, "individual": individual}
+    if part == "hand":
+        sides = [
+            [*map(_side, _entry(result, "handedness") or ())] for result in results
+        ]
+        places = zip(frame, pd.Series(individual).fillna(-1), strict=True)
+        side = [sides[i][k] if 0 <= k < len(sides[i]) else None for i, k in places]
+        frames |= {"handedness": side} if any(side) else {}
     # Faces and hands have no visibility, though some versions set it to zero.
     seen = part == "pose" and not np.isnan(values[..., 2]).all()
     return assemble(
         values[..., :2] * sizes[frame][:, None],
         None,
-        {"frame": frame, "individual": individual}
-        | ({"handedness": side} if any(side) else {}),
+        frames,
         format="mediapipe",
         confidence=values[..., 2] if seen else None,
     )
@@ -425,55 +426,46 @@ def from_sleap_io(labels: Any) -> Landmarks:
     >>> labels = sleap_io.load_file("mice.slp")    # doctest: +SKIP
     >>> from_sleap_io(labels).points               # doctest: +SKIP
     """
-    rows: list[tuple[str, int, int, Any]] = []
+    rows = []
     try:
-        for labelled in labels:
-            file, instances = labelled.video.filename, list(labelled.instances)
+        for frame in labels:
+            file, found = frame.video.filename, list(frame.instances)
             video = file if isinstance(file, str) else str([*file, ""][0])
-            before = [id(getattr(each, "from_predicted", None)) for each in instances]
-            shown = [each for each in instances if id(each) not in before] or [None]
-            number = int(labelled.frame_idx)
-            rows += [(video, number, k, each) for k, each in enumerate(shown)]
-    except (AttributeError, TypeError) as error:
+            corrected = [id(getattr(each, "from_predicted", None)) for each in found]
+            left = [each for each in found if id(each) not in corrected] or [None]
+            rows += [(video, frame.frame_idx, k, each) for k, each in enumerate(left)]
+        skeletons = [row[3].skeleton for row in rows if row[3] is not None]
+        kinds = {(tuple(s.node_names), tuple(s.edge_names)) for s in skeletons}
+        ((nodes, edges),) = kinds
+    except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(
-            f"labels of sleap-io should have labelled frames; got "
-            f"{type(labels).__name__}: {error}"
+            "labels of sleap-io should have labelled frames, with instances of one "
+            f"skeleton; got {type(labels).__name__}: {error}"
         ) from error
     rows.sort(key=lambda row: row[:3])
-    found = [instance for *_, instance in rows if instance is not None]
-    if not found:
-        raise ValueError(f"none of the {len(rows)} labelled frames has an instance")
-    nodes = list(found[0].skeleton.node_names)
-    for instance in found:
-        if list(instance.skeleton.node_names) != nodes:
-            raise ValueError(
-                "the instances are of several skeletons: "
-                f"{', '.join(nodes)}; {', '.join(instance.skeleton.node_names)}"
-            )
+    videos, numbers, places, instances = zip(*rows, strict=True)
     values = np.full((len(rows), len(nodes), 3), np.nan)
-    for row, (*_, instance) in zip(values, rows, strict=True):
-        if hasattr(instance, "score"):  # a prediction
-            row[:] = instance.numpy(scores=True)
-        elif instance is not None:
-            row[:, :2] = instance.numpy()
-    tracks = [getattr(instance, "track", None) for *_, instance in rows]
-    scores = [getattr(instance, "score", np.nan) for *_, instance in rows]
-    names = [getattr(track, "name", None) for track in tracks]
-    videos, numbers, places, _ = zip(*rows, strict=True)
-    frames = {"video": videos, "frame": numbers, "instance": places}
-    frames |= {"individual": names} if any(names) else {}
-    known = not np.isnan(scores).all()
-    edges = list(found[0].skeleton.edge_names)
-    source = "the labels of sleap-io"
+    for row, each in zip(values, instances, strict=True):
+        if each is not None:
+            points = each.numpy(**{"scores": True} if hasattr(each, "score") else {})
+            row[:, : points.shape[1]] = points
+    tracks = [getattr(each, "track", None) for each in instances]
+    frames = {
+        "video": videos,
+        "frame": numbers,
+        "instance": places,
+        "individual": [getattr(track, "name", None) for track in tracks],
+        "instance_score": [getattr(each, "score", None) for each in instances],
+    }
+    frames = {name: each for name, each in frames.items() if {*each} != {None}}
+    given = {"name": "SLEAP", "source": "labels of sleap-io"}
     return assemble(
         values[..., :2],
         nodes,
-        frames | ({"instance_score": scores} if known else {}),
+        frames,
         format="sleap-io",
-        confidence=values[..., 2] if known else None,
-        skeleton=skeleton_of_names(edges, nodes, name="SLEAP", source=source)
-        if edges
-        else None,
+        confidence=values[..., 2] if "instance_score" in frames else None,
+        skeleton=skeleton_of_names(edges, nodes, **given) if edges else None,
     )
 
 
@@ -521,7 +513,7 @@ def _persons(result: Any, part: str, where: str) -> list[NDArray[np.float64]]:
 
 def _side(hand: Any) -> str | None:
     """Return the side of a hand, from what MediaPipe tells of it."""
-    (first, *_) = [*getattr(hand, "classification", hand), None]
+    first = next(iter(getattr(hand, "classification", hand)), None)
     return getattr(first, "category_name", None) or getattr(first, "label", None)
 
 

@@ -15,13 +15,13 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm.io._landmark_columns import (
-    columns_of_individuals,
-    confidence_columns,
-    find_landmark_columns,
-)
+from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
-from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
+from isa_nrsfm.skeletons._column_names import (
+    columns_of_individuals,
+    parse_coordinate,
+    point_names,
+)
 
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
@@ -327,9 +327,10 @@ def first_lines(path: Path, n_lines: int) -> list[str]:
 
 
 def separator_of(path: Path) -> str:
-    """Return what separates the cells of a text, or semicolons if it has only these."""
-    usual, first = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 1)
-    return ";" if any(";" in line and usual not in line for line in first) else usual
+    """Return what separates the cells of a text: the usual sign, or one it has."""
+    line = "".join(first_lines(path, 1))
+    signs = (SEPARATORS.get(path.suffix.lower(), ","), *";\t,|")
+    return next((sign for sign in signs if sign in line), signs[0])
 
 
 def header_rows(path: Path, n_rows: int) -> list[list[str]]:
@@ -361,11 +362,9 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     lines.
     """
     n_rows, n_columns = 0, 0
-    if separator == ";":
-        warn_caller(
-            f"the cells of {path.name} end with semicolons, and its decimal commas are "
-            "read as points"
-        )
+    if separator != SEPARATORS.get(path.suffix.lower()):
+        commas = ", and its decimal commas are read as points" * (separator == ";")
+        warn_caller(f"the cells of {path.name} end with {separator!r}{commas}")
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = csv.reader(_without_nulls(file), delimiter=separator)
         for row in rows:
@@ -537,18 +536,12 @@ def _refuse_one_column(path: Path, separator: str, line: str) -> None:
     """Raise if the first line of a file is one cell, but has other separators."""
     if separator in line:
         raise ValueError("each line is in quotation marks: remove them")
-    for suffix, other in SEPARATORS.items():
-        if other in line:
-            raise ValueError(f"its columns end with {other!r}: rename it to *{suffix}")
-    following = first_lines(path, 2)[-1]
-    for other, pattern in (("|", "'|'"), (" ", r"r'\s+'")):
-        if 0 < line.count(other) == following.count(other):
-            raise ValueError(
-                f"its columns are separated by {other!r}; {separator!r} is needed. In "
-                f"pandas: table = pd.read_csv({path.name!r}, sep={pattern}, "
-                "header=None, dtype=str), and table.replace(r'^(-?\\d*),(\\d+)$', "
-                "r'\\1.\\2', regex=True).to_csv('new.csv', header=False, index=False)"
-            )
+    if 0 < line.count(" ") == first_lines(path, 2)[-1].count(" "):
+        raise ValueError(
+            f"its columns are separated by ' '; {separator!r} is needed. In pandas: "
+            f"table = pd.read_csv({path.name!r}, sep=r'\\s+', header=None, dtype=str), "
+            "and table.to_csv('new.csv', header=False, index=False)"
+        )
 
 
 def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
