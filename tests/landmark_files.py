@@ -264,6 +264,22 @@ def write_openpose(folder, people, first=0):
     return folder
 
 
+def mmpose(row):
+    """Return an instance as the inferencers of MMPose write it."""
+    points, scores = row[:, :2].tolist(), row[:, 2].tolist()
+    return {"keypoints": points, "keypoint_scores": scores, "bbox_score": 0.75}
+
+
+def write_tps(path, tracks):
+    """Write specimens as tpsDig does."""
+    lines = []
+    for i, points in enumerate(tracks):
+        lines += [f"LM={len(points)}", *(f"{x} {y}" for x, y in points)]
+        lines += [f"IMAGE=skull {i}.jpg", f"ID={i}", "SCALE=0.05"]
+    path.write_text("\n".join([*lines, ""]))
+    return path
+
+
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
 FRAME = deeplabcut_frame(TRACKS)
 SCORED = np.dstack([TRACKS, np.full((12, 8), 0.7)])
@@ -271,6 +287,7 @@ RESULTS = [
     {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
     for i, row in enumerate(SCORED)
 ]
+VIDEO = [{"frame_id": i, "instances": [mmpose(row)]} for i, row in enumerate(SCORED)]
 POSES = [[openpose_person(pose=row)] for row in SCORED]
 # Of each format, files of one individual: what writes them into a folder and returns
 # their path. A further word tells variants of a format apart.
@@ -310,10 +327,13 @@ WRITERS = {
     "coco-results": lambda d: write_json(d / "a.json", RESULTS),
     "openpose": lambda d: write_openpose(d / "a", POSES),
     "openpose-file": lambda d: next(write_openpose(d / "a", POSES[:1]).iterdir()),
+    "mmpose": lambda d: write_json(d / "a.json", VIDEO),
+    "mmpose-image": lambda d: write_json(d / "a.json", VIDEO[0]["instances"]),
+    "tps": lambda d: write_tps(d / "a.tps", TRACKS),
     "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
 IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
 EXPECTED = dict.fromkeys([*IN_MESH, "pyfeat-parquet"], MESH)
-EXPECTED |= dict.fromkeys(["pts-file", "openpose-file"], TRACKS[:1])
+EXPECTED |= dict.fromkeys(["pts-file", "openpose-file", "mmpose-image"], TRACKS[:1])
 EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}

@@ -79,7 +79,8 @@ def find_landmark_columns(
                 "columns must name x and y columns in turn, such as 'x_#,y_#'; "
                 f"got {columns!r}"
             )
-        return _select(names, patterns)
+        given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
+        return _select(names if given else without_boxes(names), patterns)
     names = without_boxes(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}

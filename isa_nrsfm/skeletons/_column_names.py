@@ -170,8 +170,8 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
     """
     Return what tells individuals apart in the names of x columns, if anything does.
 
-    All have points of the same names, at least so many, or two or three have four.
-    Points of one body differ by its sides.
+    All have points of the same names, at least so many; of two or three with numbers,
+    four. Points of one body differ by its sides.
 
     >>> from isa_nrsfm.skeletons._column_names import individuals_in
     >>> names = [f"p{point}_{mouse}_x" for point in range(8) for mouse in "ab"]
@@ -180,13 +180,11 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
     """
     found: list[list[str]] = []
     for division in _divisions(names):
-        sizes = {len(rests) for rests in division.values()}
-        alike = len({frozenset(rests) for rests in division.values()}) == 1
-        n_all, n_points = len(division), max(sizes, default=0)
-        enough = n_points >= least or (n_points >= 4 and n_all < 4)
-        sides = _SIDES.issuperset(key.lower() for key in division)
-        whole = alike and n_all * n_points == len(names)
-        if n_all > 1 and whole and enough and not sides:
+        rests = [frozenset(each) for each in division.values()] or [frozenset()]
+        whole = len({*rests}) == 1 and len(rests) * len(rests[0]) == len(names)
+        few = len(rests) < 4 and all(key[-1:].isdigit() for key in division)
+        enough = len(rests) > 1 and len(rests[0]) >= (4 if few else least)
+        if whole and enough and not _SIDES.issuperset(map(str.lower, division)):
             found.append(list(division))
     return min(found, key=len, default=[])
 
