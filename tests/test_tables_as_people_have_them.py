@@ -87,7 +87,7 @@ def test_parts_of_one_body_are_no_individuals():
     told = str(refused("Their 5 points are too few", landmark_table, table))
     pattern = re.search("columns='(.*?)'", told)[1]
     assert landmark_table(table, columns=pattern).points.shape == (2, 20)
-    refused("same names but for 1, 2", landmark_table, table, individuals="1,2")
+    refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
 
 
 def warnings_of(call, *args, **kwargs):

@@ -221,7 +221,7 @@ HELP = {
     "%%d/%%m/%%Y (day first), %%M:%%S (minutes and seconds), or other codes of "
     "strptime",
     "fps NUMBER": "instead of --time, the frames per second of a video; frames have "
-    "the numbers of the column frame, or of the rows",
+    "the numbers of the column frame, of the names of images, or of the rows",
     # The method.
     "n_components K": "number of basis shapes (default: 3). Of several, such as 1-8 or "
     "3,6,9, the best in cross-validation is used; auto uses as many as the table "
@@ -307,8 +307,8 @@ examples:
 
 Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
 such as x0, y0 or nose_x, nose_y; all other columns are copied to the results. Files of
-OpenFace, OpenPose, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO and WFLW, and folders of
-.pts files, are recognised automatically."""
+OpenFace, OpenPose, MMPose, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO, WFLW and tps,
+and folders of .pts files, are recognised automatically."""
 
 # Of each command: its line in the overview, description, examples, and the options of
 # each group. Of the options in a pair only one may be given.

@@ -136,7 +136,7 @@ def read_landmarks(
     Parameters
     ----------
     path : str or path-like
-        The file, or a folder of ``.pts`` files or of json files of OpenPose.
+        The file, or a folder of ``.pts`` files or of json files of OpenPose or MMPose.
     format : str, default="auto"
         The format, one of `FORMATS`. With "auto", it is the one whose files begin like
         this one, which must be a single one. Files of separated values that no other
@@ -177,6 +177,7 @@ def read_landmarks(
     --------
     from_mediapipe : Landmarks from results of MediaPipe.
     from_movement : Landmarks from datasets of movement.
+    from_sleap_io : Landmarks from labels of sleap-io.
     read_table : All columns of a table.
 
     Examples
