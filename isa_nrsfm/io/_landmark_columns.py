@@ -84,6 +84,7 @@ def find_landmark_columns(
     names = without_boxes(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
+    _refuse_individuals(names, candidates or sets)
     if not candidates:
         x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
         if x and y:
@@ -101,7 +102,6 @@ def find_landmark_columns(
             f"{small}; {_first_columns(names)}. If they have other names, give columns "
             f"(command line: --columns), such as {_likely_pattern(names)!r}"
         )
-    _refuse_individuals(names, candidates)
     if len(candidates) > 1:
         raise ValueError(_several_found(names, candidates))
     (pattern,) = candidates
@@ -203,15 +203,15 @@ def confidence_columns(
     return []
 
 
-def _refuse_individuals(names: Sequence[Hashable], candidates: dict[str, int]) -> None:
+def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None:
     """Raise if the points of sets of landmarks are those of several individuals."""
-    patterns = [pattern.split(",")[0] for pattern in candidates]
+    patterns = [pattern.split(",")[0] for pattern in sets]
     lists = [_columns_matching(names, pattern).values() for pattern in patterns]
     x = list(dict.fromkeys(chain.from_iterable(lists)))
     if not (who := individuals_in(x, MIN_POINTS)):
         return
-    largest = max(candidates, key=candidates.__getitem__)
-    whole = largest if candidates[largest] == len(x) else ",".join(candidates)
+    largest = max(sets, key=sets.__getitem__)
+    whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
     way = f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
     if n_points >= MIN_POINTS:

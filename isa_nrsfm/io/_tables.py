@@ -1,5 +1,6 @@
 """Read tables of 2D landmarks from files, and take the landmarks out of them."""
 
+import contextlib
 import csv
 import os
 import re
@@ -281,13 +282,15 @@ def read_named_columns(
     points, other = landmark_table(
         parse_table(path), columns=columns, missing=missing, individuals=individuals
     )
-    confidence = confidences_in(other, points.columns[::2], points.columns[1::2])
+    confidence, names = None, points.columns
+    with contextlib.suppress(ValueError):  # texts are no confidences
+        confidence = confidences_in(other, names[::2], names[1::2])
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
-        point_names(points.columns[::2]),
+        point_names(names[::2]),
         other if confidence is None else other.drop(columns=confidence.columns),
         format="table",
-        columns=list(points.columns),
+        columns=list(names),
         confidence=confidence,
     )
 
