@@ -610,7 +610,7 @@ def test_bad_mediapipe_results_are_refused():
     face = landmarker_result("face_landmarks", TRACKS[:1])
     refused(r"should have face_landmarks.*got int", from_mediapipe, [3], (640, 480))
     hand = landmarker_result("hand_landmarks", TRACKS[:1])
-    refused("more than one kind", from_mediapipe, [face, hand], (640, 480))
+    refused("have face, hand: choose", from_mediapipe, [face, hand], (640, 480))
     part = landmarker_result("face_landmarks", TRACKS[:1, :2])
     message = r"has 8 points, result 1 .* has 2"
     refused(message, from_mediapipe, [face, part], (640, 480))

@@ -217,7 +217,7 @@ def test_keypoints_without_names_and_of_other_categories(tmp_path, category):
     for entry in content["annotations"][::5]:
         entry["category_id"] = 4
     files.write_json(path, content)
-    told = "3 annotations are of the category 4, which has no names of keypoints"
+    told = "3 annotations are of the category 4, which names no keypoints"
     assert warned(told, read_landmarks, path).failed.sum() == 3
     content["categories"][0]["id"] = 7
     refused(
@@ -309,10 +309,10 @@ def test_results_of_all_versions_of_mediapipe(name, shape):
         if name == "hand_landmarks":
             assert list(found.frames["handedness"].fillna("")) == [side, ""]
     results[0].hand_landmarks, results[0].face_landmarks = results[0].__dict__[name], []
-    told = str(refused("more than one kind", from_mediapipe, results, (500, 500)))
+    told = str(refused("results have ", from_mediapipe, results, (500, 500)))
     assert re.search("such as part='(.*?)'", told)[1] in ("face", "hand", "pose")
     from_mediapipe(results, (500, 500), part="hand")
-    refused("part must be one of .*got 'body'", from_mediapipe, results, (5, 5), "body")
+    refused("got part='body'", from_mediapipe, results, (5, 5), "body")
 
 
 @pytest.mark.parametrize("word", ["p", "prob", "Likelihood", "v", "visibility"])

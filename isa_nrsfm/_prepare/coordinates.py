@@ -104,7 +104,8 @@ def are_shares(tracks: NDArray) -> bool:
     Positions in an image are apart in both directions. Trackers also place points
     that it cuts off, such as the legs of a body at a desk, beyond one of its borders;
     centred coordinates are beyond several. In frames, columns or a table scaled to
-    [0, 1], a few coordinates are exactly 0 and 1. Points at (0, 0) are missing.
+    [0, 1], a few coordinates are exactly 0 and 1; in aligned ones, a point is at 0.
+    Points at (0, 0) are missing.
     """
     seen = ~np.isnan(tracks).any(axis=2) & (tracks != 0).any(axis=2)
     known = tracks[seen]
@@ -117,6 +118,7 @@ def are_shares(tracks: NDArray) -> bool:
     zero, one = (((tracks == end).any(axis=2) & seen) for end in (0, 1))
     n_ends, few = zero.sum() + one.sum(), 4 + len(known) / 1000
     scaled = [np.mean(zero.any(axis) & one.any(axis)) > 0.5 for axis in (0, 1)]
-    if inside.sum() < LEAST * len(known) or any(scaled) or 0 < n_ends < few:
+    aligned = zero.all(axis=0).any() or any(scaled) or 0 < n_ends < few
+    if inside.sum() < LEAST * len(known) or aligned:
         return False
     return bool(np.ptp(tracks[inside], axis=0).min() > 0.1)

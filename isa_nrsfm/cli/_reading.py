@@ -94,21 +94,21 @@ def read_frames(
     The format in the options becomes the one found, and the coordinates of missing
     points become those of all options.
     """
-    found = chosen = layout = known = None
+    found = chosen = layout = sure = None
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
-        own = [name for name in _OF_FORMATS if name in FORMATS[args.format].options]
-        options = {name: getattr(args, name) for name in own if getattr(args, name)}
-        if "missing" in FORMATS[args.format].options:
-            options["missing"] = args.missing_value
+        given = {name: getattr(args, name) for name in _OF_FORMATS}
+        given["missing"] = args.missing_value
+        known = FORMATS[args.format].options
+        options = {name: given[name] for name in known if given.get(name)}
         found = FORMATS[args.format].read(args.table, **options)
         table = pd.concat([found.frames, found.points], axis=1)
         x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
         chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
         layout = found.skeleton
         if found.confidence is not None:
-            known = found.confidence.set_axis(x, axis=1)
+            sure = found.confidence.set_axis(x, axis=1)
     elif table is None:
         table = individuals_as_rows(read_table(args.table), args.individuals)
         if args.columns is not None:
@@ -117,7 +117,7 @@ def read_frames(
         columns = _columns_of_model(estimator, table, chosen)
     else:
         columns = chosen or find_landmark_columns(table.columns)
-    table, known, not_used = _with_confidences(args, table, columns, known)
+    table, sure, not_used = _with_confidences(args, table, columns, sure)
     kept, left_out = _rows_to_keep(args, table)
     if estimator is not None and chosen is not None:
         layout = _part_of_layout(layout, [chosen.x.index(name) for name in columns.x])
@@ -138,11 +138,12 @@ def read_frames(
     cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
     tracks = cleaned.mT
     confidence = np.full(tracks.shape[:2], np.nan)
-    if known is not None:
-        confidence = known[list(columns.x)].to_numpy(np.float64)[rows]
-    weights = np.where(np.isnan(confidence), 1.0, confidence)
+    if sure is not None:
+        confidence = sure[list(columns.x)].to_numpy(np.float64)[rows]
+    weighting = {}
     if args.weights is not None:
-        tracks[weights == 0] = np.nan
+        tracks[confidence == 0] = np.nan
+        weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
@@ -169,9 +170,7 @@ def read_frames(
         left_out=[out for out in left_out if len(out[1])],
         skeleton=layout,
         images=image_numbers(table),
-        weighting={}
-        if args.weights is None
-        else {"point_weight": weights[report.usable]},
+        weighting={name: each[report.usable] for name, each in weighting.items()},
         principal_point=_principal_point(args, other),
     )
 
@@ -273,12 +272,10 @@ def _with_confidences(
         unsure = known[list(columns.x)].to_numpy() < args.min_confidence
         points = table[columns.interleaved]
         rest[columns.interleaved] = points.mask(np.repeat(unsure, 2, axis=1))
-    unused = names and not option
-    return (
-        rest,
-        known,
-        {f"{names[0].strip()}, ... (confidences)": len(names)} if unused else {},
-    )
+    not_used = {}
+    if names and not option:
+        not_used[f"{names[0].strip()}, ... (confidences)"] = len(names)
+    return rest, known, not_used
 
 
 def _rows_to_keep(

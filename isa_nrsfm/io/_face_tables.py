@@ -17,13 +17,7 @@ from isa_nrsfm.io._landmark_columns import (
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
-from isa_nrsfm.io._tables import (
-    Missing,
-    codes_of,
-    header_names,
-    read_columns,
-    tracks_in,
-)
+from isa_nrsfm.io._tables import Missing, header_names, read_columns, tracks_in
 
 # OpenFace names points in space, in millimetres, by capital letters.
 _NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
@@ -115,7 +109,7 @@ def read_mediapipe(
     numbers = [*found.interleaved, *sizes, *scores]
     text = {*names}.difference(numbers, found.z)
     table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
-    tracks = tracks_in(table, found.interleaved, codes_of(missing))
+    tracks = tracks_in(table, found.interleaved, missing)
     known = np.abs(tracks[~np.isnan(tracks)])
     # Pixels of a face reach beyond this, and shares of the image's size do not.
     if known.size and np.median(known) <= 2.0:
@@ -178,12 +172,9 @@ def _assembled(
 
     The score of a frame is among its other columns.
     """
-    confidence, used = None, found.interleaved
-    if scores:
-        each = [*scores] * (len(found.points) // len(scores))
-        confidence = table[each].to_numpy(np.float64)
-    if len(scores) > 1:
-        used += scores
+    n_each, used = len(found.points) // max(len(scores), 1), found.interleaved
+    confidence = table[[*scores] * n_each].to_numpy(np.float64) if scores else None
+    used += scores if n_each == 1 else []
     return assemble(
         tracks_in(table, found.interleaved) if tracks is None else tracks,
         found.points,

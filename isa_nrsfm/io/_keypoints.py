@@ -181,10 +181,10 @@ def _annotations(
         if entry.get("keypoints"):
             of_images[where].append(known | entry)
     if others and category is None:
+        listed = first_items(dict.fromkeys(others))
         text = (
-            f"{len(others)} annotations are of the category "
-            f"{first_items(dict.fromkeys(others))}, which has no names of keypoints in "
-            "the file"
+            f"{len(others)} annotations are of the category {listed}, which names no "
+            "keypoints in the file"
         )
         if not any(of_images.values()):
             raise ValueError(text)
@@ -337,11 +337,11 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         raise ValueError(
             f"part must be one of {', '.join(OPENPOSE_PARTS)}; got {part!r}"
         )
-    files = _openpose_files(path) if path.is_dir() else [path]
     absent = "the folder has no files with names ..._keypoints.json, or of people"
-    names, people = _each_file(files, absent, _people_in)
-    known = {name for persons in people for _, parts in persons for name in parts}
-    listed = ", ".join(name for name in OPENPOSE_PARTS if name in known)
+    names, people = _each_file(path, _openpose_files(path), absent, _people_in)
+    names_in = {name for persons in people for person in persons for name in person}
+    known = [name for name in OPENPOSE_PARTS if name in names_in]
+    listed = ", ".join(known)
     if not known:
         raise ValueError(
             "it has no visible points in the lists pose_keypoints_2d, "
@@ -361,9 +361,9 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     for name, number, persons in zip(names, of_files, people, strict=True):
         of_file = {"file": as_utf8(name), "frame": number}
         shown = [
-            of_file | {"person": k, "keypoints": p[part].ravel().tolist()} | each
-            for k, (each, p) in enumerate(persons)
-            if part in p
+            of_file | {"person": k} | each | {"keypoints": each[part].ravel().tolist()}
+            for k, each in enumerate(persons)
+            if part in each
         ]
         entries += shown or [of_file]
     found = _landmarks(entries, None, None, "openpose", "person")
@@ -377,9 +377,10 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
 
 
 def _each_file(
-    files: Sequence[Path], absent: str, read: Callable[[Path], Any]
+    path: Path, files: Sequence[Path], absent: str, read: Callable[[Path], Any]
 ) -> tuple[list[str], list[Any]]:
-    """Read files; return their names and what they hold."""
+    """Read a file, or those found in a folder; return names and what they hold."""
+    files = files if path.is_dir() else [path]
     if not files:
         raise ValueError(absent)
     contents = []
@@ -408,22 +409,22 @@ def _openpose_files(path: Path) -> list[Path]:
     return named or _files_of(path, _JSON, _OPENPOSE)
 
 
-def _people_in(file: Path) -> list[tuple[Any, dict[str, NDArray[np.float64]]]]:
-    """Return the id of each person in a file, and the visible parts (n_points, 3)."""
+def _people_in(file: Path) -> list[dict[str, Any]]:
+    """Return the visible parts (n_points, 3) of each person in a file, and its id."""
     content = _read_json(file)
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list) or not all(isinstance(p, dict) for p in people):
         raise ValueError("expected an object with a list of objects called people")
-    keys = {part: f"{part}_keypoints_2d" for part in OPENPOSE_PARTS}
-    found = [
-        {part: _triples(person.get(key, []), key, False) for part, key in keys.items()}
-        for person in people
-    ]
-    shown = [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
-    ids = [_scalars(person).get("person_id", -1) for person in people]
-    return [
-        *zip([{"person_id": i} if i != -1 else {} for i in ids], shown, strict=True)
-    ]
+    found = []
+    for person in people:
+        who = _scalars(person).get("person_id", -1)
+        found.append({} if who == -1 else {"person_id": who})
+        for part in OPENPOSE_PARTS:
+            key = f"{part}_keypoints_2d"
+            points = _triples(person.get(key, []), key, False)
+            if points[:, 2].any():
+                found[-1][part] = points
+    return found
 
 
 def is_mmpose(path: Path) -> bool:
@@ -439,8 +440,8 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     ``keypoints``, [x, y] of each point, and ``keypoint_scores``. ``part`` chooses a
     part of whole bodies. An image without instances has one row without points.
     """
-    files = _files_of(path, _JSON, _MMPOSE_ALSO) if path.is_dir() else [path]
-    _, contents = _each_file(files, "no .json file of it is of MMPose", _instances_in)
+    files, absent = _files_of(path, _JSON, _MMPOSE_ALSO), "no file of it is of MMPose"
+    _, contents = _each_file(path, files, absent, _instances_in)
     entries = [entry for found in contents for entry in found]
     return _landmarks(entries, None, part, "mmpose", "instance")
 
@@ -485,8 +486,7 @@ def read_pts(path: Path) -> Landmarks:
     Coordinates are as they are written; iBUG counts pixels from 1.
     """
     absent = "there are no .pts files in the folder"
-    files = _files_of(path, _PTS_NAME) if path.is_dir() else [path]
-    names, points = _each_file(files, absent, _points_of)
+    names, points = _each_file(path, _files_of(path, _PTS_NAME), absent, _points_of)
     *_, tracks = stacked([{0: each} for each in points], names)
     return assemble(tracks, None, {"file": [*map(as_utf8, names)]}, format="pts")
 

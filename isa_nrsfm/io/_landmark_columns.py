@@ -213,12 +213,12 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     largest = max(sets, key=sets.__getitem__)
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
-    way = f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
-    if n_points >= MIN_POINTS:
-        way = (
-            f"For a row for each individual, use individuals={listed!r} (command line: "
-            f"--individuals {shlex.quote(listed)})"
-        )
+    way = (
+        f"For a row for each individual, use individuals={listed!r} (command line: "
+        f"--individuals {shlex.quote(listed)})"
+        if n_points >= MIN_POINTS
+        else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
+    )
     raise ValueError(
         f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
         f"of several individuals in one row. {way}. If all are points of one body, use "

@@ -291,14 +291,12 @@ def from_mediapipe(
     """
     results = list(results)
     known = list(dict.fromkeys(each for result in results for each in _parts(result)))
-    if part is None and len(known) > 1:
+    if results and part not in (known if part or len(known) > 1 else [None]):
         raise ValueError(
-            f"the results are of more than one kind, {', '.join(known)}: choose one "
-            f"with part, such as part={known[0]!r}"
+            f"the results have {', '.join(known)}: choose one with part, such as "
+            f"part={known[0]!r}; got part={part!r}"
         )
     part = part or "".join(known)
-    if part not in known and results:
-        raise ValueError(f"part must be one of {', '.join(known)}; got {part!r}")
     sizes = checked_sizes("image_sizes", image_sizes, len(results))
     names = [f"result {i} (counted from 0)" for i in range(len(results))]
     persons = [
@@ -450,13 +448,9 @@ def from_sleap_io(labels: Any) -> Landmarks:
             points = each.numpy(**{"scores": True} if hasattr(each, "score") else {})
             row[:, : points.shape[1]] = points
     tracks = [getattr(each, "track", None) for each in instances]
-    frames = {
-        "video": videos,
-        "frame": numbers,
-        "instance": places,
-        "individual": [getattr(track, "name", None) for track in tracks],
-        "instance_score": [getattr(each, "score", None) for each in instances],
-    }
+    frames: dict[str, Any] = {"video": videos, "frame": numbers, "instance": places}
+    frames["individual"] = [getattr(track, "name", None) for track in tracks]
+    frames["instance_score"] = [getattr(each, "score", None) for each in instances]
     frames = {name: each for name, each in frames.items() if {*each} != {None}}
     given = {"name": "SLEAP", "source": "labels of sleap-io"}
     return assemble(
@@ -477,11 +471,8 @@ def _entry(result: Any, name: str) -> Any:
 
 def _parts(result: Any) -> list[str]:
     """Return the parts of which a result has points, or may have."""
-    found = [
-        part
-        for part in _PARTS
-        if {f"{part}_landmarks", f"multi_{part}_landmarks"}.intersection(dir(result))
-    ]
+    names = {*dir(result)}
+    found = [p for p in _PARTS if names & {f"{p}_landmarks", f"multi_{p}_landmarks"}]
     if not found:
         raise ValueError(
             "a result of MediaPipe should have face_landmarks, hand_landmarks or "

@@ -212,10 +212,10 @@ def landmark_table(
             f"a pandas DataFrame is needed; got {type(frame).__name__} "
             "(polars tables have a method to_pandas)"
         )
-    codes, frame = codes_of(missing), individuals_as_rows(frame, individuals)
+    frame = individuals_as_rows(frame, individuals)
     names = find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
-    values = tracks_in(frame, names, codes).reshape(len(frame), len(names))
+    values = tracks_in(frame, names, missing).reshape(len(frame), len(names))
     return LandmarkTable(
         pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
         frame.drop(columns=names),
@@ -229,19 +229,18 @@ def individuals_as_rows(
     if individuals is None:
         return frame
     own = columns_of_individuals(frame.columns, individuals)
+    frame = frame.reset_index(drop=True)
     common = frame.drop(columns=[name for names in own.values() for name in names])
-    common = common.reset_index(drop=True)
     if "frame" not in common:
         common.insert(0, "frame", common.index)
-    parts = []
-    for name, columns in own.items():
-        rows = frame[[*columns]].set_axis([*columns.values()], axis=1)
-        rows = rows.set_axis(common.index, axis=0)
-        parts.append(pd.concat([common.assign(individual=name), rows], axis=1))
+    parts = [
+        common.assign(individual=name).join(frame[[*columns]].rename(columns=columns))
+        for name, columns in own.items()
+    ]
     return pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
 
 
-def codes_of(missing: Missing) -> list[float]:
+def _codes(missing: Missing) -> list[float]:
     """Return the numbers of missing points, or raise."""
     given = [] if missing is None else [0.0] if isinstance(missing, str) else missing
     codes = np.atleast_1d(np.asarray(given))
@@ -254,7 +253,7 @@ def codes_of(missing: Missing) -> list[float]:
 
 
 def tracks_in(
-    frame: "pd.DataFrame", names: Sequence[str], missing: Sequence[float] = ()
+    frame: "pd.DataFrame", names: Sequence[str], missing: Missing = None
 ) -> NDArray[np.float64]:
     """Return the points (n_frames, n_points, 2) in columns x0, y0, x1, y1, ....
 
@@ -262,7 +261,7 @@ def tracks_in(
     """
     values = np.stack([_as_numbers(frame[name]) for name in names], axis=1)
     tracks = values.reshape(len(frame), len(names) // 2, 2)
-    for number in missing:
+    for number in _codes(missing):
         tracks[(tracks == number).all(axis=2)] = np.nan
     return tracks
 
