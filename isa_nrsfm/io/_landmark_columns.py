@@ -29,7 +29,10 @@ MIN_POINTS = 7
 
 # Columns that name points, and frames or people, in tables with a row for each point.
 _POINT = "point|landmark|joint|marker|node|part(?!ic)"
-_FRAME = "frame|time|image|video|file|person|people|face|hand|subject|track|animal"
+_FRAME = (
+    "frame|time|image|video|file|session|trial|person|people|participant|subject|"
+    "patient|animal|track|face|hand"
+)
 
 
 class LandmarkColumns(NamedTuple):
