@@ -59,6 +59,7 @@ from isa_nrsfm._prepare.checks import (
     checked,
     validated_table,
 )
+from isa_nrsfm._prepare.coordinates import warn_of_rows
 from isa_nrsfm._prepare.scaling import check_weightable, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
@@ -546,6 +547,7 @@ default="affine"
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
+        warn_of_rows(source, self.camera)
         isa, n_components = self._strategy(settings.joint), self.n_components
         auto, most = n_components == "auto", None
         if self.camera == "perspective":
@@ -605,10 +607,7 @@ default="affine"
     def _ready(
         self, X: Any, point_weight: Any = None
     ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
-        """Check the parameters and the table of a fit, and set the columns' attributes.
-
-        Returns the table, the weights of its points and the settings.
-        """
+        """Return the checked table of a fit, its weights and settings; set its names."""
         joint = self.refinement in JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"

@@ -12,7 +12,6 @@ from sklearn.utils.validation import validate_data
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import completion_model
-from isa_nrsfm._prepare.coordinates import warn_of_codes, warn_of_shares
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import (
@@ -223,34 +222,19 @@ def check_points(
         )
 
 
-def warn_of_table(
-    rows: FrameBlocks,
-    n_points: int,
-    layout: Layout,
-    scale_frames: bool,
-    camera: str | None,
+def warn_if_other_layout(
+    rows: FrameBlocks, n_points: int, layout: Layout, scale_frames: bool
 ) -> None:
-    """Warn if coordinates, seen in some frames, are probably not what they should be.
-
-    Shares of the size of an image do not matter to affine cameras.
-    """
-    # Evenly spread
-    enough = max(min(1000, 1_000_000 // n_points), 100)
-    given = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
-    sample = "" if len(given) == rows.n_frames else " of a sample"
-    warn_of_codes(given.mT, f"rows{sample}")
-    if camera not in (None, "affine"):
-        warn_of_shares(given.mT)
-    if min(given.shape[::2]) >= FEWEST_COMPARED:
-        _warn_if_other_layout(given, layout, scale_frames)
-
-
-def _warn_if_other_layout(given: NDArray, layout: Layout, scale_frames: bool) -> None:
-    """Warn if a rigid object fits rows (I, 2, J) much better in the other layout.
+    """Warn if a rigid object fits the other column layout much better.
 
     Compares mean squares, not shares of the total energy. The wrong layout mixes x and
     y, and a rigid object explains the energy of their offset.
     """
+    if min(rows.n_frames, n_points) < FEWEST_COMPARED:
+        return
+    # Some frames, evenly spread
+    enough = max(min(1000, 1_000_000 // n_points), 100)
+    given = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
     other = next(name for name in LAYOUTS if name != layout)
     X = tracks_to_table(given.transpose(0, 2, 1), layout)
     both = [given, without_half_points(table_to_rows(X, other))[0]]

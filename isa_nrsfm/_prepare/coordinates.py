@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._tables.blocks import FrameBlocks
 
-# Points that are compared, at most.
-MOST_PLACES = 1_000_000
+# Rows of a fit, and points, that are compared at most.
+MOST_ROWS, MOST_PLACES = 1000, 1_000_000
 # Points of a lower confidence are seldom where they are said to be.
 UNSURE = 0.6
 # Largest part of the coordinates of shares that are beyond all borders but one.
@@ -17,6 +18,18 @@ LEAST = 0.2
 
 class CoordinateWarning(UserWarning):
     """Coordinates are probably codes of missing points, or shares of an image."""
+
+
+def warn_of_rows(rows: FrameBlocks, camera: str) -> None:
+    """Warn of some rows of a table, evenly spread; not of shares if cameras are affine.
+
+    These absorb the stretch of shares.
+    """
+    few = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
+    tracks = rows.take(few).mT
+    warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
+    if camera != "affine":
+        warn_of_shares(tracks)
 
 
 def warn_of_places(tracks: NDArray, confidence: ArrayLike | None = None) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sklearn.utils import check_array
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._prepare.checks import check_points, check_size, warn_of_table
+from isa_nrsfm._prepare.checks import check_points, check_size, warn_if_other_layout
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import is_read_later, unmasked
@@ -104,7 +104,7 @@ def scaled_table(
     check_points(visible, n_points, n_components, layout, names)
     if weights is not None:
         check_weights(weights, n_components, camera)
-    warn_of_table(blocks, n_points, layout, scale_frames, camera)
+    warn_if_other_layout(blocks, n_points, layout, scale_frames)
     translation, size, n_seen, *_ = rest
     if weights is not None:
         size = blocks.joined(weighted_sizes, weights)
