@@ -607,7 +607,7 @@ default="affine"
     def _ready(
         self, X: Any, point_weight: Any = None
     ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
-        """Return the checked table of a fit, its weights and settings; set its names."""
+        """Return the checked table of a fit, its weights and settings; set names."""
         joint = self.refinement in JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"

@@ -114,7 +114,7 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
         (
             write_openface,
             "--min-confidence 1 --columns x_#,y_#",
-            "has no confidences of all points. In tables, their columns need the names",
+            "has no confidences of all points. Their columns need the names of the x",
         ),
         (write_pts, "--min-confidence 1", "(pts) has no confidences"),
     ],

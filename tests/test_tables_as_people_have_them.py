@@ -3,6 +3,7 @@
 import re
 import shlex
 import warnings
+from itertools import pairwise
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -10,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import QUICK
-from landmark_files import BODYPARTS, FRAME, TRACKS
+from landmark_files import BODYPARTS, TRACKS
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 
@@ -138,37 +139,28 @@ def test_numbers_in_names_are_those_of_frames(names, numbers):
     assert list(image_numbers(pd.DataFrame({"image": names.split()}))) == numbers
 
 
-LISTS = dict(
-    zip(
-        ("body", "feet", "face", "left_hand", "right_hand"),
-        (
-            (0, 17, "keypoints"),
-            (17, 23, "foot_kpts"),
-            (23, 91, "face_kpts"),
-            (91, 112, "lefthand_kpts"),
-            (112, 133, "righthand_kpts"),
-        ),
-        strict=True,
-    )
+LISTS = "keypoints foot_kpts face_kpts lefthand_kpts righthand_kpts".split()
+PARTS = dict(
+    zip("body feet face left_hand right_hand all".split(), range(6), strict=True)
 )
+ENDS = [0, 17, 23, 91, 112, 133]
 BODIES = files.scene(4, 133, 7)
 
 
-@pytest.mark.parametrize("lists", [True, False])
-@pytest.mark.parametrize("part", [*LISTS, "all"])
+@pytest.mark.parametrize("lists", [LISTS, LISTS[:1]])
+@pytest.mark.parametrize("part", PARTS)
 def test_parts_of_whole_bodies(tmp_path, lists, part):
-    values, rows = np.dstack([BODIES, np.ones((4, 133))]), []
-    for i, points in enumerate(values):
-        of_lists = {key: points[a:b].ravel().tolist() for a, b, key in LISTS.values()}
-        whole = {"keypoints": points.ravel().tolist()}
-        rows.append({"image_id": i, "category_id": 1} | (of_lists if lists else whole))
-    images = [{"id": i} for i in range(4)]
-    content = {"images": images, "annotations": rows} if lists else rows
+    ends, rows = ENDS if len(lists) > 1 else [0, 133], []
+    for i, points in enumerate(np.dstack([BODIES, np.ones((4, 133))])):
+        values = [points[a:b].ravel().tolist() for a, b in pairwise(ends)]
+        rows.append(dict(zip(lists, values, strict=True)) | {"image_id": i})
+    content = {"images": [{"id": i} for i in range(4)], "annotations": rows}
+    content = content if len(lists) > 1 else rows
     path = files.write_json(tmp_path / "a.json", content)
-    first, end, _ = LISTS.get(part, (0, 133, ""))
+    first, end = [*pairwise(ENDS), (0, 133)][PARTS[part]]
     found = read_landmarks(path, part=part).points
     assert_array_equal(found, BODIES[:, first:end].reshape(4, -1))
-    if lists:
+    if len(lists) > 1:
         told = (
             "those in foot_kpts, face_kpts, .* choose with part, one of body, .*--part"
         )
@@ -176,48 +168,42 @@ def test_parts_of_whole_bodies(tmp_path, lists, part):
     refused("'nose' is none of body, ", read_landmarks, path, part="nose")
 
 
-@pytest.mark.parametrize("category", [[{"id": 1, "keypoints": []}], [{"id": 1}], []])
-def test_keypoints_without_names_and_of_other_categories(tmp_path, category):
-    content = files.coco_annotations(TRACKS)
-    path = files.write_json(tmp_path / "a.json", content | {"categories": category})
-    found = read_landmarks(path)
-    assert_array_equal(found.points, FLAT)
-    assert list(found.points)[:2] == ["x_0", "y_0"]
+def test_annotations_of_other_categories_are_counted(tmp_path):
+    content, path = files.coco_annotations(TRACKS), tmp_path / "a.json"
     for entry in content["annotations"][::5]:
         entry["category_id"] = 4
-    files.write_json(path, content)
     told = "3 annotations are of the category 4, which names no keypoints"
+    files.write_json(path, content)
     assert warned(told, read_landmarks, path).failed.sum() == 3
     content["categories"][0]["id"] = 7
     files.write_json(path, content)
     refused("12 annotations are of the category 4, 1", read_landmarks, path)
 
 
-def write_who(folder, kind, who):
-    """Write files of people with ids: annotations, results, or a folder of OpenPose."""
-    if kind == "person_id":
-        people = [[files.openpose_person(pose=row)] for row in files.SCORED]
-        for (person,), each in zip(people, who, strict=True):
-            person["person_id"] = [each]
-        path = files.write_openpose(folder / "a", people)
-        for i, file in enumerate(sorted(path.iterdir())):
-            file.rename(path / f"cam01.{i}.json")
-        return path
-    content = files.coco_annotations(TRACKS)
-    rows = content["annotations"]
-    if kind == "idx":  # in the order of texts
-        rows = [r | {"image_id": f"{i}.jpg"} for i, r in enumerate(files.RESULTS)]
-    for row, each in zip(rows, who, strict=True):
-        own = {"idx": [float(each)], "track_id": each, "name": each}
-        row |= {"attributes": own} if kind == "name" else {kind: own[kind]}
-    content = sorted(rows, key=lambda r: r["image_id"]) if kind == "idx" else content
-    return files.write_json(folder / "a.json", content)
-
-
 @pytest.mark.parametrize("kind", ["track_id", "name", "idx", "person_id"])
 def test_who_is_who_is_a_column_of_images_in_their_order(tmp_path, kind):
-    found = read_landmarks(write_who(tmp_path, kind, [5, 6, 7] * 4))
-    assert list(found.frames[kind]) == [5, 6, 7] * 4
+    who, path = [5, 6, 7] * 4, tmp_path / "a.json"
+    content = files.coco_annotations(TRACKS)
+    if kind == "idx":  # results of AlphaPose, in the order of texts
+        rows = [
+            files.RESULTS[i] | {"image_id": f"{i}.jpg", kind: [w]}
+            for i, w in enumerate(who)
+        ]
+        content = sorted(rows, key=lambda row: row["image_id"])
+    elif kind == "person_id":  # OpenPose
+        path = tmp_path / "people"
+        path.mkdir()
+        for i, each in enumerate(who):
+            person = files.openpose_person(pose=files.SCORED[i]) | {kind: [each]}
+            files.write_json(path / f"cam01.{i}.json", {"people": [person]})
+    for row, each in zip(
+        content["annotations"] if kind[0] in "tn" else (), who, strict=False
+    ):
+        row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
+    if kind != "person_id":
+        files.write_json(path, content)
+    found = read_landmarks(path)
+    assert list(found.frames[kind]) == who
     assert_array_equal(found.points, FLAT)
 
 
@@ -265,23 +251,6 @@ def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
         assert fits(path, *options, *told[2].split()).err == ""
 
 
-@pytest.mark.parametrize(
-    "save",
-    [
-        lambda path: pd.read_csv(path).to_csv(path, index=False),
-        lambda path: pd.read_csv(path).to_csv(path),
-        lambda path: FRAME.rename_axis(columns={"scorer": "individuals"}).to_csv(path),
-        lambda path: FRAME.droplevel("scorer", axis=1).to_csv(path),
-    ],
-)
-def test_deeplabcut_saved_again(tmp_path, save):
-    save(files.write_deeplabcut(tmp_path / "a.csv", FRAME))
-    found = read_landmarks(tmp_path / "a.csv")
-    assert found.format == "deeplabcut"
-    assert_allclose(found.points, FLAT)
-    assert list(found.frames["frame"]) == list(range(12))
-
-
 def labelled(xy, **known):
     """Return an instance of sleap-io; one with a score is a prediction."""
 
@@ -313,19 +282,13 @@ def test_labels_of_sleap_io():
         refused("instances of one skeleton; got ", from_sleap_io, labels)
 
 
-@pytest.mark.parametrize(
-    ("content", "frames"),
-    [
-        ({"meta_info": {}, "instance_info": files.VIDEO}, range(12)),
-        ({"predictions": [files.VIDEO[0]["instances"], []]}, [0, 1]),
-        ([files.VIDEO[0] | {"instances": files.VIDEO[0]["instances"] * 3}], [0, 0, 0]),
-    ],
-)
-def test_predictions_of_mmpose(tmp_path, content, frames):
+def test_predictions_of_mmpose(tmp_path):
+    instances = [files.VIDEO[0]["instances"] * 2, []]
+    content = [{"frame_id": i, "instances": each} for i, each in enumerate(instances)]
     found = read_landmarks(files.write_json(tmp_path / "a.json", content))
-    assert list(found.frames["frame"]) == list(frames)
-    assert_array_equal(found.points.iloc[0], FLAT[0])
-    assert found.failed.sum() == (len(frames) == 2)
+    assert list(found.frames["frame"]) == [0, 0, 1]
+    assert list(found.frames["person"].fillna(-1)) == [0, 1, -1]
+    assert list(found.failed) == [False, False, True]
 
 
 def test_specimens_of_tps(tmp_path):

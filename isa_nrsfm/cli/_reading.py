@@ -262,7 +262,7 @@ def _with_confidences(
     if known is None and option:
         raise ValueError(
             f"{option}: {args.table} ({args.format}) has no confidences of all points. "
-            "In tables, their columns need the names of the x columns, with one of the "
+            "Their columns need the names of the x columns, with one of the "
             f"words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
         )
     rest = table.drop(columns=names)
