@@ -493,9 +493,9 @@ default="affine"
         Warns
         -----
         UserWarning
-            If calibrated cameras do not determine the depth, if rows without points are
-            left out, if points lack one coordinate, if the other layout explains the
-            table much better, or if a refinement has not converged.
+            If calibrated cameras do not determine the depth, points are at codes of
+            missing ones, in shares of an image's size, of the other layout or lack a
+            coordinate, rows without points are left out, or a fit has not converged.
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep:

@@ -186,7 +186,7 @@ def read_landmarks(
     >>> from tempfile import TemporaryDirectory
     >>> from isa_nrsfm.io import read_landmarks
     >>> with TemporaryDirectory() as folder:
-    ...     for name, shift in (("a", 0), ("b", 5)):
+    ...     for name, shift in (("a", 1), ("b", 5)):
     ...         lines = [f"{j + shift} {j * j}" for j in range(3)]
     ...         head = ["version: 1", "n_points: 3", "{"]
     ...         path = Path(folder, f"{name}.pts")
@@ -196,7 +196,7 @@ def read_landmarks(
     'pts'
     >>> landmarks.points
        x_0  y_0  x_1  y_1  x_2  y_2
-    0  0.0  0.0  1.0  1.0  2.0  4.0
+    0  1.0  0.0  2.0  1.0  3.0  4.0
     1  5.0  0.0  6.0  1.0  7.0  4.0
     >>> list(landmarks.frames["file"])
     ['a.pts', 'b.pts']

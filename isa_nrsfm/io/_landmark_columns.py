@@ -125,12 +125,11 @@ def _pivoted(names: Sequence[Hashable], values: list[Hashable]) -> str:
     last = [name for name in keys if not re.search(_FRAME, str(name), re.IGNORECASE)]
     points = points or last[-1:] or ["point"]
     frames = [name for name in keys if name not in points] or ["frame"]
-    absent = [str(name) for name in (*frames, *points) if name not in names]
-    first = f"; add the columns {', '.join(absent)} first" if absent else ""
     return (
         "the table has one row for each point, with columns x and y; one row for each "
-        f"frame is needed{first}. In pandas: wide = table.pivot(index={frames}, "
-        f"columns={points[0]!r}, values={values}), and wide.columns = "
+        "frame is needed. Columns must tell frames and points apart. In pandas: "
+        f"wide = table.pivot(index={frames}, columns={points[0]!r}, values={values}), "
+        "and wide.columns = "
         "[f'{axis}_{j}' for axis, j in wide.columns], and wide = wide.reset_index()"
     )
 
