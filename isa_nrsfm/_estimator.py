@@ -46,6 +46,7 @@ from isa_nrsfm._prepare.checks import (
     undetermined,
     validated_table,
 )
+from isa_nrsfm._prepare.coordinates import warn_of_rows
 from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
@@ -499,9 +500,9 @@ default="affine"
         Warns
         -----
         UserWarning
-            If calibrated cameras do not determine the depth, if rows without points are
-            left out, if points lack one coordinate, if the other layout explains the
-            table much better, or if a refinement has not converged.
+            If calibrated cameras do not determine the depth, points are at codes of
+            missing ones, in shares of an image's size, of the other layout or lack a
+            coordinate, rows without points are left out, or a fit has not converged.
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
@@ -553,6 +554,7 @@ default="affine"
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
+        warn_of_rows(source, self.camera)
         inherited = self.random_state, self.n_jobs, self.verbose
         isa = ready_strategy(self.isa, settings.joint, *inherited)
         n_components = self.n_components
@@ -616,10 +618,7 @@ default="affine"
     def _ready(
         self, X: Any, point_weight: Any = None
     ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
-        """Check the parameters and the table of a fit, and set the columns' attributes.
-
-        Returns the table, the weights of its points and the settings.
-        """
+        """Return the checked table of a fit, its weights and settings; set names."""
         joint = self.refinement in choices.JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"

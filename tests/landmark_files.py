@@ -67,6 +67,12 @@ def saved_again(path, suffix):
     return new
 
 
+def by_pandas(path, index):
+    """Save a csv file again, whose first line are its names."""
+    pd.read_csv(path).to_csv(path, index=index)
+    return path
+
+
 def write_pyfeat(path, tracks, *, detector="Detector"):
     """Write a table as Fex.to_csv does."""
     n_frames, n_points, _ = tracks.shape
@@ -264,6 +270,22 @@ def write_openpose(folder, people, first=0):
     return folder
 
 
+def mmpose(row):
+    """Return an instance as the inferencers of MMPose write it."""
+    points, scores = row[:, :2].tolist(), row[:, 2].tolist()
+    return {"keypoints": points, "keypoint_scores": scores, "bbox_score": 0.75}
+
+
+def write_tps(path, tracks):
+    """Write specimens as tpsDig does."""
+    lines = []
+    for i, points in enumerate(tracks):
+        lines += [f"LM={len(points)}", *(f"{x} {y}" for x, y in points)]
+        lines += [f"IMAGE=skull {i}.jpg", f"ID={i}", "SCALE=0.05"]
+    path.write_text("\n".join([*lines, ""]))
+    return path
+
+
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
 FRAME = deeplabcut_frame(TRACKS)
 SCORED = np.dstack([TRACKS, np.full((12, 8), 0.7)])
@@ -271,6 +293,7 @@ RESULTS = [
     {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
     for i, row in enumerate(SCORED)
 ]
+VIDEO = [{"frame_id": i, "instances": [mmpose(row)]} for i, row in enumerate(SCORED)]
 POSES = [[openpose_person(pose=row)] for row in SCORED]
 # Of each format, files of one individual: what writes them into a folder and returns
 # their path. A further word tells variants of a format apart.
@@ -301,19 +324,42 @@ WRITERS = {
     "deeplabcut-tsv": lambda d: write_deeplabcut(d / "a.tsv", FRAME),
     "deeplabcut-table": lambda d: write_deeplabcut(d / "a.h5", FRAME),
     "deeplabcut-fixed": lambda d: write_deeplabcut(d / "a.h5", FRAME, how="fixed"),
+    "deeplabcut-lines": lambda d: write_deeplabcut(
+        d / "a.csv", FRAME.droplevel("scorer", axis=1)
+    ),
+    "deeplabcut-individuals": lambda d: write_deeplabcut(
+        d / "a.csv", FRAME.rename_axis(columns={"scorer": "individuals"})
+    ),
+    "deeplabcut-pandas": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=False),
+    "deeplabcut-index": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=True),
     "sleap": lambda d: write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),
     "sleap-csv": lambda d: write_sleap_csv(
         d / "a.csv", TRACKS[:, None], np.ones((12, 1, 8)), names=["a"]
     ),
     "sleap-parquet": lambda d: saved_again(WRITERS["sleap-csv"](d), ".parquet"),
     "coco": lambda d: write_json(d / "a.json", coco_annotations(TRACKS)),
+    "coco-unnamed": lambda d: write_json(
+        d / "a.json", coco_annotations(TRACKS) | {"categories": [{"id": 1}]}
+    ),
+    "coco-without": lambda d: write_json(
+        d / "a.json", coco_annotations(TRACKS) | {"categories": []}
+    ),
     "coco-results": lambda d: write_json(d / "a.json", RESULTS),
     "openpose": lambda d: write_openpose(d / "a", POSES),
     "openpose-file": lambda d: next(write_openpose(d / "a", POSES[:1]).iterdir()),
+    "mmpose": lambda d: write_json(d / "a.json", VIDEO),
+    "mmpose-image": lambda d: write_json(d / "a.json", VIDEO[0]["instances"]),
+    "mmpose-demo": lambda d: write_json(
+        d / "a.json", {"meta_info": {}, "instance_info": VIDEO}
+    ),
+    "mmpose-results": lambda d: write_json(
+        d / "a.json", {"predictions": [frame["instances"] for frame in VIDEO]}
+    ),
+    "tps": lambda d: write_tps(d / "a.tps", TRACKS),
     "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
 IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
 EXPECTED = dict.fromkeys([*IN_MESH, "pyfeat-parquet"], MESH)
-EXPECTED |= dict.fromkeys(["pts-file", "openpose-file"], TRACKS[:1])
+EXPECTED |= dict.fromkeys(["pts-file", "openpose-file", "mmpose-image"], TRACKS[:1])
 EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}

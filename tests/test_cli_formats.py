@@ -63,7 +63,9 @@ def write_sleap(folder):
     pair = np.stack([tracks(20), tracks(20)], axis=1)
     pair[EMPTY], pair[20:, 1] = np.nan, np.nan
     nodes = [f"node {j}" for j in range(20)]
-    path = files.write_sleap(folder / "fly.analysis.h5", pair, nodes=nodes)
+    scores = np.full(pair.shape[:3], 0.9)
+    given = {"nodes": nodes, "scores": scores}
+    path = files.write_sleap(folder / "fly.analysis.h5", pair, **given)
     options, kept = ["--skip-rows", "individual=^b$"], {"individual", "instance_score"}
     return path, options, kept, [EMPTY]
 
@@ -101,20 +103,20 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
         (
             write_openface,
             "--columns x_#,y_# --format openface",
-            "--columns needs --format table; got --format openface",
+            "--columns needs --format mediapipe or table; ",
         ),
         (write_openface, "--image-size 640x480", "--image-size needs --format mediapi"),
         (write_openface, "--focal-length 1000", "--focal-length needs --camera persp"),
         (write_openface, "--principal-point 1 2", "--principal-point needs --camera"),
         (write_openface, "--camera perspective", "needs the size of the images, with"),
-        (write_openface, "--part face", "--part needs --format openpose"),
+        (write_openface, "--part face", "--part needs --format coco or openpose"),
         (write_openpose, "", "has points of pose, face: choose one with part"),
         (
             write_openface,
             "--min-confidence 1 --columns x_#,y_#",
             "has no confidences of all points. Their columns need the names of the x",
         ),
-        (write_pts, "--min-confidence 1", "is given, but these landmarks (pts)"),
+        (write_pts, "--min-confidence 1", "(pts) has no confidences"),
     ],
 )
 def test_options_without_effect_are_refused(fails, tmp_path, write, options, message):
@@ -279,12 +281,14 @@ def write_shares(folder, change=lambda shares: shares):
     [
         (lambda shares: shares, True),
         (lambda shares: shares - np.quantile(shares, 0.04), True),
-        (lambda shares: shares - np.quantile(shares, 0.06), False),
+        (lambda shares: shares - np.quantile(shares, 0.2, axis=(0, 1)), False),
+        (lambda shares: shares * [1, 2] + [0, 0.1], True),
+        (lambda shares: (shares - shares[:, :1, :1]) * [1, 0.5], False),
         (lambda shares: shares - shares.mean(axis=1, keepdims=True), False),
         (lambda shares: (shares - shares.min()) / np.ptp(shares), False),
         (lambda shares: shares * [1920, 1080], False),
     ],
-    ids=["shares", "4 % outside", "6 % outside", "centred", "scaled", "pixels"],
+    ids="shares border corner cut_off aligned centred scaled pixels".split(),
 )
 def test_shares_of_an_image_are_named(fits, tmp_path, change, is_named):
     err = fits(write_shares(tmp_path, change), *QUICK).err

@@ -57,7 +57,7 @@ def test_right_layout_gives_no_warning_and_the_wrong_one_does(load_data, name, r
     wrong = "planar" if right == "interleaved" else "interleaved"
     table = table_of(tracks, right)
     assert messages_of_fit(table, layout=right, scale_frames=scale_frames) == []
-    (message,) = messages_of_fit(table, layout=wrong, scale_frames=scale_frames)
+    *_, message = messages_of_fit(table, layout=wrong, scale_frames=scale_frames)
     assert message.startswith(f"layout='{right}' explains the table much better")
 
 

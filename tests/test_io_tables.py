@@ -122,7 +122,7 @@ def test_zeros_are_missing_only_on_request_and_only_in_pairs(frame):
     assert_array_equal(points.isna(), missing)
     pd.testing.assert_frame_equal(landmark_table(frame, missing=0).points, points)
     for wrong in (True, np.inf, "nan"):
-        message = '"zeros" or a finite number; got'
+        message = '"zeros" or finite numbers; got'
         refused(message, landmark_table, frame, missing=wrong)
 
 

@@ -10,9 +10,10 @@ import pandas as pd
 import pytest
 from fit_runs import fit, write_landmarks
 from landmark_files import deeplabcut_frame, scene, write_deeplabcut, write_openface
-from refusals import refused
+from refusals import refused, warned
 from sklearn.base import clone
 
+import isa_nrsfm
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.cli._columns import asked_columns
@@ -278,7 +279,7 @@ def test_texts_of_tables_are_no_mathematics():
 def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
     names = [f"frame{i}" for i in (0, 1, 2, 9, 10, 11, 100)] + ["frame100b2", "g"]
     for i, name in enumerate(reversed(names)):
-        points = np.full((8, 2), len(names) - 1.0 - i)
+        points = np.full((8, 2), float(len(names) - i))
         lines = [f"{x} {y}" for x, y in points]
         text = "\n".join(["version: 1", "n_points: 8", "{", *lines, "}"])
         for kind in ("pts", "npy", "parquet"):
@@ -287,7 +288,7 @@ def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
         np.save(tmp_path / "npy" / f"{name}.npy", points.reshape(1, -1))
         table = pd.DataFrame(points.reshape(1, -1), columns=POINTS[:16])
         table.to_parquet(tmp_path / "parquet" / f"{name}.parquet")
-    order = np.arange(len(names))
+    order = 1 + np.arange(len(names))
     found = read_landmarks(tmp_path / "pts")
     assert list(found.frames["file"]) == [f"{name}.pts" for name in names]
     np.testing.assert_array_equal(found.points["x_0"], order)
@@ -316,8 +317,8 @@ def tracks_read(tmp_path):
 def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
     tracks = landmarks(200).to_numpy().reshape(200, -1, 2)
     tracks = (500 + 40 * tracks).round(digits)
-    _, warned = tracks_read(tracks)
-    assert warned == []
+    _, texts = tracks_read(tracks)
+    assert texts == []
     hidden = np.random.default_rng(0).random(tracks.shape[:2]) < 0.1
     hidden[:, :8] = False  # these are seen in all rows
     tracks[hidden] = code
@@ -327,9 +328,18 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
     assert re.match(rf"{shown} \({n_points} in all\)", warning)
-    assert warning.endswith(f"use {option.replace('=', ' ')}")
-    points, warned = tracks_read(tracks, option)
-    assert warned == []
+    assert warning.endswith(f"(command line: {option.replace('=', ' ')})")
+    call = re.search(r"with (isa_nrsfm\S+\(.*?\))", warning)[1]
+    table = pd.DataFrame(tracks.reshape(200, -1), columns=POINTS)
+    found = eval(call, {"isa_nrsfm": isa_nrsfm, "table": table}).points.to_numpy()
+    np.testing.assert_array_equal(np.isnan(found[:, ::2]), hidden)
+    warned(
+        re.escape(warning.partition(" If")[0]),
+        AffineNRSfM(1, refinement=None).fit,
+        table,
+    )
+    points, texts = tracks_read(tracks, option)
+    assert texts == []
     expected = np.where(hidden[..., None], np.nan, tracks)
     np.testing.assert_array_equal(points.reshape(tracks.shape), expected)
 
@@ -504,8 +514,6 @@ LONG = "frame,point,x,y\n" + "".join(f"{i // 8},{i % 8},{i},{-i}\n" for i in ran
         ("a.csv", LONG, r"one row for each point, .* table\.pivot\("),
         ("a.csv", WIDE.to_csv(index=False, header=False), "line with column names"),
         ("a.tsv", WIDE.to_csv(index=False, sep="\t", decimal=","), r"like 1234\.5"),
-        ("a.csv", WIDE.to_csv(index=False, sep="\t"), r"rename it to \*\.tsv"),
-        ("a.tsv", WIDE.to_csv(index=False), r"rename it to \*\.csv"),
         ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
         ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
         ("a.csv", b"PK\3\4", r"a spreadsheet or .*: save it as \.csv"),
@@ -558,40 +566,41 @@ LEVELS = WIDE.set_axis(
 @pytest.mark.parametrize(
     "text",
     [
-        WIDE.to_csv(index=False, sep=";", decimal=","),
-        WIDE.to_csv(index=False, sep=";"),
-        "\ufeff" + WIDE.to_csv(index=False, sep=";", decimal=","),
-        WIDE.to_csv(index=False, sep="|"),
         WIDE.to_csv(index=False, sep=" "),
         LEVELS.to_csv(),
         LEVELS.to_csv(index=False),
+        LEVELS.to_csv(sep=";", decimal=","),
     ],
 )
 def test_the_way_from_another_header_or_separator_is_right(tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.csv").write_text(text)
-    scope = followed(read_table, "a.csv", pd=pd)
+    with warnings.catch_warnings(action="ignore"):  # of semicolons
+        scope = followed(read_table, "a.csv", pd=pd)
     new = tmp_path / "new.csv"
     if not new.exists():
         scope["table"].to_csv(new, index=False)
     np.testing.assert_array_equal(read_landmarks(new).points, WIDE)
 
 
-def test_the_way_from_semicolons_keeps_texts_and_headers(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    path = write_deeplabcut(tmp_path / "a.csv", deeplabcut_frame(scene()))
+def test_semicolons_and_decimal_commas_are_read(tmp_path):
+    told, path = "a.csv end with ';', and its decimal commas", tmp_path / "a.csv"
+    write_deeplabcut(path, deeplabcut_frame(scene()))
     expected = read_landmarks(path).points
-    text = path.read_text().replace(",", ";").replace(".", ",")
-    (tmp_path / "b.csv").write_text(text)
-    followed(read_table, "b.csv", pd=pd)
-    np.testing.assert_array_equal(read_landmarks("new.csv").points, expected)
-    table = WIDE.assign(who=["007", "1;2"], note="a, b")
-    table.to_csv("c.csv", sep=";", decimal=",", index=False)
-    followed(read_table, "c.csv", pd=pd)
-    found = read_table("new.csv")
-    assert list(found["who"]) == ["007", "1;2"]
-    assert list(found["note"]) == ["a, b"] * 2
-    np.testing.assert_array_equal(found[POINTS], WIDE)
+    path.write_text(path.read_text().replace(",", ";").replace(".", ","))
+    np.testing.assert_array_equal(warned(told, read_landmarks, path).points, expected)
+    table = WIDE.assign(who=["007", "1;2"], note="a, b", age="30,5")
+    for begin, decimal in (("", ","), ("", "."), ("\ufeff", ",")):
+        path.write_text(begin + table.to_csv(sep=";", decimal=decimal, index=False))
+        found = warned(told, read_table, path)
+        assert list(found["who"]) == ["007", "1;2"]
+        assert list(found["note"] + found["age"]) == ["a, b30.5"] * 2
+        np.testing.assert_array_equal(found[POINTS], WIDE)
+    for name, sign in (("a.csv", "\t"), ("a.csv", "|"), ("a.tsv", ",")):
+        WIDE.to_csv(tmp_path / name, sep=sign, index=False)
+        told = re.escape(f"{name} end with {sign!r}")
+        found = warned(told, read_landmarks, tmp_path / name)
+        np.testing.assert_array_equal(found.points, WIDE)
 
 
 def test_the_way_from_several_levels_of_names_is_right():

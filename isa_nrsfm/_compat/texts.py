@@ -1,7 +1,7 @@
 """Texts of messages, and names of files."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ def first_items(items: Iterable[Any], most: int = 4) -> str:
     return ", ".join(texts[:most]) + ", ..." * (len(texts) > most)
 
 
-def by_number(path: Path) -> tuple[list[str | int], str]:
+def by_number(path: Path | str) -> tuple[list[str | int], str]:
     """
     Return a key that sorts files by name, and numbers in names by size.
 
@@ -21,8 +21,28 @@ def by_number(path: Path) -> tuple[list[str | int], str]:
     >>> [file.name for file in sorted(map(Path, ["f10", "f9", "f1"]), key=by_number)]
     ['f1', 'f9', 'f10']
     """
-    parts = re.split("([0-9]+)", path.name)
-    return [int(each) if i % 2 else each for i, each in enumerate(parts)], path.name
+    name = path if isinstance(path, str) else path.name
+    parts = re.split("([0-9]+)", name)
+    return [int(each) if i % 2 else each for i, each in enumerate(parts)], name
+
+
+def frame_numbers(names: Sequence[str]) -> list[int] | None:
+    """
+    Return the numbers that names of images have; None if these are no numbers of them.
+
+    It is the number without which the fewest names differ, those of videos.
+
+    >>> from isa_nrsfm._compat.texts import frame_numbers
+    >>> frame_numbers(["v1/img0_x2.png", "v1/img10_x2.png", "v1/img20_x2.png"])
+    [0, 10, 20]
+    """
+    parts = [re.split("([0-9]+)", name) for name in names]
+    least, found = max(len(set(names)) // 2, 1), None
+    for place in range(-2, -min(map(len, parts)), -2):
+        videos = {(*each[:place], *each[place + 1 :]) for each in parts}
+        if len(videos) <= least:
+            least, found = len(videos) - 1, [int(each[place]) for each in parts]
+    return found
 
 
 def as_utf8(text: str) -> str:

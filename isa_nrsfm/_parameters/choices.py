@@ -15,6 +15,8 @@ INDEPENDENCE = ("shapes", "coefficients")
 LOSSES = ("linear", "huber", "cauchy")
 # Sets of points in the files of OpenPose.
 OPENPOSE_PARTS = ("pose", "face", "hand_left", "hand_right")
+# Parts of whole bodies in the files of COCO and MMPose.
+WHOLE_PARTS = ("body", "feet", "face", "left_hand", "right_hand", "all")
 # The layouts in `isa_nrsfm.skeletons.SKELETONS`, in that order.
 SKELETON_NAMES = tuple(
     "ibug-68 ibug-51 xm2vts-68 xm2vts-53 muct-76 muct-61 wflw-98 wflw-65 "

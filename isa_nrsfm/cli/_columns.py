@@ -90,9 +90,10 @@ def column_results(
         smooth = estimator.smooth(
             X, time=frames.times, groups=frames.groups, **frames.weighting
         )
-        found = smooth.alpha
+        found, images = smooth.alpha, frames.images[X.index]
+        seen = f"frames {images.min():g} to {images.max():g} by {images.name or 'row'}"
         report["time"] = {
-            "column": args.time or "seconds",
+            "column": args.time or seen,
             "unit": frames.time_unit,
             "time_scales": smooth.time_scales,
             "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),

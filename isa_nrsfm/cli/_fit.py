@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import time
+import warnings
 from argparse import Namespace
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -19,6 +20,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
+from isa_nrsfm._prepare.coordinates import CoordinateWarning
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
@@ -65,6 +67,7 @@ def fit_table(
     _check_options(args)
     folder, clock = Path(args.output), {"": args.since}
     frames = read_frames(args, table=table)
+    warnings.simplefilter("ignore", CoordinateWarning)  # they are said
     X = frames.X
     if X.empty:
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)

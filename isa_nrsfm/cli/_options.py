@@ -167,6 +167,8 @@ HELP = {
     "with named columns (default: auto, recognised by the beginning of the file)",
     "columns PATTERN": "patterns of the x and y columns, if their names are ambiguous: "
     "# for a number, * for any text, such as 'x_#,y_#' or '*.px,*.py'",
+    "individuals NAMES": "individuals in one row, such as 1,2 for nose_1_x and "
+    "nose_2_x: each gets a row of its own, with the column individual",
     "skip_rows COLUMN=REGEX": "leave out rows whose column matches the expression, "
     "such as 'name=^ir'",
     "zeros_missing": "treat points at exactly (0, 0) as missing",
@@ -180,8 +182,9 @@ HELP = {
     "fit.image_size WIDTHxHEIGHT": "size of the images in pixels, such as 1920x1080: "
     "for MediaPipe, for perspective cameras, and with weak_perspective ones to say "
     "whether perspective explains the table better",
-    "part PART": "the points of OpenPose to read, if the files have several: "
-    f"{', '.join(choices.OPENPOSE_PARTS)}",
+    "part PART": "the points to read, if the files have several: of OpenPose "
+    f"{', '.join(choices.OPENPOSE_PARTS)}; of whole bodies of COCO and MMPose "
+    f"{', '.join(choices.WHOLE_PARTS)}",
     "points POINTS": "fit some of the points: inner (without the visible outline of a "
     "face, which slides over the surface as the head turns), or names, numbers and "
     "ranges such as nose,36-47 or without:0-16",
@@ -220,7 +223,7 @@ HELP = {
     "%%d/%%m/%%Y (day first), %%M:%%S (minutes and seconds), or other codes of "
     "strptime",
     "fps NUMBER": "instead of --time, the frames per second of a video; frames have "
-    "the numbers of the column frame, or of the rows",
+    "the numbers of the column frame, of the names of images, or of the rows",
     # The method.
     "n_components K": "number of basis shapes (default: 3, or that of the prior). Of "
     "several, such as 1-8 or 3,6,9, the best in cross-validation is used; auto uses as "
@@ -270,7 +273,7 @@ HELP = {
 CHOICES: dict[str, Sequence[str]] = {
     "format": ("auto", *FORMATS),
     "weights": ("confidence",),
-    "part": choices.OPENPOSE_PARTS,
+    "part": tuple(dict.fromkeys((*choices.OPENPOSE_PARTS, *choices.WHOLE_PARTS))),
     "origin": ("auto", "upper", "lower"),
     "camera": choices.CAMERA_NAMES,
     "adapt": choices.ADAPTED,
@@ -291,8 +294,8 @@ DEFAULTS = {
 }
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
 TABLE_OPTIONS = (
-    *("format", "columns", "skip_rows", "zeros_missing", "missing_value"),
-    *("min_confidence", "image_size", "part"),
+    *("format", "columns", "individuals", "skip_rows", "zeros_missing"),
+    *("missing_value", "min_confidence", "image_size", "part"),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 
@@ -313,8 +316,8 @@ examples:
 
 Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
 such as x0, y0 or nose_x, nose_y; all other columns are copied to the results. Files of
-OpenFace, OpenPose, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO and WFLW, and folders of
-.pts files, are recognised automatically."""
+OpenFace, OpenPose, MMPose, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO, WFLW and tps,
+and folders of .pts files, are recognised automatically."""
 
 # Of each command: its line in the overview, description, examples, and the options of
 # each group. Of the options in a pair only one may be given.

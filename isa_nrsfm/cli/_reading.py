@@ -1,5 +1,6 @@
 """Read the table of a command: landmarks, layout, other columns, unusable rows."""
 
+import contextlib
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
+from isa_nrsfm._prepare.coordinates import UNSURE, warn_of_places
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
@@ -24,7 +26,7 @@ from isa_nrsfm._tables.tracks import (
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
 from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.export._drawing import edges_of
-from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
+from isa_nrsfm.io import FORMATS, find_format, read_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
@@ -33,13 +35,12 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
-from isa_nrsfm.io._landmarks import Landmarks
-from isa_nrsfm.io._tables import confidences_in, tracks_in
+from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 
-# Options of one format, and that format.
-_OF_FORMATS = {"image_size": "mediapipe", "part": "openpose"}
+# Options of some formats.
+_OF_FORMATS = ("image_size", "columns", "individuals", "part")
 INNER, WITHOUT = "inner", "without:"
 # The columns of the size of an image, in pixels, by format.
 _SIZES = {"coco": ("width", "height"), "pyfeat": ("FrameWidth", "FrameHeight")}
@@ -93,31 +94,30 @@ def read_frames(
     The format in the options becomes the one found, and the coordinates of missing
     points become those of all options.
     """
-    found = chosen = layout = confidence = None
-    not_used: dict[str, int] = {}
+    found = chosen = layout = sure = None
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE:
-        given = ((name, getattr(args, name)) for name in (*_OF_FORMATS, "columns"))
+        given = {name: getattr(args, name) for name in _OF_FORMATS}
+        given["missing"] = args.missing_value
         known = FORMATS[args.format].options
-        options = {n: value for n, value in given if value is not None and n in known}
-        found = read_landmarks(
-            args.table, args.format, min_confidence=args.min_confidence, **options
-        )
+        options = {name: given[name] for name in known if given.get(name)}
+        found = FORMATS[args.format].read(args.table, **options)
         table = pd.concat([found.frames, found.points], axis=1)
         x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
         chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
-        layout, confidence = found.skeleton, _confidence(args, found)
+        layout = found.skeleton
+        if found.confidence is not None:
+            sure = found.confidence.set_axis(x, axis=1)
     elif table is None:
-        table = read_table(args.table)
+        table = individuals_as_rows(read_table(args.table), args.individuals)
         if args.columns is not None:
             chosen = find_landmark_columns(table.columns, args.columns)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
     else:
         columns = chosen or find_landmark_columns(table.columns)
-    if found is None:
-        table, confidence, not_used = _with_confidences(args, table, columns)
+    table, sure, not_used = _with_confidences(args, table, columns, sure)
     kept, left_out = _rows_to_keep(args, table)
     if estimator is not None and chosen is not None:
         layout = _part_of_layout(layout, [chosen.x.index(name) for name in columns.x])
@@ -137,17 +137,26 @@ def read_frames(
     _refuse_lost_points(args, table[kept], columns, tracks)
     cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
     tracks = cleaned.mT
-    weights = None
-    if confidence is not None:
-        weights = confidence[list(columns.x)].to_numpy(np.float64)[rows]
-        tracks[weights == 0] = np.nan
+    confidence = np.full(tracks.shape[:2], np.nan)
+    if sure is not None:
+        confidence = sure[list(columns.x)].to_numpy(np.float64)[rows]
+    weighting = {}
+    if args.weights is not None:
+        tracks[confidence == 0] = np.nan
+        weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
-    _warn_of_code(tracks[report.usable])
+    warn_of_places(tracks[report.usable], confidence[report.usable])
+    unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
+    if unsure.any() and args.min_confidence is None and args.weights is None:
+        warn_caller(
+            f"{100 * unsure.mean():.2g} % of the points have a confidence below "
+            f"{UNSURE:g}, and count like all others. If they are wrong, leave them out "
+            f"with --min-confidence {UNSURE:g}"
+        )
     other = table.drop(columns=names)
     if found is None:
-        _warn_of_shares(tracks[report.usable])
         sets = landmark_sets(other.columns)
         if columns.z:
             sets[f"{columns.z[0].strip()}, ... (third coordinate)"] = len(columns.z)
@@ -161,7 +170,7 @@ def read_frames(
         left_out=[out for out in left_out if len(out[1])],
         skeleton=layout,
         images=image_numbers(table),
-        weighting={} if weights is None else {"point_weight": weights[report.usable]},
+        weighting={name: each[report.usable] for name, each in weighting.items()},
         principal_point=_principal_point(args, other),
     )
 
@@ -203,15 +212,15 @@ def _format(args: Namespace) -> str:
     found: str = args.format
     if found == "auto":
         found = TABLE if args.columns is not None else find_format(args.table)
-    if args.columns is not None and "columns" not in FORMATS[found].options:
-        raise ValueError(f"--columns needs --format table; got --format {found}")
-    for name, of in _OF_FORMATS.items():
+    for name in _OF_FORMATS:
         if getattr(args, name) is None or name in FORMATS[found].options:
             continue
         perspective = args.command == "fit" and "perspective" in args.camera
         if name != "image_size" or not perspective:
+            having = [each.name for each in FORMATS.values() if name in each.options]
             raise ValueError(
-                f"{flag_of(name)} needs --format {of}; {args.table} has format {found}"
+                f"{flag_of(name)} needs --format {' or '.join(having)}; {args.table} "
+                f"has format {found}"
             )
     return found
 
@@ -232,47 +241,41 @@ def _principal_point(
 
 
 def _with_confidences(
-    args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns
+    args: Namespace,
+    table: "pd.DataFrame",
+    columns: LandmarkColumns,
+    known: "pd.DataFrame | None",
 ) -> tuple["pd.DataFrame", "pd.DataFrame | None", dict[str, int]]:
-    """Take the confidences out of a plain table, and apply them if asked to.
+    """Take confidences out of a table, and leave out the points that are not sure.
 
-    Returns the table, the confidences as weights, and those that are not used.
+    Those of other formats are known, by the names of x. Returns the table, the
+    confidences if there are any, and those of a plain table that are not used.
     """
-    names = confidence_columns(table.columns, columns.x, columns.y)
+    option = "" if args.weights is None else "--weights"
+    option = option if args.min_confidence is None else "--min-confidence"
+    names = []
+    if known is None:
+        names = confidence_columns(table.columns, columns.x, columns.y)
+        # Texts are no confidences, unless these are asked for.
+        with contextlib.suppress(*() if option else (ValueError,)):
+            known = confidences_in(table, columns.x, columns.y)
+    if known is None and option:
+        raise ValueError(
+            f"{option}: {args.table} ({args.format}) has no confidences of all points. "
+            "Their columns need the names of the x columns, with one of the "
+            f"words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
+        )
     rest = table.drop(columns=names)
-    if args.min_confidence is None and args.weights is None:
-        unused = {f"{names[0].strip()}, ... (confidences)": len(names)} if names else {}
-        return rest, None, unused
-    confidence = confidences_in(table, columns.x, columns.y)
-    if confidence is None:
-        option = "--weights" if args.min_confidence is None else "--min-confidence"
-        raise ValueError(
-            f"{option}: {args.table} has no confidences of all points. Their columns "
-            "need the names of the x columns, with one of the words "
-            f"{', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
-        )
-    points = table[columns.interleaved]
-    failed = np.zeros(len(table), dtype=bool)
-    found = Landmarks(points, rest, confidence, failed, TABLE, columns.points)
-    if args.min_confidence is not None:
-        found = found.without_unsure_points(args.min_confidence)
-        rest[columns.interleaved] = found.points
-    return rest, _confidence(args, found), {}
-
-
-def _confidence(args: Namespace, found: Landmarks) -> "pd.DataFrame | None":
-    """Return the confidences of points as weights, by the names of x; None unasked.
-
-    Points without a confidence have weight one.
-    """
-    if args.weights is None:
-        return None
-    if found.confidence is None:
-        raise ValueError(
-            f"--weights: {args.table} ({found.format}) has no confidences. Leave out "
-            "--weights"
-        )
-    return found.confidence.set_axis(list(found.points)[::2], axis=1).fillna(1.0)
+    if known is not None and names:
+        known = known.set_axis(list(columns.x), axis=1)
+    if known is not None and args.min_confidence is not None:
+        unsure = known[list(columns.x)].to_numpy() < args.min_confidence
+        points = table[columns.interleaved]
+        rest[columns.interleaved] = points.mask(np.repeat(unsure, 2, axis=1))
+    not_used = {}
+    if names and not option:
+        not_used[f"{names[0].strip()}, ... (confidences)"] = len(names)
+    return rest, known, not_used
 
 
 def _rows_to_keep(
@@ -310,62 +313,6 @@ def _refuse_lost_points(
             f"(first: {lost[0]}). If that point is the origin of the coordinates, "
             f"leave out {option}. If no row shows it, leave out the point: --points "
             f"without:{','.join(lost)}"
-        )
-
-
-def _warn_of_code(tracks: NDArray) -> None:
-    """Warn if points of tracks (n_frames, n_points, 2) may be missing, such as (0, 0).
-
-    The coordinates of other points are equal, exactly and in three frames, only by
-    chance. Then the point has other places as often, or others are further out. The
-    origin of the coordinates is one point in all frames, and others are around it.
-    """
-    x, y = np.moveaxis(tracks + 0.0, 2, 0)  # -0.0 + 0.0 is 0.0
-    values, counts = np.unique(x[x == y], return_counts=True)
-    if not len(values):
-        return
-    for value in {*values[[0, int(counts.argmax()), -1]], *values[values == 0]}:
-        there = (x == value) & (y == value)
-        point = there.sum(axis=0).argmax()
-        places = tracks[~there[:, point] & ~np.isnan(x[:, point]), point]
-        often = np.unique(places, axis=0, return_counts=True)[1].max(initial=0)
-        others = tracks[~there]
-        is_outside = value < np.nanmin(others) or value > np.nanmax(others)
-        n_rows = there.any(axis=1).sum()
-        is_origin = len(there) > 2 and not is_outside and not len(places)
-        enough = n_rows > 2 and (is_outside or there[:, point].sum() > 3 * often)
-        if is_origin or (value and not enough):
-            continue
-        number = f"{value:.15g}"
-        option = f"--missing-value {number}" if value else "--zeros-missing"
-        warn_caller(
-            f"in {n_rows} of {len(there)} rows points are at exactly ({number}, "
-            f"{number}) ({there.sum()} in all). If these points are missing, use "
-            f"{option}"
-        )
-
-
-def _warn_of_shares(tracks: NDArray) -> None:
-    """Warn if tracks (n_frames, n_points, 2) look like shares of the size of an image.
-
-    In a table that was scaled to [0, 1] some coordinates are exactly 0 or 1. Positions
-    in an image are between, and apart in both directions. Trackers also place points
-    beyond its border. With up to 5 % there, all of 54 simulated tables of bodies, hands
-    and faces are found, and none of 21 in pixels or metres, centred or scaled.
-    """
-    if not len(tracks):
-        return
-    low, high = np.nanmin(tracks, axis=(0, 1)), np.nanmax(tracks, axis=(0, 1))
-    known = tracks[~np.isnan(tracks)]
-    outside = np.mean((known < 0) | (known > 1))
-    scaled = np.isin(known, (0, 1)).any()
-    if outside < 0.05 and not scaled and (high - low).min() > 0.1:
-        warn_caller(
-            f"{100 * (1 - outside):.3g} % of the coordinates are between 0 and 1 (all "
-            f"between {low.min():.2g} and {high.max():.2g}), like shares of the width "
-            "and height of an image. Such shares stretch the shapes, which changes "
-            "their proportions and rotations. If these are shares, use --format "
-            "mediapipe --image-size WIDTHxHEIGHT"
         )
 
 

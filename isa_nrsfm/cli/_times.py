@@ -2,11 +2,13 @@
 
 import re
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.texts import frame_numbers
 
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
 _DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
@@ -25,6 +27,7 @@ _ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
 # Columns with the number of a frame, and others that name an image.
 _NUMBER = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number))?"
 _IMAGE = r"(?:image|img|photo|frame)(?:[ _.]?(?:id|name|path|file))?"
+_NAME = rf"{_IMAGE}|file[ _.]?(?:name|path)?"
 
 
 def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
@@ -81,18 +84,22 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
 def image_numbers(table: "pd.DataFrame") -> "pd.Series":
     """Return the number of the image of each row, under the name of its column.
 
-    It is the number of the frame, or of the image among all. Otherwise rows count.
+    It is the number of the frame, that in the name of the image, or that of the image
+    among all. Otherwise rows count.
     """
-    for expression in (_NUMBER, _IMAGE):
+    for expression in (_NUMBER, _NAME, _IMAGE):
         for name in table.columns:
             if not re.fullmatch(expression, str(name).strip(), re.IGNORECASE):
                 continue
-            numbers = pd.to_numeric(table[name], errors="coerce")
-            if expression == _NUMBER and np.isfinite(numbers).all():
-                return numbers.astype(float).rename(str(name).strip())
-            codes = pd.factorize(table[name])[0]
-            if expression == _IMAGE and (codes >= 0).all():
-                return pd.Series(codes, name=str(name).strip())
+            numbers: Any = pd.to_numeric(table[name], errors="coerce")
+            if expression == _NAME:  # not of videos with many rows each
+                several = name == "file" and table[name].duplicated().any()
+                is_name = numbers.isna().all() and not several
+                numbers = frame_numbers([*map(str, table[name])]) if is_name else None
+            elif expression == _IMAGE:
+                numbers = pd.factorize(table[name])[0]
+            if numbers is not None and np.isfinite(numbers).all():
+                return pd.Series(numbers, dtype=float, name=str(name).strip())
     return pd.Series(range(len(table)))
 
 

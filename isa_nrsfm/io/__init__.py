@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         Landmarks as Landmarks,
         from_mediapipe as from_mediapipe,
         from_movement as from_movement,
+        from_sleap_io as from_sleap_io,
     )
     from isa_nrsfm.io._models import load_model as load_model, save_model as save_model
     from isa_nrsfm.io._stored_tables import open_table as open_table

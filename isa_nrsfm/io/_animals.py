@@ -8,7 +8,9 @@ holds. Here only numbers, texts, tuples and lists are. The layouts are those of
 import io
 import json
 import pickle
+import re
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -35,6 +37,8 @@ LARGEST_RATIO = 1032
 # DeepLabCut: levels of the columns
 _LEVELS = ["scorer", "bodyparts", "coords"]
 _LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
+# Programs that save them again may leave out the first.
+_SAVED = (_LEVELS, _LEVELS_OF_MANY, _LEVELS[1:], _LEVELS_OF_MANY[1:])
 # Lightning Pose adds columns of other names, such as set.
 _COORDS = ("x", "y", "z", "likelihood")
 _VALUES = ("x", "y", "likelihood")
@@ -105,7 +109,7 @@ def numbers_of(group: Any, name: str) -> NDArray[np.float64]:
 def is_deeplabcut(path: Path) -> bool:
     """Return whether the header, or the group of an h5 file, is DeepLabCut's."""
     if path.suffix.lower() in SEPARATORS:
-        return _levels_of(header_rows(path, 4)) is not None
+        return _levels_of(header_rows(path, 4))[0] is not None
     return is_hdf5(path) and _KEY in root_groups(path)
 
 
@@ -119,7 +123,8 @@ def read_deeplabcut(path: Path) -> Landmarks:
     """
     read = _read_text if path.suffix.lower() in SEPARATORS else _read_h5
     table, columns, labels = read(path)
-    scorers = {column[0] for column in columns}
+    # pandas makes names of a line different: net, net.1, ...
+    scorers = {re.sub(r"\.\d+$", "", column[0]) for column in columns}
     if len(scorers) > 1:
         raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
     places = _places(columns)
@@ -146,7 +151,7 @@ def read_deeplabcut(path: Path) -> Landmarks:
 def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     """Read a csv or tsv file, whose first lines are the levels of the columns."""
     header = header_rows(path, 4)
-    levels = _levels_of(header)
+    levels, n_before = _levels_of(header)
     if levels is None:
         raise ValueError(
             "its first lines do not begin with scorer, bodyparts, coords or with "
@@ -156,32 +161,38 @@ def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     if len({len(row) for row in header}) > 1:
         raise ValueError("its first lines are not of the same length")
     # Labels made by hand have the path of the image in up to three columns.
-    n_index = next(i for i, name in enumerate([*header[-1][1:], "x"], 1) if name)
+    first = n_before + 1
+    n_index = next(i for i, n in enumerate([*header[-1][first:], "x"], first) if n)
+    if levels[0] != "scorer":
+        header.insert(0, [""] * len(header[0]))
     columns = list(zip(*header, strict=True))
     numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
     names = [str(i) for i in range(len(columns))]
     coordinates = [names[i] for i in numbers]
     frame = read_columns(
         path,
-        leave_out=set(names[n_index:]).difference(coordinates),
+        leave_out={*names[:n_before], *names[n_index:]}.difference(coordinates),
         numbers=coordinates,
-        text=names[:n_index],
+        text=names[n_before:n_index],
         n_header=len(levels),
         names=names,
     )
-    cells = frame.iloc[:, :n_index].fillna("").to_numpy()
+    cells = frame[names[n_before:n_index]].fillna("").to_numpy()
     labels = ["/".join(row) for row in cells]
-    values = frame.iloc[:, n_index:].to_numpy(dtype=np.float64)
+    values = frame[coordinates].to_numpy(dtype=np.float64)
     return values, [columns[i] for i in numbers], labels
 
 
-def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
-    """Return the levels that the first lines of a csv file name, or None."""
-    first = [row[0].strip().lower() if row else "" for row in header]
-    for levels in (_LEVELS, _LEVELS_OF_MANY):
+def _levels_of(header: Sequence[Sequence[str]]) -> tuple[list[str] | None, int]:
+    """Return the levels that the first lines of a csv file name, or None.
+
+    Also the number of columns before them: one if pandas has saved it again.
+    """
+    for place, levels in product((0, 1), _SAVED):
+        first = [row[place].strip().lower() for row in header if len(row) > place]
         if first[: len(levels)] == levels:
-            return levels
-    return None
+            return levels, place
+    return None, 0
 
 
 def _places(columns: Sequence[tuple[str, ...]]) -> dict[str, dict[str, dict[str, int]]]:

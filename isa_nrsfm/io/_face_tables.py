@@ -1,7 +1,7 @@
 """Read the csv tables of OpenFace, py-feat and MediaPipe's face mesh."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._prepare.coordinates import are_shares
 from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
+    confidence_columns,
     find_landmark_columns,
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
-from isa_nrsfm.io._tables import header_names, read_columns, tracks_in
+from isa_nrsfm.io._tables import Missing, header_names, read_columns, tracks_in
 
 # OpenFace names points in space, in millimetres, by capital letters.
 _NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
@@ -57,7 +59,7 @@ def read_openface(path: Path) -> Landmarks:
             raise ValueError("the column success must hold 0 and 1 only")
         table["success"] = table["success"].astype(int)
         table.loc[table["success"] == 0, found.interleaved] = np.nan
-    return _assembled(table, found, "openface", score="confidence")
+    return _assembled(table, found, "openface", scores=["confidence"])
 
 
 def is_pyfeat(path: Path) -> bool:
@@ -79,7 +81,7 @@ def read_pyfeat(path: Path) -> Landmarks:
     scores = [name for name in names if name == "FaceScore"]
     numbers = [*found.interleaved, *scores]
     table = read_columns(path, leave_out=_NOT_PYFEAT, numbers=numbers, text=["input"])
-    return _assembled(table, found, "pyfeat", score=scores[0] if scores else None)
+    return _assembled(table, found, "pyfeat", scores=scores)
 
 
 def is_mediapipe(path: Path) -> bool:
@@ -93,6 +95,7 @@ def read_mediapipe(
     path: Path,
     image_size: tuple[float, float] | None = None,
     columns: str | None = None,
+    missing: Missing = None,
 ) -> Landmarks:
     """Read a csv file with the points of MediaPipe.
 
@@ -101,11 +104,12 @@ def read_mediapipe(
     """
     names = header_names(path)
     found = find_landmark_columns(names, columns)
+    scores = confidence_columns(names, found.x, found.y)
     sizes = [name for name in ("image_width", "image_height") if name in names]
-    numbers = [*found.interleaved, *sizes]
+    numbers = [*found.interleaved, *sizes, *scores]
     text = {*names}.difference(numbers, found.z)
     table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
-    tracks = tracks_in(table, found.interleaved)
+    tracks = tracks_in(table, found.interleaved, missing)
     known = np.abs(tracks[~np.isnan(tracks)])
     # Pixels of a face reach beyond this, and shares of the image's size do not.
     if known.size and np.median(known) <= 2.0:
@@ -130,7 +134,7 @@ def read_mediapipe(
             if known.size
             else "image_size is given, but there are no points"
         )
-    return _assembled(table, found, "mediapipe", tracks=tracks)
+    return _assembled(table, found, "mediapipe", tracks=tracks, scores=scores)
 
 
 def _check_inside(shares: NDArray[np.float64]) -> None:
@@ -148,7 +152,7 @@ def _check_inside(shares: NDArray[np.float64]) -> None:
         f"{n_outside} of {n_shown} points are outside the image, by at most "
         f"{beyond[row, point]:.2g} of its width or height (point {point} in row {row})"
     )
-    if 2 * n_outside > n_shown:
+    if 2 * n_outside > n_shown and not are_shares(shares):
         raise ValueError(
             f"{found}: the coordinates are no shares of the width and height of an "
             "image. Read them without image_size, in the format table"
@@ -162,16 +166,19 @@ def _assembled(
     format: str,
     *,
     tracks: NDArray[np.float64] | None = None,
-    score: str | None = None,
+    scores: Sequence[str] = (),
 ) -> Landmarks:
-    """Return points under the names of their columns, with the score of their frame."""
-    confidence = None
-    if score is not None:
-        confidence = table[[score] * len(found.points)].to_numpy(dtype=np.float64)
+    """Return points under the names of their columns, with scores of frame or points.
+
+    The score of a frame is among its other columns.
+    """
+    n_each, used = len(found.points) // max(len(scores), 1), found.interleaved
+    confidence = table[[*scores] * n_each].to_numpy(np.float64) if scores else None
+    used += scores if n_each == 1 else []
     return assemble(
         tracks_in(table, found.interleaved) if tracks is None else tracks,
         found.points,
-        table.drop(columns=found.interleaved),
+        table.drop(columns=used),
         format=format,
         columns=found.interleaved,
         confidence=confidence,

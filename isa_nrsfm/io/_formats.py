@@ -137,7 +137,7 @@ def read_landmarks(
     Parameters
     ----------
     path : str or path-like
-        The file, or a folder of ``.pts`` files or of json files of OpenPose.
+        The file, or a folder of ``.pts`` files or of json files of OpenPose or MMPose.
     format : str, default="auto"
         The format, one of `FORMATS`. With "auto", it is the one whose files begin like
         this one, which must be a single one. Files of separated values that no other
@@ -148,8 +148,10 @@ def read_landmarks(
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
         pixels, for coordinates in shares of the image's size; ``category`` of "coco",
         the name of the category to read; ``part`` of "openpose", one of "pose", "face",
-        "hand_left" and "hand_right"; ``columns`` (also of "mediapipe") and ``missing``
-        of "table", as in `landmark_table`.
+        "hand_left" and "hand_right"; ``part`` of whole bodies of "coco" and "mmpose",
+        one of "body", "feet", "face", "left_hand", "right_hand" and "all"; ``columns``
+        and ``missing`` of "table" and "mediapipe", and ``individuals`` of "table", as
+        in `landmark_table`.
 
     Returns
     -------
@@ -166,10 +168,17 @@ def read_landmarks(
     OSError
         If the file cannot be opened.
 
+    Warns
+    -----
+    UserWarning
+        If points are probably missing, such as those at (0, 0), or coordinates are
+        probably shares of the width and height of an image.
+
     See Also
     --------
     from_mediapipe : Landmarks from results of MediaPipe.
     from_movement : Landmarks from datasets of movement.
+    from_sleap_io : Landmarks from labels of sleap-io.
     read_table : All columns of a table.
 
     Examples
@@ -178,7 +187,7 @@ def read_landmarks(
     >>> from tempfile import TemporaryDirectory
     >>> from isa_nrsfm.io import read_landmarks
     >>> with TemporaryDirectory() as folder:
-    ...     for name, shift in (("a", 0), ("b", 5)):
+    ...     for name, shift in (("a", 1), ("b", 5)):
     ...         lines = [f"{j + shift} {j * j}" for j in range(3)]
     ...         head = ["version: 1", "n_points: 3", "{"]
     ...         path = Path(folder, f"{name}.pts")
@@ -188,7 +197,7 @@ def read_landmarks(
     'pts'
     >>> landmarks.points
        x_0  y_0  x_1  y_1  x_2  y_2
-    0  0.0  0.0  1.0  1.0  2.0  4.0
+    0  1.0  0.0  2.0  1.0  3.0  4.0
     1  5.0  0.0  6.0  1.0  7.0  4.0
     >>> list(landmarks.frames["file"])
     ['a.pts', 'b.pts']
@@ -199,10 +208,14 @@ def read_landmarks(
         )
     name = find_format(path) if format == "auto" else format
     landmarks = FORMATS[name].read(path, **options)
-    if min_confidence is None:
-        return landmarks
-    with errors_of(str(path)):
-        return landmarks.without_unsure_points(min_confidence)
+    if min_confidence is not None:
+        with errors_of(str(path)):
+            landmarks = landmarks.without_unsure_points(min_confidence)
+    tracks = landmarks.points.to_numpy().reshape(len(landmarks.points), -1, 2)
+    import_module("isa_nrsfm._prepare.coordinates").warn_of_places(
+        tracks, landmarks.confidence
+    )
+    return landmarks
 
 
 def find_format(path: str | os.PathLike[str]) -> str:
@@ -301,7 +314,7 @@ _ALL = (
         "named columns x and y of each point (468 or 478, where it is recognised)",
         _TABLES,
         "_face_tables.mediapipe",
-        ("image_size", "columns"),
+        ("image_size", "columns", "missing"),
     ),
     LandmarkFormat(
         "pts",
@@ -339,7 +352,7 @@ _ALL = (
         "write json of other programs as a table",
         (".json",),
         "_keypoints.coco",
-        ("category",),
+        ("category", "part"),
     ),
     LandmarkFormat(
         "openpose",
@@ -351,12 +364,27 @@ _ALL = (
         ("part",),
     ),
     LandmarkFormat(
+        "mmpose",
+        "MMPose predictions",
+        "instances with keypoints and keypoint_scores, or frames with such instances",
+        (".json", _FOLDER),
+        "_keypoints.mmpose",
+        ("part",),
+    ),
+    LandmarkFormat(
+        "tps",
+        "tps of morphometrics",
+        "LM=N, N lines 'x y', and lines such as IMAGE=a.jpg, for each specimen",
+        (".tps",),
+        "_keypoints.tps",
+    ),
+    LandmarkFormat(
         TABLE,
         "a table with named columns",
         "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
         _TABLES,
         "_tables.named_columns",
-        ("columns", "missing"),
+        ("columns", "missing", "individuals"),
     ),
 )
 

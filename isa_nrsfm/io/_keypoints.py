@@ -1,25 +1,52 @@
-"""Read landmarks in images: COCO, OpenPose, iBUG's .pts files and the lists of WFLW."""
+"""Read landmarks in images: COCO, OpenPose, MMPose, .pts, .tps and lists of WFLW."""
 
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of, refuse_special
-from isa_nrsfm._compat.texts import as_utf8, by_number
-from isa_nrsfm._parameters.choices import OPENPOSE_PARTS
+from isa_nrsfm._compat.texts import as_utf8, by_number, first_items, frame_numbers
+from isa_nrsfm._parameters.choices import OPENPOSE_PARTS, WHOLE_PARTS
 from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
 from isa_nrsfm.io._tables import first_lines
 
-# Entries of an instance beside its image and its points.
-_OF_INSTANCE = ("id", "score", "iscrowd", "area", "category")
-_OF_IMAGE = ("file_name", "width", "height")
-_NAME = re.compile(r"(?!\.).*?(\d*)_keypoints\.json", re.IGNORECASE)
+# Entries of images and instances that are no columns under their own name.
+_LEFT_OUT = (
+    *("id", "category_id", "num_keypoints"),
+    *("license", "coco_url", "flickr_url", "date_captured"),
+)
+# COCO-WholeBody: the lists of an instance, and their numbers of points.
+_LISTS = {
+    "keypoints": 17,
+    "foot_kpts": 6,
+    "face_kpts": 68,
+    "lefthand_kpts": 21,
+    "righthand_kpts": 21,
+}
+# The places of parts in whole bodies of so many points: COCO-WholeBody, Halpe.
+_PLACES = {
+    133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
+    136: [(0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)],
+}
+_JSON = re.compile(r"(?is)(?!\.).*\.json")
+_NAME = re.compile(r"(?is)(?!\.).*_keypoints\.json")
 _OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
+_MMPOSE = re.compile(
+    rb'\s*(\{\s*"(meta_info|instance_info|predictions|visualization)"|'
+    rb'\[\s*\{\s*"(frame_id"\s*:\s*\d+\s*,\s*"instances|keypoints"\s*:\s*\[\s*\[))'
+)
+# An image without instances has an empty list.
+_MMPOSE_ALSO = re.compile(_MMPOSE.pattern + rb"|\s*\[\s*\]")
+_TPS = re.compile(r"(?i)LM\s*=\s*\d+")
+# The columns of a specimen.
+_TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
     r"\{(?P<points>[^{}]*)\}\s*"
@@ -33,33 +60,67 @@ _WFLW_LENGTHS = (197, 207)
 
 
 def is_coco(path: Path) -> bool:
-    """Return whether a file begins as a json object or list, not of OpenPose."""
+    """Return whether a file begins as a json object or list, of no other format."""
     begins = _beginning(path)[:1] in (b"{", b"[")
-    return begins and not is_openpose(path)
+    return begins and not is_openpose(path) and not is_mmpose(path)
 
 
 def _beginning(path: Path) -> bytes:
     """Return the first bytes of a file, without byte order mark and leading blanks."""
     with path.open("rb") as file:
-        return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+        return file.read(256).removeprefix(b"\xef\xbb\xbf").lstrip()
 
 
-def read_coco(path: Path, category: str | None = None) -> Landmarks:
+def read_coco(
+    path: Path, category: str | None = None, part: str | None = None
+) -> Landmarks:
     """Read keypoints of COCO, annotations or results of a detector.
 
     Annotations are an object with ``images``, ``annotations`` and ``categories``; the
     third number of a keypoint is 0 if not labelled, 1 if hidden and 2 if visible.
     Results are a list of objects with ``image_id``, ``category_id``, ``keypoints`` and
     ``score``; the third number is a confidence. Each instance has a row, and each image
-    without any has one without points. ``category`` chooses one of several with
-    different keypoints.
+    without any has one without points, in the order of the numbers in their names.
+    ``category`` chooses one of several with different keypoints, ``part`` a part of
+    whole bodies.
     """
     content = _read_json(path)
     if isinstance(content, list):
-        if category is not None:
-            raise ValueError("results of a detector do not name their categories")
-        return _results(content)
-    return _annotations(content, category)
+        entries = _results(content, category)
+        return _landmarks(entries, None, part, "coco", "result")
+    entries, names = _annotations(content, category)
+    found = _landmarks(entries, names, part, "coco", "annotation")
+    return replace(found, confidence=None)
+
+
+def _landmarks(
+    entries: Sequence[dict[str, Any]],
+    names: list[str] | None,
+    part: str | None,
+    format: str,
+    what: str,
+) -> Landmarks:
+    """Return landmarks of entries with ``keypoints``; of images without any, too.
+
+    A point is missing if x and y, or its third number, are zero.
+    """
+    seen = [bool(entry.get("keypoints")) for entry in entries]
+    if names is None and not any(seen):
+        raise ValueError(f"there are no frames in it: no {what} has keypoints")
+    given = [entry for entry in entries if entry.get("keypoints")]
+    found, names = _keypoints(given, names, part, what)
+    values = np.full((len(entries), *found.shape[1:]), np.nan)
+    values[seen] = found
+    absent = (values[..., :2] == 0).all(axis=2) | (values[..., 2] == 0)
+    rows = [_scalars(entry) for entry in entries]
+    columns = dict.fromkeys(name for row in rows for name in row)
+    return assemble(
+        np.where(absent[..., None], np.nan, values[..., :2]),
+        names,
+        {name: [row.get(name) for row in rows] for name in columns},
+        format=format,
+        confidence=values[..., 2],
+    )
 
 
 def _read_json(path: Path) -> Any:
@@ -71,8 +132,10 @@ def _read_json(path: Path) -> Any:
         raise ValueError(f"it is not json: {error}") from error
 
 
-def _results(entries: list[Any]) -> Landmarks:
-    """Return the landmarks of a list of results."""
+def _results(entries: list[Any], category: str | None) -> list[dict[str, Any]]:
+    """Return the entries of a list of results, which must be of one category."""
+    if category is not None:
+        raise ValueError("results of a detector do not name their categories")
     _refuse_non_objects(entries, "results")
     if not all(isinstance(entry.get("image_id", 0), int | str) for entry in entries):
         raise ValueError("the image_id of a result must be a number or a text")
@@ -82,33 +145,26 @@ def _results(entries: list[Any]) -> Landmarks:
             "the results are of more than one category_id: "
             f"{', '.join(sorted(categories))}"
         )
-    values = _keypoints(entries, "result")
-    # Detectors that find no point write zeros, as annotators do.
-    tracks = np.where((values == 0).all(axis=2, keepdims=True), np.nan, values)
-    return assemble(
-        tracks[..., :2],
-        None,
-        _columns(entries, {}),
-        format="coco",
-        confidence=values[..., 2],
-    )
+    return sorted(entries, key=lambda entry: by_number(str(entry.get("image_id"))))
 
 
-def _annotations(content: Any, category: str | None) -> Landmarks:
-    """Return the landmarks of an object with annotations."""
+def _annotations(
+    content: Any, category: str | None
+) -> tuple[list[dict[str, Any]], list[str] | None]:
+    """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
-    if not isinstance(content, dict) or not all(
-        isinstance(content.get(part), list) for part in lists
-    ):
+    content = {"categories": []} | content if isinstance(content, dict) else {}
+    if not all(isinstance(content.get(part), list) for part in lists):
         raise ValueError(
             "expected an object with the lists images, annotations and categories, or "
             "a list of results"
         )
     for part in lists:
         _refuse_non_objects(content[part], part)
-    chosen, point_names = _chosen_categories(content["categories"], category)
+    chosen, names = _chosen_categories(content["categories"], category)
     images = _by_id(content["images"], "images")
-    entries = []
+    of_images: dict[Any, list[dict[str, Any]]] = {image: [] for image in images}
+    others = []
     for entry in content["annotations"]:
         where, of = entry.get("image_id"), entry.get("category_id")
         if not isinstance(where, int | str) or where not in images:
@@ -116,47 +172,59 @@ def _annotations(content: Any, category: str | None) -> Landmarks:
                 f"annotation {entry.get('id')!r} is of image {where!r}, which is not "
                 "among the images"
             )
-        if isinstance(of, int | str) and of in chosen and "keypoints" in entry:
-            entries.append({**entry, "category": str(chosen[of].get("name"))})
-    order = {image: i for i, image in enumerate(images)}
-    entries.sort(key=lambda entry: order[entry["image_id"]])
-    values = _keypoints(entries, "annotation", len(point_names))
-    tracks = np.where(values[..., 2:] == 0, np.nan, values)[..., :2]
-    shown = {entry["image_id"] for entry in entries}
-    empty = [{"image_id": image} for image in images if image not in shown]
-    gaps = np.full((len(empty), *tracks.shape[1:]), np.nan)
-    return assemble(
-        np.concatenate([tracks, gaps]),
-        point_names,
-        _columns([*entries, *empty], images),
-        format="coco",
-    )
+        known = {"annotation_id": entry.get("id")}
+        if isinstance(of, int | str) and of in chosen:
+            known["category"] = str(chosen[of].get("name"))
+        elif content["categories"] and entry.get("keypoints"):
+            others.append(str(of))
+            continue
+        if entry.get("keypoints"):
+            of_images[where].append(known | entry)
+    if others and category is None:
+        listed = first_items(dict.fromkeys(others))
+        text = (
+            f"{len(others)} annotations are of the category {listed}, which names no "
+            "keypoints in the file"
+        )
+        if not any(of_images.values()):
+            raise ValueError(text)
+        warn_caller(f"{text}. They are left out")
+    entries = [
+        {"image_id": image} | _scalars(images[image]) | entry
+        for image, found in of_images.items()
+        for entry in found or [{}]
+    ]
+    names_of = {image: str(each.get("file_name", "")) for image, each in images.items()}
+    return sorted(entries, key=lambda e: by_number(names_of[e["image_id"]])), names
 
 
 def _chosen_categories(
     categories: list[dict[str, Any]], name: str | None
-) -> tuple[dict[Any, dict[str, Any]], tuple[str, ...]]:
-    """Return the categories to read by their ids, and their common keypoints."""
-    with_points = [entry for entry in categories if entry.get("keypoints")]
-    names = [str(entry.get("name")) for entry in with_points]
+) -> tuple[dict[Any, dict[str, Any]], list[str] | None]:
+    """Return the categories to read by their ids, and their common keypoints.
+
+    Where no category has names of keypoints, all are read.
+    """
+    named = [entry for entry in categories if entry.get("keypoints")] or categories
+    names = [str(entry.get("name")) for entry in named]
     if name is not None:
-        with_points = [e for e in with_points if str(e.get("name")) == name]
-    if not with_points:
-        raise ValueError(
-            "no category has keypoints"
-            if not names
-            else f"no category {name!r} has keypoints; there are {', '.join(names)}"
-        )
-    for entry in with_points:
-        points = entry["keypoints"]
-        if not isinstance(points, list) or not all(isinstance(p, str) for p in points):
+        named = [entry for entry in named if str(entry.get("name")) == name]
+        if not named:
+            raise ValueError(
+                f"no category {name!r} has keypoints; there are {', '.join(names)}"
+            )
+    points: list[str] = []
+    for entry in named:
+        found = entry.get("keypoints") or []
+        if not isinstance(found, list) or not all(isinstance(p, str) for p in found):
             raise ValueError("the keypoints of a category must be a list of names")
-        if points != with_points[0]["keypoints"]:
+        if found != (points or found):
             raise ValueError(
                 f"the categories {', '.join(names)} have different keypoints: choose "
                 "one with category"
             )
-    return _by_id(with_points, "categories"), tuple(with_points[0]["keypoints"])
+        points = found
+    return _by_id(named, "categories"), points or None
 
 
 def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]]:
@@ -167,19 +235,49 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
 
 
 def _keypoints(
-    entries: Sequence[dict[str, Any]], what: str, n_points: int | None = None
-) -> NDArray[np.float64]:
-    """Return the keypoints of instances, (n_instances, n_points, 3)."""
+    entries: Sequence[dict[str, Any]],
+    names: list[str] | None,
+    part: str | None,
+    what: str,
+) -> tuple[NDArray[np.float64], list[str] | None]:
+    """Return keypoints of instances (n_instances, n_points, 3) and names, of a part."""
+    gap = {key: [0] * 3 * n for key, n in _LISTS.items()} | {"keypoints": None}
+    further = [key for key in gap if any(key in entry for entry in entries)][1:]
+    if further and part is None:
+        part = "body"
+        warn_caller(
+            f"the points of bodies are read, and those in {', '.join(further)} are "
+            f"left out: choose with part, one of {', '.join(WHOLE_PARTS)} (command "
+            "line: --part)"
+        )
+    n_lists = len(_LISTS) if further and part != "body" else 1
+    n_points = len(names) if names and n_lists == 1 else 0
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
-        name = f"{what} {number} (counted from 0)"
-        found.append(_triples(entry.get("keypoints"), f"keypoints of {name}", True))
+        of_file = f" of {entry['file']}" if "file" in entry else ""
+        name = f"{what} {number} (counted from 0){of_file}"
+        lists = [
+            _triples(entry.get(key, gap[key]), f"{key} of {name}", True)
+            for key in [*_LISTS][:n_lists]
+        ]
+        found.append(np.concatenate(lists))
         n_points = n_points or len(found[0])
         if len(found[-1]) != max(n_points, 1):
             raise ValueError(
                 f"{name} should have {max(n_points, 1)} keypoints; got {len(found[-1])}"
             )
-    return np.reshape(found, (len(entries), n_points or 0, 3))
+    values = np.reshape(found, (len(entries), n_points, 3))
+    places: dict[str, tuple[int, int]] = dict.fromkeys(("body", "all"), (0, n_points))
+    places |= zip(WHOLE_PARTS, _PLACES.get(n_points, []), strict=False)
+    if part is not None and part not in places:
+        raise ValueError(
+            f"part={part!r} is none of {', '.join(places)}, the parts of {n_points} "
+            f"points; whole bodies have {' or '.join(map(str, _PLACES))}"
+        )
+    chosen = slice(*places[part or "all"])
+    return values[:, chosen], names[chosen] if names and len(
+        names
+    ) == n_points else None
 
 
 def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
@@ -200,18 +298,20 @@ def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
     return np.array(numbers, dtype=np.float64).reshape(-1, 3)
 
 
-def _columns(
-    rows: list[dict[str, Any]], images: dict[Any, dict[str, Any]]
-) -> dict[str, list[Any]]:
-    """Return the columns of rows: image, instance and its scores."""
-    of_image = [images.get(row.get("image_id"), {}) for row in rows]
-    columns = {"image_id": [row.get("image_id") for row in rows]}
-    for names, sources in ((_OF_IMAGE, of_image), (_OF_INSTANCE, rows)):
-        for name in names:
-            if any(name in source for source in sources):
-                column = "annotation_id" if name == "id" else name
-                columns[column] = [source.get(name) for source in sources]
-    return columns
+def _scalars(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of an instance or image that are one number or text.
+
+    Those of ``attributes`` are among them, as people and videos are told apart there.
+    """
+    found, further = {}, entry.get("attributes")
+    for name, value in {
+        **(further if isinstance(further, dict) else {}),
+        **entry,
+    }.items():
+        value = value[0] if isinstance(value, list) and len(value) == 1 else value
+        if isinstance(value, str | int | float) and name not in _LEFT_OUT:
+            found[name] = value
+    return found
 
 
 def _refuse_non_objects(entries: list[Any], what: str) -> None:
@@ -221,10 +321,8 @@ def _refuse_non_objects(entries: list[Any], what: str) -> None:
 
 
 def is_openpose(path: Path) -> bool:
-    """Return whether a file begins as those of OpenPose, or a folder has such names."""
-    if path.is_dir():
-        return any(_NAME.fullmatch(file.name) for file in path.iterdir())
-    return _OPENPOSE.match(_beginning(path)) is not None
+    """Return whether a file begins as those of OpenPose, or a folder has such files."""
+    return bool(_openpose_files(path))
 
 
 def read_openpose(path: Path, part: str | None = None) -> Landmarks:
@@ -239,10 +337,11 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         raise ValueError(
             f"part must be one of {', '.join(OPENPOSE_PARTS)}; got {part!r}"
         )
-    absent = "the folder has no files with names ..._keypoints.json"
-    names, people = _each_file(path, _NAME, absent, _people_in)
-    known = {name for persons in people for person in persons for name in person}
-    found = ", ".join(name for name in OPENPOSE_PARTS if name in known)
+    absent = "the folder has no files with names ..._keypoints.json, or of people"
+    names, people = _each_file(path, _openpose_files(path), absent, _people_in)
+    names_in = {name for persons in people for person in persons for name in person}
+    known = [name for name in OPENPOSE_PARTS if name in names_in]
+    listed = ", ".join(known)
     if not known:
         raise ValueError(
             "it has no visible points in the lists pose_keypoints_2d, "
@@ -250,46 +349,40 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
         )
     if len(known) > 1 and part is None:
         raise ValueError(
-            f"it has points of {found}: choose one with part (command line: --part)"
+            f"it has points of {listed}: choose one with part (command line: --part)"
         )
-    part = part or found
+    part = part or listed
     if part not in known:
-        raise ValueError(f"it has no points of {part}, but of {found}")
-    chosen = [
-        {k: person[part] for k, person in enumerate(persons) if part in person}
-        for persons in people
-    ]
-    image, numbers, values = stacked(chosen, names)
-    tracks, scores = np.split(values, [2], axis=2)
-    tracks = np.where(scores == 0, np.nan, tracks)
+        raise ValueError(f"it has no points of {part}, but of {listed}")
+    of_files = frame_numbers(names) or []
+    if len(set(of_files)) < len(names):
+        of_files = list(range(len(names)))
+    entries: list[dict[str, Any]] = []
+    for name, number, persons in zip(names, of_files, people, strict=True):
+        of_file = {"file": as_utf8(name), "frame": number}
+        shown = [
+            of_file | {"person": k} | each | {"keypoints": each[part].ravel().tolist()}
+            for k, each in enumerate(persons)
+            if part in each
+        ]
+        entries += shown or [of_file]
+    found = _landmarks(entries, None, None, "openpose", "person")
     # Points that are cut off can be outside of the image.
-    if np.nanmedian(np.abs(tracks)) <= 1:
+    if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
             "the coordinates are shares of the image's size, which stretch the shapes. "
             "Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    matches = map(_NAME.fullmatch, names)
-    of_files = [int(match[1]) for match in matches if match and match[1]]
-    if len(set(of_files)) < len(names):
-        of_files = list(range(len(names)))
-    frames = {
-        "file": [as_utf8(names[i]) for i in image],
-        "frame": [of_files[i] for i in image],
-        "person": numbers,
-    }
-    return assemble(tracks, None, frames, format="openpose", confidence=scores[..., 0])
+    return found
 
 
 def _each_file(
-    path: Path, pattern: re.Pattern[str], absent: str, read: Callable[[Path], Any]
+    path: Path, files: Sequence[Path], absent: str, read: Callable[[Path], Any]
 ) -> tuple[list[str], list[Any]]:
-    """Read a file, or those of a folder whose names match, in the order of numbers."""
-    files = [path]
-    if path.is_dir():
-        matching = (file for file in path.iterdir() if pattern.fullmatch(file.name))
-        files = sorted(matching, key=by_number)
-        if not files:
-            raise ValueError(absent)
+    """Read a file, or those found in a folder; return names and what they hold."""
+    files = files if path.is_dir() else [path]
+    if not files:
+        raise ValueError(absent)
     contents = []
     for file in files:
         refuse_special(file)
@@ -298,24 +391,91 @@ def _each_file(
     return [file.name for file in files], contents
 
 
-def _people_in(file: Path) -> list[dict[str, NDArray[np.float64]]]:
-    """Return the visible parts of each person in a file, (n_points, 3) each."""
+def _files_of(
+    path: Path, names: re.Pattern[str], begins: re.Pattern[bytes] | None = None
+) -> list[Path]:
+    """Return a file, or those of a folder, that have such a name and beginning."""
+    files = sorted(path.iterdir(), key=by_number) if path.is_dir() else [path]
+    return [
+        file
+        for file in files
+        if names.fullmatch(file.name)
+        and (begins is None or (file.is_file() and begins.match(_beginning(file))))
+    ]
+
+
+def _openpose_files(path: Path) -> list[Path]:
+    """Return the files of OpenPose in a folder, by their names or beginnings."""
+    named = _files_of(path, _NAME) if path.is_dir() else []
+    return named or _files_of(path, _JSON, _OPENPOSE)
+
+
+def _people_in(file: Path) -> list[dict[str, Any]]:
+    """Return the visible parts (n_points, 3) of each person in a file, and its id."""
     content = _read_json(file)
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list) or not all(isinstance(p, dict) for p in people):
         raise ValueError("expected an object with a list of objects called people")
-    keys = {part: f"{part}_keypoints_2d" for part in OPENPOSE_PARTS}
-    found = [
-        {part: _triples(person.get(key, []), key, False) for part, key in keys.items()}
-        for person in people
-    ]
-    return [{part: p for part, p in each.items() if p[:, 2].any()} for each in found]
+    found = []
+    for person in people:
+        who = _scalars(person).get("person_id", -1)
+        found.append({} if who == -1 else {"person_id": who})
+        for part in OPENPOSE_PARTS:
+            key = f"{part}_keypoints_2d"
+            points = _triples(person.get(key, []), key, False)
+            if points[:, 2].any():
+                found[-1][part] = points
+    return found
+
+
+def is_mmpose(path: Path) -> bool:
+    """Return whether a file, or one of a folder, begins as predictions of MMPose."""
+    return bool(_files_of(path, _JSON, _MMPOSE))
+
+
+def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
+    """Read predictions of MMPose of a video or an image, or of a folder of images.
+
+    A file has a list of instances, or of objects with ``frame_id`` and ``instances``,
+    or such a list as ``instance_info`` or ``predictions``. An instance has
+    ``keypoints``, [x, y] of each point, and ``keypoint_scores``. ``part`` chooses a
+    part of whole bodies. An image without instances has one row without points.
+    """
+    files, absent = _files_of(path, _JSON, _MMPOSE_ALSO), "no file of it is of MMPose"
+    _, contents = _each_file(path, files, absent, _instances_in)
+    entries = [entry for found in contents for entry in found]
+    return _landmarks(entries, None, part, "mmpose", "instance")
+
+
+def _instances_in(file: Path) -> list[dict[str, Any]]:
+    """Return the instances in a file as those of COCO; one without points if none."""
+    content = _read_json(file)
+    if isinstance(content, dict):
+        content = content.get("instance_info", content.get("predictions"))
+    if not isinstance(content, list):
+        raise ValueError("expected a list of instances, or of frames with instances")
+    if all("keypoints" in each for each in content):
+        content = [{"instances": content}]
+    entries = []
+    for number, frame in enumerate(content):
+        if not isinstance(frame, dict):
+            frame = {"frame_id": number, "instances": frame}
+        known = {"file": as_utf8(file.name)}
+        if "frame_id" in frame:
+            known["frame"] = frame["frame_id"]
+        for person, each in enumerate(frame["instances"]):
+            pairs = zip(each["keypoints"], each["keypoint_scores"], strict=True)
+            values = [float(v) for (x, y), score in pairs for v in (x, y, score)]
+            entries.append(known | each | {"person": person, "keypoints": values})
+        if not frame["instances"]:
+            entries.append(known)
+    return entries
 
 
 def is_pts(path: Path) -> bool:
     """Return whether a file begins as .pts files do, or a folder has such files."""
     if path.is_dir():
-        return any(_PTS_NAME.fullmatch(file.name) for file in path.iterdir())
+        return bool(_files_of(path, _PTS_NAME))
     return "".join(first_lines(path, 1)).lstrip().startswith("version")
 
 
@@ -327,9 +487,43 @@ def read_pts(path: Path) -> Landmarks:
     Coordinates are as they are written; iBUG counts pixels from 1.
     """
     absent = "there are no .pts files in the folder"
-    names, points = _each_file(path, _PTS_NAME, absent, _points_of)
+    names, points = _each_file(path, _files_of(path, _PTS_NAME), absent, _points_of)
     *_, tracks = stacked([{0: each} for each in points], names)
     return assemble(tracks, None, {"file": [*map(as_utf8, names)]}, format="pts")
+
+
+def is_tps(path: Path) -> bool:
+    """Return whether a file begins with a number of landmarks."""
+    return _TPS.match("".join(first_lines(path, 1)).strip()) is not None
+
+
+def read_tps(path: Path) -> Landmarks:
+    """Read a tps file of morphometrics, with a row for each specimen.
+
+    ``LM=12`` and twelve lines ``x y`` are followed by lines such as ``IMAGE=a.jpg``,
+    ``ID=1`` and ``SCALE=0.1``, the columns of the frames. y points up. Points of curves
+    are left out.
+    """
+    text = path.read_text(encoding="utf-8-sig")
+    head, *parts = re.split(r"(?im)^\s*LM\s*=", text)
+    if head.strip() or not parts:
+        raise ValueError(f"expected LM= and a number of landmarks; got {text[:40]!r}")
+    tracks, rows, n_left = [], [], 0
+    for number, part in enumerate(parts):
+        with errors_of(f"specimen {number} (counted from 0)"):
+            count, *lines = filter(None, map(str.strip, part.splitlines()))
+            points = " ".join(lines[: int(count)]).replace("NA", "nan")
+            tracks.append({0: _floats(points.split()).reshape(int(count), 2)})
+            entries = [line.partition("=") for line in lines[int(count) :]]
+            if entries and not entries[0][1]:
+                raise ValueError(f"there are more than {count} landmarks")
+        n_left += sum(not equals for _, equals, _ in entries)
+        known = {name.strip().lower(): value.strip() for name, _, value in entries}
+        rows.append({name: known[name] for name in _TPS_ENTRIES if name in known})
+    if n_left:
+        warn_caller(f"{n_left} points of curves are left out")
+    *_, values = stacked(tracks, [f"specimen {i}" for i in range(len(tracks))])
+    return assemble(values, None, rows, format="tps")
 
 
 def is_wflw(path: Path) -> bool:

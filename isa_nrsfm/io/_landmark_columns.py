@@ -4,18 +4,35 @@ In patterns ``#`` is a number and ``*`` is any text.
 """
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
+from isa_nrsfm.skeletons._column_names import (
+    individuals_in,
+    parse_coordinate,
+    point_names,
+    without_boxes,
+)
 
 # What stands for the axis letter in the names of confidences: nose_conf, conf_0.
-CONFIDENCES = ("confidence", "conf", "likelihood", "score", "visibility", "c")
+CONFIDENCES = (
+    *("confidence", "conf", "likelihood", "score", "visibility", "c"),
+    *("p", "prob", "probability", "v", "vis", "presence"),
+)
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
+
+
+# Columns that name points, and frames or people, in tables with a row for each point.
+_POINT = "point|landmark|joint|marker|node|part(?!ic)"
+_FRAME = (
+    "frame|time|image|video|file|session|trial|person|people|participant|subject|"
+    "patient|animal|track|face|hand"
+)
 
 
 class LandmarkColumns(NamedTuple):
@@ -65,18 +82,16 @@ def find_landmark_columns(
                 "columns must name x and y columns in turn, such as 'x_#,y_#'; "
                 f"got {columns!r}"
             )
-        return _select(names, patterns)
+        given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
+        return _select(names if given else without_boxes(names), patterns)
+    names = without_boxes(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
+    _refuse_individuals(names, candidates or sets)
     if not candidates:
         x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
         if x and y:
-            raise ValueError(
-                "the table has one row for each point, with columns x and y; one row "
-                "for each frame is needed. In pandas: wide = table.pivot("
-                f"index='frame', columns='point', values={[x[0], y[0]]}), and "
-                "wide.columns = [f'{axis}_{j}' for axis, j in wide.columns]"
-            )
+            raise ValueError(_pivoted(names, [x[0], y[0]]))
         if any(isinstance(name, tuple) for name in names):
             raise ValueError(
                 "the names of the columns have several levels: join them to names such "
@@ -100,6 +115,23 @@ def find_landmark_columns(
             "the same names: give every point a name of its own, such as x0, y0, x1, y1"
         )
     return _select(names, pattern.split(","))
+
+
+def _pivoted(names: Sequence[Hashable], values: list[Hashable]) -> str:
+    """Return how a table with a row for each point gets one for each frame."""
+    aside = {"x", "y", "z", "", *CONFIDENCES}
+    keys = [name for name in names if str(name).strip().lower() not in aside]
+    points = [name for name in keys if re.search(_POINT, str(name), re.IGNORECASE)]
+    last = [name for name in keys if not re.search(_FRAME, str(name), re.IGNORECASE)]
+    points = points or last[-1:] or ["point"]
+    frames = [name for name in keys if name not in points] or ["frame"]
+    return (
+        "the table has one row for each point, with columns x and y; one row for each "
+        "frame is needed. Columns must tell frames and points apart. In pandas: "
+        f"wide = table.pivot(index={frames}, columns={points[0]!r}, values={values}), "
+        "and wide.columns = "
+        "[f'{axis}_{j}' for axis, j in wide.columns], and wide = wide.reset_index()"
+    )
 
 
 def _likely_pattern(names: Iterable[Hashable]) -> str:
@@ -165,11 +197,35 @@ def confidence_columns(
         same = [a == b for a, b in zip(*pair, strict=False)]
         place = [*same, False].index(False)  # of the axis letter
         parts.append((pair[0][:place], pair[0][place + 1 :]))
-    for word in CONFIDENCES:
+    words = ((w, w.capitalize(), w.upper()) for w in CONFIDENCES)
+    for word in chain.from_iterable(words):
         found = [f"{before}{word}{after}" for before, after in parts]
         if by_name.keys() >= {*found}:
             return [by_name[name] for name in found]
     return []
+
+
+def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None:
+    """Raise if the points of sets of landmarks are those of several individuals."""
+    patterns = [pattern.split(",")[0] for pattern in sets]
+    lists = [_columns_matching(names, pattern).values() for pattern in patterns]
+    x = list(dict.fromkeys(chain.from_iterable(lists)))
+    if not (who := individuals_in(x, MIN_POINTS)):
+        return
+    largest = max(sets, key=sets.__getitem__)
+    whole = largest if sets[largest] == len(x) else ",".join(sets)
+    listed, n_points = ",".join(who), len(x) // len(who)
+    way = (
+        f"For a row for each individual, use individuals={listed!r} (command line: "
+        f"--individuals {shlex.quote(listed)})"
+        if n_points >= MIN_POINTS
+        else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
+    )
+    raise ValueError(
+        f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
+        f"of several individuals in one row. {way}. If all are points of one body, use "
+        f"columns={whole!r} (command line: --columns {shlex.quote(whole)})"
+    )
 
 
 def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:

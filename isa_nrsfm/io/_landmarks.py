@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm.skeletons import Skeleton, find_skeleton
+from isa_nrsfm.skeletons import Skeleton, find_skeleton, skeleton_of_names
 from isa_nrsfm.skeletons._recognition import LAYOUTS_OF_READERS, numbered
 
-_MEDIAPIPE_PARTS = ("face_landmarks", "hand_landmarks", "pose_landmarks")
+_PARTS = ("face", "hand", "pose", "left_hand", "right_hand")
 # movement named the axes keypoints and individuals in its earlier versions.
 _MOVEMENT_DIMS = {"keypoints": "keypoint", "individuals": "individual"}
 
@@ -40,7 +40,8 @@ class Landmarks:
     failed : ndarray of bool, shape (n_frames,)
         Frames in which tracking failed or found nothing. All their points are NaN.
     format : str
-        Name of the format, one of `isa_nrsfm.io.FORMATS`, "mediapipe" or "movement".
+        Name of the format, one of `isa_nrsfm.io.FORMATS`, "mediapipe", "movement" or
+        "sleap-io".
     point_names : tuple of str, length n_points
         Names of the points.
     skeleton : Skeleton or None
@@ -240,34 +241,38 @@ def refuse_same_names(names: Sequence[str]) -> None:
         seen.add(name)
 
 
-def from_mediapipe(results: Iterable[Any], image_sizes: ArrayLike) -> Landmarks:
+def from_mediapipe(
+    results: Iterable[Any], image_sizes: ArrayLike, part: str | None = None
+) -> Landmarks:
     """
-    Take the landmarks out of results of MediaPipe's face, hand or pose landmarker.
+    Take the landmarks out of results of MediaPipe's landmarkers.
 
     Parameters
     ----------
     results : iterable of FaceLandmarkerResult
-        The results of one image each; HandLandmarkerResult and PoseLandmarkerResult
-        will do as well. Any objects with a list ``face_landmarks``, ``hand_landmarks``
-        or ``pose_landmarks`` that has, for each face, a list of objects with ``x`` and
-        ``y`` are taken.
+        The results of one image each; HandLandmarkerResult, PoseLandmarkerResult,
+        HolisticLandmarkerResult and those of the older solutions will do as well. Any
+        objects with a list ``face_landmarks``, ``hand_landmarks`` or ``pose_landmarks``
+        that has, for each face, a list of objects with ``x`` and ``y`` are taken.
     image_sizes : array-like of shape (2,) or (n_results, 2)
         Width and height of all images, or of each, in pixels. MediaPipe gives x in
         shares of the width and y in shares of the height.
+    part : {"face", "hand", "pose", "left_hand", "right_hand"}, optional
+        The part to take, if the results have several, as those of holistic landmarkers.
 
     Returns
     -------
     Landmarks
         The points in pixels, a row for each face (hand, pose), in the order of the
-        results. `frames` has the number of the result and that of the face in it. A
-        result without a face has one row without points. Poses have their visibility
-        as confidence.
+        results. `frames` has the number of the result, that of the face in it, and for
+        hands the ``handedness``. A result without a face has one row without points.
+        Poses have their visibility as confidence.
 
     Raises
     ------
     ValueError
-        If an object is not such a result, if faces have different numbers of points,
-        or if the sizes are not those of the images.
+        If an object is not such a result, if none of several parts is chosen, if faces
+        have different numbers of points, or if the sizes are not those of the images.
 
     Examples
     --------
@@ -285,24 +290,36 @@ def from_mediapipe(results: Iterable[Any], image_sizes: ArrayLike) -> Landmarks:
     array([False,  True])
     """
     results = list(results)
-    parts = {part for result in results for part in _parts(result)}
-    if len(parts) > 1:
-        raise ValueError(f"the results are of more than one kind: {sorted(parts)}")
+    known = list(dict.fromkeys(each for result in results for each in _parts(result)))
+    if results and part not in (known if part or len(known) > 1 else [None]):
+        raise ValueError(
+            f"the results have {', '.join(known)}: choose one with part, such as "
+            f"part={known[0]!r}; got part={part!r}"
+        )
+    part = part or "".join(known)
     sizes = checked_sizes("image_sizes", image_sizes, len(results))
     names = [f"result {i} (counted from 0)" for i in range(len(results))]
     persons = [
-        {k: _values(points, name) for k, points in enumerate(getattr(result, *parts))}
+        dict(enumerate(_persons(result, part, name)))
         for result, name in zip(results, names, strict=True)
     ]
     if not any(len(values) for each in persons for values in each.values()):
         raise ValueError(f"none of the {len(results)} results has any landmarks")
     frame, individual, values = stacked(persons, names)
+    frames = {"frame": frame, "individual": individual}
+    if part == "hand":
+        sides = [
+            [*map(_side, _entry(result, "handedness") or ())] for result in results
+        ]
+        places = zip(frame, pd.Series(individual).fillna(-1), strict=True)
+        side = [sides[i][k] if 0 <= k < len(sides[i]) else None for i, k in places]
+        frames |= {"handedness": side} if any(side) else {}
     # Faces and hands have no visibility, though some versions set it to zero.
-    seen = parts == {"pose_landmarks"} and not np.isnan(values[..., 2]).all()
+    seen = part == "pose" and not np.isnan(values[..., 2]).all()
     return assemble(
         values[..., :2] * sizes[frame][:, None],
         None,
-        {"frame": frame, "individual": individual},
+        frames,
         format="mediapipe",
         confidence=values[..., 2] if seen else None,
     )
@@ -375,27 +392,120 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
     )
 
 
+def from_sleap_io(labels: Any) -> Landmarks:
+    """
+    Take the landmarks out of labels of the package sleap-io.
+
+    It reads projects of SLEAP (``.slp``), NWB, poses of YOLO, Label Studio and others.
+
+    Parameters
+    ----------
+    labels : sleap_io.Labels
+        The labelled frames, of one skeleton.
+
+    Returns
+    -------
+    Landmarks
+        The points, a row for each instance, in the order of videos and frames. `frames`
+        has the video, the number of the frame and that of the instance in it, and where
+        they are known ``individual`` (the track) and ``instance_score``. A frame
+        without instances has one row without points. Predictions that were corrected
+        by hand are left out. Points labelled by hand have no confidence.
+
+    Raises
+    ------
+    ValueError
+        If the object has no labelled frames, or instances of different skeletons.
+
+    Examples
+    --------
+    >>> import sleap_io                            # doctest: +SKIP
+    >>> from isa_nrsfm.io import from_sleap_io
+    >>> labels = sleap_io.load_file("mice.slp")    # doctest: +SKIP
+    >>> from_sleap_io(labels).points               # doctest: +SKIP
+    """
+    rows = []
+    try:
+        for frame in labels:
+            file, found = frame.video.filename, list(frame.instances)
+            video = file if isinstance(file, str) else str([*file, ""][0])
+            corrected = [id(getattr(each, "from_predicted", None)) for each in found]
+            left = [each for each in found if id(each) not in corrected] or [None]
+            rows += [(video, frame.frame_idx, k, each) for k, each in enumerate(left)]
+        skeletons = [row[3].skeleton for row in rows if row[3] is not None]
+        kinds = {(tuple(s.node_names), tuple(s.edge_names)) for s in skeletons}
+        ((nodes, edges),) = kinds
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            "labels of sleap-io should have labelled frames, with instances of one "
+            f"skeleton; got {type(labels).__name__}: {error}"
+        ) from error
+    rows.sort(key=lambda row: row[:3])
+    videos, numbers, places, instances = zip(*rows, strict=True)
+    values = np.full((len(rows), len(nodes), 3), np.nan)
+    for row, each in zip(values, instances, strict=True):
+        if each is not None:
+            points = each.numpy(**{"scores": True} if hasattr(each, "score") else {})
+            row[:, : points.shape[1]] = points
+    tracks = [getattr(each, "track", None) for each in instances]
+    frames: dict[str, Any] = {"video": videos, "frame": numbers, "instance": places}
+    frames["individual"] = [getattr(track, "name", None) for track in tracks]
+    frames["instance_score"] = [getattr(each, "score", None) for each in instances]
+    frames = {name: each for name, each in frames.items() if {*each} != {None}}
+    given = {"name": "SLEAP", "source": "labels of sleap-io"}
+    return assemble(
+        values[..., :2],
+        nodes,
+        frames,
+        format="sleap-io",
+        confidence=values[..., 2] if "instance_score" in frames else None,
+        skeleton=skeleton_of_names(edges, nodes, **given) if edges else None,
+    )
+
+
+def _entry(result: Any, name: str) -> Any:
+    """Return an entry of a result of MediaPipe, also of older versions, or None."""
+    found = getattr(result, name, None)
+    return getattr(result, f"multi_{name}", None) if found is None else found
+
+
 def _parts(result: Any) -> list[str]:
-    """Return which lists of landmarks a result has."""
-    parts = [part for part in _MEDIAPIPE_PARTS if hasattr(result, part)]
-    if not parts:
+    """Return the parts of which a result has points, or may have."""
+    names = {*dir(result)}
+    found = [p for p in _PARTS if names & {f"{p}_landmarks", f"multi_{p}_landmarks"}]
+    if not found:
         raise ValueError(
             "a result of MediaPipe should have face_landmarks, hand_landmarks or "
             f"pose_landmarks; got {type(result).__name__}"
         )
-    return parts
+    return found
 
 
-def _values(landmarks: Sequence[Any], where: str) -> NDArray[np.float64]:
-    """Return x, y and visibility of landmarks, NaN if absent, (n_points, 3)."""
+def _persons(result: Any, part: str, where: str) -> list[NDArray[np.float64]]:
+    """Return x, y and visibility of the faces of a result, NaN if absent.
+
+    Each is (n_points, 3). Older versions have messages with a list called landmark.
+    These, and holistic landmarkers, may have one face instead of a list, or None.
+    """
+    found, values = _entry(result, f"{part}_landmarks"), []
     try:
-        values = [(p.x, p.y, getattr(p, "visibility", None)) for p in landmarks]
-        return np.array(values, dtype=np.float64).reshape(-1, 3)
+        faces = [] if found is None else list(getattr(found, "landmark", found))
+        for face in [faces] if faces and hasattr(faces[0], "x") else faces:
+            points = getattr(face, "landmark", face)
+            seen = [(p.x, p.y, getattr(p, "visibility", None)) for p in points]
+            values.append(np.array(seen, dtype=np.float64).reshape(-1, 3))
+        return values
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(
             f"{where} should have a list of objects with numbers x and y for each "
             f"face: {error}"
         ) from error
+
+
+def _side(hand: Any) -> str | None:
+    """Return the side of a hand, from what MediaPipe tells of it."""
+    first = next(iter(getattr(hand, "classification", hand)), None)
+    return getattr(first, "category_name", None) or getattr(first, "label", None)
 
 
 def _by_axes(dataset: Any, name: str, wanted: tuple[str, ...]) -> Any:

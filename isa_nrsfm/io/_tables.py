@@ -1,5 +1,6 @@
 """Read tables of 2D landmarks from files, and take the landmarks out of them."""
 
+import contextlib
 import csv
 import os
 import re
@@ -11,22 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
-from isa_nrsfm.skeletons._column_names import parse_coordinate, point_names
+from isa_nrsfm.skeletons._column_names import (
+    columns_of_individuals,
+    parse_coordinate,
+    point_names,
+)
 
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
+_DECIMAL_COMMA = r"^(\s*[+-]?\d*),(\d+(?:[eE][+-]?\d+)?\s*)$"
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = (
     *("", "na", "nan", "n/a", "null", "none"),
     # Of spreadsheets, pandas, and C programs on Windows.
     *("#n/a", "<na>", "nan(ind)", "-nan(ind)"),
 )
+
+
+Missing = Literal["zeros"] | float | Sequence[float] | None
 
 
 class LandmarkTable(NamedTuple):
@@ -108,7 +118,7 @@ def parse_table(path: Path) -> "pd.DataFrame":
                 "it is a spreadsheet or a compressed file, in spite of its name: save "
                 f"it as {suffix}, or unpack it"
             )
-    return _read_text(path, SEPARATORS[suffix])
+    return _read_text(path, separator_of(path))
 
 
 def write_table(frame: "pd.DataFrame", path: str | os.PathLike[str]) -> None:
@@ -145,7 +155,8 @@ def landmark_table(
     frame: "pd.DataFrame",
     *,
     columns: str | Sequence[str] | None = None,
-    missing: Literal["zeros"] | float | None = None,
+    missing: Missing = None,
+    individuals: str | Sequence[str] | None = None,
 ) -> LandmarkTable:
     """
     Take the landmark columns out of a table, in the order x0, y0, x1, y1, ....
@@ -162,9 +173,13 @@ def landmark_table(
         The landmark columns, if their names are ambiguous: patterns of x and
         y columns in turn, such as ``"x_#,y_#"``, with ``#`` for a number and ``*`` for
         any text.
-    missing : {"zeros"} or float, optional
+    missing : {"zeros"}, float or sequence of float, optional
         The x and y of missing points, such as -1, exactly; they become NaN. "zeros" is
-        the number 0.
+        the number 0. Of several numbers, a point has one.
+    individuals : str or sequence of str, optional
+        The individuals in one row, such as ``"1,2"`` for nose_1_x and nose_2_x: the
+        parts by which their columns differ. Each has a row of its own, and the other
+        columns have ``frame``, the number of the row, and ``individual``.
 
     Returns
     -------
@@ -174,8 +189,9 @@ def landmark_table(
     Raises
     ------
     ValueError
-        If there is no set of landmark columns or more than one, if a point has only
-        one of two coordinates, or if a cell is neither a finite number nor empty.
+        If there is no set of landmark columns or more than one, if the points are
+        probably of several individuals, if a point has only one of two coordinates, or
+        if a cell is neither a finite number nor empty.
 
     Examples
     --------
@@ -196,25 +212,48 @@ def landmark_table(
             f"a pandas DataFrame is needed; got {type(frame).__name__} "
             "(polars tables have a method to_pandas)"
         )
-    code = 0.0 if missing == "zeros" else missing
-    if code is not None and (
-        isinstance(code, bool | str) or not np.isfinite(np.float64(code))
-    ):
-        raise ValueError(
-            f'missing must be None, "zeros" or a finite number; got {missing!r}'
-        )
-    codes = [] if code is None else [float(code)]
+    frame = individuals_as_rows(frame, individuals)
     names = find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
-    values = tracks_in(frame, names, codes).reshape(len(frame), len(names))
+    values = tracks_in(frame, names, missing).reshape(len(frame), len(names))
     return LandmarkTable(
         pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
         frame.drop(columns=names),
     )
 
 
+def individuals_as_rows(
+    frame: "pd.DataFrame", individuals: str | Sequence[str] | None
+) -> "pd.DataFrame":
+    """Return a table with a row for each individual of each row, if there are any."""
+    if individuals is None:
+        return frame
+    own = columns_of_individuals(frame.columns, individuals)
+    frame = frame.reset_index(drop=True)
+    common = frame.drop(columns=[name for names in own.values() for name in names])
+    if "frame" not in common:
+        common.insert(0, "frame", common.index)
+    parts = [
+        common.assign(individual=name).join(frame[[*columns]].rename(columns=columns))
+        for name, columns in own.items()
+    ]
+    return pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
+
+
+def _codes(missing: Missing) -> list[float]:
+    """Return the numbers of missing points, or raise."""
+    given = [] if missing is None else [0.0] if isinstance(missing, str) else missing
+    codes = np.atleast_1d(np.asarray(given))
+    wrong = isinstance(missing, str) and missing != "zeros"
+    if wrong or codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
+        raise ValueError(
+            f'missing must be None, "zeros" or finite numbers; got {missing!r}'
+        )
+    return [float(code) for code in codes]
+
+
 def tracks_in(
-    frame: "pd.DataFrame", names: Sequence[str], missing: Sequence[float] = ()
+    frame: "pd.DataFrame", names: Sequence[str], missing: Missing = None
 ) -> NDArray[np.float64]:
     """Return the points (n_frames, n_points, 2) in columns x0, y0, x1, y1, ....
 
@@ -222,7 +261,7 @@ def tracks_in(
     """
     values = np.stack([_as_numbers(frame[name]) for name in names], axis=1)
     tracks = values.reshape(len(frame), len(names) // 2, 2)
-    for number in missing:
+    for number in _codes(missing):
         tracks[(tracks == number).all(axis=2)] = np.nan
     return tracks
 
@@ -235,17 +274,22 @@ def is_named_columns(_path: Path) -> bool:
 def read_named_columns(
     path: Path,
     columns: str | None = None,
-    missing: Literal["zeros"] | float | None = None,
+    missing: Missing = None,
+    individuals: str | Sequence[str] | None = None,
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
-    points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
-    confidence = confidences_in(other, points.columns[::2], points.columns[1::2])
+    points, other = landmark_table(
+        parse_table(path), columns=columns, missing=missing, individuals=individuals
+    )
+    confidence, names = None, points.columns
+    with contextlib.suppress(ValueError):  # texts are no confidences
+        confidence = confidences_in(other, names[::2], names[1::2])
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
-        point_names(points.columns[::2]),
+        point_names(names[::2]),
         other if confidence is None else other.drop(columns=confidence.columns),
         format="table",
-        columns=list(points.columns),
+        columns=list(names),
         confidence=confidence,
     )
 
@@ -284,12 +328,18 @@ def first_lines(path: Path, n_lines: int) -> list[str]:
     return lines
 
 
+def separator_of(path: Path) -> str:
+    """Return what separates the cells of a text: the usual sign, or one it has."""
+    line = "".join(first_lines(path, 1))
+    signs = (SEPARATORS.get(path.suffix.lower(), ","), *";\t,|")
+    return next((sign for sign in signs if sign in line), signs[0])
+
+
 def header_rows(path: Path, n_rows: int) -> list[list[str]]:
     """Return the cells of the first rows of a file; fewer if it is no csv file."""
     try:
-        separator = SEPARATORS.get(path.suffix.lower(), ",")
         lines = first_lines(path, n_rows)
-        return list(csv.reader(lines, delimiter=separator, strict=True))
+        return list(csv.reader(lines, delimiter=separator_of(path), strict=True))
     except csv.Error:
         return []
 
@@ -314,6 +364,9 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     lines.
     """
     n_rows, n_columns = 0, 0
+    if separator != SEPARATORS.get(path.suffix.lower()):
+        commas = ", and its decimal commas are read as points" * (separator == ";")
+        warn_caller(f"the cells of {path.name} end with {separator!r}{commas}")
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = csv.reader(_without_nulls(file), delimiter=separator)
         for row in rows:
@@ -380,11 +433,12 @@ def read_columns(
             {n: frame[n] if n in text else _numbers_if_all(frame[n]) for n in frame}
         )
     else:
-        separator = SEPARATORS[path.suffix.lower()]
+        separator = separator_of(path)
         if sum(1 for _ in checked_rows(path, separator)) <= n_header:
             raise ValueError("it has a header but no rows")
         given: dict[str, Any] = {
             "sep": separator,
+            "decimal": "," if separator == ";" else ".",
             "header": None,
             "names": names,
             "skiprows": n_header,
@@ -447,8 +501,10 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     second = [cell.strip().lower() for cell in next(rows)]
     if second.count("x") == second.count("y") > 1:
         index = "" if second[0] in ("x", "y") else ", index_col=0"
+        decimal = ", decimal=','" if separator == ";" else ""
         way = (
-            f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}), "
+            f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}, "
+            f"sep={separator!r}{decimal}), "
             "and table.columns = ['_'.join(name) for name in table.columns]"
         )
         raise ValueError(
@@ -467,6 +523,8 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         keep_default_na=False,
         encoding="utf-8-sig",
     )
+    if separator == ";":
+        frame = frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
     frame.columns = pd.Index(header)
     for name in header:
         if parse_coordinate(name) is not None:
@@ -480,18 +538,12 @@ def _refuse_one_column(path: Path, separator: str, line: str) -> None:
     """Raise if the first line of a file is one cell, but has other separators."""
     if separator in line:
         raise ValueError("each line is in quotation marks: remove them")
-    for suffix, other in SEPARATORS.items():
-        if other in line:
-            raise ValueError(f"its columns end with {other!r}: rename it to *{suffix}")
-    following = first_lines(path, 2)[-1]
-    for other, pattern in ((";", "';'"), ("|", "'|'"), (" ", r"r'\s+'")):
-        if 0 < line.count(other) == following.count(other):
-            raise ValueError(
-                f"its columns are separated by {other!r}; {separator!r} is needed. In "
-                f"pandas: table = pd.read_csv({path.name!r}, sep={pattern}, "
-                "header=None, dtype=str), and table.replace(r'^(-?\\d*),(\\d+)$', "
-                "r'\\1.\\2', regex=True).to_csv('new.csv', header=False, index=False)"
-            )
+    if 0 < line.count(" ") == first_lines(path, 2)[-1].count(" "):
+        raise ValueError(
+            f"its columns are separated by ' '; {separator!r} is needed. In pandas: "
+            f"table = pd.read_csv({path.name!r}, sep=r'\\s+', header=None, dtype=str), "
+            "and table.to_csv('new.csv', header=False, index=False)"
+        )
 
 
 def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:

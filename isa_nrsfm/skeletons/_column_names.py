@@ -11,7 +11,7 @@ sets, ``thumb_#_x`` and ``*_x``.
 """
 
 import re
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from itertools import pairwise, zip_longest
 from typing import Any, Literal
 
@@ -27,6 +27,15 @@ _LABEL_AXIS = re.compile(rf"(.*[^ _.\-])({_SEPARATORS})([xyzXYZ])", re.DOTALL)
 # x_nose
 _AXIS_LABEL = re.compile(rf"([xyzXYZ])({_SEPARATORS})([^ _.\-].*)", re.DOTALL)
 _TRAILING_NUMBER = re.compile(r"(.*?)(\d+)", re.DOTALL)
+# The sizes of boxes, named like the x of their corner.
+_HEIGHTS = {"w": "h", "W": "H", "width": "height", "Width": "Height"}
+_WIDTH = re.compile("[wW](?:idth)?")
+# Parts of names, with the separator after them: words, or numbers in words.
+_PARTS = (r"[^ _.\-]+[ _.\-]*", r"\d+|\D+")
+# Words that tell parts of one body apart, and letters of axes.
+_SIDES = frozenset(
+    "x left right l r upper lower front hind fore rear top bottom inner outer".split()
+)
 
 
 # The axis, 0, 1 or 2 for x, y or z; the point, the name without its axis letter ("3",
@@ -125,3 +134,76 @@ def checked_names(parameter: str, names: Any, default: Any) -> list[str]:
             f"{parameter} must hold {len(default)} names; got {len(names)}"
         )
     return names
+
+
+def without_boxes(names: Sequence[Hashable]) -> list[Hashable]:
+    """Leave out columns with the corner of a box: x beside w and h, x_min and x_max."""
+    texts = {str(name).strip() for name in names}
+    found = ((name, size) for name in texts for size in _WIDTH.finditer(name))
+    corners = {
+        f"{name[: size.start()]}{axis}{name[size.end() :]}"
+        for name, size in found
+        if f"{name[: size.start()]}{_HEIGHTS[size[0]]}{name[size.end() :]}" in texts
+        for axis in "xyXY"
+    }
+    ends = [{name, name.replace("min", "max")} for name in texts if "min" in name]
+    corners.update(*(pair for pair in ends if texts.issuperset(pair)))
+    return [name for name in names if str(name).strip() not in corners]
+
+
+def _divisions(names: Iterable[Hashable]) -> Iterator[dict[str, dict[str, Hashable]]]:
+    """Yield names by one of their parts, and by the rest: {"1": {"nose_x": name}}."""
+    for expression in _PARTS:
+        split = [(re.findall(expression, str(name).strip()), name) for name in names]
+        for place in (0, 1, 2, -1, -2, -3):
+            found: dict[str, dict[str, Hashable]] = {}
+            for parts, name in split:
+                if len(parts) > max(place, -place - 1, 1):
+                    others = [*parts]
+                    key = others.pop(place).strip(" _.-")
+                    rest = "".join(others).rstrip(" _.-")
+                    found.setdefault(key, {})[rest] = name
+            yield found
+
+
+def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
+    """
+    Return what tells individuals apart in the names of x columns, if anything does.
+
+    All have points of the same names, at least so many; of two or three with numbers,
+    four. Points of one body differ by its sides.
+
+    >>> from isa_nrsfm.skeletons._column_names import individuals_in
+    >>> names = [f"p{point}_{mouse}_x" for point in range(8) for mouse in "ab"]
+    >>> individuals_in(names, least=7)
+    ['a', 'b']
+    """
+    found: list[list[str]] = []
+    for division in _divisions(names):
+        rests = [frozenset(each) for each in division.values()] or [frozenset()]
+        whole = len({*rests}) == 1 and len(rests) * len(rests[0]) == len(names)
+        few = len(rests) < 4 and all(key[-1:].isdigit() for key in division)
+        enough = len(rests) > 1 and len(rests[0]) >= (4 if few else least)
+        if whole and enough and not _SIDES.issuperset(map(str.lower, division)):
+            found.append(list(division))
+    return min(found, key=len, default=[])
+
+
+def columns_of_individuals(
+    names: Iterable[Hashable], individuals: str | Sequence[str]
+) -> dict[str, dict[Hashable, str]]:
+    """Return the columns of each individual, with their names without it."""
+    listed = individuals.split(",") if isinstance(individuals, str) else individuals
+    who, names = [str(name).strip() for name in listed], list(names)
+    best: dict[str, dict[Hashable, str]] = {}
+    for division in _divisions(names):
+        own = [division.get(name, {}) for name in who]
+        common = [rest for rest in own[0] if all(rest in each for each in own)]
+        if len(common) > max(map(len, best.values()), default=0):
+            pairs = zip(who, own, strict=True)
+            best = {name: {each[rest]: rest for rest in common} for name, each in pairs}
+    if not best:
+        raise ValueError(
+            f"no columns have the same names but for {', '.join(who)} (individuals)"
+        )
+    return best

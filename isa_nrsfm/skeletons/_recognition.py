@@ -27,7 +27,10 @@ LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = {
     ),
     "pts": ("ibug-68", "ibug-51"),
     "wflw": ("wflw-98", "wflw-65"),
-    "coco": ("coco-17", "coco-wholebody-133"),
+    **dict.fromkeys(
+        ("coco", "mmpose"),
+        ("coco-17", "coco-wholebody-133", "ibug-68", "hand-21", "wflw-98"),
+    ),
     "openpose": ("body-25", "hand-21"),
 }
 

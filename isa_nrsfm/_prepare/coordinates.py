@@ -1,0 +1,137 @@
+"""Coordinates that are no places in an image: codes of missing points, shares."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._tables.blocks import FrameBlocks
+
+# Rows of a fit, and points, that are compared at most.
+MOST_ROWS, MOST_PLACES = 1000, 1_000_000
+# Points of a lower confidence are seldom where they are said to be.
+UNSURE = 0.6
+# Largest part of the coordinates of shares that are beyond all borders but one.
+FEW = 0.05
+# Least part of the points of shares that are in the image.
+LEAST = 0.2
+
+
+class CoordinateWarning(UserWarning):
+    """Coordinates are probably codes of missing points, or shares of an image."""
+
+
+def warn_of_rows(rows: FrameBlocks, camera: str) -> None:
+    """Warn of some rows of a table, evenly spread; not of shares if cameras are affine.
+
+    These absorb the stretch of shares.
+    """
+    few = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
+    tracks = rows.take(few).mT
+    warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
+    if camera != "affine":
+        warn_of_shares(tracks)
+
+
+def warn_of_places(tracks: NDArray, confidence: ArrayLike | None = None) -> None:
+    """Warn of codes in tracks (n_frames, n_points, 2), and of shares; of sure points.
+
+    Trackers place points that they do not see beyond the image.
+    """
+    warn_of_codes(tracks)
+    if confidence is not None:
+        unsure = np.asarray(confidence)[..., None] < UNSURE
+        tracks = np.where(unsure, np.nan, tracks)
+    warn_of_shares(tracks)
+
+
+def warn_of_codes(tracks: NDArray, rows: str = "rows") -> None:
+    """Warn if points of tracks (n_frames, n_points, 2) may be missing, such as (0, 0).
+
+    Codes such as -1 may be shifted or scaled: they are the same pair of numbers. Other
+    points are at the same place, exactly and in three frames, only by chance. Then the
+    point has other places as often, or others are further out. The origin of the
+    coordinates is one point in all frames, and others are around it.
+    """
+    places = np.empty(tracks.shape[:2], dtype=complex)
+    places.real, places.imag = np.moveaxis(tracks + 0.0, 2, 0)  # -0.0 + 0.0 is 0.0
+    shown = places[~np.isnan(places)]
+    shown = shown[:: -(-len(shown) // MOST_PLACES) or 1]
+    found = {0j}
+    for some in (shown, shown[shown.real == shown.imag]):
+        if len(some):
+            values, counts = np.unique(some, return_counts=True)
+            found |= {*values[[0, int(counts.argmax()), -1]]}
+    for place in sorted(found, key=lambda place: (place.real, place.imag)):
+        there = places == place
+        counts, n_rows = there.sum(axis=0), there.any(axis=1).sum()
+        point = counts.argmax()
+        other, others = places[~there[:, point], point], tracks[~there]
+        if not n_rows or np.isnan(others).all():
+            continue
+        often = np.unique(other, return_counts=True, equal_nan=False)[1].max(initial=0)
+        xy = np.array([place.real, place.imag])
+        beyond = (xy < np.nanmin(others, axis=0)) | (xy > np.nanmax(others, axis=0))
+        is_outside = beyond.all()
+        is_origin = len(there) > 2 and not is_outside and np.isnan(other).all()
+        enough = n_rows > 2 and (is_outside or counts[point] > 3 * often)
+        equal = xy[0] == xy[1]
+        alone = not equal and np.count_nonzero(counts) < 2
+        if is_origin or alone or (place and not enough):
+            continue
+        number, way = f"{xy[0]:.15g}", "before coordinates are shifted or scaled"
+        if equal:
+            option = f"--missing-value {number}" if place else "--zeros-missing"
+            way = (
+                f"with isa_nrsfm.io.landmark_table(table, missing={number}) (command "
+                f"line: {option})"
+            )
+        warn_caller(
+            f"in {n_rows} of {len(there)} {rows} points are at exactly ({number}, "
+            f"{xy[1]:.15g}) ({there.sum()} in all). If these points are missing, make "
+            f"them NaN {way}",
+            CoordinateWarning,
+        )
+
+
+def warn_of_shares(tracks: NDArray) -> None:
+    """Warn if tracks (n_frames, n_points, 2) look like shares of an image's size."""
+    if not are_shares(tracks):
+        return
+    known = tracks[~np.isnan(tracks)]
+    inside = np.mean((known >= 0) & (known <= 1))
+    warn_caller(
+        f"{100 * inside:.3g} % of the coordinates are between 0 and 1 (all between "
+        f"{known.min():.2g} and {known.max():.2g}), like shares of the width and "
+        "height of an image. Such shares stretch the shapes, which changes their "
+        "proportions and rotations. If these are shares, multiply x by the width and "
+        "y by the height of the image: isa_nrsfm.io.read_landmarks with "
+        "format='mediapipe' and image_size=(WIDTH, HEIGHT) does it (command line: "
+        "--format mediapipe --image-size WIDTHxHEIGHT)",
+        CoordinateWarning,
+    )
+
+
+def are_shares(tracks: NDArray) -> bool:
+    """Return whether tracks (n_frames, n_points, 2) look like shares of an image.
+
+    Positions in an image are apart in both directions. Trackers also place points
+    that it cuts off, such as the legs of a body at a desk, beyond one of its borders;
+    centred coordinates are beyond several. In frames, columns or a table scaled to
+    [0, 1], a few coordinates are exactly 0 and 1; in aligned ones, a point is at 0.
+    Points at (0, 0) are missing.
+    """
+    seen = ~np.isnan(tracks).any(axis=2) & (tracks != 0).any(axis=2)
+    known = tracks[seen]
+    if not len(known):
+        return False
+    beyond = np.mean([known < 0, known > 1], axis=1)  # of two borders, in x and y
+    if beyond.sum() - beyond.max() > 2 * FEW:
+        return False
+    inside = ((tracks >= 0) & (tracks <= 1)).all(axis=2) & seen
+    zero, one = (((tracks == end).any(axis=2) & seen) for end in (0, 1))
+    n_ends, few = zero.sum() + one.sum(), 4 + len(known) / 1000
+    scaled = [np.mean(zero.any(axis) & one.any(axis)) > 0.5 for axis in (0, 1)]
+    aligned = zero.all(axis=0).any() or any(scaled) or 0 < n_ends < few
+    if inside.sum() < LEAST * len(known) or aligned:
+        return False
+    return bool(np.ptp(tracks[inside], axis=0).min() > 0.1)

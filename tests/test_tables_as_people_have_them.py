@@ -1,0 +1,333 @@
+"""Files as trackers and people have them: what is read, and advice that is followed."""
+
+import re
+import shlex
+import warnings
+from itertools import pairwise
+from types import SimpleNamespace
+
+import landmark_files as files
+import numpy as np
+import pandas as pd
+import pytest
+from fit_runs import QUICK
+from landmark_files import BODYPARTS, TRACKS
+from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused, warned
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.cli._times import image_numbers
+from isa_nrsfm.datasets import make_body_tracks, make_nonrigid_tracks
+from isa_nrsfm.io import from_mediapipe, from_sleap_io, landmark_table, read_landmarks
+
+N = 40
+POINTS = make_nonrigid_tracks(N, 8, 1, noise=0.01, random_state=0).data
+POINTS = (100 * POINTS + 400).round(2).reshape(N, 8, 2)
+FLAT = TRACKS.reshape(12, -1)
+
+
+def table_of(name, tracks, parts=BODYPARTS):
+    """Return a table of points under names such as "{part}_{axis}"."""
+    names = [name.format(part=part, axis=axis) for part in parts for axis in "xy"]
+    return pd.DataFrame(tracks.reshape(len(tracks), -1), columns=names)
+
+
+def warnings_of(call, *args, **kwargs):
+    """Return the texts of the warnings of a call, and its result."""
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        found = call(*args, **kwargs)
+    return " ".join(str(each.message) for each in caught), found
+
+
+@pytest.mark.parametrize(
+    ("name", "who"),
+    [
+        ("{part}_{who}_{axis}", "12"),  # SimBA
+        ("{who}.{part}.{axis}", ("inst0", "inst1")),  # sleap-io
+        ("net_{who}_{part}_{axis}", ("resident", "intruder")),  # levels of DeepLabCut
+        ("pt_{part}_{who}_{axis}", ("cam1", "cam2")),  # DLTdv
+        ("{part}_{axis}_{who}", "12"),
+        ("{who}{part} {axis}", "12"),
+    ],
+)
+def test_individuals_in_a_row_are_a_question(tmp_path, fits, name, who):
+    own = [name.replace("{who}", each) for each in who]
+    tables = [table_of(each, POINTS + 300 * i) for i, each in enumerate(own)]
+    scores = [f"{each.format(part=p, axis='p')}" for each in own for p in BODYPARTS]
+    path = tmp_path / "pair.csv"
+    pd.concat(tables, axis=1).assign(**dict.fromkeys(scores, 1.0)).to_csv(path)
+    told = str(refused("several individuals in one row", read_landmarks, path))
+    rows = read_landmarks(path, individuals=re.search("individuals='(.*?)'", told)[1])
+    assert list(rows.frames["individual"]) == [*who] * N
+    assert list(rows.frames["frame"]) == list(np.repeat(range(N), 2))
+    for i in (0, 1):
+        assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
+    assert (rows.confidence == 1).all(axis=None)
+    options = re.findall(r"command line: (--\w+ .*?)\)", told)
+    for option, found in zip(
+        options, ("80 frames of 8", "40 frames of 16"), strict=True
+    ):
+        assert found in fits(path, *QUICK, "1", *shlex.split(option)).out
+
+
+def test_parts_of_one_body_are_no_individuals():
+    hand = ["wrist", *(f"{f}_{j}" for f in ("thumb", "index", "ring") for j in "1234")]
+    sides = [f"{side}_{part}" for side in ("left", "right") for part in BODYPARTS]
+    legs = [f"leg{i}_{part}" for i in range(6) for part in ("hip", "knee", "foot")]
+    few = [f"{part}_{mouse}" for mouse in "12" for part in BODYPARTS[:5]]
+    for parts in (hand, sides, legs, few):
+        table, options = (
+            table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts),
+            {},
+        )
+        if parts is few:
+            told = str(refused("Their 5 points are too few", landmark_table, table))
+            options["columns"] = re.search("columns='(.*?)'", told)[1]
+        assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
+    refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
+
+
+@pytest.mark.parametrize("seen", [1.0, 0.6, 0.3])
+def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
+    tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
+    tracks = tracks - tracks.min((0, 1))
+    shares = tracks / tracks[..., 1].max() / seen * [0.53, 0.95] + [0.2, 0.02]
+    path, told = tmp_path / "pose.csv", "like shares of the width and height"
+    table_of("LM{part}_{axis}", shares, range(17)).to_csv(path, index=False)
+    text, plain = warnings_of(read_landmarks, path)
+    assert told in text
+    for camera in ("affine", "weak_perspective"):
+        text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points)
+        assert (told in text) == (camera != "affine")
+    n_outside = (shares > 1).any(axis=2).sum()
+    for columns in ({}, {"columns": "LM#_x,LM#_y"}):
+        size = {"format": "mediapipe", "image_size": (1280, 720)}
+        text, found = warnings_of(read_landmarks, path, **size, **columns)
+        assert (f"{n_outside} of {17 * N} points are outside" in text) == (
+            n_outside > 0
+        )
+        points = found.points.to_numpy().reshape(shares.shape)
+        assert_allclose(points, shares * [1280, 720])
+
+
+@pytest.mark.parametrize("code", [(0, 0), (-1, -1), (-1280, -720), (-310, -205)])
+def test_codes_of_missing_points_in_python(tmp_path, code):
+    tracks, hidden = POINTS.copy(), np.random.default_rng(1).random((N, 8)) < 0.1
+    tracks[hidden] = code
+    table, fit = table_of("{part}_{axis}", tracks), AffineNRSfM(1, refinement=None).fit
+    table.to_csv(tmp_path / "a.csv", index=False)
+    for call, X in ((read_landmarks, tmp_path / "a.csv"), (fit, table.to_numpy())):
+        text, _ = warnings_of(call, X)
+        assert f"exactly ({code[0]}, {code[1]}) ({hidden.sum()} in all)" in text
+    assert ("make them NaN before coordinates are shifted" in text) == (code[0] < -1)
+    tracks[hidden] = np.nan  # as advised
+    assert "exactly" not in warnings_of(fit, tracks.reshape(N, -1))[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        ("labeled-data/v/img0010.png labeled-data/v/img0030.png", [10, 30]),
+        ("0.jpg 10.jpg 2.jpg", [0, 10, 2]),
+        ("v1_7_x2.png v1_9_x2.png v1_30_x2.png", [7, 9, 30]),
+        ("a/1.png a/5.png b/1.png b/5.png", [1, 5, 1, 5]),
+        ("e3a1.png 77b0.png 0c9d.png", [0, 1, 2]),  # no numbers of frames
+        ("anna.png bob.png anna.png", [0, 1, 0]),
+    ],
+)
+def test_numbers_in_names_are_those_of_frames(names, numbers):
+    assert list(image_numbers(pd.DataFrame({"image": names.split()}))) == numbers
+
+
+LISTS = "keypoints foot_kpts face_kpts lefthand_kpts righthand_kpts".split()
+PARTS = dict(
+    zip("body feet face left_hand right_hand all".split(), range(6), strict=True)
+)
+ENDS = [0, 17, 23, 91, 112, 133]
+BODIES = files.scene(4, 133, 7)
+
+
+@pytest.mark.parametrize("lists", [LISTS, LISTS[:1]])
+@pytest.mark.parametrize("part", PARTS)
+def test_parts_of_whole_bodies(tmp_path, lists, part):
+    ends, rows = ENDS if len(lists) > 1 else [0, 133], []
+    for i, points in enumerate(np.dstack([BODIES, np.ones((4, 133))])):
+        values = [points[a:b].ravel().tolist() for a, b in pairwise(ends)]
+        rows.append(dict(zip(lists, values, strict=True)) | {"image_id": i})
+    content = {"images": [{"id": i} for i in range(4)], "annotations": rows}
+    content = content if len(lists) > 1 else rows
+    path = files.write_json(tmp_path / "a.json", content)
+    first, end = [*pairwise(ENDS), (0, 133)][PARTS[part]]
+    found = read_landmarks(path, part=part).points
+    assert_array_equal(found, BODIES[:, first:end].reshape(4, -1))
+    if len(lists) > 1:
+        told = (
+            "those in foot_kpts, face_kpts, .* choose with part, one of body, .*--part"
+        )
+        assert len(warned(told, read_landmarks, path).point_names) == 17
+    refused("'nose' is none of body, ", read_landmarks, path, part="nose")
+
+
+def test_annotations_of_other_categories_are_counted(tmp_path):
+    content, path = files.coco_annotations(TRACKS), tmp_path / "a.json"
+    for entry in content["annotations"][::5]:
+        entry["category_id"] = 4
+    told = "3 annotations are of the category 4, which names no keypoints"
+    files.write_json(path, content)
+    assert warned(told, read_landmarks, path).failed.sum() == 3
+    content["categories"][0]["id"] = 7
+    files.write_json(path, content)
+    refused("12 annotations are of the category 4, 1", read_landmarks, path)
+
+
+@pytest.mark.parametrize("kind", ["track_id", "name", "idx", "person_id"])
+def test_who_is_who_is_a_column_of_images_in_their_order(tmp_path, kind):
+    who, path = [5, 6, 7] * 4, tmp_path / "a.json"
+    content = files.coco_annotations(TRACKS)
+    if kind == "idx":  # results of AlphaPose, in the order of texts
+        rows = [
+            files.RESULTS[i] | {"image_id": f"{i}.jpg", kind: [w]}
+            for i, w in enumerate(who)
+        ]
+        content = sorted(rows, key=lambda row: row["image_id"])
+    elif kind == "person_id":  # OpenPose
+        path = tmp_path / "people"
+        path.mkdir()
+        for i, each in enumerate(who):
+            person = files.openpose_person(pose=files.SCORED[i]) | {kind: [each]}
+            files.write_json(path / f"cam01.{i}.json", {"people": [person]})
+    for row, each in zip(
+        content["annotations"] if kind[0] in "tn" else (), who, strict=False
+    ):
+        row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
+    if kind != "person_id":
+        files.write_json(path, content)
+    found = read_landmarks(path)
+    assert list(found.frames[kind]) == who
+    assert_array_equal(found.points, FLAT)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrap"),
+    [
+        ("pose_landmarks", lambda points: SimpleNamespace(landmark=points)),
+        ("multi_face_landmarks", lambda points: [SimpleNamespace(landmark=points)]),
+        ("left_hand_landmarks", lambda points: points),  # HolisticLandmarker
+        ("hand_landmarks", lambda points: [points]),
+    ],
+)
+@pytest.mark.parametrize("nobody", [None, []])
+def test_results_of_all_versions_of_mediapipe(name, wrap, nobody):
+    points = [SimpleNamespace(x=x, y=y, visibility=0.5) for x, y in TRACKS[0] / 500]
+    results = [SimpleNamespace(**{name: each}) for each in (wrap(points), nobody)]
+    results[0].handedness = [[SimpleNamespace(category_name="Left")]]
+    found = from_mediapipe(results, (500, 500))
+    assert_allclose(found.points.iloc[0], FLAT[0])
+    assert list(found.failed) == [False, True]
+    if name == "hand_landmarks":
+        assert list(found.frames["handedness"].fillna("")) == ["Left", ""]
+    results[0].hand_landmarks, results[0].face_landmarks = vars(results[0])[name], []
+    told = refused("results have .*got part=None", from_mediapipe, results, (5, 5))
+    assert re.search("part='(.*?)'", str(told))[1] in ("face", "hand", "pose")
+    from_mediapipe(results, (500, 500), part="hand")
+    refused("got part='body'", from_mediapipe, results, (5, 5), "body")
+
+
+@pytest.mark.parametrize("word", ["p", "prob", "Likelihood", "v", "visibility"])
+@pytest.mark.parametrize("size", [[], ["--image-size", "1000x1000"]])
+def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
+    score, path = np.random.default_rng(0).uniform(0.2, 1.0, (N, 8)), tmp_path / "a.csv"
+    table = table_of("{part}_{axis}", POINTS / (1000 if size else 1))
+    scores = {f"{part}_{word}": score[:, j] for j, part in enumerate(BODYPARTS)}
+    table.assign(**scores).to_csv(path, index=False)
+    given = {"format": "mediapipe", "image_size": (1000, 1000)} if size else {}
+    found = read_landmarks(path, min_confidence=0.5, **given)
+    assert_array_equal(found.points.isna().to_numpy()[:, ::2], score < 0.5)
+    assert found.frames.empty
+    if word == "p":
+        options = [*QUICK, "1", *size, "--format", "mediapipe" if size else "table"]
+        told = re.search(r"(\d+) % of .* with (--min.*)", fits(path, *options).err)
+        assert int(told[1]) == round(100 * (score < 0.6).mean())
+        assert fits(path, *options, *told[2].split()).err == ""
+
+
+def labelled(xy, **known):
+    """Return an instance of sleap-io; one with a score is a prediction."""
+
+    def numpy(scores=False):
+        return np.column_stack([xy, np.full(8, 0.5)]) if scores else xy
+
+    skeleton = SimpleNamespace(node_names=BODYPARTS, edge_names=[("snout", "neck")])
+    return SimpleNamespace(numpy=numpy, skeleton=skeleton, **known)
+
+
+def test_labels_of_sleap_io():
+    a, b = (SimpleNamespace(name=name) for name in "ab")
+    seen = [labelled(TRACKS[i], track=t, score=0.9) for i, t in enumerate((a, b, a))]
+    seen.append(labelled(TRACKS[3], track=None, from_predicted=seen[2]))
+    frames = [
+        SimpleNamespace(
+            video=SimpleNamespace(filename="m.mp4"), frame_idx=t, instances=i
+        )
+        for t, i in ((9, seen[2:]), (2, seen[:2]), (4, []))
+    ]
+    found = from_sleap_io(frames)
+    assert list(found.frames["frame"]) == [2, 2, 4, 9]
+    assert list(found.frames["individual"].fillna("")) == ["a", "b", "", ""]
+    assert_array_equal(found.points, [FLAT[0], FLAT[1], FLAT[0] * np.nan, FLAT[3]])
+    assert list(found.confidence["snout"].fillna(-1)) == [0.5, 0.5, -1, -1]
+    assert found.skeleton.edges.tolist() == [[0, 3]]
+    seen[0].skeleton.node_names = ["a"]
+    for labels in (frames, [], [3], 3):
+        refused("instances of one skeleton; got ", from_sleap_io, labels)
+
+
+def test_predictions_of_mmpose(tmp_path):
+    instances = [files.VIDEO[0]["instances"] * 2, []]
+    content = [{"frame_id": i, "instances": each} for i, each in enumerate(instances)]
+    found = read_landmarks(files.write_json(tmp_path / "a.json", content))
+    assert list(found.frames["frame"]) == [0, 0, 1]
+    assert list(found.frames["person"].fillna(-1)) == [0, 1, -1]
+    assert list(found.failed) == [False, False, True]
+
+
+def test_specimens_of_tps(tmp_path):
+    path = files.write_tps(tmp_path / "a.tps", TRACKS)
+    text = path.read_text().replace("ID=3", "CURVES=1\nPOINTS=1\n1 1\nID=3")
+    path.write_text(text)
+    found = warned("1 points of curves are left out", read_landmarks, path).frames
+    assert list(found.iloc[3]) == ["skull 3.jpg", "3", "0.05"]
+    for wrong, message in (("LM3=8", "expected LM="), ("LM=9", "specimen 0 .*'IMAGE")):
+        path.write_text(text.replace("LM=8", wrong))
+        refused(message, read_landmarks, path, "tps")
+    path.write_text(text.replace("LM=8", "LM=7"))
+    refused("there are more than 7 landmarks", read_landmarks, path)
+
+
+@pytest.mark.parametrize("names", ["frame landmark_index", "t bodypart", "Frame id"])
+@pytest.mark.parametrize("further", [[], ["video"], ["hand", "participant"]])
+def test_the_recipe_for_a_row_a_point_has_the_names_of_the_table(names, further):
+    frame, point = names.split()
+    rows = [(i, j, *TRACKS[i, j]) for i in range(12) for j in range(8)]
+    table = pd.DataFrame(rows, columns=[frame, point, "x", "y"]).assign(score=0.5)
+    table = pd.concat(
+        [table.assign(**dict.fromkeys(further, v)) for v in "ab"[: 1 + bool(further)]]
+    )
+    told = str(refused("one row for each point", landmark_table, table))
+    scope = {"table": table}
+    for line in told.partition("In pandas: ")[2].split(", and "):
+        exec(line, scope)
+    points, other = landmark_table(scope["wide"])
+    assert_array_equal(points.iloc[:: 1 + bool(further)], FLAT)
+    assert {*other} == {frame, *further}
+
+
+@pytest.mark.parametrize("box", ["x y w h", "bbox_x bbox_y bbox_w bbox_h"])
+@pytest.mark.parametrize("name", ["{part}_{axis}", "{part}{axis}"])
+def test_corners_of_boxes_are_no_points(box, name):
+    table = table_of(name, TRACKS).assign(**dict.fromkeys(box.split(), 5.0))
+    options = {}
+    if "_" not in name:
+        told = str(refused("--columns", landmark_table, table))
+        options["columns"] = told.rpartition("such as ")[2].strip("'")
+    assert_array_equal(landmark_table(table, **options).points, FLAT)
