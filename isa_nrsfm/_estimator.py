@@ -138,15 +138,11 @@ default="affine"
         the image's width and height, if nothing else is known.
     prior : AffineNRSfM, default=None
         A fitted model of the same points, with calibrated cameras, that is adapted to
-        the table instead of a fit from nothing: frontal photos and few frames do not
-        determine depths by themselves. `isa_nrsfm.datasets.load_face_prior` is one of
-        faces. `n_components` is that of the prior, or "auto". Rotation, mirror image
-        and mixing of the basis are those of the prior, so that coefficients of all
-        tables with one prior can be compared. The strategy `isa` and `independence`
-        are not used.
+        the table: frontal photos and few frames alone do not determine depths.
+        `isa_nrsfm.datasets.load_face_prior` is one of faces. `n_components` is its K,
+        or "auto". `isa` and `independence` have no effect.
     adapt : {"mean", "shapes"}, default="mean"
-        Shapes that differ from those of the prior, by as much as the table shows
-        (`prior_std_`): only the mean shape, or all of them.
+        Shapes that may differ from the prior's: only the mean shape, or all.
     independence : {"shapes", "coefficients", None}, default="shapes"
         Criterion for the basis of the joint refinement. The likelihood does not depend
         on the mixing of the basis shapes. "shapes" makes them independent of each other
@@ -255,9 +251,8 @@ default="affine"
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
     prior_std_ : ndarray of shape (2,)
-        Standard deviations of the points of the mean shape and of the basis shapes from
-        those of the prior, in sizes of frames. Zero for a fixed basis. Only with a
-        prior, which also fixes the scale and the signs of shapes and coefficients.
+        Standard deviations of the mean shape and of the basis shapes from those of the
+        prior, in sizes of frames. The prior also fixes scales and signs.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -555,8 +550,8 @@ default="affine"
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
         warn_of_rows(source, self.camera)
-        inherited = self.random_state, self.n_jobs, self.verbose
-        isa = ready_strategy(self.isa, settings.joint, *inherited)
+        own = self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
+        isa = ready_strategy(*own)
         n_components = self.n_components
         if settings.prior is not None:
             n_components = len(settings.prior.basis)

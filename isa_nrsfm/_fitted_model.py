@@ -180,19 +180,19 @@ class TableModel(NamedTuple):
         return whole
 
     def misfit(self, rows: NDArray, weights: NDArray | None = None) -> float:
-        """Return the median distance of points from fits, in deviations of the noise.
+        """Return the median distance of points from fits over the expected one.
 
-        Distances that are tiny for the size of a frame count as noise.
+        Noise and errors of the shapes are expected, and distances that are tiny for the
+        size of a frame.
         """
         assert isinstance(self.frames, PosteriorFrames)
         fit = self.posterior(rows, weights)
         weight = (seen_points(rows) if weights is None else weights).sum(axis=1)
+        noise = 2.0 * self.frames.noise_variance * self.frames.error_ratios(fit.alpha)
+        noise = np.maximum(noise, LEAST_MISFIT**2)
         known = np.isfinite(fit.objective)
-        if not known.any():
-            return 0.0
-        square = np.median(self.frames.squares(fit, weight)[known])
-        noise = max(2.0 * self.frames.noise_variance, LEAST_MISFIT**2)
-        return float(np.sqrt(square / noise))
+        ratios = (self.frames.squares(fit, weight) / noise)[known]
+        return float(np.sqrt(np.median(ratios))) if known.any() else 0.0
 
     def linearised(
         self, rows: NDArray, weights: NDArray | None = None

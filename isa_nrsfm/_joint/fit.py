@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, compose, distances
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
-from isa_nrsfm._joint.prior import ROUNDS
+from isa_nrsfm._joint.prior import ROUNDS, TOL_SHARE
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,
     FactorisedTable,
@@ -76,7 +76,9 @@ def fit_jointly(
     else:
         shapes = first.frames.coordinates(start.shapes)
         start = first.aligned(start._replace(shapes=shapes), first.cameras)
-        fit = first.unreversed(start, first.cameras)
+        # The widths of a prior change its first fit.
+        rough = {} if settings.prior is None else {"tol": settings.tol / TOL_SHARE}
+        fit = first.unreversed(start, first.cameras, **rough)
     ratio = fit.camera_noise_ratio
     if fit.prior is None:
         fit, least_noise, sufficient = judged(first, table, fit, start)
