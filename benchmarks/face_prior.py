@@ -12,6 +12,7 @@ them. Only these places come from the photos. Needs ``ict_bu3dfe_like_68.npz``,
 ISA_NRSFM_DATA. Writes ``isa_nrsfm/datasets/face_prior.npz``.
 """
 
+import argparse
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +37,11 @@ NUMBERS = (
 
 def main():
     """Make the model, and write its file."""
+    about = __doc__.strip().split("\n")[0]
+    parser = argparse.ArgumentParser(
+        "python -m benchmarks.face_prior", description=about
+    )
+    parser.parse_args()
     faces, dense, photos = map(load_arrays, (ICT, DENSE, FACES))
     W = photos["W2d"][photos["source"] != CHECKED]
     annotated = AffineNRSfM(20, camera="weak_perspective", random_state=0)

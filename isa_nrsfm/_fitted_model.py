@@ -17,7 +17,7 @@ from isa_nrsfm._frames.models import (
 from isa_nrsfm._frames.pinhole import Pinhole, zoomed
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
-from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
+from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import (
     Layout,
@@ -180,19 +180,21 @@ class TableModel(NamedTuple):
         return whole
 
     def misfit(self, rows: NDArray, weights: NDArray | None = None) -> float:
-        """Return the median distance of points from fits over the expected one.
+        """Return the typical distance of points from fits over the expected one.
 
         Noise and errors of the shapes are expected, and distances that are tiny for the
-        size of a frame.
+        size of a frame. Few outliers have no effect.
         """
         assert isinstance(self.frames, PosteriorFrames)
-        fit = self.posterior(rows, weights)
-        weight = (seen_points(rows) if weights is None else weights).sum(axis=1)
-        noise = 2.0 * self.frames.noise_variance * self.frames.error_ratios(fit.alpha)
-        noise = np.maximum(noise, LEAST_MISFIT**2)
-        known = np.isfinite(fit.objective)
-        ratios = (self.frames.squares(fit, weight) / noise)[known]
-        return float(np.sqrt(np.median(ratios))) if known.any() else 0.0
+        fit = self.decompose(rows, weights, False, np.float64)
+        distance = self.distances(rows, *fit[:3])
+        if weights is not None:
+            distance *= np.sqrt(np.where(weights > 0, weights, np.nan))
+        constant, slope = self.frames.certainty.images
+        ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
+        expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)
+        known = distance[np.isfinite(distance)]
+        return median_noise(known) / float(np.sqrt(expected)) if len(known) else 0.0
 
     def linearised(
         self, rows: NDArray, weights: NDArray | None = None

@@ -369,7 +369,8 @@ class PosteriorFrames:
         is divided by the error variance of the images over that of the noise. These
         ratios (n, 1, 1) are returned, too.
         """
-        ratio = self.error_ratios(alpha)[:, None, None]
+        constant, slope = self.certainty.images
+        ratio = (constant + slope * leverages(alpha))[:, None, None]
         rest = np.eye(alpha.shape[1]) + (ratio - 1.0) * covariance
         return np.linalg.solve(rest, ratio * covariance), ratio
 
@@ -443,11 +444,6 @@ class PosteriorFrames:
         excess /= self.certainty.residual or np.nan
         excess = np.fmax(excess, 1.0)
         return sizes[:, None] * np.sqrt(variances * excess[:, None])
-
-    def error_ratios(self, alpha: NDArray) -> NDArray:
-        """Return error variances (n,) of images over that of the noise."""
-        constant, slope = self.certainty.images
-        return np.asarray(constant + slope * leverages(alpha))
 
     def squares(self, fit: FramePosterior, weight: NDArray) -> NDArray:
         """Return mean squared residuals (n,) of points; weight (n,): of all points."""
