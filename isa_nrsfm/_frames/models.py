@@ -7,12 +7,13 @@ coefficients together.
 """
 
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     distances,

@@ -23,12 +23,13 @@ last index of all arrays.
 """
 
 from collections.abc import Iterator
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     DIAGONAL,

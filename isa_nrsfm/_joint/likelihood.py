@@ -29,13 +29,14 @@ Cameras M and their gradient G are (2, 3, n_frames).
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from operator import add
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._frames.point_sums import (
     FrameTracks,
     ShapeProducts,

@@ -10,12 +10,13 @@ maximisation.
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.newton import CalibratedSearch
