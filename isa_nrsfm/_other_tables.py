@@ -20,9 +20,10 @@ from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import seen_points
 
 # Distance of points from the shapes of a prior, in sizes of frames, beyond its noise,
-# from which they are other points; misfit of frames that noise and other people do not
-# reach: docs/benchmarks/README.md, "Thresholds".
-OTHER_POINTS, LARGEST_MISFIT = 0.15, 1.8
+# from which they are other points; misfit of frames, with calibrated and with affine
+# cameras, that noise and other people do not reach: docs/benchmarks/README.md,
+# "Thresholds".
+OTHER_POINTS, LARGEST_MISFIT, OF_AFFINE = 0.15, 1.8, 5.0
 
 
 def warn_if_foreign(
@@ -33,13 +34,13 @@ def warn_if_foreign(
         return
     some = spread(np.arange(table.n_frames), min(table.n_frames, 100))
     weights = None if weights is None else weights[some]
-    misfit = model.misfit(table.take(some), weights)
-    if misfit > LARGEST_MISFIT:
+    misfit, camera = model.misfit(table.take(some), weights), model.frames.camera
+    if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X by itself"
-        if model.frames.camera != "affine":
+        if camera != "affine":
             way = (
                 "Adapt the model to X: AffineNRSfM(n_components='auto', camera="
-                f"{model.frames.camera!r}, prior=model).fit(X)"
+                f"{camera!r}, prior=model).fit(X)"
             )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "

@@ -425,6 +425,11 @@ class AffineNRSfMCV(
         """Return a search with a clone of the estimator, its scorer and splitter."""
         estimator = AffineNRSfM() if self.estimator is None else self.estimator
         check_class(estimator, "estimator")
+        if estimator.prior is not None:
+            raise ValueError(
+                "a fit with a prior has as many basis shapes as the prior: there is no "
+                "n_components to choose. Set prior=None, or fit the estimator itself"
+            )
         estimator, scorer = clone(estimator), check_scoring(estimator, self.scoring)
         # More blocks cost more, and hardly change the choice. Neighbours are alike:
         # large blocks keep them together.
