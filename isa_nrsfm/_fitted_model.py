@@ -189,7 +189,8 @@ class TableModel(NamedTuple):
         fit = self.decompose(rows, weights, False, np.float64)
         distance = self.distances(rows, *fit[:3])
         if weights is not None:
-            distance *= np.sqrt(np.where(weights > 0, weights, np.nan))
+            weights = np.where(weights > 0, weights, np.nan)
+            distance *= np.sqrt(weights / np.nanmean(weights))
         constant, slope = self.frames.certainty.images
         ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
         expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)

@@ -37,16 +37,17 @@ def warn_if_foreign(
     misfit, camera = model.misfit(table.take(some), weights), model.frames.camera
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X by itself"
-        if camera != "affine":
+        if camera != "affine" and model.frames.certainty.determined:
+            planar = ", layout='planar'" if model.layout == "planar" else ""
             way = (
                 "Adapt the model to X: AffineNRSfM(n_components='auto', camera="
-                f"{camera!r}, prior=model).fit(X)"
+                f"{camera!r}, prior=model{planar}).fit(X)"
             )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "
             "model as its noise explains: they come from another annotator or tracker, "
-            "or move as the fitted table does not show. Shapes, depths and "
-            f"coefficients may be wrong. {way}"
+            "show other people or objects, or move as the fitted table does not show. "
+            f"Shapes, depths and coefficients may be wrong. {way}"
         )
 
 
@@ -59,7 +60,7 @@ def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
         raise ValueError(
             "prior needs calibrated cameras and refinement='joint'; got camera="
             f"{estimator.camera!r}, refinement={estimator.refinement!r}. Set camera="
-            "'weak_perspective'"
+            "'weak_perspective' and refinement='joint'"
         )
     prior = getattr(prior, "estimator", prior)  # of a FrozenEstimator
     model = getattr(prior, "_model", None)
@@ -109,11 +110,14 @@ def prior_start(
     model = settings.prior
     frames = model.frames
     n_frames = table.rows.n_frames
-    rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
+    some = spread(np.arange(n_frames), min(n_frames, 200))
+    rows = table.rows.take(some)
+    weights = None if table.weights is None else table.weights[some]
     frames = replace(frames, camera="weak_perspective", loss=settings.loss)
-    fit = frames.posterior(rows, False)
+    fit = frames.posterior(rows, False, weights)
     if settings.loss == "linear":
-        square = np.nanmedian(frames.squares(fit, seen_points(rows).sum(axis=1)))
+        weights = seen_points(rows) if weights is None else weights
+        square = np.nanmedian(frames.squares(fit, weights.sum(axis=1)))
     else:  # without outliers
         distance = distances(rows, frames.shapes, *fit[:3])
         square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2

@@ -14,6 +14,8 @@ UNSURE = 0.6
 FEW = 0.05
 # Least part of the points of shares that are in the image.
 LEAST = 0.2
+# Largest median of centred coordinates.
+CENTRED = 0.03
 
 
 class CoordinateWarning(UserWarning):
@@ -125,13 +127,17 @@ def are_shares(tracks: NDArray) -> bool:
     if not len(known):
         return False
     beyond = np.mean([known < 0, known > 1], axis=1)  # of two borders, in x and y
-    if beyond.sum() - beyond.max() > 2 * FEW:
+    # Half of the points of a centred body are on either side.
+    centred = (np.abs(np.median(known, axis=0)) < CENTRED).any()
+    if centred or beyond.sum() - beyond.max() > 2 * FEW:
         return False
     inside = ((tracks >= 0) & (tracks <= 1)).all(axis=2) & seen
     zero, one = (((tracks == end).any(axis=2) & seen) for end in (0, 1))
-    n_ends, few = zero.sum() + one.sum(), 4 + len(known) / 1000
+    ends, few = (zero.sum(), one.sum()), 4 + len(known) / 1000
     scaled = [np.mean(zero.any(axis) & one.any(axis)) > 0.5 for axis in (0, 1)]
-    aligned = zero.all(axis=0).any() or any(scaled) or 0 < n_ends < few
+    aligned = (
+        zero.all(axis=0).any() or any(scaled) or (0 < min(ends) and sum(ends) < few)
+    )
     if inside.sum() < LEAST * len(known) or aligned:
         return False
     return bool(np.ptp(tracks[inside], axis=0).min() > 0.1)

@@ -231,7 +231,20 @@ def individuals_as_rows(
     own = columns_of_individuals(frame.columns, individuals)
     frame = frame.reset_index(drop=True)
     common = frame.drop(columns=[name for names in own.values() for name in names])
-    if "frame" not in common:
+    if "individual" in common:
+        raise ValueError(
+            "the table has a column 'individual' already, which individuals would "
+            "replace: rename it"
+        )
+    others = [name for name in common if parse_coordinate(name) is not None]
+    if others:
+        warn_caller(
+            f"{len(others)} columns of coordinates are not those of all individuals "
+            f"(first: {others[0]!r}): they are left out"
+        )
+        common = common.drop(columns=others)
+    # Other numbers or names of images say more than those of rows.
+    if not any(re.search("frame|image|img|file", str(n), re.I) for n in common):
         common.insert(0, "frame", common.index)
     parts = [
         common.assign(individual=name).join(frame[[*columns]].rename(columns=columns))

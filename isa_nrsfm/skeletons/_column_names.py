@@ -170,8 +170,8 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
     """
     Return what tells individuals apart in the names of x columns, if anything does.
 
-    All have points of the same names, at least so many; of two or three with numbers,
-    four. Points of one body differ by its sides.
+    They have points of the same names, at least so many, and together nearly all; of
+    two or three with numbers, four. Points of one body differ by its sides.
 
     >>> from isa_nrsfm.skeletons._column_names import individuals_in
     >>> names = [f"p{point}_{mouse}_x" for point in range(8) for mouse in "ab"]
@@ -180,12 +180,14 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
     """
     found: list[list[str]] = []
     for division in _divisions(names):
-        rests = [frozenset(each) for each in division.values()] or [frozenset()]
-        whole = len({*rests}) == 1 and len(rests) * len(rests[0]) == len(names)
-        few = len(rests) < 4 and all(key[-1:].isdigit() for key in division)
-        enough = len(rests) > 1 and len(rests[0]) >= (4 if few else least)
-        if whole and enough and not _SIDES.issuperset(map(str.lower, division)):
-            found.append(list(division))
+        keys = [key for key, each in division.items() if len(each) > 1]
+        rests = [frozenset(division[key]) for key in keys] or [frozenset()]
+        common = frozenset.intersection(*rests)
+        whole = len(rests) * len(common) >= 0.8 * len(names)
+        few = len(rests) < 4 and all(key[-1:].isdigit() for key in keys)
+        enough = len(rests) > 1 and len(common) >= (4 if few else least)
+        if whole and enough and not _SIDES.issuperset(map(str.lower, keys)):
+            found.append(keys)
     return min(found, key=len, default=[])
 
 
@@ -202,7 +204,7 @@ def columns_of_individuals(
         if len(common) > max(map(len, best.values()), default=0):
             pairs = zip(who, own, strict=True)
             best = {name: {each[rest]: rest for rest in common} for name, each in pairs}
-    if not best:
+    if not best or len({*who}) < len(who):
         raise ValueError(
             f"no columns have the same names but for {', '.join(who)} (individuals)"
         )
