@@ -184,6 +184,7 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
         rests = [frozenset(division[key]) for key in keys] or [frozenset()]
         common = frozenset.intersection(*rests)
         whole = len(rests) * len(common) >= 0.8 * len(names)
+        whole &= max(map(len, rests)) <= 1.1 * len(common) + 1  # others are sets
         few = len(rests) < 4 and all(key[-1:].isdigit() for key in keys)
         enough = len(rests) > 1 and len(common) >= (4 if few else least)
         if whole and enough and not _SIDES.issuperset(map(str.lower, keys)):
