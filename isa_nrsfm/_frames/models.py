@@ -357,11 +357,12 @@ class PosteriorFrames:
         known = covariance.shape[1] == len(self.shapes) - 1
         widened = self.widened(alpha, covariance)[0] if known else None
         motion, alpha, deviation = self.gauge.apply(motion, alpha, widened)
-        motion, translation = (
+        return Decomposition(
             motion * sizes[:, None, None],
             translation * sizes[:, None],
+            alpha,
+            deviation,
         )
-        return Decomposition(motion, translation, alpha, deviation)
 
     def widened(self, alpha: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
         """Return covariances (n, K, K) with the errors of the shapes.
@@ -405,8 +406,14 @@ class PosteriorFrames:
         precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         covariance, ratio = self.widened(fit.alpha, fit.covariance)
-        posterior = motion, fit.translation * sizes[:, None], fit.alpha, covariance
-        return LinearisedFrames(*posterior, precision / ratio, slope)
+        return LinearisedFrames(
+            motion,
+            fit.translation * sizes[:, None],
+            fit.alpha,
+            covariance,
+            precision / ratio,
+            slope,
+        )
 
     def depth_deviations(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None

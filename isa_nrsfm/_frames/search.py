@@ -167,16 +167,19 @@ class FrameSearch:
         weights = np.where(seen_points(rows), given, 0.0)
         complete = (weights == 1.0).all(axis=1)
         fits = FramePosterior.unknown(n_frames, n_components, covariances)
-        options: dict[str, Any] = {"starts": starts, "covariances": covariances}
         # Complete frames share one Gram matrix.
         for chosen in np.flatnonzero(complete), np.flatnonzero(~complete):
             if len(chosen):
                 frames = padded(chosen)
                 own = None if complete[frames[0]] else weights[frames]
-                tracks = frame_tracks(rows[frames], own)
-                if initial is not None:
-                    options["initial"] = initial[frames]
-                fits.put(frames, self.fit(tracks, noise[frames], **options))
+                fit = self.fit(
+                    frame_tracks(rows[frames], own),
+                    noise[frames],
+                    initial=None if initial is None else initial[frames],
+                    starts=starts,
+                    covariances=covariances,
+                )
+                fits.put(frames, fit)
         return fits
 
     def fit(
@@ -262,9 +265,15 @@ class FrameSearch:
                 spreads = self.covariances(problem, M, alpha)
                 covariance, turns = map(frames_first, spreads)
                 spreads = covariance, self.space.T @ turns @ self.space
-            objective = np.maximum(objective, 0.0)  # less is rounding errors
-            fit = motion @ self.space, products.positions(motion, alpha.T), alpha.T
-            fits.put(block, FramePosterior(*fit, *spreads, objective, converged))
+            minima = FramePosterior(
+                motion @ self.space,
+                products.positions(motion, alpha.T),
+                alpha.T,
+                *spreads,
+                np.maximum(objective, 0.0),  # less is rounding errors
+                converged,
+            )
+            fits.put(block, minima)
         return fits
 
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:

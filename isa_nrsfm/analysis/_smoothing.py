@@ -312,10 +312,16 @@ def estimated_dynamics(
         lengths = n_components, n_walks, n_components * shares
         start = np.repeat([max(least, FIRST_RATE), 0.0, 0.0], lengths)
         limits = [(least, np.log(LARGEST_RATE)), (-40.0, 10.0), (-7.0, 7.0)]
-        options: dict[str, Any] = {"jac": True, "method": "L-BFGS-B"}
-        options["bounds"] = [limits[i] for i in np.repeat([0, 1, 2], lengths)]
-        options["options"] = {"maxiter": max_iter, "gtol": tol, "ftol": 1e-12}
-        found.append(minimize(minus_log_likelihood, start, **options))
+        found.append(
+            minimize(
+                minus_log_likelihood,
+                start,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=[limits[i] for i in np.repeat([0, 1, 2], lengths)],
+                options={"maxiter": max_iter, "gtol": tol, "ftol": 1e-12},
+            )
+        )
     # Akaike's criterion: one rate for each coefficient
     if found[1].fun - found[0].fun <= n_components + STRONG_EVIDENCE:
         return None

@@ -443,9 +443,10 @@ def _named_dims(dataset: Any) -> list[str] | None:
 
 def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
     """Return the skeleton of the dataset of edges; None if it is empty or absent."""
-    if "edge_names" not in file or not np.size(
-        content := content_of(file, "edge_names")
-    ):
+    if "edge_names" not in file:
+        return None
+    content = content_of(file, "edge_names")
+    if not np.size(content):
         return None
     size = np.shape(content)
     if len(size) != 2 or 2 not in size:

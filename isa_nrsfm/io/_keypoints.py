@@ -275,9 +275,9 @@ def _keypoints(
             f"points; whole bodies have {' or '.join(map(str, _PLACES))}"
         )
     chosen = slice(*places[part or "all"])
-    return values[:, chosen], names[chosen] if names and len(
-        names
-    ) == n_points else None
+    if names and len(names) == n_points:
+        return values[:, chosen], names[chosen]
+    return values[:, chosen], None
 
 
 def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
@@ -304,10 +304,9 @@ def _scalars(entry: dict[str, Any]) -> dict[str, Any]:
     Those of ``attributes`` are among them, as people and videos are told apart there.
     """
     found, further = {}, entry.get("attributes")
-    for name, value in {
-        **(further if isinstance(further, dict) else {}),
-        **entry,
-    }.items():
+    if isinstance(further, dict):
+        entry = further | entry
+    for name, value in entry.items():
         value = value[0] if isinstance(value, list) and len(value) == 1 else value
         if isinstance(value, str | int | float) and name not in _LEFT_OUT:
             found[name] = value

@@ -42,8 +42,13 @@ class BaseSubspaceAnalysis(
     @one_blas_thread
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
-        least = {"ensure_min_samples": 2, "ensure_min_features": self.subspace_size}
-        signals = validate_data(self, unmasked(signals), dtype=np.float64, **least)
+        signals = validate_data(
+            self,
+            unmasked(signals),
+            dtype=np.float64,
+            ensure_min_samples=2,
+            ensure_min_features=self.subspace_size,
+        )
         n_signals = signals.shape[1]
         if n_signals % self.subspace_size:
             raise ValueError(

@@ -408,8 +408,13 @@ class PooledFastICA(BaseSubspaceAnalysis):
         # This imports all linear models, which `transform` does not need.
         from sklearn.decomposition import FastICA
 
-        limits = {"max_iter": self.max_iter, "tol": self.tol}
-        ica = FastICA(whiten=False, fun=self.fun, w_init=start, **limits)
+        ica = FastICA(
+            whiten=False,
+            fun=self.fun,
+            max_iter=self.max_iter,
+            tol=self.tol,
+            w_init=start,
+        )
         with warnings.catch_warnings(record=True, action="always") as caught:
             ica.fit(Z.T)
         converged = not any(w.category is ConvergenceWarning for w in caught)
