@@ -5,6 +5,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+# Columns with the number of a frame, with an image, and with the name of one.
+FRAME = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number))?"
+IMAGE = r"(?:image|img|photo|frame)(?:[ _.]?(?:id|name|path|file))?"
+IMAGE_NAME = rf"{IMAGE}|file[ _.]?(?:name|path)?"
+
 
 def first_items(items: Iterable[Any], most: int = 4) -> str:
     """Return the first items with commas between them, and dots if there are more."""

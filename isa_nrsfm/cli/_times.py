@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._compat.texts import frame_numbers
+from isa_nrsfm._compat.texts import FRAME, IMAGE, IMAGE_NAME, frame_numbers
 
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
 _DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
@@ -24,10 +24,6 @@ _TIMES = [" ".join(pair) for pair in product(_DAYS, _OF_DAY)]
 # The ways in which dates and durations are usually written.
 _FORMATS = ("ISO8601", *_DAYS, *_TIMES, *_OF_DAY[3:], _MINUTES, _HOURS)
 _ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
-# Columns with the number of a frame, and others that name an image.
-_NUMBER = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number))?"
-_IMAGE = r"(?:image|img|photo|frame)(?:[ _.]?(?:id|name|path|file))?"
-_NAME = rf"{_IMAGE}|file[ _.]?(?:name|path)?"
 
 
 def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
@@ -43,7 +39,7 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
     known = column.dropna().astype(str)
     numbers = pd.to_numeric(known, errors="coerce")
     if format is None and numbers.notna().all():
-        of_frames = re.fullmatch(_NUMBER, str(column.name).strip(), re.IGNORECASE)
+        of_frames = re.fullmatch(FRAME, str(column.name).strip(), re.IGNORECASE)
         unit = "frames" if of_frames else f"in the unit of the column {column.name}"
         return np.asarray(numbers.reindex(column.index), dtype=float), unit
     zoned = known.str.fullmatch(f".*{_ZONE}")
@@ -87,16 +83,16 @@ def image_numbers(table: "pd.DataFrame") -> "pd.Series":
     It is the number of the frame, that in the name of the image, or that of the image
     among all. Otherwise rows count.
     """
-    for expression in (_NUMBER, _NAME, _IMAGE):
+    for expression in (FRAME, IMAGE_NAME, IMAGE):
         for name in table.columns:
             if not re.fullmatch(expression, str(name).strip(), re.IGNORECASE):
                 continue
             numbers: Any = pd.to_numeric(table[name], errors="coerce")
-            if expression == _NAME:  # not of videos with many rows each
+            if expression == IMAGE_NAME:  # not of videos with many rows each
                 several = name == "file" and table[name].duplicated().any()
                 is_name = numbers.isna().all() and not several
                 numbers = frame_numbers([*map(str, table[name])]) if is_name else None
-            elif expression == _IMAGE:
+            elif expression == IMAGE:
                 numbers = pd.factorize(table[name])[0]
             if numbers is not None and np.isfinite(numbers).all():
                 return pd.Series(numbers, dtype=float, name=str(name).strip())

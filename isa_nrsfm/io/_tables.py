@@ -15,6 +15,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
@@ -244,7 +245,8 @@ def individuals_as_rows(
         )
         common = common.drop(columns=others)
     # Other numbers or names of images say more than those of rows.
-    if not any(re.search("frame|image|img|file", str(n), re.I) for n in common):
+    image = re.compile(rf"\s*(?:{FRAME}|{IMAGE_NAME})\s*", re.IGNORECASE)
+    if not any(image.fullmatch(str(name)) for name in common):
         common.insert(0, "frame", common.index)
     parts = [
         common.assign(individual=name).join(frame[[*columns]].rename(columns=columns))
