@@ -20,6 +20,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from benchmarks._sets import FACES, ICT, Case, load_arrays
 from isa_nrsfm import AffineNRSfM
@@ -59,7 +60,10 @@ def vertex_weights(inner, dense, annotated):
 
     inner (68, 3): landmarks of the model; annotated (68, 3): those of photos.
     """
-    vertices = mean_mesh(dense)
+    vertices = dense["mean"] + sum(
+        np.tensordot(dense[f"{part}_coeffs"].mean(0), dense[part], 1)
+        for part in ("identity", "expression")
+    )
     tree, mirror = KDTree(vertices), np.array([-1.0, 1.0, 1.0])
     _, opposite = KDTree(dense["mean"]).query(dense["mean"] * mirror)
     weights = np.zeros((68, len(vertices)))
@@ -82,28 +86,20 @@ def vertex_weights(inner, dense, annotated):
 
 def jaw_in(annotated, inner):
     """Return the error of the inner points, and the jaw, after a similarity."""
-    from_, to = annotated[INNER], inner[INNER]
-    U, s, Vt = np.linalg.svd((from_ - from_.mean(0)).T @ (to - to.mean(0)))
-    signs = np.array([1.0, 1.0, np.linalg.det(U @ Vt)])
-    scale = s @ signs / np.sum((from_ - from_.mean(0)) ** 2)
-    moved = scale * (annotated - from_.mean(0)) @ (U * signs) @ Vt + to.mean(0)
+    moved, to = annotated - annotated[INNER].mean(0), inner[INNER]
+    centred = to - to.mean(0)
+    turn, _ = Rotation.align_vectors(centred, moved[INNER])
+    moved = turn.apply(moved)
+    scale = np.vdot(centred, moved[INNER]) / np.vdot(moved[INNER], moved[INNER])
+    moved = scale * moved + to.mean(0)
     return np.sum((moved[INNER] - to) ** 2), moved[JAW]
-
-
-def mean_mesh(dense):
-    """Return the mean of all faces (n_vertices, 3)."""
-    parts = ("identity", "expression")
-    return dense["mean"] + sum(
-        np.tensordot(dense[f"{part}_coeffs"].mean(0), dense[part], 1) for part in parts
-    )
 
 
 def landmarks(dense, weights):
     """Return the landmarks (n, 68, 3) of all faces."""
-    parts = ("identity", "expression")
     return weights @ dense["mean"] + sum(
         np.tensordot(dense[f"{part}_coeffs"], weights @ dense[part].astype(float), 1)
-        for part in parts
+        for part in ("identity", "expression")
     )
 
 
