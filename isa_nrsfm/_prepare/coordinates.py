@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.blocks import FrameBlocks
 
+# All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
 MOST_ROWS, MOST_PLACES = 1000, 1_000_000
 # Points of a lower confidence are seldom where they are said to be.
