@@ -550,11 +550,11 @@ default="affine"
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
         warn_of_rows(source, self.camera)
-        own = self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
-        isa = ready_strategy(*own)
-        n_components = self.n_components
-        if settings.prior is not None:
-            n_components = len(settings.prior.basis)
+        isa = ready_strategy(
+            self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
+        )
+        prior, n_components = settings.prior, self.n_components
+        n_components = n_components if prior is None else len(prior.basis)
         auto, most = n_components == "auto", None
         if self.camera == "perspective":
             of_fit = source, weights, isa, settings, self.principal_point
@@ -1020,8 +1020,8 @@ default="affine"
             few visible points.
         """
         table, weights = self._opened(X, point_weight)
-        own = *self._focal_shares(table), *weights
-        return table.collect(self._model.reproject, *own)
+        reproject = partial(self._model.reproject, weighted=bool(weights))
+        return table.collect(reproject, *self._focal_shares(table), *weights)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None

@@ -30,7 +30,7 @@ from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
     compose,
-    full_rotations,
+    line_of_sight,
     nearest_calibrated,
     reference_camera,
     reprojection_error,
@@ -270,10 +270,10 @@ def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointS
     """
     frames, unit = model.frames, (model.unit or 1.0) / (table.unit or 1.0)
     assert isinstance(frames, PosteriorFrames)
-    n_frames, n_more = table.rows.n_frames, n_components + 1 - len(frames.shapes)
+    n_more = n_components + 1 - len(frames.shapes)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance
     if n_more:
-        rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
+        rows = table.rows.take(spread(np.arange(table.rows.n_frames), 200))
         frames = replace(frames, shapes=shapes, noise_variance=noise)
         fit = frames.posterior(rows)
         rows = rows - fit.translation[:, :, None]
@@ -351,8 +351,7 @@ def _joint_frames(
     mean_shape, basis = mean_shape.astype(table.dtype), basis.astype(table.dtype)
     cameras = frames.motion / table.sizes[:, None, None]
     if prior is not None:
-        R, scales = full_rotations(cameras)
-        sight = scales[:, None] * R[:, 2]
+        sight = line_of_sight(cameras)
         errors = prior.depth_errors(information, noise, sight, frames.alpha)
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         certainty = certainty.of_prior(errors.mean(), np.mean(depths**2))
@@ -382,15 +381,19 @@ def _measures(
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
     reference = mean_camera(frames, table.sizes, settings.camera)
-    position = (frames.translation - table.translation) / table.sizes[:, None]
-    fit = np.concatenate([mean_shape[None], basis]).mT, cameras, position, frames.alpha
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
         "rank_floor_": factorised.rest_share,
         "singular_values_": (table.unit or 1.0) * factorised.singular_values,
         "energy_share_": energy / (energy.sum() or 1.0),
-        "inverse_snr_": reprojection_error(table.rows, *fit),
+        "inverse_snr_": reprojection_error(
+            table.rows,
+            np.concatenate([mean_shape[None], basis]).mT,
+            cameras,
+            (frames.translation - table.translation) / table.sizes[:, None],
+            frames.alpha,
+        ),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 

@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from isa_nrsfm._frames.camera_models import compose, full_rotations, project
+from isa_nrsfm._frames.camera_models import (
+    compose,
+    full_rotations,
+    line_of_sight,
+    project,
+)
 from isa_nrsfm._frames.models import (
     MIRROR,
     Decomposition,
@@ -32,7 +37,8 @@ from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 # Level of the two-sided test by which missing points decide on the mirror image: false
 # decisions are in docs/depth.md, "The mirror image".
 MIRROR_LEVEL = 0.01
-# Least distance of points from the fit, in sizes of frames, of `TableModel.misfit`.
+# Least distance of points from the fit, in sizes of frames, of `TableModel.misfit`:
+# docs/benchmarks/README.md, "Thresholds".
 LEAST_MISFIT = 0.005
 # Depths and fit of a perspective frame agree if a repeat changes depths by less than
 # this share: docs/benchmarks/README.md, "Thresholds".
@@ -118,8 +124,7 @@ class TableModel(NamedTuple):
     def depths(self, motion: NDArray, alpha: NDArray) -> NDArray:
         """Return the depths (n, J) of points, in units of the table."""
         shapes = compose(self.mean_shape, self.basis, alpha)
-        R, scales = full_rotations(motion)
-        return np.vecdot(shapes, (scales[:, None] * R[:, 2])[:, None])
+        return np.vecdot(shapes, line_of_sight(motion)[:, None])
 
     def mirrored(self) -> "TableModel":
         """Return the model with shapes mirrored in depth."""
@@ -240,22 +245,23 @@ class TableModel(NamedTuple):
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         return shapes, deviations / scales[:, None]
 
-    def reproject(self, rows: NDArray, *own: NDArray) -> NDArray:
+    def reproject(
+        self, rows: NDArray, *by_frame: NDArray, weighted: bool = False
+    ) -> NDArray:
         """Return images of the fitted shapes, as a table.
 
-        With shares (n, 1) they are zoomed back. There may be weights (n, J) of points.
+        With shares (n, 1) by frame they are zoomed back. If `weighted`, weights (n, J)
+        of points follow.
         """
-        share, weights = (
-            next((part for part in own if (part.shape[1] == 1) == is_share), None)
-            for is_share in (True, False)
-        )
+        weights = by_frame[-1] if weighted else None
+        shares = by_frame[: len(by_frame) - weighted]
         fit = self.decompose(rows, weights, deviations=False)
         motion, translation, alpha, _ = fit
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation)
-        if self.pinhole is not None and share is not None:
+        if self.pinhole is not None and shares:
             centre = self.pinhole.centre[:, 0]
-            images = zoomed(images, 1.0 / share[..., None], centre)
+            images = zoomed(images, 1.0 / shares[0][..., None], centre)
         return tracks_to_table(images, self.layout)
 
     def images(self, shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:

@@ -32,7 +32,7 @@ def warn_if_foreign(
     """Warn if frames lie farther from the shapes of a model than its noise explains."""
     if table.n_frames < FEWEST_COMPARED:
         return
-    some = spread(np.arange(table.n_frames), min(table.n_frames, 100))
+    some = spread(np.arange(table.n_frames), 100)
     weights = None if weights is None else weights[some]
     misfit, camera = model.misfit(table.take(some), weights), model.frames.camera
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
@@ -109,8 +109,7 @@ def prior_start(
     """
     model = settings.prior
     frames = model.frames
-    n_frames = table.rows.n_frames
-    some = spread(np.arange(n_frames), min(n_frames, 200))
+    some = spread(np.arange(table.rows.n_frames), 200)
     rows = table.rows.take(some)
     weights = None if table.weights is None else table.weights[some]
     frames = replace(frames, camera="weak_perspective", loss=settings.loss)

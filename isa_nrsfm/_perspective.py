@@ -206,9 +206,8 @@ class PerspectiveTable(NamedTuple):
         agrees = change < SETTLED * self.settings.tol / JOINT_TOL
         return agrees or n_repeats >= (2 if fit.energy > WORSE * best else most)
 
-    def of_prior(self, f: float) -> PerspectiveFit:
-        """Return the frames of the prior's shapes."""
-        model = self.settings.prior._replace(pinhole=self.pinhole(f))
+    def of_model(self, model: TableModel) -> PerspectiveFit:
+        """Return the frames of the shapes of a fitted model, with its focal length."""
         frames = self.source.joined(model.in_virtual_cameras)
         squares = np.full(len(model.mean_shape), np.inf)
         return PerspectiveFit(model, frames, True, {"isa_": None}, energies=squares)
@@ -221,8 +220,7 @@ class PerspectiveTable(NamedTuple):
 
     def started(self, model: TableModel, n_components: Any) -> PerspectiveFit:
         """Return the fit from the model of a similar table, with its focal length."""
-        frames = self.source.joined(model.in_virtual_cameras)
-        fit = PerspectiveFit(model, frames, True, {"isa_": None})
+        fit = self.of_model(model)
         return self.settled(fit.pinhole, n_components, fit)[0]
 
     def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
@@ -302,7 +300,8 @@ def fit_perspective(
         elif given is not None:
             f = common(given)
             if with_prior:
-                first = table.of_prior(f)
+                prior = table.settings.prior._replace(pinhole=table.pinhole(f))
+                first = table.of_model(prior)
             else:
                 virtual = table.pinhole(f, near=False)
                 first = table.fit(virtual, n_components, progress=progress)

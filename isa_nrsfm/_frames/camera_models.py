@@ -317,6 +317,12 @@ def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
     return np.einsum("ik,irc->irkc", c, motion).reshape(2 * len(alpha), -1)
 
 
+def line_of_sight(motion: NDArray) -> NDArray:
+    """Return ``s r_3`` (n, 3) of cameras (n, 2, 3): products with points are depths."""
+    R, scales = full_rotations(motion)
+    return scales[:, None] * R[:, 2]
+
+
 def compose(mean_shape: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
     """Return the shapes of frames, ``B_0 + sum_k alpha_ik B_k`` (n, ...)."""
     return mean_shape + np.tensordot(alpha, basis, axes=1)

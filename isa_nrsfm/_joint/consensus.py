@@ -115,7 +115,7 @@ def consensus(
     first[:, :2] += fit.translation[:, :, None]
     # Groups of some of the points
     n_points, limits = part.shape[2], settings.limits
-    chosen = spread(np.arange(n_points), min(n_points, MOST_POINTS))
+    chosen = spread(np.arange(n_points), MOST_POINTS)
     mean_square = float(np.nanmean(part**2))
     price = 1.0 / (limits.basis_std**2 * mean_square)
     floor = FLOOR_SHARE * limits.least_noise * mean_square

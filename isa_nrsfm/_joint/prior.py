@@ -64,6 +64,11 @@ class ShapePrior(NamedTuple):
         return self.gauge.mixing.T[:, : 1 if self.fixed else None]
 
     @property
+    def along(self) -> NDArray:
+        """The changes for each axis, (3 (K + 1), 3n)."""
+        return np.kron(self.changes, np.eye(3))
+
+    @property
     def variances(self) -> NDArray:
         """Prior variances (n,) of the free public shapes."""
         mean_shape, basis = np.square(self.widths)
@@ -75,26 +80,25 @@ class ShapePrior(NamedTuple):
         """Return the prior of some of the points."""
         return self._replace(shapes=centred(self.shapes[:, :, kept]))
 
-    def differences(self, shapes: NDArray) -> NDArray:
-        """Return E (n, 3, J)."""
-        return np.tensordot(np.linalg.pinv(self.changes), shapes - self.shapes, 1)
+    def differences(self, shapes: NDArray) -> tuple[NDArray, NDArray]:
+        """Return E (n, 3, J), and the matrix N (n, K + 1) of the free public shapes."""
+        N = np.linalg.pinv(self.changes)
+        return np.tensordot(N, shapes - self.shapes, 1), N
 
     def term(self, shapes: NDArray) -> tuple[float, NDArray]:
         """Return the term of -2 log L, and its derivative by the shapes."""
-        E = self.differences(shapes)
+        E, N = self.differences(shapes)
         pulled = E / self.variances[:, None, None]
-        slope = np.tensordot(np.linalg.pinv(self.changes).T, pulled, 1)
-        return float(np.vdot(E, pulled)), 2.0 * slope
+        return float(np.vdot(E, pulled)), 2.0 * np.tensordot(N.T, pulled, 1)
 
     def covariance(self, curvature: NDArray, noise: float) -> NDArray:
         """Return the covariance of E (m, 3n, 3n), for curvatures without prior."""
-        along = np.kron(self.changes, np.eye(3))
-        prior = np.repeat(1.0 / self.variances, 3)
+        along, prior = self.along, np.repeat(1.0 / self.variances, 3)
         return np.linalg.inv(along.T @ curvature @ along / noise + np.diag(prior))
 
     def inverse(self, curvature: NDArray, noise: float) -> NDArray:
         """Return inverses of curvatures (m, 3 (K + 1), 3 (K + 1)) with the prior."""
-        along = np.kron(self.changes, np.eye(3))
+        along = self.along
         return along @ self.covariance(curvature, noise) @ along.T / noise
 
     def updated(
@@ -102,7 +106,8 @@ class ShapePrior(NamedTuple):
     ) -> "ShapePrior":
         """Return the prior with the widths that follow from a fit."""
         n_free, n_points = len(self.variances), shapes.shape[2]
-        squares = np.sum(self.differences(shapes) ** 2, axis=(1, 2))
+        E, _ = self.differences(shapes)
+        squares = np.sum(E**2, axis=(1, 2))
         covariance = self.covariance(curvature, noise)
         covariance = covariance.mean(axis=0).reshape(n_free, 3, n_free, 3)
         trace = np.einsum("kaka->k", covariance)

@@ -132,7 +132,7 @@ def best_starts(
     # Frames for the comparison, spread evenly from the most to the least rigid
     rows = frames.coordinates(table.W).reshape(frames.n_frames, 2, -1)
     order = np.argsort(rigid_energy(rows, frames.coordinates(factors.rigid_shape)))
-    few = np.sort(spread(order, min(400 if thorough else 200, len(order))))
+    few = np.sort(spread(order, 400 if thorough else 200))
     # No prior: with the large noise of a start it would make basis shapes vanish.
     part = replace(problem.part(few, tol=limits.compared_tol), penalty=0.0)
     seen, n_components = rows[few], len(paper) - 1

@@ -26,7 +26,8 @@ from isa_nrsfm._tables.tracks import (
 # Largest weight of a point: sums of weighted squares stay far from overflow.
 LARGEST_WEIGHT = 1e30
 # Smallest weight of a point, as a share of the largest of its frame. Such points have
-# no effect on others, and curvatures of their shapes exceed rounding errors.
+# no effect on others, and curvatures of their shapes exceed rounding errors:
+# docs/benchmarks/README.md, "Thresholds".
 LEAST_WEIGHT = 1e-8
 
 
@@ -108,8 +109,8 @@ def scaled_table(
         weights = None if weights is None else weights[shown]
     if determines:
         check_points(visible, n_points, n_components, layout, names)
-    if weights is not None and determines:
-        check_weights(weights, n_components, camera)
+        if weights is not None:
+            check_weights(weights, n_components, camera)
     warn_if_other_layout(blocks, n_points, layout, scale_frames)
     translation, size, n_seen, *_ = rest
     if weights is not None:
@@ -126,11 +127,19 @@ def scaled_table(
     single = dtype == np.float32 and n_points >= 200 and complete and not robust
     unit_rows = partial(_unit_rows, dtype=np.float32 if single else np.float64)
     spacing = np.finfo(dtype).eps * largest.astype(np.float64)
-    precision = float(np.sqrt(np.mean((spacing / size) ** 2)))
-    unit = None if scale_frames else float(size[0])
-    rows = blocks.derive(unit_rows, translation, size)
-    frames = shown, blocks, rows, size, translation, n_seen
-    return ScaledTable(*frames, n_points, unit, precision, dtype, weights)
+    return ScaledTable(
+        shown,
+        blocks,
+        blocks.derive(unit_rows, translation, size),
+        size,
+        translation,
+        n_seen,
+        n_points,
+        None if scale_frames else float(size[0]),
+        float(np.sqrt(np.mean((spacing / size) ** 2))),
+        dtype,
+        weights,
+    )
 
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:

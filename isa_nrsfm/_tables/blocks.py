@@ -298,7 +298,8 @@ def _first_half(rows: NDArray) -> NDArray:
 
 
 def spread(order: NDArray, n: int) -> NDArray:
-    """Return n entries of an order (n_frames,) at equal distances, ends included."""
+    """Return n entries of an order at equal distances, ends included; at most all."""
+    n = min(n, len(order))
     return order[np.linspace(0, len(order) - 1, n).round().astype(int)]
 
 
@@ -319,5 +320,5 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     for point in np.flatnonzero(shown < fewest).tolist():
         shows = rows.joined(lambda block, j=point: ~np.isnan(block[:, 0, j]))
         showing = order[shows[order]]
-        chosen[spread(showing, min(fewest, len(showing)))] = True
+        chosen[spread(showing, fewest)] = True
     return np.flatnonzero(chosen)
