@@ -344,7 +344,7 @@ def start(options):
         X = pd.DataFrame(faces.data, columns=faces.feature_names)
         save_model(AffineNRSfM(3, random_state=0).fit(X), model)
         write_table(X.iloc[:1], table)
-        transform = [*package, "transform", model, table, "--output", output]
+        transform = [*package, "transform", model, table, "--output", output, "--force"]
         for title, command, against, reference in (
             ("--version", [*package, "--version"], "python", nothing),
             ("--help", [*package, "--help"], "python", nothing),
