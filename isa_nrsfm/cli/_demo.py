@@ -13,7 +13,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm.cli._fit import fit_table
 from isa_nrsfm.cli._options import PROGRAM, build_parser
 from isa_nrsfm.cli._reading import drawing_options
-from isa_nrsfm.cli._sections import fit_text, text_of
+from isa_nrsfm.cli._sections import fit_text
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
@@ -26,7 +26,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     folder = Path(args.output)
     options = [
         *("fit", str(folder / "tracks.csv"), "--n-components", "1-5"),
-        *("--camera", "weak_perspective", "--output", str(folder)),
+        *("--output", str(folder)),
         *["--force"] * args.force,
         *["--no-figures"] * args.no_figures,
         *drawing_options(args),
@@ -51,7 +51,7 @@ def run(args: Namespace, warned: list[str]) -> str:
         ),
     ]
     ending = {"Truth": lines, "Again": [shlex.join([PROGRAM, *options])]}
-    return f"{fit_text(report, folder)}\n\n{text_of('', ending)}"
+    return fit_text(report, folder, ending)
 
 
 def _compare(faces: Bunch, estimator: AffineNRSfM, X: Any) -> dict[str, Any]:

@@ -22,13 +22,19 @@ from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._prepare.coordinates import CoordinateWarning
 from isa_nrsfm._selection import standard_errors
+from isa_nrsfm.analysis._advice import facts_of
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, NONE, flag_of
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
-from isa_nrsfm.cli._report import model_report, table_report, versions
+from isa_nrsfm.cli._report import (
+    model_report,
+    perspective_advice,
+    table_report,
+    versions,
+)
 from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
@@ -46,7 +52,7 @@ _PARAMETERS = (
 
 def run(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
-    return fit_text(fit_table(args, warned), Path(args.output))
+    return fit_text(fit_table(args, warned), Path(args.output), {})
 
 
 def fit_table(
@@ -100,7 +106,7 @@ def fit_table(
             _outputs.refuse_replacing([folder / name for name in files], own)
         removed = {*_old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
-        estimator, search = _fitted(args, frames, clock)
+        estimator, search, perspective = _fitted(args, frames, clock)
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
@@ -124,7 +130,7 @@ def fit_table(
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args, frames),
                 **({} if search is None else {"choice": choice_report(search, X)}),
-                "model": model_report(estimator, frames, drawn["edges"]),
+                "model": model_report(estimator, frames, drawn["edges"], perspective),
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
@@ -152,17 +158,16 @@ def fit_table(
 
 def _load_prior(args: Namespace) -> None:
     """Load the prior, and set the options that it determines unless they are given."""
-    camera, n_components, asked = "affine", 3, args.n_components
+    n_components, asked = 3, args.n_components
     if args.prior is not None:
         face = args.prior == FACE_PRIOR
         args.prior = load_face_prior() if face else load_model(args.prior)
         n_components = len(args.prior.basis_)
         asked = None if asked == (AUTO,) else asked
-        if (camera := args.prior.camera_) == "affine":
-            camera = "weak_perspective"  # such a prior is refused
+        if args.camera is None and args.prior.camera_ != "affine":  # which is refused
+            args.camera = args.prior.camera_
     elif args.adapt == "shapes":
         raise ValueError("--adapt shapes needs --prior")
-    args.camera = args.camera or camera
     args.n_components = asked or (n_components,)
 
 
@@ -178,10 +183,7 @@ def _check_options(args: Namespace) -> None:
         import_optional("matplotlib", extra="plot")
     for name in ("focal_length", "principal_point"):
         if getattr(args, name) is not None and args.camera != "perspective":
-            raise ValueError(
-                f"{flag_of(name)} needs --camera perspective; got --camera "
-                f"{args.camera}"
-            )
+            raise ValueError(f"{flag_of(name)} needs --camera perspective")
     joint = {"--std": args.std, "--n-components auto": args.n_components[0] == AUTO}
     for option, is_given in joint.items():
         if is_given and args.refinement not in JOINT_REFINEMENTS:
@@ -204,8 +206,12 @@ def _seconds(clock: dict[str, float]) -> dict[str, float]:
 
 def _fitted(
     args: Namespace, frames: Frames, clock: dict[str, float]
-) -> tuple[AffineNRSfM, AffineNRSfMCV | None]:
-    """Return the model that the options ask for, and the search for its K."""
+) -> tuple[AffineNRSfM, AffineNRSfMCV | None, str]:
+    """Return the model that the options ask for, the search for its K, and a message.
+
+    That is of perspective cameras if they explain the table better than those of the
+    model, which the options then ask for.
+    """
     isa = None
     if args.isa == "fast" or args.n_init is not None:
         strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
@@ -214,13 +220,17 @@ def _fitted(
         name: None if getattr(args, name) == NONE else getattr(args, name)
         for name in _PARAMETERS
     }
-    perspective = args.camera == "perspective"
+    near = {"camera": "perspective", "principal_point": frames.principal_point}
+    if args.camera is None:
+        joint = args.refinement in JOINT_REFINEMENTS
+        given["camera"] = "weak_perspective" if joint else "affine"
+    elif args.camera == "perspective":
+        given |= near
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=isa,
         scale_frames=not args.no_scale_frames,
         hidden_points=not args.no_hidden_points,
-        principal_point=frames.principal_point if perspective else None,
         **given,
     )
     search, X, groups = None, frames.X, frames.groups
@@ -245,9 +255,14 @@ def _fitted(
     else:
         # For `shown_progress`; the model that is written does not have it.
         estimator.set_params(verbose=2).fit(X, **frames.weighting)
-        estimator.set_params(verbose=0)
+    perspective = perspective_advice(estimator, frames)
+    if perspective and args.camera is None:
+        show_stage("fit with perspective cameras")
+        estimator.set_params(verbose=2, n_components=len(estimator.basis_), **near)
+        estimator.fit(X, **frames.weighting)
+    estimator.set_params(verbose=0)
     clock["fit"] = time.perf_counter()
-    return estimator, search
+    return estimator, search, perspective
 
 
 def _old_figures(folder: Path, new: list[str]) -> list[str]:
@@ -264,7 +279,8 @@ def _old_figures(folder: Path, new: list[str]) -> list[str]:
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
     """Return the numbers tried, their held-out errors, seconds, and the one chosen.
 
-    If that is the largest, also the next numbers with their expected seconds.
+    If that is the largest, and the table supports it, also the next numbers that it
+    allows with their expected seconds.
     """
     results, n_parts = search.cv_results_, search.n_splits_
     seconds = results["path_fit_time"] + n_parts * (
@@ -283,10 +299,11 @@ def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
     }
     fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
     best = search.best_estimator_
-    camera = best.camera_ if best.refinement in JOINT_REFINEMENTS else None
-    most = most_components(fitted, X.shape[1] // 2, camera)
+    joint = best.refinement in JOINT_REFINEMENTS
+    most = most_components(fitted, X.shape[1] // 2, best.camera_ if joint else None)
     following = np.arange(tried[-1] + 1, min(tried[-1] + 3, most) + 1)
-    if search.n_components_ == tried[-1] and len(following):
+    supported = not joint or facts_of(best).n_supported == tried[-1]
+    if search.n_components_ == tried[-1] and supported:
         report["next"] = {
             "n_components": following.tolist(),
             "seconds": float(extrapolated(tried, seconds, following).sum()),

@@ -180,8 +180,8 @@ HELP = {
     "image_size WIDTHxHEIGHT": "size of the images for MediaPipe, in pixels, such as "
     "1920x1080",
     "fit.image_size WIDTHxHEIGHT": "size of the images in pixels, such as 1920x1080: "
-    "for MediaPipe, for perspective cameras, and with weak_perspective ones to say "
-    "whether perspective explains the table better",
+    "for MediaPipe, and for perspective cameras, which are then compared with "
+    "weak_perspective ones",
     "part PART": "the points to read, if the files have several: of OpenPose "
     f"{', '.join(choices.OPENPOSE_PARTS)}; of whole bodies of COCO and MMPose "
     f"{', '.join(choices.WHOLE_PARTS)}",
@@ -228,10 +228,11 @@ HELP = {
     "n_components K": "number of basis shapes (default: 3, or that of the prior). Of "
     "several, such as 1-8 or 3,6,9, the best in cross-validation is used; auto uses as "
     "many as the table determines, at most twelve",
-    "camera": "camera model: affine (no assumption), weak_perspective (a rotation and "
-    "a scale per frame), orthographic (one scale), or perspective (for objects near "
-    "the camera, as before a webcam). All but affine estimate depth and proportions "
-    "(default: affine, or that of the prior)",
+    "camera": "camera model: weak_perspective (a rotation and a scale per frame), "
+    "orthographic (one scale), perspective (for objects near the camera, as before a "
+    "webcam), or affine (no assumption, for stretched images), which leaves depth and "
+    "proportions open (default: that of the prior; perspective if the size of the "
+    "images is known and held-out points say so; otherwise weak_perspective)",
     "focal_length NUMBER": "of perspective cameras, in pixels (default: estimated). "
     "For images of width w and height h OpenFace assumes 500 w / 640, and MediaPipe "
     "0.816 h (63 degrees vertically)",
@@ -329,9 +330,9 @@ _COMMANDS: dict[str, tuple[str, str, str, dict[str, tuple]]] = {
 examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
   isa-nrsfm fit faces.csv --n-components 1-12 --output results
-  isa-nrsfm fit body.csv --camera weak_perspective -k auto --output results
+  isa-nrsfm fit body.csv -k auto --output results
   isa-nrsfm fit photos.csv --prior face-68 --output results
-  isa-nrsfm fit webcam.csv --camera perspective --image-size 1280x720 --output results
+  isa-nrsfm fit webcam.csv --image-size 1280x720 --output results
   isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
       --n-components 9 --output muct
   isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results

@@ -215,8 +215,8 @@ def _format(args: Namespace) -> str:
     for name in _OF_FORMATS:
         if getattr(args, name) is None or name in FORMATS[found].options:
             continue
-        perspective = args.command == "fit" and "perspective" in args.camera
-        if name != "image_size" or not perspective:
+        near = args.command == "fit" and args.camera not in ("affine", "orthographic")
+        if name != "image_size" or not near:
             having = [each.name for each in FORMATS.values() if name in each.options]
             raise ValueError(
                 f"{flag_of(name)} needs --format {' or '.join(having)}; {args.table} "

@@ -15,7 +15,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm.analysis._advice import MOST_GROSS, advice, camera_meaning, facts_of
+from isa_nrsfm.analysis._advice import advice, camera_meaning, facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics, outlier_text
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
@@ -36,6 +36,7 @@ MUCH_LOWER = 0.9
 def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
     """Describe the table, its rows and columns that are used, and the others."""
     X, names = frames.X, list(frames.points.columns)
+    used = {args.group, args.time, *(label.name for label in frames.labels)}
     missing = X.iloc[:, ::2].isna().to_numpy()
     return {
         "path": str(Path(args.table).resolve()),
@@ -51,6 +52,7 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
         "last_columns": names[-2:],
         "absent_numbers": frames.columns.gaps,
         "coordinates_not_used": frames.not_used,
+        "other_columns": [name for name in frames.other if name not in used],
         "rows_left_out": [
             {
                 "reason": reason,
@@ -77,9 +79,12 @@ def quality_report(
 
 
 def model_report(
-    estimator: AffineNRSfM, frames: Frames, edges: Any = "auto"
+    estimator: AffineNRSfM, frames: Frames, edges: Any = "auto", perspective: str = ""
 ) -> dict[str, Any]:
-    """Describe a fitted model and how well it explains its table."""
+    """Describe a fitted model and how well it explains its table.
+
+    `perspective` is the advice to use perspective cameras.
+    """
     from isa_nrsfm.plotting._views import view_and_layout  # not needed by transform
 
     X, alpha, explained = frames.X, estimator.alpha_, fitted_table(estimator)
@@ -89,7 +94,11 @@ def model_report(
     _, layout, lines, _ = view_and_layout(estimator, edges)
     is_joint = estimator.refinement in JOINT_REFINEMENTS
     found = estimator.diagnostics(X) if is_joint else None
-    for message in () if found is None else _advice(found, estimator, frames):
+    messages = () if found is None else found.messages
+    if perspective and estimator.camera_ == "weak_perspective":
+        known = {"perspective": f'{perspective}. Use camera="perspective"'}
+        messages = advice(facts_of(estimator, **known))
+    for message in messages:
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)
     coefficients = pd.DataFrame(
@@ -124,6 +133,7 @@ def model_report(
         "focal_length": getattr(estimator, "focal_length_", None),
         "focal_length_std": getattr(estimator, "focal_length_std_", None),
         "principal_point": estimator.principal_point,
+        "perspective": perspective,
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
@@ -135,30 +145,22 @@ def model_report(
     }
 
 
-def _advice(
-    found: Diagnostics, estimator: AffineNRSfM, frames: Frames
-) -> tuple[str, ...]:
-    """Return messages on a fit, of perspective if that explains the table better."""
-    share, point = found.outlier_share, frames.principal_point
-    bent = estimator.loss == "linear" and share > MOST_GROSS
-    if point is None or bent or estimator.camera_ != "weak_perspective":
-        return found.messages
-    text = _perspective_advice(estimator, frames, point)
-    if not text:
-        return found.messages
-    return advice(facts_of(estimator, outlier_share=share, perspective=text))
+def perspective_advice(estimator: AffineNRSfM, frames: Frames) -> str:
+    """Compare fits of some rows with perspective and without; say what is better.
 
-
-def _perspective_advice(
-    estimator: AffineNRSfM, frames: Frames, point: tuple[float, float]
-) -> str:
-    """Compare fits of some rows with perspective and without; return advice, or none.
-
-    The first focal length is too long for most cameras, which does no harm. It takes
-    two or three times as long as the fit without perspective, and the estimate ten.
+    Nothing is said if the fit had other cameras, or outliers that bend it, and if the
+    point of the image on the axis of the camera is not known. The first focal length is
+    too long for most cameras, which does no harm. It takes two or three times as long
+    as the fit without perspective, and the estimate ten.
     """
     from isa_nrsfm._selection import StartedNRSfM  # not needed by transform
 
+    point = frames.principal_point
+    if point is None or estimator.camera_ != "weak_perspective":
+        return ""
+    share = estimator.diagnostics(frames.X).outlier_share
+    if facts_of(estimator, outlier_share=share).bent:
+        return ""
     show_stage("comparison with perspective")
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
     X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
@@ -179,8 +181,8 @@ def _perspective_advice(
     if not error < MUCH_LOWER * weak or np.isinf(model.focal_length_):
         return ""
     return (
-        f"perspective explains the table better: error of held-out points "
-        f'{100 * error:.2g} % instead of {100 * weak:.2g} %. Use camera="perspective"'
+        "perspective explains the table better: error of held-out points "
+        f"{100 * error:.2g} % instead of {100 * weak:.2g} %"
     )
 
 

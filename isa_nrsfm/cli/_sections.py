@@ -70,16 +70,9 @@ def fit_title(report: dict[str, Any]) -> str:
 
 
 def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
-    """Return the sections of the report of a fit, without the files."""
+    """Return the sections of the report of a fit, answers first, without the files."""
     model = report["model"]
-    sections = {"Table": table_section(report["table"])}
-    if "choice" in report:
-        sections["Choice"] = _choice(report["choice"])
-    elif model["parameters"]["n_components"] == AUTO:
-        sections["Choice"] = [f"K = {model['n_components']}: found by {AUTO}"]
-    sections["Fit"] = _fit(report)
-    sections["Cameras"] = _cameras(model, report.get("position_unit"))
-    sections["Alpha"] = _alpha(model["alpha"])
+    sections: dict[str, Section] = {}
     if "labels" in report:
         labels = [_label(label) for label in report["labels"]]
         sections["Labels"] = [part for parts in labels for part in parts]
@@ -87,7 +80,14 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
         sections["Groups"] = _groups(report["groups"])
     if "time" in report:
         sections["Time"] = _time(report["time"])
-    return sections
+    sections["Alpha"] = _alpha(model["alpha"])
+    if "choice" in report:
+        sections["Choice"] = _choice(report["choice"])
+    elif model["parameters"]["n_components"] == AUTO:
+        sections["Choice"] = [f"K = {model['n_components']}: found by {AUTO}"]
+    sections["Fit"] = _fit(report)
+    sections["Cameras"] = _cameras(model, report.get("position_unit"))
+    return sections | {"Table": table_section(report["table"])}
 
 
 def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
@@ -105,6 +105,12 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
         not_used = table["coordinates_not_used"].items()
         listed = "; ".join(f"{pattern} ({n_points})" for pattern, n_points in not_used)
         parts.append(f"coordinates not used: {listed}")
+    if table.get("other_columns"):
+        listed = first_items(map(str, table["other_columns"]), MOST_LISTED)
+        parts.append(
+            f"other columns: {listed}. Use --label COLUMN to see how coefficients "
+            "depend on one, --group COLUMN for people or videos, and --time COLUMN."
+        )
     rows = [[f"{table['n_rows']}", "rows"]]
     for out in table["rows_left_out"]:
         result = "left out" if out["skipped_on_request"] else unusable
@@ -150,14 +156,15 @@ def text_of(title: str, sections: Sections) -> str:
     return "\n\n".join(blocks)
 
 
-def fit_text(report: dict[str, Any], folder: Path) -> str:
-    """Return the report of a fit as text."""
+def fit_text(report: dict[str, Any], folder: Path, more: Sections) -> str:
+    """Return the report of a fit as text, with more sections after it."""
     described = [
         [name, content.partition(";")[0].partition(": the image")[0]]
         for name, content in report["files"].items()
     ]
     listed: Section = [f"in {folder}", Cells([], described)]
-    return text_of(fit_title(report), fit_sections(report) | {"Files": listed})
+    sections = fit_sections(report) | {"Files": listed, **more}
+    return text_of(fit_title(report), sections | {"Open": [f"{folder / PAGE}"]})
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
@@ -192,9 +199,10 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     parts = [f"<h1>{title}</h1>", f'<p class="quiet">{about}</p>']
     for warning in report["warnings"]:
         parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
+    parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
     sections = fit_sections(report)
-    for name in ("Fit", "Cameras"):
-        parts += _markup(name, sections.pop(name))
+    for name in ("Labels", "Groups", "Time", "Alpha"):
+        parts += _markup(name, sections.pop(name, ()))
     for name, content in report["files"].items():
         if name.endswith(".png"):
             image = base64.b64encode((folder / name).read_bytes()).decode()
@@ -203,7 +211,6 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
                 f'<figure><img src="data:image/png;base64,{image}" alt="{caption}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
-    sections["Table"] = sections.pop("Table")
     sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
     found = report["versions"].items()
     sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
@@ -229,8 +236,8 @@ def _lines(part: str | Cells) -> list[str]:
 
 
 def _markup(name: str, parts: Section) -> list[str]:
-    """Return the HTML of a section."""
-    found = [f"<h2>{name}</h2>"]
+    """Return the HTML of a section, of an empty one nothing."""
+    found = [f"<h2>{name}</h2>"] if parts else []
     for part in parts:
         if isinstance(part, str):
             found.append(f"<p>{escape(part)}</p>")
@@ -266,7 +273,7 @@ def _fit(report: dict[str, Any]) -> Section:
         size = f"{_percent(noise)} of the frame's size"
         if not model["frames_scaled"]:
             size = f"{noise:.3g} in the units of the table"
-        parts.append(f"noise {size} (standard deviation of a coordinate)")
+        parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
     if "prior" in report:
         parts.append(_prior(report["prior"], model["parameters"]["adapt"]))
     if model["outliers"] is not None and model["outliers"]["message"]:
@@ -312,6 +319,8 @@ def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Secti
     if model["camera"] == "perspective" and not model["mirror_decided_by_perspective"]:
         title += " and a mirror image in depth"
     parts = [title, *_perspective(model, unit)]
+    if model["camera"] == "perspective" and model["perspective"]:
+        parts.append(_sentence(model["perspective"]))
     if uncertainty and math.isfinite(uncertainty):
         parts.append(
             f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
@@ -396,13 +405,13 @@ def _choice(choice: dict[str, Any]) -> Section:
         from isa_nrsfm._selection import NO_SHAPE
 
         return [cells, NO_SHAPE]
-    parts: list[str | Cells] = [cells, "errors in frames held out of the fit"]
-    if choice["chosen"] == tried[-1]:
-        parts.append("larger K may be better: this is the largest that was tried")
+    parts: list[str | Cells] = [cells, "as under Fit, in frames left out of the fit"]
     if "next" in choice:
-        following, seconds = choice["next"]["n_components"], choice["next"]["seconds"]
-        numbers = "-".join(map(str, sorted({following[0], following[-1]})))
-        parts.append(f"K = {numbers} would take about {seconds:.0f} s more")
+        parts.append("larger K may be better: this is the largest that was tried")
+        if following := choice["next"]["n_components"]:
+            numbers = "-".join(map(str, sorted({following[0], following[-1]})))
+            seconds = choice["next"]["seconds"]
+            parts.append(f"K = {numbers} would take about {seconds:.0f} s more")
     return parts
 
 
@@ -416,6 +425,12 @@ def _label(label: dict[str, Any]) -> Section:
     if label["n_without_label"]:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
+    related = [
+        name for name, p in zip(names, label["p_values"], strict=True) if p < 0.05
+    ]
+    answer = f"{label['column']} goes with {', '.join(related)} (p < 0.05)."
+    if not related:
+        answer = f"{label['column']} goes with no coefficient (p >= 0.05)."
     statistic, meaning = "Spearman", "rank correlation, from -1 to 1"
     if label["statistic"] == "eta_squared":
         statistic, meaning = "eta squared", "share of the variance between classes"
@@ -433,6 +448,7 @@ def _label(label: dict[str, Any]) -> Section:
     if label["untested"]:
         test = f"no p-values: {label['untested']}"
     return [
+        *[answer] * (not label["untested"]),
         Cells(["", statistic, "p"], rows, title),
         f"{statistic}: {meaning}; {test}",
         *means,
