@@ -113,8 +113,8 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
     pd.testing.assert_frame_equal(alpha[["name", "code"]], faces[["name", "code"]])
     assert_allclose(alpha[ALPHA], model.alpha_, rtol=1e-12)
 
-    numbers = "row m00 m01 m02 m10 m11 m12 tx ty inverse_snr yaw pitch roll scale"
-    assert " ".join(cameras) == numbers
+    numbers = "row m00 m01 m02 m10 m11 m12 tx ty inverse_snr yaw pitch roll scale "
+    assert " ".join(cameras) == numbers + "yaw_std pitch_std roll_std"
     arrays = np.load(fitted.folder / "shapes.npz", allow_pickle=False)
     assert list(arrays["component_names"]) == ALPHA
     assert list(arrays["point_names"]) == [str(j) for j in range(68)]
@@ -167,7 +167,7 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
         (
             "--independence coefficients --loss huber -k 1 --isa fast --n-init 1",
             {"independence": "coefficients", "loss": "huber", "n_components": 1}
-            | {"isa__n_init": 1},
+            | {"isa__n_init": 1, "camera": "weak_perspective"},
         ),
     ],
 )
@@ -216,8 +216,8 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     X = pd.DataFrame(faces.data, columns=faces.feature_names)
     X.to_csv(tmp_path / "faces.csv", index=False)
     options = ["--camera", camera, "-k", "auto", "--fps", 25, "--no-figures"]
-    if camera == "weak_perspective":  # no advice on perspective
-        options += ["--image-size", "1280x720"]
+    if camera == "weak_perspective":  # by default; no advice on perspective
+        options = [*options[2:], "--image-size", "1280x720"]
     found = fits(tmp_path / "faces.csv", *options)
     out, model, report = found.out, found.model, found.report["model"]
     assert found.err == ""
@@ -235,7 +235,7 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     assert report["camera_meaning"][1:] in " ".join(out.split())
     noise, scaled = np.sqrt(model.noise_variance_), camera == "weak_perspective"
     shown = f"{100 * noise:.3g} % of the frame's size"
-    assert f"noise {shown if scaled else f'{noise:.3g} in the units'}" in out
+    assert f"noise in the fit {shown if scaled else f'{noise:.3g} in the units'}" in out
     fitted = np.asarray(model.reproject(X))
     expected = inverse_snr(X, fitted, scale_frames=scaled)
     assert report["inverse_snr"] == pytest.approx(expected, rel=1e-6)
@@ -307,11 +307,17 @@ def test_perspective_cameras(fits, fails, transforms, webcam, tmp_path):
     assert "decides between the two mirror images" in message
 
 
-@pytest.mark.slow
-def test_perspective_is_advised(fits, webcam):
-    options = ["--camera", "weak_perspective", "--image-size", "1280x720"]
+@pytest.mark.parametrize("camera", slow_after(1, [None, "weak_perspective"]))
+def test_perspective_is_found_or_advised(fits, webcam, camera):
+    options = ["--image-size", "1280x720", *["--camera", camera] * bool(camera)]
     found = fits(webcam[0], "--no-figures", "-k", 1, *options)
-    assert "warning: perspective explains the table better: error of held" in found.err
+    better = "erspective explains the table better: error of held-out points "
+    if camera is None:
+        assert found.err == ""
+        assert found.model.camera_ == "perspective"
+        assert f"P{better}" in " ".join(found.out.split())
+        return
+    assert f"warning: p{better}" in found.err
     assert found.err.endswith(". Use --camera perspective\n")
 
 
@@ -555,7 +561,7 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
         (["--skip-rows", "nam=i"], "no column 'nam'; its columns are name, x_0, y_0"),
         (["--skip-rows", "name=^i"], "fitted: 60 left out (name matches '^i')"),
         (
-            ["-k", "40"],
+            ["-k", "40", "--camera", "affine"],
             "--n-components 40 needs at least 124 points, the table has 68; with 68 "
             "points the largest possible --n-components is 21 with affine cameras, and "
             "129 with calibrated ones (--camera weak_perspective)",
@@ -734,7 +740,8 @@ def test_demo_writes_a_table_and_finds_its_faces(succeeds, tmp_path, monkeypatch
     assert report["choice"]["n_components"] == [1, 2, 3, 4, 5]
     assert report["choice"]["chosen"] == len(truth["basis"]) == 3
     assert list(pd.read_csv(demo.folder / "tracks.csv"))[:3] == ["frame", "x_0", "y_0"]
-    command = out[out.index("isa-nrsfm fit") :].split()[1:]
+    command = out[out.index("isa-nrsfm fit") :].splitlines()[0].split()[1:]
+    assert out.endswith("\n\nOpen       isa-nrsfm-demo/report.html\n")
     command[command.index("1-5")] = "3"
     succeeds(*command)
     assert (demo.folder / "alpha.csv").read_bytes() == before

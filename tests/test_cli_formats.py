@@ -105,7 +105,11 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
             "--columns x_#,y_# --format openface",
             "--columns needs --format mediapipe or table; ",
         ),
-        (write_openface, "--image-size 640x480", "--image-size needs --format mediapi"),
+        (
+            write_openface,
+            "--image-size 640x480 --camera affine",
+            "--image-size needs --format mediapi",
+        ),
         (write_openface, "--focal-length 1000", "--focal-length needs --camera persp"),
         (write_openface, "--principal-point 1 2", "--principal-point needs --camera"),
         (write_openface, "--camera perspective", "needs the size of the images, with"),
@@ -249,7 +253,8 @@ def test_confidences_of_a_plain_table_are_weights(fits, fails, tmp_path):
     found = fits(path, *options, "--points", "without:2,7")
     left = np.delete(np.arange(20), [2, 7])
     X = table[points].to_numpy().reshape(N_FRAMES, 20, 2)[:, left]
-    model, X = AffineNRSfM(1, random_state=0), X.reshape(N_FRAMES, -1)
+    model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
+    X = X.reshape(N_FRAMES, -1)
     model.fit(X, point_weight=confidence[:, left])
     alpha = found.alpha["alpha_1"]
     np.testing.assert_allclose(alpha, model.alpha_[:, 0], atol=1e-6)

@@ -187,7 +187,8 @@ def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys, rng):
     table = pd.DataFrame(tracks.reshape(40, 40), columns=names)
     table.to_csv(tmp_path / "flat.csv", index=False)
     results = tmp_path / "results"
-    assert main(["fit", str(tmp_path / "flat.csv"), *QUICK, str(results)]) == 0
+    options = ["--camera", "affine", *QUICK, str(results)]
+    assert main(["fit", str(tmp_path / "flat.csv"), *options]) == 0
     error = capsys.readouterr().err
     told = "viewer.html has affine shapes, and cameras.csv has no angles: a metric"
     assert f"warning: {told}" in error

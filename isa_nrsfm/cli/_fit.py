@@ -105,6 +105,9 @@ def fit_table(
             own = {*earlier, _outputs.REPORT} if earlier else ()
             _outputs.refuse_replacing([folder / name for name in files], own)
         removed = {*_old_figures(folder, files), *figures}
+        used = {args.group, args.time, frames.images.name}
+        used |= {label.name for label in frames.labels}
+        unused = [name for name in frames.other if name not in used]
         clock["read"] = time.perf_counter()
         estimator, search, perspective = _fitted(args, frames, clock)
         show_stage("answers")
@@ -128,7 +131,7 @@ def fit_table(
                 "command": "fit",
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-                "table": table_report(args, frames),
+                "table": table_report(args, frames) | {"other_columns": unused},
                 **({} if search is None else {"choice": choice_report(search, X)}),
                 "model": model_report(estimator, frames, drawn["edges"], perspective),
                 **answers,

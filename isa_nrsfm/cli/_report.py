@@ -36,7 +36,6 @@ MUCH_LOWER = 0.9
 def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
     """Describe the table, its rows and columns that are used, and the others."""
     X, names = frames.X, list(frames.points.columns)
-    used = {args.group, args.time, *(label.name for label in frames.labels)}
     missing = X.iloc[:, ::2].isna().to_numpy()
     return {
         "path": str(Path(args.table).resolve()),
@@ -52,7 +51,6 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
         "last_columns": names[-2:],
         "absent_numbers": frames.columns.gaps,
         "coordinates_not_used": frames.not_used,
-        "other_columns": [name for name in frames.other if name not in used],
         "rows_left_out": [
             {
                 "reason": reason,

@@ -425,12 +425,6 @@ def _label(label: dict[str, Any]) -> Section:
     if label["n_without_label"]:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
-    related = [
-        name for name, p in zip(names, label["p_values"], strict=True) if p < 0.05
-    ]
-    answer = f"{label['column']} goes with {', '.join(related)} (p < 0.05)."
-    if not related:
-        answer = f"{label['column']} goes with no coefficient (p >= 0.05)."
     statistic, meaning = "Spearman", "rank correlation, from -1 to 1"
     if label["statistic"] == "eta_squared":
         statistic, meaning = "eta squared", "share of the variance between classes"
@@ -445,10 +439,15 @@ def _label(label: dict[str, Any]) -> Section:
     if means:
         means.insert(0, "mean of each class if p < 0.05, in standard deviations:")
     test = f"p-values: permutations of {label['permuted']}"
+    answer = f"{label['column']} was not tested: {label['untested']}."
     if label["untested"]:
-        test = f"no p-values: {label['untested']}"
+        test = "no p-values"
+    else:
+        related = np.asarray(names)[np.less(label["p_values"], 0.05)]
+        coefficients = ", ".join(related) or "no coefficient"
+        answer = f"{label['column']} goes with {coefficients} (p < 0.05)."
     return [
-        *[answer] * (not label["untested"]),
+        answer,
         Cells(["", statistic, "p"], rows, title),
         f"{statistic}: {meaning}; {test}",
         *means,
