@@ -66,13 +66,8 @@ ALWAYS: Figures = {
 
 
 def figures_of(args: Namespace, frames: Frames) -> Figures:
-    """Return the figures that the options ask for."""
-    figures = dict(ALWAYS)
-    if len(args.n_components) > 1:
-        figures["choice.png"] = (
-            "held-out error by the number of basis shapes",
-            lambda fit: plotting.ComponentChoiceDisplay.from_estimator(fit.search),
-        )
+    """Return the figures that the options ask for, answers first."""
+    figures: Figures = {}
     for number, label in enumerate(frames.labels, 1):
         caption = f"coefficients by {label.name}"
         figures[f"label_{number}.png"] = caption, partial(_by_label, label)
@@ -83,6 +78,12 @@ def figures_of(args: Namespace, frames: Frames) -> Figures:
     if frames.times is not None:
         caption = "coefficients in time, with a band of one standard deviation"
         figures["time.png"] = caption, _in_time
+    figures |= ALWAYS
+    if len(args.n_components) > 1:
+        figures["choice.png"] = (
+            "held-out error by the number of basis shapes",
+            lambda fit: plotting.ComponentChoiceDisplay.from_estimator(fit.search),
+        )
     return figures
 
 
