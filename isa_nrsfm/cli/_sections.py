@@ -37,6 +37,9 @@ _CAMERAS = {
     "perspective": "perspective: shapes are known up to size",
 }
 
+# Rows of a table in the terminal, at most.
+MOST_SHOWN = 16
+
 
 class Cells(NamedTuple):
     """A table: titles of the columns if they have any, rows, and a title."""
@@ -223,7 +226,10 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
 
 
 def _lines(part: str | Cells) -> list[str]:
-    """Return the lines of a part: sentences, which end with a point, are wrapped."""
+    """Return the lines of a part: sentences, which end with a point, are wrapped.
+
+    Tables with a head end after `MOST_SHOWN`.
+    """
     if isinstance(part, str):
         return textwrap.wrap(part, 90) if part.endswith(".") else [part]
     columns = []
@@ -232,6 +238,8 @@ def _lines(part: str | Cells) -> list[str]:
         align, width = ">" if is_number else "<", max(map(len, column))
         columns.append([f"{cell:{align}{width}}" for cell in column])
     rows = ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
+    if part.head and (more := len(rows[MOST_SHOWN:])):
+        rows[MOST_SHOWN:] = [f"... {more} more in {PAGE}"]
     return [part.title, *rows] if part.title else rows
 
 
@@ -262,7 +270,7 @@ def _fit(report: dict[str, Any]) -> Section:
     remark = ""
     if model["parameters"]["loss"] != "linear":
         remark = " (outliers count fully)"
-    elif model["rank_floor"] is not None:
+    elif model["rank_floor"] is not None and "prior" not in report:
         floor = _percent(model["rank_floor"])
         remark = f" (no model with {_shapes(model)} is below {floor})"
     parts = quality_section(model, remark)
