@@ -107,7 +107,7 @@ def fit_table(
         removed = {*_old_figures(folder, files), *figures}
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
-        unused = [name for name in frames.other if name not in used]
+        unused = [name for name in frames.other if name and name not in used]
         clock["read"] = time.perf_counter()
         estimator, search, perspective = _fitted(args, frames, clock)
         show_stage("answers")
