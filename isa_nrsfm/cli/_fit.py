@@ -259,7 +259,7 @@ def _fitted(
         # For `shown_progress`; the model that is written does not have it.
         estimator.set_params(verbose=2).fit(X, **frames.weighting)
     perspective = perspective_advice(estimator, frames)
-    if perspective and args.camera is None:
+    if perspective and args.camera is None and args.refinement == "joint":
         show_stage("fit with perspective cameras")
         estimator.set_params(verbose=2, n_components=len(estimator.basis_), **near)
         estimator.fit(X, **frames.weighting)

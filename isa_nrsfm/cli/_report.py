@@ -94,8 +94,9 @@ def model_report(
     found = estimator.diagnostics(X) if is_joint else None
     messages = () if found is None else found.messages
     if perspective and estimator.camera_ == "weak_perspective":
-        known = {"perspective": f'{perspective}. Use camera="perspective"'}
-        messages = advice(facts_of(estimator, **known))
+        joint = ', refinement="joint"' * (estimator.refinement == "consensus")
+        use = f'{perspective}. Use camera="perspective"{joint}'
+        messages = advice(facts_of(estimator, perspective=use))
     for message in messages:
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)
