@@ -19,7 +19,12 @@ from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
 from isa_nrsfm.calibration import canonical_pose
-from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
+from isa_nrsfm.datasets import (
+    make_body_tracks,
+    make_face_tracks,
+    make_hand_tracks,
+    make_nonrigid_tracks,
+)
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import (
     BasisShapeDisplay,
@@ -274,13 +279,28 @@ def test_layouts_are_recognised_named_or_given():
 
     assert lines_of("auto", FACE) is IBUG
     assert lines_of("auto", HAND) is HAND_21
-    assert lines_of("auto", BODY) is None
+    # The tree with the shortest lines joins the points of an unknown one.
+    line = np.array([[0.0, 0, 0], [5, 0, 0], [2, 0, 0], [2, 0, 0], [3, 1, 0]])
+    assert_array_equal(lines_of("auto", line).edges, [[0, 2], [1, 4], [2, 3], [2, 4]])
+    assert lines_of("auto", np.ones((401, 3))) is None
     assert lines_of("coco-17", BODY) is COCO
     assert lines_of(COCO, BODY) is COCO
     assert lines_of(None, FACE) is None
     found = lines_of([(0, 1), (4, 2)], BODY)
     assert_array_equal(found.edges, [[0, 1], [4, 2]])
+    assert_array_equal(lines_of([(0, 2, 1)], BODY).edges, [[0, 1], [0, 2], [1, 2]])
     assert not found.sides.any()
+
+
+def test_points_that_are_near_in_the_images_are_joined():
+    scene = make_nonrigid_tracks(40, 12, 1, camera="weak_perspective", random_state=0)
+    model = AffineNRSfM(1, camera="weak_perspective").fit(scene.data)
+    # Seen from the front only, with depths that no image shows
+    model.motion_[:] = model.reference_motion_ = np.eye(2, 3)
+    model.mean_shape_ = np.outer(np.arange(12.0), [1, 0, 0])
+    model.mean_shape_[::2, 2] = 100.0
+    chain = np.add.outer(np.arange(11), [0, 1])
+    assert_array_equal(BasisShapeDisplay.from_estimator(model).edges, chain)
 
 
 # The layout is known whatever is drawn. Hands are in any direction.
@@ -496,6 +516,7 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert texts(display)[1:] == [f"Basis shape {k}" for k in (1, 2, 3)]
     drift = "3 standard deviations"
     shown = ["mean shape", f"\N{MINUS SIGN}{drift}", f"+{drift}"]
+    shown.append("lines: minimal spanning tree")
     assert legend_of(display) == shown
     display = random_shapes().plot(components=[2, 0])
     assert_array_equal(display.components_, [2, 0])

@@ -264,7 +264,7 @@ def point_distances(
     names = names_of_points(model)
     first, second = np.array([point_numbers(pair, names) for pair in pairs]).T
     if unit is None:
-        if space.layout is None or space.layout.name != "ibug-68":
+        if space.lines is None or space.lines.name != "ibug-68":
             raise ValueError(
                 "unit must name two points, as these are not the 68 of a face"
             )

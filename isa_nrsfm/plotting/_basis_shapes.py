@@ -48,7 +48,9 @@ class BasisShapeDisplay:
             default="auto"
         Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
         points. A layout has separate colours for left and right in the mean shape.
-        "auto" recognises a known layout by the number and order of the points.
+        "auto" recognises a known layout by the number and order of the points. Up to
+        400 points without one are joined by a minimal spanning tree, the tree with the
+        shortest lines.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
         points up. "auto" is "lower" if a face or a body would otherwise be upside down.
@@ -185,8 +187,9 @@ class BasisShapeDisplay:
                 default="auto"
             Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
             points. "auto" recognises a known layout by the names or by the number and
-            order of the points. Faces, bodies and hands of known layouts stand upright
-            for any value of `edges`.
+            order of the points. The tree of other points is that of their distances in
+            the images. Faces, bodies and hands of known layouts stand upright for any
+            value of `edges`.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
             that points up. "auto" is "lower" if a face or a body would otherwise be

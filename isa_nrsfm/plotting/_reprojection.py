@@ -41,7 +41,8 @@ class ReprojectionDisplay:
             default=None
         Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
         points. A layout has separate colours for left and right. "auto" recognises a
-        known layout by the number and order of the points in the first frame.
+        known layout by the number and order of the points in the first frame. Up to
+        400 points without one are joined by a minimal spanning tree.
     origin : {"auto", "upper", "lower"}, default="upper"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
         points up. "auto" is "lower" if a face or a body would otherwise be upside down
@@ -169,7 +170,8 @@ class ReprojectionDisplay:
                 default="auto"
             Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
             points. "auto" recognises a known layout by the names of the points, or by
-            the number and order of those of the mean shape.
+            the number and order of those of the mean shape. Up to 400 points without a
+            known one are joined by the minimal spanning tree of `BasisShapeDisplay`.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
             that points up. "auto" is "lower" if a face or a body would otherwise be
