@@ -87,8 +87,8 @@ def write_viewer(
     Write a page that shows a shape model in any browser.
 
     The page is one file that needs no network and no other program. It shows the mean
-    shape in 3D with a slider for each basis shape. It plays the frames of a table, with
-    or without their cameras. In a scatter plot of two coefficients, click on a frame to
+    shape in 3D, turned by 20 degrees at first, with a slider for each basis shape. It
+    plays the frames of a table, with or without their cameras. In a scatter plot of two coefficients, click on a frame to
     show it.
 
     Parameters
