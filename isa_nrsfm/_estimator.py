@@ -411,15 +411,15 @@ default="affine"
         n_components: Any = 3,
         *,
         isa: Any = None,
-        block_recovery: str = "generalized_eigen",
-        refinement: str | None = "joint",
-        camera: str = "affine",
+        block_recovery: choices.BlockRecovery = "generalized_eigen",
+        refinement: choices.Refinement | None = "joint",
+        camera: choices.Camera = "affine",
         focal_length: Any = None,
         principal_point: Any = None,
         prior: Any = None,
-        adapt: str = "mean",
-        independence: str | None = "shapes",
-        loss: str = "linear",
+        adapt: choices.Adapted = "mean",
+        independence: choices.Independence | None = "shapes",
+        loss: choices.Loss = "linear",
         layout: Layout = "interleaved",
         scale_frames: bool = True,
         hidden_points: bool = True,
@@ -617,7 +617,7 @@ default="affine"
         joint = self.refinement in choices.JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
-            only_joint = {
+            only_joint: dict[str, list[Any]] = {
                 "n_components": ["auto"],
                 "loss": [*choices.LOSSES[1:]],
                 "independence": ["coefficients"],
@@ -849,7 +849,7 @@ default="affine"
     def reconstruct(
         self,
         X: Any,
-        camera: str | None = None,
+        camera: choices.CalibratedCamera | None = None,
         *,
         return_std: bool = False,
         point_weight: Any = None,
@@ -1148,7 +1148,7 @@ default="affine"
         There are no weights if all visible points have weight one. Unless `reset`, the
         table must match the fit: parameters that are set after it have no effect.
         """
-        layout, loss = self.layout, self.loss
+        layout, loss = self.layout, str(self.loss)
         joint = self.refinement in choices.JOINT_REFINEMENTS
         if not reset:
             check_is_fitted(self)

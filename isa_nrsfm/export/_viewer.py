@@ -88,8 +88,8 @@ def write_viewer(
 
     The page is one file that needs no network and no other program. It shows the mean
     shape in 3D, turned by 20 degrees at first, with a slider for each basis shape. It
-    plays the frames of a table, with or without their cameras. In a scatter plot of two coefficients, click on a frame to
-    show it.
+    plays the frames of a table, with or without their cameras. In a scatter plot of two
+    coefficients, click on a frame to show it.
 
     Parameters
     ----------
