@@ -576,6 +576,11 @@ def test_classes_have_boxes_of_their_frames():
         medians = [line.get_ydata()[0] for line in thick]
         assert_allclose(medians, [np.median(ALPHA[y == c, k]) for c in "abc"])
     assert display.axes_[-1].get_xlabel() == "mood"
+    # Dataframes have names, which are no mathematics.
+    named = pd.DataFrame(ALPHA, columns=["jaw $", 2])
+    display = CoefficientsDisplay(alpha=named, y=pd.Series(y, name="$")).plot()
+    assert [axes.get_ylabel() for axes in display.axes_] == [r"jaw \$", "2"]
+    assert display.axes_[-1].get_xlabel() == r"\$"
     missing = np.where(np.arange(30)[:, None] == 3, np.nan, ALPHA)
     display = CoefficientsDisplay(alpha=missing, y=y).plot()
     assert len(display.axes_[0].collections[0].get_offsets()) == 29
