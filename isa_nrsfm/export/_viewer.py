@@ -285,20 +285,17 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
         raise ValueError(
             f"labels must hold {n_rows} labels, one per row; got shape {values.shape}"
         )
-    texts, order = [], {}
+    keys: list[tuple[Any, ...]] = []  # numbers first, those without a label last
     for value in values.tolist():
-        missing = is_missing(value)
-        text = UNLABELLED if missing else str(value)
-        number = isinstance(value, Real)
-        order[text] = (missing, not number, value if number else 0, text)
-        texts.append(text)
-    categories = sorted(order, key=order.__getitem__)
-    if len(categories) > MOST_LABELS:
+        number = not is_missing(value) and isinstance(value, Real)
+        text = UNLABELLED if is_missing(value) else str(value)
+        keys.append((is_missing(value), not number, value if number else 0, text))
+    found = sorted(set(keys))
+    if len(found) > MOST_LABELS:
         raise ValueError(
-            f"labels must have at most {MOST_LABELS} different values; got "
-            f"{len(categories)}"
+            f"labels must have at most {MOST_LABELS} different values; got {len(found)}"
         )
-    return np.array([*map(categories.index, texts)], dtype=np.intp), categories
+    return np.array([*map(found.index, keys)], dtype=np.intp), [k[-1] for k in found]
 
 
 def write_glb(

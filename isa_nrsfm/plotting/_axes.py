@@ -68,12 +68,10 @@ def side_colours(sides: NDArray, middle: str) -> list[str]:
 def percent(fraction: float) -> str:
     """Write a fraction as percent with two digits, three from 100 % on."""
     value = 100.0 * fraction
-    if 0 < value < 1e-3:
-        return f"{value:.1e} %"
-    if 0 < value < 100:
-        value = float(f"{value:.1e}")  # round first: 9.96 becomes 10
-    exponent = int(np.floor(np.log10(value))) if value > 0 else 1
-    return f"{value:.{max(1 - exponent, 0)}f} %"
+    if not 0 < value < 99.5:
+        return f"{value:.0f} %"
+    text = f"{value:.1e}" if value < 1e-3 else f"{value:#.2g}"
+    return f"{text.removesuffix('.')} %"
 
 
 def wrap_title(title: str, axes: NDArray) -> str:

@@ -130,9 +130,13 @@ def choose_lines(
     tree of the points `seen`, by default the shape. Without lines only the points are
     drawn.
     """
-    layout, pairs = choose_layout(edges, shape, names), None
-    lines, name = None if edges is None else layout, "edges"
-    if edges is not None and not isinstance(edges, str | Skeleton):
+    named, pairs, name = isinstance(edges, str | Skeleton), None, "edges"
+    if named and edges != "auto":
+        layout: Skeleton | None = checked_skeleton(edges, len(shape))
+    else:
+        layout = find_skeleton(len(shape), names, shape=shape)
+    lines = None if edges is None else layout
+    if edges is not None and not named:
         pairs = edges_of(checked_links("edges", edges, len(shape), triangles=True))
     elif edges is not None and layout is None and not is_dense(shape):
         pairs, name = spanning_tree(shape if seen is None else seen), SPANNING_TREE
@@ -148,15 +152,6 @@ def spanning_tree(points: NDArray) -> NDArray[np.intp]:
     # A distance of zero would be no edge; the same length added to all has no effect.
     lengths = squareform(distances + np.nanmax(distances, initial=0.0))
     return np.transpose(minimum_spanning_tree(lengths).nonzero())
-
-
-def choose_layout(
-    edges: Any, shape: NDArray, names: tuple[str, ...] | None = None
-) -> Skeleton | None:
-    """Return the layout of points given by `edges`, or the recognised one."""
-    if isinstance(edges, Skeleton) or (isinstance(edges, str) and edges != "auto"):
-        return checked_skeleton(edges, len(shape))
-    return find_skeleton(len(shape), names, shape=shape)
 
 
 def choose_origin(
