@@ -40,7 +40,7 @@ pytestmark = [may_not_converge, one_start]
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
 SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
-# Of each display: arguments, the number of its axes, and arguments of styles.
+# Of each display: arguments, and the number of its axes.
 DISPLAYS = {
     BasisShapeDisplay: (
         {
@@ -51,31 +51,16 @@ DISPLAYS = {
             "energy_share": [0.5, 0.3, 0.2],
         },
         8,
-        {
-            "point_kw": {"s": 11},
-            "edge_kw": {"linewidths": 3},
-            "arrow_kw": {"zorder": 9},
-        },
     ),
-    CoefficientsDisplay: ({"alpha": RNG.standard_normal((30, 2))}, 2, {}),
+    CoefficientsDisplay: ({"alpha": RNG.standard_normal((30, 2))}, 2),
     ComponentChoiceDisplay: (
         {"n_components": [2, 4], "scores": SCORES, "chosen": 4},
         1,
-        {"errorbar_kw": {"color": "red"}},
     ),
-    ModeCovarianceDisplay: (
-        {"mode_covariance": np.eye(6)},
-        1,
-        {"im_kw": {"cmap": "PuOr"}},
-    ),
+    ModeCovarianceDisplay: ({"mode_covariance": np.eye(6)}, 1),
     ReprojectionDisplay: (
         {"observed": POINTS, "reprojected": 1.1 * POINTS, "edges": [[0, 1]]},
         6,
-        {
-            "observed_kw": {"s": 21},
-            "reprojected_kw": {"s": 22},
-            "edge_kw": {"linewidths": 4},
-        },
     ),
 }
 EACH = pytest.mark.parametrize("kind", DISPLAYS)
@@ -104,9 +89,9 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch, kind):
 
 @EACH
 def test_displays_draw_on_a_new_figure_or_given_axes(kind):
-    arguments, n_axes, styles = DISPLAYS[kind]
+    arguments, n_axes = DISPLAYS[kind]
     display = kind(**arguments)
-    assert display.plot(**styles) is display
+    assert display.plot() is display
     assert plt.get_fignums() == [display.figure_.number]
     # Titles, labels and legends are on the page, and do not cover each other.
     figure = display.figure_
@@ -136,18 +121,9 @@ def test_displays_take_keywords_and_fitted_estimators(kind):
     assert plt.get_fignums() == []
 
 
-def test_styles_can_be_changed():
-    kinds = DISPLAYS.items()
-    drawn = [kind(**given).plot(**styles) for kind, (given, _, styles) in kinds]
-    shapes, _, choice, covariance, frames = drawn
-    assert shapes.plus_[0].get_sizes() == [11]
-    assert shapes.axes_[1, 0].collections[0].get_linewidths() == [3]
-    assert shapes.arrows_[0].get_zorder() == 9
-    assert choice.errorbar_.lines[0].get_color() == "red"
-    assert covariance.im_.get_cmap().name == "PuOr"
-    assert frames.observed_[0].get_sizes() == [21]
-    assert frames.reprojected_[0].get_sizes() == [22]
-    assert frames.edges_[0].get_linewidths() == [4]
+def test_points_can_have_another_style():
+    shapes = BasisShapeDisplay(**DISPLAYS[BasisShapeDisplay][0])
+    assert shapes.plot(point_kw={"s": 11}).plus_[0].get_sizes() == [11]
 
 
 @pytest.mark.parametrize(
@@ -680,9 +656,6 @@ def test_colours_of_the_matrix_are_symmetric(scale):
     middle = display.im_.cmap(display.im_.norm([0.0]))[0, :3]
     assert_allclose(middle, middle[0], atol=0.01)  # a grey
     assert middle[0] > 0.95
-    display.plot(scale=scale, absolute=True)
-    assert_array_equal(display.im_.get_array(), np.abs(matrix))
-    assert display.im_.get_clim() == (0, high)
     small = ModeCovarianceDisplay(mode_covariance=np.diag([1.0, 1, 1, 0.05, 1, 1]))
     assert (small.plot(scale=scale).im_.norm(0.05) > 0.6) == (scale == "asinh")
 
@@ -705,8 +678,8 @@ def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     assert display.boundaries_.get_segments() == []
     assert display.colorbar_.mappable is display.im_
     assert display.colorbar_.ax.get_ylabel() == "covariance"
-    display.plot(normalize=True, absolute=True)
-    assert display.colorbar_.ax.get_ylabel() == "absolute correlation"
+    display.plot(normalize=True)
+    assert display.colorbar_.ax.get_ylabel() == "correlation"
     assert display.plot(colorbar=False).colorbar_ is None
     assert len(display.figure_.axes) == 1
 
@@ -737,8 +710,6 @@ def test_ticks_of_the_asinh_scale(largest):
     boxes = [tick.get_window_extent() for tick in axis.get_yticklabels()]
     assert len(boxes) == len(ticks)
     assert not any(a.overlaps(b) for a, b in pairwise(boxes))
-    display.plot(absolute=True)
-    assert_array_equal(display.colorbar_.ax.get_yticks(), ticks[ticks >= 0])
 
 
 def test_correlations():

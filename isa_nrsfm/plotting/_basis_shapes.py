@@ -236,8 +236,6 @@ class BasisShapeDisplay:
         components: ArrayLike | None = None,
         n_columns: int | None = None,
         point_kw: dict[str, Any] | None = None,
-        edge_kw: dict[str, Any] | None = None,
-        arrow_kw: dict[str, Any] | None = None,
     ) -> BasisShapeDisplay:
         """
         Draw the shapes.
@@ -257,10 +255,6 @@ class BasisShapeDisplay:
             Shapes side by side in the new figure. By default as few as fit on a page.
         point_kw : dict, default=None
             Arguments for the scatters of points. They override the defaults.
-        edge_kw : dict, default=None
-            Arguments for the LineCollections of joined points.
-        arrow_kw : dict, default=None
-            Arguments for the quivers of arrows.
 
         Returns
         -------
@@ -300,7 +294,6 @@ class BasisShapeDisplay:
         if not amplitudes.ndim:
             size = f"{amplitudes:g} standard deviations"
             below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
-        point_kw, edge_kw, arrow_kw = point_kw or {}, edge_kw or {}, arrow_kw or {}
         self.mean_: list[Any] = []
         self.minus_: list[Any] = []
         self.plus_: list[Any] = []
@@ -312,12 +305,12 @@ class BasisShapeDisplay:
                 shapes.append((self.plus_, mean + d, _axes.PLUS_COLOUR, above))
             for view, axis in zip(_axes.VIEWS, pair, strict=True):
                 for artists, shape, colour, label in shapes:
-                    style = {"color": colour, "label": label} | point_kw
-                    drawn = self._draw(axis, shape[:, view], style, edge_kw, not block)
+                    style = {"color": colour, "label": label} | (point_kw or {})
+                    drawn = self._draw(axis, shape[:, view], style, not block)
                     artists.append(drawn)
                 if block and not _axes.is_dense(mean):
                     ends = (*mean[:, view].T, *d[:, view].T)
-                    self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE | arrow_kw))
+                    self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE))
                 _axes.hide_frame(axis)
                 _axes.show_view(axis, view, limits[block], self.origin)
             title = self._title(block, amplitudes, reduction[block])
@@ -328,9 +321,7 @@ class BasisShapeDisplay:
             self._add_legend()
         return self
 
-    def _draw(
-        self, axis: Any, points: NDArray, style: Any, edge_kw: Any, sided: bool
-    ) -> Any:
+    def _draw(self, axis: Any, points: NDArray, style: Any, sided: bool) -> Any:
         """Draw one shape in one view, the mean shape with colours of the sides."""
         layout = self.skeleton
         if layout is not None:
@@ -338,8 +329,7 @@ class BasisShapeDisplay:
             if sided and colour == _axes.MEAN_COLOUR:
                 colours = _axes.side_colours(layout.edge_sides, colour)
                 style = style | {"color": _axes.side_colours(layout.sides, colour)}
-            edge_kw = {"colors": colours} | edge_kw
-            _axes.draw_segments(axis, points[layout.edges], **edge_kw)
+            _axes.draw_segments(axis, points[layout.edges], colors=colours)
             style = {"s": 2.0} | style
         return _axes.draw_points(axis, points, **style)
 
