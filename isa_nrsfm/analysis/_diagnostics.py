@@ -96,7 +96,7 @@ class Diagnostics(NamedTuple):
         certainty = "not estimated"
         if math.isfinite(self.depth_uncertainty):
             certainty = f"{_percent(self.depth_uncertainty)} of the depth"
-        shares = [f"{share:.2f}" for share in self.reliability]
+        shares = first_items((f"{share:.2f}" for share in self.reliability), 12)
         rows = [["", "effective frames", "pose share"]]
         for frames, share in zip(self.effective_frames, self.pose_share, strict=True):
             known = "" if math.isnan(share) else _percent(max(share, 0.0))
@@ -106,7 +106,7 @@ class Diagnostics(NamedTuple):
             f"cameras: {self.camera_meaning}",
             f"depth error: {certainty}",
             f"deformation: {_percent(self.deformation_amplitude)} of the mean shape",
-            f"reliability, along uncorrelated directions: {', '.join(shares)}",
+            f"reliability, along uncorrelated directions: {shares}",
             aligned(rows),
         ]
         return "\n".join(lines)
@@ -299,9 +299,7 @@ def _lines(model: Any) -> dict[str, str]:
             if model.frames_scaled_
             else f"{noise:.3g} in the units of the table"
         )
-    shares = [_percent(share) for share in model.energy_share_]
-    more = ["..."] * (len(shares) > 12)
-    lines["Energy of each"] = ", ".join(shares[:12] + more)
+    lines["Energy of each"] = first_items(map(_percent, model.energy_share_), 12)
     if "Noise" in lines and "Frames" in lines:
         messages = model.diagnostics().messages
         lines["Diagnostics"] = "; ".join(messages) or "no warning"
