@@ -259,12 +259,10 @@ def predictability(
             f"groups; got {most}"
         )
     n_folds = min(n_folds, most)
-    splitter = {
-        ("classes", True): StratifiedKFold,
-        ("classes", False): StratifiedGroupKFold,
-        ("number", True): KFold,
-        ("number", False): GroupKFold,
-    }[found, numbers is None]
+    alone, grouped = KFold, GroupKFold
+    if found == "classes":
+        alone, grouped = StratifiedKFold, StratifiedGroupKFold
+    splitter = alone if numbers is None else grouped
     folds = splitter(n_folds, shuffle=True, random_state=random_state)
     ridge = RidgeCV(np.logspace(-3, 3, 13))
     model = LinearDiscriminantAnalysis() if found == "classes" else ridge

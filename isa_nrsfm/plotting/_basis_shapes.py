@@ -318,7 +318,8 @@ class BasisShapeDisplay:
             pair[0].set_title(title, loc="left", fontsize="small")
             pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
         if ax is None:
-            self._add_legend()
+            shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
+            _axes.add_legend(self.figure_, shown, self.skeleton, markerscale=3.0)
         return self
 
     def _draw(self, axis: Any, points: NDArray, style: Any, sided: bool) -> Any:
@@ -347,17 +348,3 @@ class BasisShapeDisplay:
         if reduction > 1:
             notes.append(f"drawn 1:{reduction:.2g}")
         return f"{title} ({', '.join(notes)})" if notes else title
-
-    def _add_legend(self) -> None:
-        """Add the colours of the ends of the drift, and of the sides, below."""
-        from matplotlib.lines import Line2D
-
-        style: dict[str, Any] = {"linewidth": 1.5}
-        if self.edges is None:
-            style = {"marker": "o", "linestyle": "none", "markersize": 3}
-        shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
-        handles = [
-            Line2D([], [], color=p.get_facecolor()[0], label=p.get_label(), **style)
-            for p in shown
-        ]
-        _axes.add_legend(self.figure_, handles, self.skeleton)
