@@ -50,6 +50,7 @@ from isa_nrsfm._prepare.coordinates import warn_of_rows
 from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
+    CHECKS,
     StoredTable,
     column_sample,
     is_on_dask,
@@ -68,6 +69,13 @@ _NEEDS_CALIBRATED = (
     "needs a model with calibrated cameras; got camera='affine'. Fit with "
     "camera='weak_perspective' or camera='orthographic'"
 )
+# What has other names in scikit-learn's decompositions.
+_OTHER_NAMES = {
+    "components_": "has the name basis_: basis shapes (n_components, n_points, 3)",
+    "explained_variance_ratio_": "has the name energy_share_: shares of the deformation"
+    " in the images",
+    "mean_": "has the name mean_shape_: the mean shape (n_points, 3)",
+}
 
 
 class AffineNRSfM(
@@ -91,10 +99,10 @@ class AffineNRSfM(
         ``ceil(8 (K + 2) / 5)`` frames. Calibrated cameras allow up to 2J - 7 basis
         shapes of J points, if there are enough frames (joint refinement only): for 17
         points 27 instead of 4. "auto" fits twelve basis shapes, or as many as the table
-        allows, and keeps the relevant and reliable ones (joint refinement only); their
-        number is ``len(basis_)``. With ``refinement="consensus"`` the joint fit has at
-        most twelve, and the result has K principal components of the merged shapes;
-        "auto" keeps those that exceed the noise, at most 60.
+        allows, and keeps the relevant and reliable ones (joint refinement only). With
+        ``refinement="consensus"`` the joint fit has at most twelve, and the result has
+        K principal components of the merged shapes; "auto" keeps those that exceed the
+        noise, at most 60.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
@@ -107,9 +115,8 @@ class AffineNRSfM(
         motion. "eigen" is the exact minimiser under a norm constraint, "irls" the
         published iteration for the same cost. "generalized_eigen" maximises the
         explained share of the motion. "eigen" and "irls" can collapse onto a direction
-        in which the subspace hardly moves, and "irls" depends on the first frame. The
-        default has neither problem. With a refinement all three lead to nearly the same
-        result, because it starts from more places.
+        in which the subspace hardly moves, and "irls" depends on the first frame. With
+        a refinement all three lead to nearly the same result.
     refinement : {"joint", "consensus", "alternating", None}, default="joint"
         "joint" finds the cameras, shapes and noise variance of greatest marginal
         likelihood, with normally distributed coefficients. It starts from the paper's
@@ -163,10 +170,9 @@ default="affine"
         units of the table in any case. If False, frames are weighted by their size.
         With orthographic cameras, which have one scale, frames are not scaled.
     hidden_points : bool, default=True
-        Whether points may be missing because the object hides them. Such points are
-        farther away than visible ones, which decides between the two mirror images in
-        depth (`mirror_certainty_`). Set False if points are missing for other reasons
-        that depend on the view.
+        Whether points may be missing because the object hides them, which decides
+        between the two mirror images in depth (`mirror_certainty_`). Set False if
+        points are missing for other reasons that depend on the view.
     max_iter : int, default=1000
         Largest number of steps of the refinement.
     tol : float or None, default=None
@@ -181,10 +187,9 @@ default="affine"
         Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept.
     frames_folder : str, path-like or None, default=None
         Folder for the kept arrays. Each fit makes a new folder within it, with files
-        ``alpha.npy`` and so on. The attributes are memory maps of these files;
-        ``alpha_.filename`` is the path. A fit that fails leaves no files. Fits never
-        remove the files of earlier fits, because other models may use them. None keeps
-        the arrays in memory.
+        ``alpha.npy`` and so on, and never removes others. The attributes are memory
+        maps of these files; ``alpha_.filename`` is the path. None keeps the arrays in
+        memory.
     working_memory : float or None, default=None
         Largest memory of a block, in megabytes, of a table that is not in memory (a
         memory map or a table of `isa_nrsfm.io.open_table`). None is scikit-learn's
@@ -202,31 +207,31 @@ default="affine"
 
     Attributes
     ----------
+    n_components_ : int
+        K, the number of basis shapes.
     mean_shape_ : ndarray of shape (n_points, 3)
         Mean shape B_0, centred and white: the mean of ``b b^T`` over the points is the
         identity (of rank two for flat objects). With weak-perspective cameras only the
         mean square of its coordinates is one. With orthographic ones it is in the units
         of the table. x and y are the axes of the mean camera (so y points down for
         image coordinates), z is depth, away from the viewer if `mirror_certainty_` is
-        known. The mirror image in depth fits equally well.
+        known.
     basis_ : ndarray of shape (n_components, n_points, 3)
         Basis shapes B_k, centred, sorted by decreasing energy in the images, each for
-        one standard deviation of `alpha_`. Basis shapes without motion in the table are
-        zero.
+        one standard deviation of `alpha_`; zero without motion in the table.
     alpha_ : ndarray of shape (n_frames, n_components)
         Coefficients of the frames, scaled to unit variance; signs chosen so that the
         skewness is non-negative. Their mean is zero after the joint refinement.
     alpha_std_ : ndarray of shape (n_frames, n_components)
         Posterior standard deviations of `alpha_`, with the errors of the shapes (joint
-        refinement only). They assume independent noise, so they are too small for
-        deformation that the basis shapes do not model, and for coefficients without
+        refinement only). They assume independent noise: they are too small where basis
+        shapes do not model the deformation, and for coefficients without
         `reliability_`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Affine cameras, in the units of the table. With perspective, those of
         weak-perspective cameras with the same rotations and positions.
     translation_ : ndarray of shape (n_frames, 2)
-        Images of the origin of the shapes, in the units of the table: the centroids of
-        complete frames.
+        Images of the shapes' origin in the table: the centroids of complete frames.
     depth_uncertainty_ : float
         Expected RMS error of the depths of the frames, relative to their RMS
         (calibrated cameras with the joint refinement only). Above 0.55, depths and
@@ -293,7 +298,7 @@ default="affine"
     camera_ : str
         The camera model of the fit.
     frames_scaled_ : bool
-        Whether each frame was divided by its own size; never with orthographic cameras.
+        Whether each frame was divided by its own size.
     n_iter_ : int
         Number of steps of the refinement; for a large table, of those with all frames.
     n_features_in_ : int
@@ -308,10 +313,6 @@ default="affine"
 
     Notes
     -----
-    Affine cameras determine the shapes up to one affinity of space and one scale a
-    frame. The affinity is fixed as described for `mean_shape_`; angles and proportions
-    in depth are not those of the object.
-
     `fit` and the methods for new tables accept tables that are not in memory. For a
     dask array, `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays,
     like the results of `transform`, `decompose`, `reconstruct` and `reproject`.
@@ -342,6 +343,7 @@ default="affine"
     (5, 4)
     """
 
+    n_components_: int
     mean_shape_: NDArray
     basis_: NDArray
     alpha_: NDArray
@@ -411,15 +413,15 @@ default="affine"
         n_components: Any = 3,
         *,
         isa: Any = None,
-        block_recovery: str = "generalized_eigen",
-        refinement: str | None = "joint",
-        camera: str = "affine",
+        block_recovery: choices.BlockRecovery = "generalized_eigen",
+        refinement: choices.Refinement | None = "joint",
+        camera: choices.Camera = "affine",
         focal_length: Any = None,
         principal_point: Any = None,
         prior: Any = None,
-        adapt: str = "mean",
-        independence: str | None = "shapes",
-        loss: str = "linear",
+        adapt: choices.Adapted = "mean",
+        independence: choices.Independence | None = "shapes",
+        loss: choices.Loss = "linear",
         layout: Layout = "interleaved",
         scale_frames: bool = True,
         hidden_points: bool = True,
@@ -485,9 +487,9 @@ default="affine"
             If X has an odd number of columns, infinite values, too few points or frames
             for `n_components`, or column names that contradict `layout`; if a frame
             shows one to three points, or points on one line only; if a point is visible
-            in too few frames; if parameters or tables need the joint refinement; or if
-            `frames_folder` is an empty text. If weights are negative or not finite,
-            have another shape, or are not supported by parameters or table.
+            in too few frames; if parameters or tables need the joint refinement; if
+            `frames_folder` is an empty text; or if weights are negative, not finite, of
+            another shape, or not supported by parameters or table.
         OSError
             If `frames_folder` cannot be made or written to, before the fit; if the disk
             is full, after it.
@@ -586,6 +588,7 @@ default="affine"
         attributes: dict[str, Any] = fitted | {
             "_model": model,
             "_n_features_out": len(model.basis),
+            "n_components_": len(model.basis),
             "camera_": self.camera,
             "frames_scaled_": bool(settings.scale_frames),
         }
@@ -617,7 +620,7 @@ default="affine"
         joint = self.refinement in choices.JOINT_REFINEMENTS
         if not joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
-            only_joint = {
+            only_joint: dict[str, list[Any]] = {
                 "n_components": ["auto"],
                 "loss": [*choices.LOSSES[1:]],
                 "independence": ["coefficients"],
@@ -630,12 +633,6 @@ default="affine"
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
         check_camera(self)
-        if self.refinement == "consensus" and point_weight is not None:
-            raise ValueError(
-                "point_weight is not supported by the fit with refinement='consensus', "
-                "whose groups of points are fitted without weights. Set "
-                "refinement='joint', or give no point_weight"
-            )
         source, weights = self._opened(X, point_weight, reset=True)
         params = self.get_params(deep=False)
         if self.tol is None:
@@ -680,10 +677,12 @@ default="affine"
     if not TYPE_CHECKING:  # mypy would accept any name
 
         def __getattr__(self, name: str) -> Any:
-            """Raise an error; it states why affine fits lack an attribute."""
-            affine = vars(self).get("camera_") == "affine"
-            if affine and name in ("rotations_", "scales_", "depth_uncertainty_"):
-                raise AttributeError(f"{name} {_NEEDS_CALIBRATED}", name=name, obj=self)
+            """Raise an error; it states why an attribute is lacking, or its name."""
+            reason, affine = _OTHER_NAMES.get(name), vars(self).get("camera_")
+            if name in ("rotations_", "scales_", "depth_uncertainty_"):
+                reason = _NEEDS_CALIBRATED if affine == "affine" else None
+            if reason is not None:
+                raise AttributeError(f"{name} {reason}", name=name, obj=self)
             return super().__getattribute__(name)
 
     def _html_repr(self) -> str:
@@ -751,8 +750,7 @@ default="affine"
         Coefficients are Gaussian processes in time, cameras are integrated random
         walks, both estimated from the table. Each frame has the weight of its
         likelihood: frames with few visible points have little weight, with less than
-        six none. The fit of the shapes does not depend on the order of the frames:
-        smoothing is a step after it.
+        six none. The shapes are those of `fit`.
 
         Parameters
         ----------
@@ -766,9 +764,8 @@ default="affine"
             median difference is one step. Other differences are rounded to whole steps.
             If None, consecutive frames are one step apart.
         groups : array-like of shape (n_frames,), default=None
-            Person, video or scene of each frame. Smoothing does not cross groups.
-            Each sequence has its own intercept, so that differences between people are
-            not taken for dynamics. None for one group.
+            Person, video or scene of each frame. Smoothing does not cross groups, which
+            have intercepts of their own. None for one group.
         max_gap : int, default=30
             Largest gap, in steps, across which coefficients are smoothed.
         max_iter : int, default=100
@@ -794,9 +791,8 @@ default="affine"
         The processes have the Matern covariance of order 3/2 (Hartikainen, Sarkka,
         2010). Coefficients and camera of a frame are observed through its likelihood,
         linearised at the fit of `transform` (Rauch, Tung, Striebel, 1965). Time scales
-        and variances maximise the likelihood. If the evidence for dynamics of the
-        coefficients is weak, as for photos in any order, the result is that of
-        `decompose`: the likelihood is compared with that of intercepts alone.
+        and variances maximise the likelihood. If it is hardly larger than that of
+        intercepts alone, as for photos in any order, the result is that of `decompose`.
         """
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)
@@ -827,9 +823,8 @@ default="affine"
         -------
         ndarray of shape (n_frames, 3, 3)
             Posterior covariances, in radians squared, of the errors w of the rotations,
-            as rotation vectors: ``R exp(hat(w))``, with w in the axes of the shapes.
-            Each is the covariance of the frame plus that of the shapes, from a
-            jackknife over groups of points. NaN for rows with too few visible points.
+            as rotation vectors: ``R exp(hat(w))``, with w in the axes of the shapes,
+            and with errors of the shapes. NaN for rows with too few visible points.
 
         Raises
         ------
@@ -849,7 +844,7 @@ default="affine"
     def reconstruct(
         self,
         X: Any,
-        camera: str | None = None,
+        camera: choices.CalibratedCamera | None = None,
         *,
         return_std: bool = False,
         point_weight: Any = None,
@@ -864,12 +859,11 @@ default="affine"
             whose frames are not fitted again.
         camera : {"orthographic", "weak_perspective"} or None, default=None
             Calibrated camera model of the images, for a model that was fitted with
-            affine cameras. None returns affine shapes, in the space of `mean_shape_`:
-            their angles and proportions in depth are not those of the object. Otherwise
-            shapes are Euclidean, up to one rotation and one mirror image for all
-            frames. With "weak_perspective" each camera has its own scale, and the sizes
-            of the shapes have no meaning. With "orthographic" all cameras have one
-            scale, and shapes are in the units of the table.
+            affine cameras. None returns shapes in the space of `mean_shape_`. Otherwise
+            they are Euclidean, up to one rotation and one mirror image for all frames.
+            With "weak_perspective" each camera has its own scale, and the sizes of the
+            shapes have no meaning. With "orthographic" all cameras have one scale, and
+            shapes are in the units of the table.
         return_std : bool, default=False
             Whether to return the standard deviations of the depths, for a model with
             calibrated cameras.
@@ -890,10 +884,9 @@ default="affine"
         Raises
         ------
         ValueError
-            If `camera` is none of these, if the cameras of the fitted table see fewer
-            than three directions of space, or if the model was fitted with calibrated
-            cameras other than `camera`. If `return_std` is given with a decomposition,
-            or the decomposition has another number of coefficients.
+            If the cameras of the fitted table see fewer than three directions of
+            space, if the model was fitted with calibrated cameras other than `camera`,
+            or if the decomposition does not fit the model or `return_std`.
 
         Warns
         -----
@@ -908,10 +901,8 @@ default="affine"
         Notes
         -----
         The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
-        `motion_` and `alpha_`, the cameras and coefficients of the fitted table, for
-        any X. If the model was fitted with calibrated cameras, its shapes are Euclidean
-        already. They are not rotated, so that `scales_` and `rotations_` are those of
-        their cameras.
+        the fitted table. Calibrated cameras have Euclidean shapes already, which are
+        not rotated: `scales_` and `rotations_` are those of their cameras.
         """
         check_is_fitted(self)
         known = (None, self.camera_, *choices.CALIBRATED_CAMERAS)
@@ -957,30 +948,47 @@ default="affine"
 
         return table.collect(model.uncertain_shapes if return_std else shapes, *weights)
 
+    def shapes(self, alpha: Any) -> NDArray:
+        """
+        Return the 3D shapes with given coefficients.
+
+        Parameters
+        ----------
+        alpha : array-like of shape (n_shapes, n_components)
+            Coefficients, of frames or chosen ones: their standard deviation is one.
+
+        Returns
+        -------
+        ndarray of shape (n_shapes, n_points, 3)
+            ``S_i = mean_shape_ + sum_k alpha_ik basis_[k]``, NaN for rows with NaN. For
+            the coefficients of frames it is the same as `reconstruct`.
+
+        Raises
+        ------
+        ValueError
+            If there is not one column for each basis shape.
+        """
+        check_is_fitted(self)
+        alpha = check_array(unmasked(alpha), input_name="alpha", **CHECKS)
+        if alpha.shape[1] != len(self.basis_):
+            expected = len(alpha), len(self.basis_)
+            raise ValueError(f"alpha must have shape {expected}; got {alpha.shape}")
+        return compose(self.mean_shape_, self.basis_, alpha)
+
     def mirrored(self) -> Self:
         """
         Return the mirror image of the model in depth, which fits equally well.
 
-        Neither affine nor calibrated cameras distinguish an object from its mirror
-        image. If missing points do not decide (`mirror_certainty_`), the fit chooses
-        the one whose mean shape has depths of positive skewness. Use this method if
-        that is the wrong one, for example a face whose nose points away. Coefficients,
-        reprojection and score stay the same.
+        If missing points do not decide between the two (`mirror_certainty_`), the fit
+        chooses the one whose mean shape has depths of positive skewness. Use this
+        method if that is the wrong one, for example a face whose nose points away.
+        Coefficients, reprojection and score stay the same.
 
         Returns
         -------
         AffineNRSfM
             A copy with changed signs of z of the shapes and of the third column of the
             cameras. Its rotations are ``D R D`` with ``D = diag(1, 1, -1)``.
-
-        Examples
-        --------
-        >>> from isa_nrsfm import AffineNRSfM
-        >>> from isa_nrsfm.datasets import make_face_tracks
-        >>> faces = make_face_tracks(n_frames=100, random_state=0)
-        >>> model = AffineNRSfM(2, camera="weak_perspective").fit(faces.data)
-        >>> bool((model.mirrored().mean_shape_[:, 2] == -model.mean_shape_[:, 2]).all())
-        True
         """
         check_is_fitted(self)
         if sees_perspective(self):
@@ -1042,24 +1050,19 @@ default="affine"
         Returns
         -------
         ndarray of shape (n_frames, 2 * n_points)
-            The table, in the order of `layout`.
+            The table, in the order of `layout`. NaN for rows with NaN in `alpha`.
 
         Raises
         ------
         ValueError
             If the shapes do not fit the model or each other.
         """
-        check_is_fitted(self)
-        alpha = unmasked(alpha)
-        alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
+        shapes = self.shapes(alpha)
         motion = self.reference_motion_ if motion is None else motion
         if translation is None:
             translation = self.reference_translation_
-        n_frames, n_components = len(alpha), len(self.basis_)
-        alpha = checked("alpha", alpha, (n_frames, n_components))
-        motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
-        translation = checked("translation", translation, (n_frames, 2), (2,))
-        shapes = compose(self.mean_shape_, self.basis_, alpha)
+        motion = checked("motion", motion, (len(shapes), 2, 3), (2, 3))
+        translation = checked("translation", translation, (len(shapes), 2), (2,))
         images = self._model.images(shapes, motion, translation)
         return tracks_to_table(images, self._model.layout)
 
@@ -1067,10 +1070,9 @@ default="affine"
         """
         Return minus the inverse SNR of points held out of the fit of their frame.
 
-        The points are divided into five parts, always the same. Each part is predicted
-        from the others, frame by frame. Unlike the reprojection error of fitted points,
-        this error rises with too many basis shapes. So the score can choose
-        `n_components`.
+        The points are divided into five fixed parts, each predicted from the others,
+        frame by frame. Unlike the reprojection error of fitted points, this error rises
+        with too many basis shapes: it can choose `n_components`.
 
         Parameters
         ----------
@@ -1107,11 +1109,7 @@ default="affine"
         Returns
         -------
         Diagnostics
-            Named tuple of camera_singular_values, deformation_amplitude, reliability,
-            effective_frames, weak_deviations, depth_uncertainty, camera_noise_ratio,
-            camera_meaning, pose_share, outlier_share, outliers and messages. The
-            messages are sentences, for example if the table supports fewer basis
-            shapes, or if it has outliers.
+            Named tuple of figures, and messages on what to do about them.
 
         Raises
         ------
@@ -1148,14 +1146,15 @@ default="affine"
         There are no weights if all visible points have weight one. Unless `reset`, the
         table must match the fit: parameters that are set after it have no effect.
         """
-        layout, loss = self.layout, self.loss
+        layout, loss = self.layout, str(self.loss)
         joint = self.refinement in choices.JOINT_REFINEMENTS
         if not reset:
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
             joint, loss = isinstance(frames, PosteriorFrames), frames.loss
         if point_weight is not None:
-            check_weightable(X, joint, loss)
+            grouped = reset and self.refinement == "consensus"
+            check_weightable(X, joint, loss, grouped)
         if is_read_later(X):
             check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)

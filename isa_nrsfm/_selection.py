@@ -37,7 +37,7 @@ from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._joint.settings import JOINT_TOL
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS, CalibratedCamera
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 
@@ -346,7 +346,7 @@ class AffineNRSfMCV(
         """
         return self._fitted().decompose(X)
 
-    def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
+    def reconstruct(self, X: Any, camera: CalibratedCamera | None = None) -> NDArray:
         """
         Return the 3D shape of each frame of a table.
 

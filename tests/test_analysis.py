@@ -267,6 +267,15 @@ class TestAssociation:
         assert list(frame.columns) == ["eta_squared", "p_value"]
         assert list(frame.index) == [1, 2, 3]
         assert_array_equal(frame["p_value"], found.p_value)
+        head, *rows, meaning = str(found).splitlines()
+        assert head.split() == ["eta", "squared", "p"]
+        shown = [row.split() for row in rows]
+        assert [row[0] for row in shown] == ["alpha_1", "alpha_2", "alpha_3"]
+        assert_allclose([float(row[2]) for row in shown], found.p_value, atol=5e-4)
+        assert meaning.endswith("p-values: permutations of frames; 120 frames")
+        untested = found._replace(untested="one group", kind="number")
+        assert "rank correlation" in str(untested)
+        assert "no p-values: one group; 120 frames" in str(untested)
 
     @pytest.mark.parametrize(
         ("y", "options", "message"),

@@ -61,8 +61,11 @@ def test_layouts_are_recognised_by_order_or_names(fits, bodies, bodies_fit, tmp_
     assert "points recognised as hand-21" in found.out
     assert found.report["model"]["skeleton"] == "hand-21"
     assert edges_of(tmp_path / "viewer.html") == (pairs_of("hand-21"), [])
-    # Bodies of 17 points are not guessed.
-    assert edges_of(bodies_fit.folder / "viewer.html") == (set(), [])
+    # Bodies of 17 points are not guessed: 16 lines join them.
+    viewer = bodies_fit.folder / "viewer.html"
+    pairs, sides = edges_of(viewer)
+    assert (len(pairs), sides) == (16, [])
+    assert "joined by a minimal spanning tree" in content_of(viewer)["about"]
     assert bodies_fit.report["model"]["skeleton"] is None
     names = [f"{name}_{axis}" for name in bodies.point_names for axis in "xy"]
     fits(write(bodies, tmp_path / "bodies.csv", names), "--no-figures", *QUICK)
@@ -99,7 +102,8 @@ def test_edges_of_a_file(fits, succeeds, table, bodies_fit, tmp_path):
         assert is_noted == (options == ())
         return edges_of(tmp_path / "viewer.html")[0]
 
-    assert drawn() == drawn("--edges", "none") == set()
+    assert len(drawn()) == 16
+    assert drawn("--edges", "none") == set()
     own.write_text("5,7\n7,9\n")
     assert drawn("--edges", own) == {(5, 7), (7, 9)}
     # Of triangles the sides are drawn, each once.

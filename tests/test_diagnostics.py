@@ -170,6 +170,26 @@ class TestFigures:
         found = model.diagnostics()
         assert_allclose(found.deformation_amplitude, expected, rtol=1e-9)
 
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    def test_are_printed_as_sentences_and_a_table(self, model, camera):
+        found = model.diagnostics()
+        if camera == "affine":
+            pose = np.array([np.nan, 0.1])
+            found = found._replace(depth_uncertainty=np.nan, pose_share=pose)
+            found = found._replace(messages=("Use more frames",))
+        first, *_, head, one, two = str(found).splitlines()
+        depth = f"{100 * found.depth_uncertainty:.3g} % of the depth"
+        if camera == "affine":
+            assert (first, two.split()[2:]) == ("Use more frames", ["10", "%"])
+            depth = "not estimated"
+        else:
+            assert first == "no warning"
+        assert f"\ndepth error: {depth}\n" in str(found)
+        assert f"\ncameras: {found.camera_meaning}\n" in str(found)
+        assert head.split() == ["effective", "frames", "pose", "share"]
+        assert one.split()[:2] == ["alpha_1", f"{found.effective_frames[0]:.1f}"]
+        assert len(one) == len(two) == len(head)
+
     def test_covariance_of_the_mirror_image(self, model):
         depth = np.tile([1.0, 1.0, -1.0], 2)
         expected = model.mode_covariance_ * np.outer(depth, depth)

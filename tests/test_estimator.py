@@ -189,6 +189,7 @@ def test_attributes_have_the_documented_shapes_and_types(dtype, refinement):
     assert type(model.inverse_snr_) is float
     assert type(model.rank_floor_) is float
     assert type(model.n_iter_) is int
+    assert model.n_components_ == n_components
     assert model.n_features_in_ == 2 * N_POINTS
     assert isinstance(model.isa_, FastISA)
     assert not hasattr(model, "feature_names_in_")
@@ -201,6 +202,21 @@ def test_every_attribute_is_documented(model):
     assert fitted <= documented
     documented = {name for name in documented if name.endswith("_")}
     assert documented - fitted == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "own"),
+    [
+        ("components_", "basis_"),
+        ("explained_variance_ratio_", "energy_share_"),
+        ("mean_", "mean_shape_"),
+    ],
+)
+def test_names_of_scikit_learn_lead_to_those_of_the_model(name, own, model):
+    with pytest.raises(AttributeError, match=f"{name} has the name {own}"):
+        getattr(model, name)
+    assert hasattr(model, own)
+    assert not hasattr(model, name)
 
 
 def test_inputs_of_other_types_are_fitted_in_double_precision():
@@ -573,7 +589,7 @@ def test_bad_new_tables_are_refused(model, method, table, message):
     ("arguments", "message"),
     [
         (([[0.0, 0.0]],), r"alpha must have shape \(1, 3\); got \(1, 2\)"),
-        (([[0.0, 0.0, np.nan]],), "alpha contains NaN"),
+        (([["low", 0.0, 0.0]],), "could not convert string to float"),
         (([0.0, 0.0, 0.0],), "Expected 2D array"),
         (
             (np.zeros((4, 3)), np.zeros((3, 2, 3))),
@@ -887,6 +903,8 @@ def test_shapes_of_fitted_frames(camera):
     X[2] = np.nan
     frames = model.decompose(X)
     assert_array_equal(model.reconstruct(frames), model.reconstruct(X))
+    assert_array_equal(model.shapes(frames.alpha.tolist()), model.reconstruct(X))
+    assert np.isnan(model.inverse_transform(frames.alpha)[2]).all()
     wanted = "orthographic" if camera == "affine" else camera
     found = model.reconstruct(frames, wanted)
     assert_array_equal(found, model.reconstruct(X, wanted))

@@ -96,6 +96,7 @@ def test_names_and_bounds_are_exact(written):
     extras = read.mesh["extras"]
     assert extras["targetNames"] == ["alpha_1", "alpha_2", "alpha_3"]
     assert extras["pointNames"] == [str(j) for j in range(68)]
+    assert extras["lines"] == "ibug-68"
     primitive = read.primitive(4)
     for part in (primitive["attributes"], *primitive["targets"]):
         accessor = read.document["accessors"][part["POSITION"]]

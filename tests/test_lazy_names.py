@@ -74,6 +74,8 @@ def test_names_are_those_that_type_checkers_see(name):
     seen = for_type_checkers(package)
     assert set(package.__all__) <= {*seen, "__version__"}
     assert {*seen, *package.__all__} <= set(dir(package))
+    if "__getattr__" in vars(package):
+        assert {each for each in dir(package) if each[:2] != "__"} == {*seen}
     for public, module in seen.items():
         expected = getattr(importlib.import_module(module), public)
         assert getattr(package, public) is expected

@@ -19,7 +19,12 @@ from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
 from isa_nrsfm.calibration import canonical_pose
-from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
+from isa_nrsfm.datasets import (
+    make_body_tracks,
+    make_face_tracks,
+    make_hand_tracks,
+    make_nonrigid_tracks,
+)
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import (
     BasisShapeDisplay,
@@ -35,7 +40,7 @@ pytestmark = [may_not_converge, one_start]
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
 SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
-# Of each display: arguments, the number of its axes, and arguments of styles.
+# Of each display: arguments, and the number of its axes.
 DISPLAYS = {
     BasisShapeDisplay: (
         {
@@ -46,31 +51,16 @@ DISPLAYS = {
             "energy_share": [0.5, 0.3, 0.2],
         },
         8,
-        {
-            "point_kw": {"s": 11},
-            "edge_kw": {"linewidths": 3},
-            "arrow_kw": {"zorder": 9},
-        },
     ),
-    CoefficientsDisplay: ({"alpha": RNG.standard_normal((30, 2))}, 2, {}),
+    CoefficientsDisplay: ({"alpha": RNG.standard_normal((30, 2))}, 2),
     ComponentChoiceDisplay: (
         {"n_components": [2, 4], "scores": SCORES, "chosen": 4},
         1,
-        {"errorbar_kw": {"color": "red"}},
     ),
-    ModeCovarianceDisplay: (
-        {"mode_covariance": np.eye(6)},
-        1,
-        {"im_kw": {"cmap": "PuOr"}},
-    ),
+    ModeCovarianceDisplay: ({"mode_covariance": np.eye(6)}, 1),
     ReprojectionDisplay: (
         {"observed": POINTS, "reprojected": 1.1 * POINTS, "edges": [[0, 1]]},
         6,
-        {
-            "observed_kw": {"s": 21},
-            "reprojected_kw": {"s": 22},
-            "edge_kw": {"linewidths": 4},
-        },
     ),
 }
 EACH = pytest.mark.parametrize("kind", DISPLAYS)
@@ -99,9 +89,9 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch, kind):
 
 @EACH
 def test_displays_draw_on_a_new_figure_or_given_axes(kind):
-    arguments, n_axes, styles = DISPLAYS[kind]
+    arguments, n_axes = DISPLAYS[kind]
     display = kind(**arguments)
-    assert display.plot(**styles) is display
+    assert display.plot() is display
     assert plt.get_fignums() == [display.figure_.number]
     # Titles, labels and legends are on the page, and do not cover each other.
     figure = display.figure_
@@ -131,18 +121,9 @@ def test_displays_take_keywords_and_fitted_estimators(kind):
     assert plt.get_fignums() == []
 
 
-def test_styles_can_be_changed():
-    kinds = DISPLAYS.items()
-    drawn = [kind(**given).plot(**styles) for kind, (given, _, styles) in kinds]
-    shapes, _, choice, covariance, frames = drawn
-    assert shapes.plus_[0].get_sizes() == [11]
-    assert shapes.axes_[1, 0].collections[0].get_linewidths() == [3]
-    assert shapes.arrows_[0].get_zorder() == 9
-    assert choice.errorbar_.lines[0].get_color() == "red"
-    assert covariance.im_.get_cmap().name == "PuOr"
-    assert frames.observed_[0].get_sizes() == [21]
-    assert frames.reprojected_[0].get_sizes() == [22]
-    assert frames.edges_[0].get_linewidths() == [4]
+def test_points_can_have_another_style():
+    shapes = BasisShapeDisplay(**DISPLAYS[BasisShapeDisplay][0])
+    assert shapes.plot(point_kw={"s": 11}).plus_[0].get_sizes() == [11]
 
 
 @pytest.mark.parametrize(
@@ -274,13 +255,28 @@ def test_layouts_are_recognised_named_or_given():
 
     assert lines_of("auto", FACE) is IBUG
     assert lines_of("auto", HAND) is HAND_21
-    assert lines_of("auto", BODY) is None
+    # The tree with the shortest lines joins the points of an unknown one.
+    line = np.array([[0.0, 0, 0], [5, 0, 0], [2, 0, 0], [2, 0, 0], [3, 1, 0]])
+    assert_array_equal(lines_of("auto", line).edges, [[0, 2], [1, 4], [2, 3], [2, 4]])
+    assert lines_of("auto", np.ones((401, 3))) is None
     assert lines_of("coco-17", BODY) is COCO
     assert lines_of(COCO, BODY) is COCO
     assert lines_of(None, FACE) is None
     found = lines_of([(0, 1), (4, 2)], BODY)
     assert_array_equal(found.edges, [[0, 1], [4, 2]])
+    assert_array_equal(lines_of([(0, 2, 1)], BODY).edges, [[0, 1], [0, 2], [1, 2]])
     assert not found.sides.any()
+
+
+def test_points_that_are_near_in_the_images_are_joined():
+    scene = make_nonrigid_tracks(40, 12, 1, camera="weak_perspective", random_state=0)
+    model = AffineNRSfM(1, camera="weak_perspective").fit(scene.data)
+    # Seen from the front only, with depths that no image shows
+    model.motion_[:] = model.reference_motion_ = np.eye(2, 3)
+    model.mean_shape_ = np.outer(np.arange(12.0), [1, 0, 0])
+    model.mean_shape_[::2, 2] = 100.0
+    chain = np.add.outer(np.arange(11), [0, 1])
+    assert_array_equal(BasisShapeDisplay.from_estimator(model).edges, chain)
 
 
 # The layout is known whatever is drawn. Hands are in any direction.
@@ -496,6 +492,7 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert texts(display)[1:] == [f"Basis shape {k}" for k in (1, 2, 3)]
     drift = "3 standard deviations"
     shown = ["mean shape", f"\N{MINUS SIGN}{drift}", f"+{drift}"]
+    shown.append("lines: minimal spanning tree")
     assert legend_of(display) == shown
     display = random_shapes().plot(components=[2, 0])
     assert_array_equal(display.components_, [2, 0])
@@ -555,6 +552,11 @@ def test_classes_have_boxes_of_their_frames():
         medians = [line.get_ydata()[0] for line in thick]
         assert_allclose(medians, [np.median(ALPHA[y == c, k]) for c in "abc"])
     assert display.axes_[-1].get_xlabel() == "mood"
+    # Dataframes have names, which are no mathematics.
+    named = pd.DataFrame(ALPHA, columns=["jaw $", 2])
+    display = CoefficientsDisplay(alpha=named, y=pd.Series(y, name="$")).plot()
+    assert [axes.get_ylabel() for axes in display.axes_] == [r"jaw \$", "2"]
+    assert display.axes_[-1].get_xlabel() == r"\$"
     missing = np.where(np.arange(30)[:, None] == 3, np.nan, ALPHA)
     display = CoefficientsDisplay(alpha=missing, y=y).plot()
     assert len(display.axes_[0].collections[0].get_offsets()) == 29
@@ -654,9 +656,6 @@ def test_colours_of_the_matrix_are_symmetric(scale):
     middle = display.im_.cmap(display.im_.norm([0.0]))[0, :3]
     assert_allclose(middle, middle[0], atol=0.01)  # a grey
     assert middle[0] > 0.95
-    display.plot(scale=scale, absolute=True)
-    assert_array_equal(display.im_.get_array(), np.abs(matrix))
-    assert display.im_.get_clim() == (0, high)
     small = ModeCovarianceDisplay(mode_covariance=np.diag([1.0, 1, 1, 0.05, 1, 1]))
     assert (small.plot(scale=scale).im_.norm(0.05) > 0.6) == (scale == "asinh")
 
@@ -679,8 +678,8 @@ def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     assert display.boundaries_.get_segments() == []
     assert display.colorbar_.mappable is display.im_
     assert display.colorbar_.ax.get_ylabel() == "covariance"
-    display.plot(normalize=True, absolute=True)
-    assert display.colorbar_.ax.get_ylabel() == "absolute correlation"
+    display.plot(normalize=True)
+    assert display.colorbar_.ax.get_ylabel() == "correlation"
     assert display.plot(colorbar=False).colorbar_ is None
     assert len(display.figure_.axes) == 1
 
@@ -711,8 +710,6 @@ def test_ticks_of_the_asinh_scale(largest):
     boxes = [tick.get_window_extent() for tick in axis.get_yticklabels()]
     assert len(boxes) == len(ticks)
     assert not any(a.overlaps(b) for a, b in pairwise(boxes))
-    display.plot(absolute=True)
-    assert_array_equal(display.colorbar_.ax.get_yticks(), ticks[ticks >= 0])
 
 
 def test_correlations():

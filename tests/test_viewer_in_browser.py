@@ -107,6 +107,9 @@ def test_the_mouse_turns_and_zooms_the_shape(browser, page):
     box = browser.run(places)
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     points = browser.run("viewer.points()")
+    # At first the shape is turned by 20 degrees.
+    assert browser.run("viewer.state().turn[0]") == pytest.approx(np.cos(np.pi / 9))
+    browser.click("front")
     before = browser.array("viewer.projected()")
     browser.drag((x, y), (x + 60, y))
     after = browser.array("viewer.projected()")
@@ -124,6 +127,7 @@ def test_the_mouse_turns_and_zooms_the_shape(browser, page):
 def test_keys_turn_and_zoom_the_shape(browser, page):
     browser.open(page)
     browser.run("document.getElementById('scene').focus()")
+    browser.press("0", 48)
     for key, code in (("ArrowRight", 39), ("ArrowUp", 38), ("+", 187)):
         browser.press(key, code)
     state = browser.run("viewer.state()")

@@ -53,6 +53,15 @@ def of_misspelt_names() -> None:
     isa_nrsfm.AffineNRSFM  # type: ignore[attr-defined] # noqa: B018
 
 
+def of_misspelt_values() -> None:
+    AffineNRSfM(camera="weak")  # type: ignore[arg-type]
+    AffineNRSfM(refinement="paper")  # type: ignore[arg-type]
+    AffineNRSfM(loss="squared")  # type: ignore[arg-type]
+    AffineNRSfM(independence="frames")  # type: ignore[arg-type]
+    AffineNRSfM(adapt="all")  # type: ignore[arg-type]
+    AffineNRSfM(block_recovery="qr")  # type: ignore[arg-type]
+
+
 def main(folder: Path) -> float:
     faces = make_face_tracks(n_frames=100, random_state=0)
     points, _ = landmark_table(pd.read_csv(folder / "faces.csv"))

@@ -46,7 +46,8 @@ def lazy_names(
         return namespace[name]
 
     def listed() -> list[str]:
-        return sorted({*namespace, *modules})
+        special = [name for name in namespace if name.startswith("__")]
+        return sorted([*modules, *special])
 
     if os.environ.get(EAGER):
         for name in modules:

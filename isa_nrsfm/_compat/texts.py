@@ -17,6 +17,14 @@ def first_items(items: Iterable[Any], most: int = 4) -> str:
     return ", ".join(texts[:most]) + ", ..." * (len(texts) > most)
 
 
+def aligned(rows: Iterable[Sequence[str]]) -> str:
+    """Return the rows of a table as lines, with columns of one width."""
+    columns = list(zip(*rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    lines = zip(*columns, strict=True)
+    return "\n".join("  ".join(map(str.rjust, line, widths)) for line in lines)
+
+
 def by_number(path: Path | str) -> tuple[list[str | int], str]:
     """
     Return a key that sorts files by name, and numbers in names by size.

@@ -1,18 +1,28 @@
-"""The values of text parameters of `AffineNRSfM`, each default first.
+"""The types and values of text parameters of `AffineNRSfM`, each default first.
 
-No imports: the help of the command line must not wait for NumPy or scikit-learn.
+The help of the command line must not wait for NumPy or scikit-learn.
 """
 
-BLOCK_RECOVERIES = ("generalized_eigen", "eigen", "irls")
-REFINEMENTS = ("joint", "consensus", "alternating")
+from typing import Literal, get_args
+
+BlockRecovery = Literal["generalized_eigen", "eigen", "irls"]
+Refinement = Literal["joint", "consensus", "alternating"]
+CalibratedCamera = Literal["weak_perspective", "orthographic"]
+Camera = Literal["affine", CalibratedCamera, "perspective"]
+# Shapes that move away from those of a prior: the mean shape, or all.
+Adapted = Literal["mean", "shapes"]
+Independence = Literal["shapes", "coefficients"]
+Loss = Literal["linear", "huber", "cauchy"]
+
+BLOCK_RECOVERIES: tuple[BlockRecovery, ...] = get_args(BlockRecovery)
+REFINEMENTS: tuple[Refinement, ...] = get_args(Refinement)
 # Refinements that begin with the joint fit.
 JOINT_REFINEMENTS = ("joint", "consensus")
-CALIBRATED_CAMERAS = ("weak_perspective", "orthographic")
-CAMERA_NAMES = ("affine", *CALIBRATED_CAMERAS, "perspective")
-# Shapes that move away from those of a prior: the mean shape, or all.
-ADAPTED = ("mean", "shapes")
-INDEPENDENCE = ("shapes", "coefficients")
-LOSSES = ("linear", "huber", "cauchy")
+CALIBRATED_CAMERAS: tuple[CalibratedCamera, ...] = get_args(CalibratedCamera)
+CAMERA_NAMES: tuple[Camera, ...] = get_args(Camera)
+ADAPTED: tuple[Adapted, ...] = get_args(Adapted)
+INDEPENDENCE: tuple[Independence, ...] = get_args(Independence)
+LOSSES: tuple[Loss, ...] = get_args(Loss)
 # Sets of points in the files of OpenPose.
 OPENPOSE_PARTS = ("pose", "face", "hand_left", "hand_right")
 # Parts of whole bodies in the files of COCO and MMPose.

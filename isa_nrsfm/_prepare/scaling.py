@@ -170,8 +170,17 @@ def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:
     return kept - np.nanmean(kept, axis=2, keepdims=True)
 
 
-def check_weightable(X: Any, joint: bool, loss: str) -> None:
-    """Raise if weights of points are not supported by a fit, or for a table."""
+def check_weightable(X: Any, joint: bool, loss: str, grouped: bool) -> None:
+    """Raise if weights of points are not supported by a fit, or for a table.
+
+    `grouped`: groups of points are to be fitted, for a consensus.
+    """
+    if grouped:
+        raise ValueError(
+            "point_weight is not supported by the fit with refinement='consensus', "
+            "whose groups of points are fitted without weights. Set "
+            "refinement='joint', or give no point_weight"
+        )
     if not joint:
         raise ValueError(
             "point_weight needs a fit with refinement='joint', because the refinement "

@@ -7,7 +7,7 @@ frame has NaN in both. *Tracks* ``(n_frames, n_points, 2)`` are the form of publ
 results.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from isa_nrsfm._compat.caller import warn_caller
 
 # Columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
 Layout = Literal["interleaved", "planar"]
-LAYOUTS: tuple[Layout, ...] = ("interleaved", "planar")
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 # Least number of visible points of a frame. Each point gives two equations; an affine
 # camera with its translation has eight unknowns. Coefficients need no further points:
 # the prior determines them where the points do not.

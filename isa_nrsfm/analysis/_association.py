@@ -21,6 +21,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.texts import aligned
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm.analysis._frame_columns import (
     checked_column,
@@ -70,6 +71,21 @@ class Association(NamedTuple):
     n_frames: int
     permuted: str
     untested: str = ""
+
+    def __repr__(self) -> str:
+        """Return the results as a table and what they are."""
+        name, meaning = "Spearman", "rank correlation, from -1 to 1"
+        if self.kind == "classes":
+            name, meaning = "eta squared", "share of the variance between classes"
+        rows = [["", name, "p"]]
+        for value, p in zip(self.statistic, self.p_value, strict=True):
+            known = "" if self.untested else f"{p:.3f}"
+            rows.append([f"alpha_{len(rows)}", f"{value:.2f}", known])
+        test = f"p-values: permutations of {self.permuted}"
+        if self.untested:
+            test = f"no p-values: {self.untested}"
+        meaning = f"{name}: {meaning}; {test}; {self.n_frames} frames"
+        return f"{aligned(rows)}\n{meaning}"
 
     def to_frame(self) -> "pd.DataFrame":
         """
@@ -243,12 +259,10 @@ def predictability(
             f"groups; got {most}"
         )
     n_folds = min(n_folds, most)
-    splitter = {
-        ("classes", True): StratifiedKFold,
-        ("classes", False): StratifiedGroupKFold,
-        ("number", True): KFold,
-        ("number", False): GroupKFold,
-    }[found, numbers is None]
+    alone, grouped = KFold, GroupKFold
+    if found == "classes":
+        alone, grouped = StratifiedKFold, StratifiedGroupKFold
+    splitter = alone if numbers is None else grouped
     folds = splitter(n_folds, shuffle=True, random_state=random_state)
     ridge = RidgeCV(np.logspace(-3, 3, 13))
     model = LinearDiscriminantAnalysis() if found == "classes" else ridge

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._compat.texts import aligned, first_items
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm.analysis._advice import (
@@ -90,6 +90,26 @@ class Diagnostics(NamedTuple):
     outlier_share: float
     outliers: NDArray
     messages: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the messages, the figures of the table and those of coefficients."""
+        certainty = "not estimated"
+        if math.isfinite(self.depth_uncertainty):
+            certainty = f"{_percent(self.depth_uncertainty)} of the depth"
+        shares = first_items((f"{share:.2f}" for share in self.reliability), 12)
+        rows = [["", "effective frames", "pose share"]]
+        for frames, share in zip(self.effective_frames, self.pose_share, strict=True):
+            known = "" if math.isnan(share) else _percent(max(share, 0.0))
+            rows.append([f"alpha_{len(rows)}", f"{frames:.1f}", known])
+        lines = [
+            *(self.messages or ["no warning"]),
+            f"cameras: {self.camera_meaning}",
+            f"depth error: {certainty}",
+            f"deformation: {_percent(self.deformation_amplitude)} of the mean shape",
+            f"reliability, along uncorrelated directions: {shares}",
+            aligned(rows),
+        ]
+        return "\n".join(lines)
 
 
 def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics:
@@ -279,9 +299,7 @@ def _lines(model: Any) -> dict[str, str]:
             if model.frames_scaled_
             else f"{noise:.3g} in the units of the table"
         )
-    shares = [_percent(share) for share in model.energy_share_]
-    more = ["..."] * (len(shares) > 12)
-    lines["Energy of each"] = ", ".join(shares[:12] + more)
+    lines["Energy of each"] = first_items(map(_percent, model.energy_share_), 12)
     if "Noise" in lines and "Frames" in lines:
         messages = model.diagnostics().messages
         lines["Diagnostics"] = "; ".join(messages) or "no warning"

@@ -123,9 +123,8 @@ def sequences_of(
     found = []
     for rows in rows_of:
         lengths = np.maximum(np.rint(np.diff(time[rows]) / unit), 1).astype(int)
-        for part in np.split(
-            np.arange(len(rows)), np.flatnonzero(lengths > max_gap) + 1
-        ):
+        cuts = np.flatnonzero(lengths > max_gap) + 1
+        for part in np.split(np.arange(len(rows)), cuts):
             steps = np.cumsum(np.append(0, lengths[part[:-1]]))
             found.append((rows[part], steps))
     return found, unit

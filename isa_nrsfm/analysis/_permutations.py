@@ -235,15 +235,21 @@ def _weights(labels: csr_array, means: csr_array, order: FrameOrder) -> NDArray:
     sizes = order.sizes[:, None]
     if (sizes == sizes[0]).all():
         return np.ones(sizes.shape)
-    (n_frames, _), n_groups = labels.shape, len(sizes)
     square, of_means = labels.power(2).sum(axis=0), (sizes.T @ means.power(2))[0]
-    total = square - labels.sum(axis=0) ** 2 / n_frames
-    within = (square - of_means) / (n_frames - n_groups)
-    apart = (of_means - square + total) / (n_groups - 1)
-    size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
-    between = np.maximum(apart - within, 0.0) / size
+    total = square - labels.sum(axis=0) ** 2 / labels.shape[0]
+    between, within = variances(square - of_means, of_means - square + total, sizes)
     share = np.average(between / (between + within), weights=total)
     return np.asarray(1.0 / np.sqrt(share + (1.0 - share) / sizes))
+
+
+def variances(
+    within: NDArray, between: NDArray, sizes: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return variances (k,) between and within groups, from sums of squares (k,)."""
+    n_frames, n_apart = np.sum(sizes), len(sizes) - 1
+    size = (n_frames - np.sum(sizes**2) / n_frames) / n_apart  # the typical one
+    within = within / (n_frames - len(sizes))
+    return np.maximum(between / n_apart - within, 0.0) / size, within
 
 
 def _standard(means: NDArray, weights: NDArray) -> NDArray:

@@ -11,6 +11,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.sources import CHECKS
 from isa_nrsfm.analysis._frame_columns import checked_column, group_numbers
+from isa_nrsfm.analysis._permutations import indicators, variances
 
 
 class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
@@ -190,9 +191,7 @@ def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArra
             f"{', '.join(empty[:5])}). Their coefficients have nothing to be compared "
             f"with. Remove these groups{remedy}"
         )
-    sums = np.stack(
-        [np.bincount(numbers[used], column, len(found)) for column in X[used].T], axis=1
-    )
+    sums = indicators(numbers)[used].T @ X[used]
     return found, sums / sizes[:, None]
 
 
@@ -273,14 +272,9 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
             "variances between and within groups need two groups, and one with two "
             f"frames; got {n_groups} groups of {n_frames} frames"
         )
-    # Mean squares of the analysis of variance, and the typical size of a group
-    sums = np.stack([np.bincount(numbers, column) for column in X.T], axis=1)
-    means = sums / sizes[:, None]
-    within = np.sum((X - means[numbers]) ** 2, axis=0) / (n_frames - n_groups)
-    apart = sizes @ (means - X.mean(axis=0)) ** 2 / (n_groups - 1)
-    size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
-    # Variance components
-    between = np.maximum(apart - within, 0.0) / size
+    means = indicators(numbers).T @ X / sizes[:, None]
+    inside = np.sum((X - means[numbers]) ** 2, axis=0)
+    between, within = variances(inside, sizes @ (means - X.mean(axis=0)) ** 2, sizes)
     total = between + within
     share = np.divide(between, total, where=total > 0, out=np.zeros_like(total))
     return BetweenShare(share, 1.0 - share, n_groups, n_frames)

@@ -21,13 +21,13 @@ with respect to these.
 """
 
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import gen_batches
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
+from isa_nrsfm._parameters.choices import CalibratedCamera
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 # Bound on the ratio of stretches of space by a root Q of the metric G. It is exceeded
@@ -42,8 +42,6 @@ STRETCH_OF_START = 3.0
 
 # Matrices whose products with ``[[xx, xy], [xy, yy]]`` are xx - yy, 2 xy and xx + yy.
 ROW_PRODUCTS = np.array([[[1.0, 0, 1], [0, 1, 0]], [[0, 1, 0], [-1, 0, 1]]])
-
-CalibratedCamera = Literal["orthographic", "weak_perspective"]
 
 
 def unit_cameras(motion: NDArray) -> NDArray:

@@ -44,7 +44,7 @@ def run(args: Namespace, warned: list[str]) -> str:
             options["labels"] = labels[frames.usable]
     if "edges" in _OPTIONS[content]:
         names = names_of_points(estimator)
-        options |= _reading.drawing(args, names, stored, surfaces=content == "glb")
+        options |= _reading.drawing(args, names, stored)
     if options.get("camera") == NONE:
         options["camera"] = None
 

@@ -130,8 +130,7 @@ def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:
     alpha = fit.estimator.alpha_[:, :MOST_DRAWN]
     return plotting.CoefficientsDisplay(
         alpha=alpha[label.notna()],
-        y=label.dropna().to_numpy(),
-        label=str(label.name).replace("$", r"\$"),  # no mathematics
+        y=label.dropna(),
         component_names=names_of_components(None, alpha.shape[1]),
     ).plot(kind="classes" if has_classes(label) else "number")
 

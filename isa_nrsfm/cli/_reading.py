@@ -25,7 +25,6 @@ from isa_nrsfm._tables.tracks import (
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
 from isa_nrsfm.cli._times import image_numbers
-from isa_nrsfm.export._drawing import edges_of
 from isa_nrsfm.io import FORMATS, find_format, read_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
@@ -463,22 +462,17 @@ def drawing_files(args: Namespace) -> list[str]:
 
 
 def drawing(
-    args: Namespace,
-    names: Sequence[str],
-    stored: Skeleton | None,
-    surfaces: bool = False,
+    args: Namespace, names: Sequence[str], stored: Skeleton | None
 ) -> dict[str, Any]:
     """Return the options of displays: lines or surfaces to draw, where y is zero.
 
-    The lines are those of an option, or of the skeleton stored in the table. Triangles
-    become lines unless surfaces are drawn.
+    The lines are those of an option, or of the skeleton stored in the table.
     """
     edges: Any = "auto"
     if args.edges == NONE:
         edges = None
     elif args.edges is not None:
-        links = _read_edges(args.edges, names, numbered=args.points is None)
-        edges = links if surfaces else edges_of(links)
+        edges = _read_edges(args.edges, names, numbered=args.points is None)
     # With --points, --skeleton is the layout of all points, and `stored` of the rest.
     elif args.skeleton is not None and (args.points is None or stored is None):
         edges = _given_layout(args.skeleton, names)

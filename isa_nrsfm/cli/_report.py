@@ -83,7 +83,9 @@ def model_report(
 
     `perspective` is the advice to use perspective cameras.
     """
-    from isa_nrsfm.plotting._views import view_and_layout  # not needed by transform
+    # Not needed by transform
+    from isa_nrsfm.plotting._axes import SPANNING_TREE
+    from isa_nrsfm.plotting._views import view_and_layout
 
     X, alpha, explained = frames.X, estimator.alpha_, fitted_table(estimator)
     errors = np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2, axis=1))
@@ -137,6 +139,7 @@ def model_report(
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
         "n_edges": None if edges is None else 0 if lines is None else len(lines.edges),
+        "spanning_tree": lines is not None and lines.name == SPANNING_TREE,
         "outliers": None if found is None else _outliers(found, estimator, X),
         "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),

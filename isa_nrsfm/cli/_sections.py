@@ -290,12 +290,15 @@ def _fit(report: dict[str, Any]) -> Section:
     parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
     if model["skeleton"] is not None:
         parts.append(f"points recognised as {model['skeleton']}")
-    elif model["n_edges"] == 0:
+    elif model["n_edges"] == 0 or model["spanning_tree"]:
+        drawn = "join them by a minimal spanning tree of the mean shape; give lines"
+        if not model["spanning_tree"]:
+            drawn = "have no lines between them; give these"
         n_points = report["table"]["n_points"]
         alike = [s.name for s in SKELETONS.values() if s.n_points == n_points]
         parts.append(
-            "points of no known layout: figures and viewer have no lines between them; "
-            "give these with --edges FILE or --skeleton LAYOUT"
+            f"points of no known layout: figures and viewer {drawn} with --edges FILE "
+            "or --skeleton LAYOUT"
             + (f" (of {n_points} points: {', '.join(alike)})" if alike else "")
             + ". If they are upside down, y points up in the table: use --origin lower."
         )

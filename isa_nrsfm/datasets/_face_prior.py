@@ -89,6 +89,7 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     model.__dict__ |= {
         "_model": TableModel(frames, mean_shape, basis, "interleaved", None),
         "_n_features_out": K,
+        "n_components_": K,
         "n_features_in_": n_features,
         "camera_": "weak_perspective",
         "frames_scaled_": True,

@@ -264,7 +264,7 @@ def point_distances(
     names = names_of_points(model)
     first, second = np.array([point_numbers(pair, names) for pair in pairs]).T
     if unit is None:
-        if space.layout is None or space.layout.name != "ibug-68":
+        if space.lines is None or space.lines.name != "ibug-68":
             raise ValueError(
                 "unit must name two points, as these are not the 68 of a face"
             )
@@ -285,17 +285,15 @@ def point_numbers(pair: Sequence[Any], names: Sequence[str]) -> tuple[int, int]:
             "expected pairs of points, such as [(62, 66)] for the distance of points "
             f"62 and 66; got {pair!r} instead of a pair"
         )
-    found = []
+    places = {str(j): j for j in range(len(names))}
+    places |= {name: j for j, name in enumerate(names)}
     for each in pair:
-        if str(each) in names:
-            found.append(list(names).index(str(each)))
-        elif str(each).isdecimal() and int(each) < len(names):
-            found.append(int(each))
-        else:
+        if str(each) not in places:
             raise ValueError(
                 f"there is no point {each!r}; the {len(names)} points are "
                 f"{', '.join(list(names)[:4])}, ..."
             )
+    found = [places[str(each)] for each in pair]
     if len(found) != 2 or found[0] == found[1]:
         raise ValueError(f"expected two different points; got {tuple(pair)}")
     return found[0], found[1]

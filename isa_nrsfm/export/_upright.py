@@ -26,15 +26,13 @@ from isa_nrsfm.calibration import (
 from isa_nrsfm.plotting._views import (
     UPSIDE_DOWN,
     Origin,
-    choose_layout,
-    choose_origin,
     euclidean_axes,
+    lines_of_model,
     upright_turn,
     viewing_rotation,
     viewing_transform,
 )
 from isa_nrsfm.skeletons import Skeleton
-from isa_nrsfm.skeletons._column_names import names_of_points
 
 Camera = Literal["weak_perspective"] | None
 
@@ -47,14 +45,14 @@ class UprightSpace(NamedTuple):
     ``shape @ transform.T`` is upright; the transform of Euclidean shapes is orthogonal.
     `camera` is None for affine shapes; `metric`, or None, makes shapes of affine
     cameras Euclidean. The diagonal `image_axes` maps the axes of an image to the
-    upright ones.
+    upright ones; `lines` are those to draw, of the layout if it is known.
     """
 
     camera: str | None
     metric: DeformationMetric | None
     transform: NDArray
     image_axes: NDArray
-    layout: Skeleton | None
+    lines: Skeleton | None
 
 
 def upright_space(
@@ -91,8 +89,8 @@ def upright_space(
         )
     shape = model.mean_shape_ @ (transform @ to_metric).T
     image_axes = np.eye(3)
-    layout = choose_layout(edges, shape, names_of_points(model))
-    if choose_origin(origin, shape, layout) == "lower":
+    layout, lines, origin = lines_of_model(model, edges, origin, shape)
+    if origin == "lower":
         image_axes[1, 1] = -1
         transform, shape = UPSIDE_DOWN @ transform, shape @ UPSIDE_DOWN
     transform = upright_turn(shape, layout, "upper") @ transform
@@ -101,7 +99,7 @@ def upright_space(
         transform = MIRROR @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
-    return UprightSpace(known, metric, transform, image_axes, layout)
+    return UprightSpace(known, metric, transform, image_axes, lines)
 
 
 def upright_frames(

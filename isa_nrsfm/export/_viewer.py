@@ -20,7 +20,6 @@ from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
-from isa_nrsfm.export._drawing import Links, choose_drawing, edges_of
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
     Camera,
@@ -28,10 +27,10 @@ from isa_nrsfm.export._upright import (
     upright_space,
     viewed_shapes,
 )
-from isa_nrsfm.plotting._axes import is_dense
-from isa_nrsfm.plotting._views import UPSIDE_DOWN, Origin
+from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
+from isa_nrsfm.plotting._views import UPSIDE_DOWN, Edges, Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
-from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
+from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT
 
 # The colours of more labels than this look alike.
 MOST_LABELS = 30
@@ -78,7 +77,7 @@ def write_viewer(
     times: ArrayLike | None = None,
     depth_std: ArrayLike | None = None,
     n_frames: int = 1000,
-    edges: Links = "auto",
+    edges: Edges = "auto",
     names: Sequence[str] | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
@@ -88,9 +87,9 @@ def write_viewer(
     Write a page that shows a shape model in any browser.
 
     The page is one file that needs no network and no other program. It shows the mean
-    shape in 3D with a slider for each basis shape. It plays the frames of a table, with
-    or without their cameras. In a scatter plot of two coefficients, click on a frame to
-    show it.
+    shape in 3D, turned by 20 degrees at first, with a slider for each basis shape. It
+    plays the frames of a table, with or without their cameras. In a scatter plot of two
+    coefficients, click on a frame to show it.
 
     Parameters
     ----------
@@ -121,7 +120,9 @@ def write_viewer(
         Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, pairs of points
         (n_edges, 2), or triangles (n_triangles, 3), whose sides are drawn. "auto"
         recognises a known layout by the names or by the number and order of the points.
-        A layout has separate colours for left and right.
+        A layout has separate colours for left and right. Up to 400 points without a
+        known one are joined by a minimal spanning tree: of all trees the one with the
+        shortest lines, by the distances in the images.
     names : sequence of str of length n_components, default=None
         Names of the basis shapes; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
@@ -184,7 +185,7 @@ def write_viewer(
     seconds = np.empty(0) if times is None else _seconds(times, n_rows)[rows]
 
     shapes = viewed_shapes(space, model)
-    links, sides = choose_drawing(edges, space.layout, shapes.shape[1])
+    lines = space.lines
     size = np.linalg.norm(shapes[0], axis=1).max()
     rotations = np.empty((0, 3, 3))
     if space.camera is not None and len(motion):
@@ -192,8 +193,11 @@ def write_viewer(
         rotations = UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
     labelled = hasattr(X, "iloc")  # pandas: rows have names
     known = space.camera if frames_of(model).certainty.determined else "unknown"
+    about = ABOUT[known] + MIRRORED * (not sees_perspective(model))
+    if lines is not None and lines.name == SPANNING_TREE:
+        about += f" Points without a known layout are joined by a {SPANNING_TREE}."
     content = {
-        "about": ABOUT[known] + MIRRORED * (not sees_perspective(model)),
+        "about": about,
         "points": list(names_of_points(model)),
         "components": components,
         "categories": categories,
@@ -201,8 +205,8 @@ def write_viewer(
         "labels": codes[rows].tolist() if categories else [],
         "count": _count(n_rows, len(seen), len(rows)),
         "shapes": _encoded(shapes / size, "<f4"),
-        "edges": _encoded(edges_of(links), "<u4"),
-        "sides": sides.tolist() if sides.any() else [],
+        "edges": _encoded(np.empty(0) if lines is None else lines.edges, "<u4"),
+        "sides": lines.sides.tolist() if lines is not None and lines.left else [],
         "alpha": _encoded(alpha, "<f4"),
         "rotations": _encoded(rotations, "<f4"),
         "deviations": _encoded(deviations[rows] / size, "<f4"),
@@ -281,27 +285,24 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
         raise ValueError(
             f"labels must hold {n_rows} labels, one per row; got shape {values.shape}"
         )
-    texts, order = [], {}
+    keys: list[tuple[Any, ...]] = []  # numbers first, those without a label last
     for value in values.tolist():
-        missing = is_missing(value)
-        text = UNLABELLED if missing else str(value)
-        number = isinstance(value, Real)
-        order[text] = (missing, not number, value if number else 0, text)
-        texts.append(text)
-    categories = sorted(order, key=order.__getitem__)
-    if len(categories) > MOST_LABELS:
+        number = not is_missing(value) and isinstance(value, Real)
+        text = UNLABELLED if is_missing(value) else str(value)
+        keys.append((is_missing(value), not number, value if number else 0, text))
+    found = sorted(set(keys))
+    if len(found) > MOST_LABELS:
         raise ValueError(
-            f"labels must have at most {MOST_LABELS} different values; got "
-            f"{len(categories)}"
+            f"labels must have at most {MOST_LABELS} different values; got {len(found)}"
         )
-    return np.array([*map(categories.index, texts)], dtype=np.intp), categories
+    return np.array([*map(found.index, keys)], dtype=np.intp), [k[-1] for k in found]
 
 
 def write_glb(
     model: Any,
     path: str | os.PathLike[str],
     *,
-    edges: Links = "auto",
+    edges: Edges = "auto",
     names: Sequence[str] | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
@@ -326,8 +327,8 @@ def write_glb(
         triangles of a surface, counter-clockwise as seen from outside; or None for
         nothing. "auto" recognises the layout of hands and bodies by the names or the
         number and order of the points. Otherwise it is a surface of the Delaunay
-        triangles of the front view, with the layout of a face drawn on it. More than
-        400 points of a surface are not drawn as points.
+        triangles of the front view, with the layout of a face drawn on it, or the tree
+        of `write_viewer`. More than 400 points of a surface are not drawn as points.
     names : sequence of str of length n_components, default=None
         Names of the morph targets; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
@@ -364,9 +365,9 @@ def write_glb(
     -----
     As required by glTF, y points up and z to the viewer. The true size is unknown, so
     the largest extent of the mean shape is one unit. ``extras`` of the mesh has the
-    names of the points and the scale factor of the shapes. Euclidean basis shapes of
-    affine cameras are the least squares fit to the shapes of the frames; those of
-    calibrated cameras are the model's.
+    names of the points and of the lines, and the scale factor of the shapes. Euclidean
+    basis shapes of affine cameras are the least squares fit to the shapes of the
+    frames; those of calibrated cameras are the model's.
     """
     suffix_of(path, [".glb"])
     space = upright_space(model, camera, origin, mirrored, edges)
@@ -374,26 +375,33 @@ def write_glb(
     shapes = viewed_shapes(space, model)
     factor = 1 / np.ptp(shapes[0], axis=0).max()
     shapes = factor * shapes
-    links, sides = choose_drawing(edges, space.layout, shapes.shape[1])
-    surface, is_face = None, space.layout is None or space.layout.kind == "face"
-    if links.shape[1] == 3:
-        surface, links = links, np.empty((0, 2), np.intp)
-    elif isinstance(edges, str) and edges == "auto" and is_face:
-        surface = frontal_triangles(shapes[0])
-    of_links = sides_of_edges(sides, links)
-    drawn_edges = [links[of_links == side] for side in (MIDDLE, LEFT, RIGHT)]
+    lines, surface, drawn_edges = space.lines, None, []
+    if np.shape(cast(Any, edges))[1:] == (3,):
+        lines, surface = None, np.asarray(edges)
+    elif isinstance(edges, str) and edges == "auto":
+        if lines is None or lines.kind in ("face", "other"):
+            surface = frontal_triangles(shapes[0])
+    if lines is not None:
+        drawn_edges = [
+            lines.edges[lines.edge_sides == side] for side in (MIDDLE, LEFT, RIGHT)
+        ]
 
     file = Binary()
     primitives = _primitives(file, shapes, surface, drawn_edges)
     used = sorted({part["material"] for part in primitives})
     for part in primitives:
         part["material"] = used.index(part["material"])
-    extras = {"targetNames": targets, "pointNames": list(names_of_points(model))}
+    extras = {
+        "targetNames": targets,
+        "pointNames": list(names_of_points(model)),
+        "lines": None if lines is None else lines.name,
+        "factor": factor,
+    }
     mesh = {
         "name": "mean shape",
         "primitives": primitives,
         "weights": [0.0] * len(targets),
-        "extras": extras | {"factor": factor},
+        "extras": extras,
     }
     times, weights = _swings(len(targets))
     sampler = {"input": file.add(times, bounds=True), "interpolation": "LINEAR"}

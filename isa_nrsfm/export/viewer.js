@@ -19,6 +19,7 @@
   const SWING = { amplitude: 2, seconds: 3 };
   const BAR = 2; // standard deviations on either side of a point
   const EYE = 6; // distance of the viewer, in radii of the mean shape
+  const OPENED = Math.PI / 9; // turned to the side at first, so that depth is seen
   const LEVELS = 12; // of depth, far ones drawn first and paler
   const TRUE_SPEED = "true";
   const N_COLOURS = 8; // of the page; more labels go round the circle of hues
@@ -437,6 +438,8 @@
     actions[event.key]();
   });
   byId("front").addEventListener("click", frontView);
+  // The camera of a frame sees it from the front.
+  byId("pose").addEventListener("change", (event) => event.target.checked && frontView());
   for (const id of ["ghost", "mirror", "over", "bars", "pose", "across", "upwards"])
     byId(id).addEventListener("change", redraw);
 
@@ -484,6 +487,7 @@
     state: () => ({ ...state, weights: Array.from(state.weights) }),
   };
   showButtons();
+  turnBy(OPENED, 0);
   showWeights();
   if (deviations.length) showFrame(0);
 })();

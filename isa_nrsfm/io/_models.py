@@ -59,7 +59,7 @@ FINITE = (
 )
 POSITIVE = ("noise_variance", "noise_variance_", "unit", "depth_variances", "leverage")
 # Attributes that the model of a frame implies.
-IMPLIED = ("camera_", "frames_scaled_")
+IMPLIED = ("n_components_", "camera_", "frames_scaled_")
 
 
 class NamedStrategy(BaseEstimator):
@@ -236,7 +236,7 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
         entries["unit"],
         _pinhole(entries),
     )
-    estimator._n_features_out = len(estimator.basis_)
+    estimator.n_components_ = estimator._n_features_out = len(estimator.basis_)
     pinhole = estimator._model.pinhole
     estimator.camera_ = entries["camera"] if pinhole is None else "perspective"
     estimator.frames_scaled_ = entries["unit"] is None

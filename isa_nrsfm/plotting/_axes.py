@@ -13,6 +13,8 @@ PLUS_COLOUR = "#D55E00"
 MINUS_COLOUR = "#0072B2"
 OBSERVED_COLOUR = "black"
 MEAN_COLOUR = "0.55"
+# Name of the lines between points that have no known layout.
+SPANNING_TREE = "minimal spanning tree"
 # Bluish green and reddish purple of the same palette, for the sides of a body.
 LEFT_COLOUR = "#009E73"
 RIGHT_COLOUR = "#CC79A7"
@@ -66,12 +68,10 @@ def side_colours(sides: NDArray, middle: str) -> list[str]:
 def percent(fraction: float) -> str:
     """Write a fraction as percent with two digits, three from 100 % on."""
     value = 100.0 * fraction
-    if 0 < value < 1e-3:
-        return f"{value:.1e} %"
-    if 0 < value < 100:
-        value = float(f"{value:.1e}")  # round first: 9.96 becomes 10
-    exponent = int(np.floor(np.log10(value))) if value > 0 else 1
-    return f"{value:.{max(1 - exponent, 0)}f} %"
+    if not 0 < value < 99.5:
+        return f"{value:.0f} %"
+    text = f"{value:.1e}" if value < 1e-3 else f"{value:#.2g}"
+    return f"{text.removesuffix('.')} %"
 
 
 def wrap_title(title: str, axes: NDArray) -> str:
@@ -168,15 +168,18 @@ def show_view(axis: Any, view: list[int], limits: NDArray, origin: str) -> None:
 
 
 def add_legend(figure: Any, entries: list[Any], skeleton: Any, **options: Any) -> None:
-    """Add a legend below a figure, with the sides of a skeleton if it has any."""
+    """Add a legend below a figure, with sides of a skeleton, or what lines are."""
     from matplotlib.lines import Line2D
 
+    lines: dict[str, str] = {}
     if skeleton is not None and skeleton.left:
-        sides = (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR))
-        entries = entries + [
-            Line2D([], [], color=colour, label=side, linewidth=1.5)
-            for side, colour in sides
-        ]
+        lines = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR}
+    elif skeleton is not None and skeleton.name == SPANNING_TREE:
+        lines = {f"lines: {SPANNING_TREE}": MEAN_COLOUR}
+    entries = entries + [
+        Line2D([], [], color=colour, label=label, linewidth=1.5)
+        for label, colour in lines.items()
+    ]
     style = {"loc": "outside lower center", "frameon": False, "fontsize": "small"}
     figure.legend(handles=entries, ncols=len(entries), **(style | options))
 

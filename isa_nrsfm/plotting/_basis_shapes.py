@@ -48,7 +48,9 @@ class BasisShapeDisplay:
             default="auto"
         Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
         points. A layout has separate colours for left and right in the mean shape.
-        "auto" recognises a known layout by the number and order of the points.
+        "auto" recognises a known layout by the number and order of the points. Up to
+        400 points without one are joined by a minimal spanning tree, the tree with the
+        shortest lines.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
         points up. "auto" is "lower" if a face or a body would otherwise be upside down.
@@ -185,8 +187,9 @@ class BasisShapeDisplay:
                 default="auto"
             Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
             points. "auto" recognises a known layout by the names or by the number and
-            order of the points. Faces, bodies and hands of known layouts stand upright
-            for any value of `edges`.
+            order of the points. The tree of other points is that of their distances in
+            the images. Faces, bodies and hands of known layouts stand upright for any
+            value of `edges`.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
             that points up. "auto" is "lower" if a face or a body would otherwise be
@@ -233,8 +236,6 @@ class BasisShapeDisplay:
         components: ArrayLike | None = None,
         n_columns: int | None = None,
         point_kw: dict[str, Any] | None = None,
-        edge_kw: dict[str, Any] | None = None,
-        arrow_kw: dict[str, Any] | None = None,
     ) -> BasisShapeDisplay:
         """
         Draw the shapes.
@@ -254,10 +255,6 @@ class BasisShapeDisplay:
             Shapes side by side in the new figure. By default as few as fit on a page.
         point_kw : dict, default=None
             Arguments for the scatters of points. They override the defaults.
-        edge_kw : dict, default=None
-            Arguments for the LineCollections of joined points.
-        arrow_kw : dict, default=None
-            Arguments for the quivers of arrows.
 
         Returns
         -------
@@ -297,7 +294,6 @@ class BasisShapeDisplay:
         if not amplitudes.ndim:
             size = f"{amplitudes:g} standard deviations"
             below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
-        point_kw, edge_kw, arrow_kw = point_kw or {}, edge_kw or {}, arrow_kw or {}
         self.mean_: list[Any] = []
         self.minus_: list[Any] = []
         self.plus_: list[Any] = []
@@ -309,12 +305,12 @@ class BasisShapeDisplay:
                 shapes.append((self.plus_, mean + d, _axes.PLUS_COLOUR, above))
             for view, axis in zip(_axes.VIEWS, pair, strict=True):
                 for artists, shape, colour, label in shapes:
-                    style = {"color": colour, "label": label} | point_kw
-                    drawn = self._draw(axis, shape[:, view], style, edge_kw, not block)
+                    style = {"color": colour, "label": label} | (point_kw or {})
+                    drawn = self._draw(axis, shape[:, view], style, not block)
                     artists.append(drawn)
                 if block and not _axes.is_dense(mean):
                     ends = (*mean[:, view].T, *d[:, view].T)
-                    self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE | arrow_kw))
+                    self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE))
                 _axes.hide_frame(axis)
                 _axes.show_view(axis, view, limits[block], self.origin)
             title = self._title(block, amplitudes, reduction[block])
@@ -322,12 +318,11 @@ class BasisShapeDisplay:
             pair[0].set_title(title, loc="left", fontsize="small")
             pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
         if ax is None:
-            self._add_legend()
+            shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
+            _axes.add_legend(self.figure_, shown, self.skeleton, markerscale=3.0)
         return self
 
-    def _draw(
-        self, axis: Any, points: NDArray, style: Any, edge_kw: Any, sided: bool
-    ) -> Any:
+    def _draw(self, axis: Any, points: NDArray, style: Any, sided: bool) -> Any:
         """Draw one shape in one view, the mean shape with colours of the sides."""
         layout = self.skeleton
         if layout is not None:
@@ -335,8 +330,7 @@ class BasisShapeDisplay:
             if sided and colour == _axes.MEAN_COLOUR:
                 colours = _axes.side_colours(layout.edge_sides, colour)
                 style = style | {"color": _axes.side_colours(layout.sides, colour)}
-            edge_kw = {"colors": colours} | edge_kw
-            _axes.draw_segments(axis, points[layout.edges], **edge_kw)
+            _axes.draw_segments(axis, points[layout.edges], colors=colours)
             style = {"s": 2.0} | style
         return _axes.draw_points(axis, points, **style)
 
@@ -354,17 +348,3 @@ class BasisShapeDisplay:
         if reduction > 1:
             notes.append(f"drawn 1:{reduction:.2g}")
         return f"{title} ({', '.join(notes)})" if notes else title
-
-    def _add_legend(self) -> None:
-        """Add the colours of the ends of the drift, and of the sides, below."""
-        from matplotlib.lines import Line2D
-
-        style: dict[str, Any] = {"linewidth": 1.5}
-        if self.edges is None:
-            style = {"marker": "o", "linestyle": "none", "markersize": 3}
-        shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
-        handles = [
-            Line2D([], [], color=p.get_facecolor()[0], label=p.get_label(), **style)
-            for p in shown
-        ]
-        _axes.add_legend(self.figure_, handles, self.skeleton)

@@ -44,9 +44,10 @@ class CoefficientsDisplay:
         50 groups, those with the most frames are drawn in time, and the title mentions
         it.
     label : str, default=None
-        Name of `y` on the axis. By default "label".
+        Name of `y` on the axis. By default that of a pandas Series, or "label".
     component_names : list of str of length n_components, default=None
-        Names of the basis shapes. By default their numbers, from 1.
+        Names of the basis shapes. By default those of the columns of a dataframe
+        `alpha`, or their numbers, from 1.
 
     Attributes
     ----------
@@ -80,9 +81,9 @@ class CoefficientsDisplay:
     def __init__(
         self,
         *,
-        alpha: ArrayLike,
+        alpha: Any,
         alpha_std: ArrayLike | None = None,
-        y: ArrayLike | None = None,
+        y: Any = None,
         time: ArrayLike | None = None,
         groups: ArrayLike | None = None,
         label: str | None = None,
@@ -105,7 +106,11 @@ class CoefficientsDisplay:
             None if values is None else checked_column(name, values, n_frames)
             for name, values in (("y", y), ("time", time), ("groups", groups))
         )
+        if label is None and getattr(y, "name", None) is not None:
+            label = _no_mathematics(y.name)
         self.label = "label" if label is None else label
+        if component_names is None and hasattr(alpha, "columns"):
+            component_names = [*map(_no_mathematics, alpha.columns)]
         self.component_names = checked_names(
             "component_names", component_names, range(1, n_components + 1)
         )
@@ -141,7 +146,7 @@ class CoefficientsDisplay:
             Videos or people. Curves are not joined between groups. If there are more
             than 50 groups, those with the most frames are drawn.
         label : str, default=None
-            Name of `y` on the axis. By default "label".
+            Name of `y` on the axis. By default that of a pandas Series, or "label".
         component_names : list of str of length n_components, default=None
             Names of the basis shapes. By default their numbers, from 1.
         ax : array of n_components matplotlib Axes, default=None
@@ -287,6 +292,11 @@ class CoefficientsDisplay:
             cuts = np.flatnonzero((apart > 3 * typical) | (apart < 0 * typical))
             pieces += np.split(rows, cuts + 1)
         return pieces
+
+
+def _no_mathematics(name: Any) -> str:
+    """Return a name of a table as matplotlib draws it."""
+    return str(name).replace("$", r"\$")
 
 
 def _rows_of_largest(groups: NDArray) -> tuple[NDArray, list[NDArray]]:

@@ -134,9 +134,7 @@ class ComponentChoiceDisplay:
         )
         return display.plot(ax, **kw)
 
-    def plot(
-        self, ax: Any = None, *, errorbar_kw: dict[str, Any] | None = None
-    ) -> ComponentChoiceDisplay:
+    def plot(self, ax: Any = None) -> ComponentChoiceDisplay:
         """
         Draw the curve.
 
@@ -144,8 +142,6 @@ class ComponentChoiceDisplay:
         ----------
         ax : matplotlib Axes, default=None
             Axes to draw on. By default a new figure.
-        errorbar_kw : dict, default=None
-            Arguments for matplotlib's ``errorbar``. They override the defaults.
 
         Returns
         -------
@@ -166,9 +162,7 @@ class ComponentChoiceDisplay:
         bars = values.std(axis=1, ddof=1) / np.sqrt(n_splits) if n_splits > 1 else None
         style = {"fmt": "o-", "markersize": 4, "capsize": 3, "color": MINUS_COLOUR}
         style["label"] = "mean" if bars is None else "mean, one standard error"
-        self.errorbar_ = self.ax_.errorbar(
-            self.n_components, mean, bars, **(style | (errorbar_kw or {}))
-        )
+        self.errorbar_ = self.ax_.errorbar(self.n_components, mean, bars, **style)
         self.chosen_ = None
         if self.chosen is not None:
             point = self.chosen, mean[np.argmax(self.n_components == self.chosen)]

@@ -16,12 +16,12 @@ BLOCK = 3  # directions of space, rows and columns of one basis shape's block
 LINEAR_SHARE = 0.02  # of the largest absolute value, end of the linear colour scale
 
 
-def asinh_ticks(largest: float, *, signed: bool) -> NDArray:
+def asinh_ticks(largest: float) -> NDArray:
     """Return zero and the powers of ten within the range of an asinh scale."""
     # The lowest one is far enough from zero for both numbers to be readable.
     lowest = np.ceil(np.log10(LINEAR_SHARE / 2 * largest))
     powers = 10.0 ** np.arange(lowest, np.floor(np.log10(largest)) + 1)
-    return np.concatenate([-powers[::-1] if signed else [], [0.0], powers])
+    return np.concatenate([-powers[::-1], [0.0], powers])
 
 
 class ModeCovarianceDisplay:
@@ -151,22 +151,17 @@ class ModeCovarianceDisplay:
         self,
         ax: Any = None,
         *,
-        absolute: bool = False,
         normalize: bool = False,
         scale: Literal["asinh", "linear"] | None = None,
         colorbar: bool = True,
-        im_kw: dict[str, Any] | None = None,
     ) -> ModeCovarianceDisplay:
         """
-        Draw the matrix.
+        Draw the matrix: blue is negative, red positive and white zero.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
             Axes to draw on. By default a new figure.
-        absolute : bool, default=False
-            Whether to show absolute values, on a scale from zero. Otherwise blue is
-            negative, red positive and white zero.
         normalize : bool, default=False
             Whether to show correlations instead of covariances.
         scale : {"asinh", "linear"}, default=None
@@ -176,8 +171,6 @@ class ModeCovarianceDisplay:
             linear scale only the first ones may be visible.
         colorbar : bool, default=True
             Whether to add a colour bar.
-        im_kw : dict, default=None
-            Arguments for matplotlib's ``imshow``. They override the defaults.
 
         Returns
         -------
@@ -203,19 +196,15 @@ class ModeCovarianceDisplay:
             scales = np.sqrt(np.diag(values))
             inverse = np.divide(1.0, scales, np.zeros(len(scales)), where=scales > 0)
             values = values * np.outer(inverse, inverse)
-        if absolute:
-            values, label = np.abs(values), f"absolute {label}"
         largest = np.abs(values).max() or 1.0
-        low = 0.0 if absolute else -largest
-        limits: dict[str, Any] = {"vmin": low, "vmax": largest}
+        limits: dict[str, Any] = {"vmin": -largest, "vmax": largest}
         if scale is None:
             scale = "linear" if normalize else "asinh"
         linear, asinh = Normalize(**limits), AsinhNorm(LINEAR_SHARE * largest, **limits)
         norms = {"linear": linear, "asinh": asinh}
         if scale not in norms:
             raise ValueError(f'scale must be "asinh" or "linear"; got {scale!r}')
-        style = {"cmap": "Greys" if absolute else "RdBu_r", "norm": norms[scale]}
-        style |= {"interpolation": "nearest"} | (im_kw or {})
+        style = {"cmap": "RdBu_r", "norm": norms[scale], "interpolation": "nearest"}
         self.im_ = self.ax_.imshow(values, **style)
 
         n_modes, names = len(values), self.component_names
@@ -241,7 +230,7 @@ class ModeCovarianceDisplay:
         if colorbar:
             self.colorbar_ = self.figure_.colorbar(self.im_, ax=self.ax_, label=label)
             if scale == "asinh":
-                ticks = asinh_ticks(largest, signed=not absolute)
+                ticks = asinh_ticks(largest)
                 texts = [f"{tick:g}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
                 self.colorbar_.set_ticks(ticks, labels=texts)
                 self.colorbar_.minorticks_off()

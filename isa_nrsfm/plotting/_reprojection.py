@@ -41,7 +41,8 @@ class ReprojectionDisplay:
             default=None
         Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
         points. A layout has separate colours for left and right. "auto" recognises a
-        known layout by the number and order of the points in the first frame.
+        known layout by the number and order of the points in the first frame. Up to
+        400 points without one are joined by a minimal spanning tree.
     origin : {"auto", "upper", "lower"}, default="upper"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
         points up. "auto" is "lower" if a face or a body would otherwise be upside down
@@ -169,7 +170,8 @@ class ReprojectionDisplay:
                 default="auto"
             Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
             points. "auto" recognises a known layout by the names of the points, or by
-            the number and order of those of the mean shape.
+            the number and order of those of the mean shape. Up to 400 points without a
+            known one are joined by the minimal spanning tree of `BasisShapeDisplay`.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
             that points up. "auto" is "lower" if a face or a body would otherwise be
@@ -228,9 +230,6 @@ class ReprojectionDisplay:
         ax: Any = None,
         *,
         n_columns: int | None = None,
-        observed_kw: dict[str, Any] | None = None,
-        reprojected_kw: dict[str, Any] | None = None,
-        edge_kw: dict[str, Any] | None = None,
     ) -> ReprojectionDisplay:
         """
         Draw the frames.
@@ -241,12 +240,6 @@ class ReprojectionDisplay:
             Axes to draw on, one per frame. By default a new figure with a legend below.
         n_columns : int, default=None
             Columns of panels of the new figure. By default 3 or fewer.
-        observed_kw : dict, default=None
-            Arguments for the scatter of observed points. They override the defaults.
-        reprojected_kw : dict, default=None
-            Arguments for the scatter of reprojected points.
-        edge_kw : dict, default=None
-            Arguments for the LineCollection of the joined reprojected points.
 
         Returns
         -------
@@ -271,9 +264,8 @@ class ReprojectionDisplay:
         self.reprojected_: list[Any] = []
         self.errors_: list[Any] = []
         self.edges_: list[Any] = []
-        styles = [style or {} for style in (observed_kw, reprojected_kw, edge_kw)]
         for i, axes in enumerate(self.axes_):
-            self._plot_frame(axes, i, *styles)
+            self._plot_frame(axes, i)
         if ax is None:
             entries = [self.observed_[0], self.reprojected_[0]]
             scale = 4.0 if _axes.is_dense(self.observed[0]) else 1.0
@@ -287,26 +279,23 @@ class ReprojectionDisplay:
         aspect = np.divide(height, width, out=np.ones_like(width), where=width > 0)
         return PANEL_WIDTH * float(np.clip(np.median(aspect), 0.4, 1.3))
 
-    def _plot_frame(
-        self, axes: Any, i: int, observed_kw: Any, reprojected_kw: Any, edge_kw: Any
-    ) -> None:
+    def _plot_frame(self, axes: Any, i: int) -> None:
         """Draw one frame."""
         observed, reprojected = self.observed[i], self.reprojected[i]
         if self.skeleton is not None:
             colours = _axes.side_colours(self.skeleton.edge_sides, _axes.PLUS_COLOUR)
-            style = {"colors": colours, "linewidths": 0.8, "alpha": 0.8}
+            style = {"colors": colours, "alpha": 0.8}
             segments = reprojected[self.skeleton.edges]
-            self.edges_.append(_axes.draw_segments(axes, segments, **(style | edge_kw)))
+            self.edges_.append(_axes.draw_segments(axes, segments, **style))
         colour, thin = _axes.OBSERVED_COLOUR, {"linewidths": 0.6}
         style = {"color": colour}
         if not _axes.is_dense(observed):
             style = {"s": 14.0, "facecolors": "none", "edgecolors": colour} | thin
             error = np.stack([observed, reprojected], axis=1)
             self.errors_.append(_axes.draw_segments(axes, error, colors=colour, **thin))
-        style |= {"label": "observed"} | observed_kw
-        self.observed_.append(_axes.draw_points(axes, observed, **style))
+        drawn = _axes.draw_points(axes, observed, label="observed", **style)
+        self.observed_.append(drawn)
         style = {"color": _axes.PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
-        style |= reprojected_kw
         self.reprojected_.append(_axes.draw_points(axes, reprojected, **style))
         _axes.hide_frame(axes)
         axes.set_aspect("equal", adjustable="datalim")

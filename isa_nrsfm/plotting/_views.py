@@ -6,18 +6,22 @@ weak-perspective as possible, and shapes face the mean camera. Shapes of calibra
 cameras are only rotated.
 """
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.distance import pdist, squareform
 
 from isa_nrsfm._estimator import frames_of
 from isa_nrsfm.calibration import _metric, canonical_pose
+from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
-from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
+from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton, edges_of
 
-# A name of a layout or "auto", the layout itself, or pairs of points.
+# A name of a layout or "auto", the layout itself, pairs of points or triangles.
 Edges = ArrayLike | Skeleton | str | None
 Origin = Literal["auto", "upper", "lower"]
 
@@ -58,8 +62,20 @@ def view_and_layout(
         view = np.nanmedian(np.asarray(estimator.scales_)) * euclidean_axes(estimator)
     else:
         view = viewing_transform(estimator.motion_, estimator.reference_motion_)
-    shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
-    return view, *choose_lines(edges, origin, shape, names)
+    shape = estimator.mean_shape_ @ view.T
+    return view, *lines_of_model(estimator, edges, origin, shape)
+
+
+def lines_of_model(
+    estimator: Any, edges: Edges, origin: Origin, shape: NDArray
+) -> tuple[Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
+    """Return layout, lines and origin of a model with a mean shape (n_points, 3).
+
+    Points without a layout are near each other if they are near in the images.
+    """
+    gram = _metric.mean_gram(_metric.unit_cameras(np.asarray(estimator.motion_)))
+    seen = estimator.mean_shape_ @ _metric.symmetric_power(gram, 0.5)
+    return choose_lines(edges, origin, shape, names_of_points(estimator), seen)
 
 
 def depth_note(estimator: Any) -> str:
@@ -102,28 +118,40 @@ def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
 
 
 def choose_lines(
-    edges: Edges, origin: Origin, shape: NDArray, names: tuple[str, ...] | None = None
+    edges: Edges,
+    origin: Origin,
+    shape: NDArray,
+    names: tuple[str, ...] | None = None,
+    seen: NDArray | None = None,
 ) -> tuple[Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
     """Return layout, lines to draw and origin of a shape (n_points, 2 or 3).
 
-    Without lines only the points are drawn.
+    Points without a layout, unless there are many, are joined by a minimal spanning
+    tree of the points `seen`, by default the shape. Without lines only the points are
+    drawn.
     """
-    layout = choose_layout(edges, shape, names)
+    named, pairs, name = isinstance(edges, str | Skeleton), None, "edges"
+    if named and edges != "auto":
+        layout: Skeleton | None = checked_skeleton(edges, len(shape))
+    else:
+        layout = find_skeleton(len(shape), names, shape=shape)
     lines = None if edges is None else layout
-    if edges is not None and not isinstance(edges, str | Skeleton):
-        pairs = checked_links("edges", edges, len(shape)).tolist()
-        curves = tuple(map(tuple, pairs))
-        lines = Skeleton("edges", "other", len(shape), curves, "the user")
+    if edges is not None and not named:
+        pairs = edges_of(checked_links("edges", edges, len(shape), triangles=True))
+    elif edges is not None and layout is None and not is_dense(shape):
+        pairs, name = spanning_tree(shape if seen is None else seen), SPANNING_TREE
+    if pairs is not None:
+        bare = layout or Skeleton(name, "other", len(shape), (), "the points")
+        lines = replace(bare, curves=tuple(map(tuple, pairs.tolist())))
     return layout, lines, choose_origin(origin, shape, layout)
 
 
-def choose_layout(
-    edges: Any, shape: NDArray, names: tuple[str, ...] | None = None
-) -> Skeleton | None:
-    """Return the layout of points given by `edges`, or the recognised one."""
-    if isinstance(edges, Skeleton) or (isinstance(edges, str) and edges != "auto"):
-        return checked_skeleton(edges, len(shape))
-    return find_skeleton(len(shape), names, shape=shape)
+def spanning_tree(points: NDArray) -> NDArray[np.intp]:
+    """Return the pairs of points (n_pairs, 2) of the tree with the shortest edges."""
+    distances = pdist(points)
+    # A distance of zero would be no edge; the same length added to all has no effect.
+    lengths = squareform(distances + np.nanmax(distances, initial=0.0))
+    return np.transpose(minimum_spanning_tree(lengths).nonzero())
 
 
 def choose_origin(

@@ -111,6 +111,14 @@ def checked_links(
     return found.astype(np.intp)
 
 
+def edges_of(links: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return pairs of points as they are, and the sides of triangles, once."""
+    if links.shape[1] == 2:
+        return links
+    sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    return np.unique(np.sort(sides, axis=1), axis=0)
+
+
 def find_skeleton(
     n_points: int,
     names: Sequence[Any] | None = None,
