@@ -11,15 +11,19 @@ RMS of the errors of the depths over the standard deviations of
 import time
 
 import numpy as np
+from scipy.linalg import orthogonal_procrustes
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from benchmarks._run import run_sections
 from benchmarks._sets import (
     SETS,
+    Case,
+    as_table,
     instance,
     is_present,
     load,
+    load_arrays,
     rotations_and_scales,
     shapes_in_camera,
     spoiled as spoiled_table,
@@ -237,12 +241,45 @@ def synthetic(options):
         )
 
 
+def bodies(options):
+    """CMU, 28 joints in mm: hip on hip, and after a similarity of each frame, mirrored.
+
+    The hip is the first joint.
+    """
+    arrays = load_arrays(Case("CMU", "cmu_body", 12))
+    if arrays is None:
+        return
+    truth, X = arrays["S3d"].astype(float), as_table(arrays["W2d"].astype(float))
+    columns = "".join(f"{name:>9}" for name in (*CONVENTIONS, "hip, mm", "turned"))
+    print(f"{'refinement, K':24}{columns}")
+    cases = [("joint", K) for K in (8, 12, 24)] + [("consensus", "auto")]
+    for refinement, K in cases:
+        model, _ = fitted(X, refinement, K, "orthographic", options.jobs)
+        shapes, true = in_camera(model, X)[0], truth - truth[:, :1]
+        shapes = shapes - shapes[:, :1]
+        shapes *= (1, 1, np.sign(np.sum(shapes[:, :, 2] * true[:, :, 2])))
+        hip = np.linalg.norm(shapes - true, axis=2).mean()
+        shapes, true = (S - S.mean(axis=1, keepdims=True) for S in (shapes, true))
+        distances = []
+        for S, T in zip(shapes, true, strict=True):
+            turn, scale = orthogonal_procrustes(S, T)
+            moved = scale / np.sum(S**2) * S @ turn
+            distances.append(np.linalg.norm(moved - T, axis=1).mean())
+        print(
+            f"{f'{refinement}, {len(model.basis_)}':24}"
+            + "".join(f"{error:9.4f}" for error in errors_3d(truth, shapes))
+            + f"{hip:9.1f}{np.mean(distances):9.1f}",
+            flush=True,
+        )
+
+
 SECTIONS = {
     "complete": complete,
     "spoiled": spoiled,
     "smoothed": smoothed,
     "new": new_frames,
     "synthetic": synthetic,
+    "bodies": bodies,
 }
 
 if __name__ == "__main__":
