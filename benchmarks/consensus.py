@@ -20,7 +20,6 @@ from benchmarks._sets import (
     SETS,
     Case,
     as_table,
-    instance,
     is_present,
     load,
     load_arrays,
@@ -29,7 +28,7 @@ from benchmarks._sets import (
     spoiled as spoiled_table,
 )
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
+from isa_nrsfm.metrics import mean_shape_error_3d
 
 CAPTURED = ("yoga", "pickup", "drink")
 # Markers near 15 joints of the body, of the 41 of the motion capture.
@@ -224,23 +223,6 @@ def new_frames(options):
             print(f"{title:20}" + "".join(f"{each:8.2f}" for each in found), flush=True)
 
 
-def synthetic(options):
-    """Affine errors of synthetic tables with the true K and 2 % noise."""
-    for seed in range(options.seeds):
-        tracks = instance(seed, 68, 3, 0.02, camera="weak_perspective")
-        errors = []
-        for refinement in ("joint", "consensus"):
-            model, _ = fitted(tracks.data, refinement, 3, "weak_perspective")
-            errors.append(
-                affine_shape_error(tracks.shapes, model.reconstruct(tracks.data))
-            )
-        print(
-            f"seed {seed}: joint {errors[0]:.5f}, consensus {errors[1]:.5f}, ratio "
-            f"{errors[1] / errors[0]:.3f}",
-            flush=True,
-        )
-
-
 def bodies(options):
     """CMU, 28 joints in mm: hip on hip, and after a similarity of each frame, mirrored.
 
@@ -278,7 +260,6 @@ SECTIONS = {
     "spoiled": spoiled,
     "smoothed": smoothed,
     "new": new_frames,
-    "synthetic": synthetic,
     "bodies": bodies,
 }
 

@@ -437,7 +437,8 @@ def seen_faces(seed):
     photos = load_table(FACES)
     if photos is not None:
         photos = photos[::4]
-        cameras = load_face_prior(9).decompose(photos).motion
+        with warnings.catch_warnings(action="ignore"):  # of another annotator
+            cameras = load_face_prior(9).decompose(photos).motion
         points = photos.reshape(len(photos), -1, 2)
         lips, nose = np.linalg.norm(points[:, [62, 27]] - points[:, [66, 33]], axis=2).T
         rotations, _ = rotations_and_scales(cameras)
