@@ -20,7 +20,7 @@ from isa_nrsfm.skeletons import SKELETONS
 
 ALPHA, PCA = "alpha, K=9", "PCA of aligned points, 18"
 COLOURS = {ALPHA: "#D55E00", PCA: "#0072B2"}
-TITLES = {ALPHA: "isa_nrsfm,\n9 numbers", PCA: "PCA of aligned\npoints, 18 numbers"}
+TITLES = {ALPHA: "isa_nrsfm, 9 numbers", PCA: "PCA of aligned points, 18"}
 # People whose turned faces are drawn; the others are learnt.
 DRAWN = np.arange(80, 100)
 
@@ -50,7 +50,6 @@ def main():
     side = np.abs(np.arctan2(rotations[:, 0, 2], rotations[:, 2, 2])) > np.radians(30)
     draw_predictions(predicted, X, y, told, np.flatnonzero(new & side))
     scores = {name: scores_of(s, X, y, people, views) for name, s in steps.items()}
-    print(scores)
     draw_scores(right.subplots(), scores)
     figure.savefig(Path(__file__).with_suffix(".png"), dpi=100)
 
@@ -80,9 +79,9 @@ def draw_predictions(figure, X, y, told, rows):
 def draw_scores(axis, scores):
     """Draw the shares of right predictions."""
     kinds = {
-        ("frontal", "frontal"): "front\nto front",
-        ("frontal", "turned"): "front\nto turned",
-        ("left", "right"): "left\nto right",
+        ("frontal", "frontal"): "front:\nfront",
+        ("frontal", "turned"): "front:\nturned",
+        ("left", "right"): "left:\nright",
     }
     for place, (name, title) in enumerate(TITLES.items()):
         values = [100 * scores[name][kind] for kind in kinds]
@@ -91,10 +90,10 @@ def draw_scores(axis, scores):
         axis.bar_label(bars, fmt="%.0f", padding=2)
     axis.axhline(16, color="0.4", linestyle=":", linewidth=1)
     axis.set_xticks(range(len(kinds)), kinds.values())
-    axis.set(ylim=(0, 105), title="Expressions that are right, %")
-    axis.set_xlabel("learnt, predicted (dotted: guesses)", fontsize=10)
+    axis.set(ylim=(0, 108), title="Expressions that are right, %")
+    axis.set_xlabel("learnt: predicted (dotted: guesses)", fontsize=10)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(loc="upper left", ncols=2, frameon=False, fontsize=10)
+    axis.legend(loc="upper center", frameon=False, fontsize=11)
 
 
 if __name__ == "__main__":
