@@ -264,8 +264,8 @@ def test_variables_of_matlab_are_the_model(sequence):
 # Of these pages each runs in a test of its own.
 WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
 REFERENCE = (
-    *("conventions", "depth", "export", "formats", "large_tables", "perspective"),
-    *("skeletons", "two_studies"),
+    *("conventions", "depth", "export", "formats", "index", "large_tables"),
+    *("perspective", "skeletons", "two_studies"),
 )
 # Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
 OF_OTHERS = ("from_movement", "dask")
