@@ -422,11 +422,11 @@ def scores_of(steps, X, y, people, views):
     for learn, test in folds.split(X, y, people):
         for learnt, others in LEARNT.items():
             rows = learn[views[learnt][learn]]
-            with warnings.catch_warnings(action="ignore"):  # of depths
+            with warnings.catch_warnings(action="ignore"):  # of depths, other people
                 model = make_pipeline(steps, last).fit(X[rows], y[rows])
-            for other in others:
-                rows = test[views[other][test]]
-                scores[learnt, other].append(model.score(X[rows], y[rows]))
+                for other in others:
+                    rows = test[views[other][test]]
+                    scores[learnt, other].append(model.score(X[rows], y[rows]))
     return {kinds: np.mean(values) for kinds, values in scores.items()}
 
 
