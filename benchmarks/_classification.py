@@ -6,7 +6,6 @@ from sklearn.model_selection import GroupKFold, StratifiedKFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from benchmarks._figures import draw_bars
 from benchmarks._methods import CALIBRATED, METHOD_TITLES, METHODS
 from benchmarks._results import grid, remarks
 from benchmarks._run import Section, every_seed
@@ -67,7 +66,7 @@ def measure_accuracy(measured, name, method, seed):
     options = {"groups": data.subjects, "cv": cv, "error_score": "raise"}
     with measured():
         scores = 100 * cross_val_score(classifier, X, data.labels, **options)
-    return {"accuracy": scores.mean(), "spread": scores.std(ddof=1), "folds": scores}
+    return {"accuracy": scores.mean(), "folds": scores}
 
 
 def page(records):
@@ -82,21 +81,9 @@ def page(records):
             "expressions the subjects are not known: a person may be on both sides of "
             "a fold, which helps all features.\n",
             grid(records, measure="accuracy", **titles),
-            "Standard deviation between the folds, percent.\n",
-            grid(records, measure="spread", digits=2, **titles),
-            "Seconds of the five folds.\n",
-            grid(records, measure="seconds", **titles),
             remarks(records, FEATURES),
         ]
     )
-
-
-def draw(records, folder):
-    """Draw the accuracy, and return the name of the file."""
-    file, label = "classification.png", "accuracy, %"
-    titles = FEATURES, SET_TITLES
-    draw_bars(records, *titles, "accuracy", folder / file, label, log=False)
-    return [file]
 
 
 CLASSIFICATION = Section(
@@ -105,6 +92,5 @@ CLASSIFICATION = Section(
     page,
     ("ict_68", "expressions"),
     tuple(FEATURES),
-    draw=draw,
     runs=runs,
 )

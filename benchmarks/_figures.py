@@ -1,10 +1,10 @@
-"""Pictures of the comparison: reprojections, bars of errors, curves of recovery."""
+"""Pictures of the comparison: reprojections, curves of recovery and cost."""
 
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks._results import ROUNDING, found, number, select
+from benchmarks._results import select
 from isa_nrsfm.plotting import ReprojectionDisplay
 
 # The palette of Okabe and Ito, one colour a method; the others are grey.
@@ -19,11 +19,8 @@ COLOURS = {
     "kong_lucey": "#E69F00",
 }
 OTHER_COLOUR = "0.6"
-BAR_HEIGHT, PANEL_WIDTH, PANEL_HEIGHT, LABEL_WIDTH = 0.27, 2.7, 1.9, 1.9  # inches
-MOST_COLUMNS = 4
+PANEL_WIDTH, PANEL_HEIGHT, LABEL_WIDTH = 2.7, 1.9, 1.9  # inches
 DOTS_PER_INCH, N_COLOURS = 110, 64
-# Logarithmic axes end this far below the largest number, for errors that are rounding.
-LEAST_SHARE = 1e-5
 
 
 def save(figure, path):
@@ -82,84 +79,6 @@ def draw_reprojections(shown, titles, heading, path, origin="auto"):
     handles = [display.observed_[0], display.reprojected_[0]]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     save(figure, path)
-
-
-def draw_bars(records, row_titles, column_titles, measure, path, label, log=True):
-    """
-    Draw a panel a set with a bar a method, from the smallest to the largest of seeds.
-
-    Parameters
-    ----------
-    records : DataFrame
-        Of a section.
-    row_titles, column_titles : dict of str
-        Titles of methods and sets, in order.
-    measure : str
-        A column.
-    path : path-like
-        The png file.
-    label : str
-        Name and unit of the numbers.
-    log : bool, default=True
-        Whether the axis is logarithmic.
-    """
-
-    def titles_of(titles, column):
-        """Return the titles of those that have a value."""
-        known = set(records.loc[records[measure].notna(), column])
-        return {name: title for name, title in titles.items() if name in known}
-
-    rows, columns = titles_of(row_titles, "method"), titles_of(column_titles, "set")
-    n_columns = min(MOST_COLUMNS, len(columns))
-    n_rows = -(-len(columns) // n_columns)
-    width = LABEL_WIDTH + PANEL_WIDTH * n_columns
-    size = width, (BAR_HEIGHT * len(rows) + 0.9) * n_rows
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(n_rows, n_columns, squeeze=False, sharey=True)
-    for unused in axes.ravel()[len(columns) :]:
-        figure.delaxes(unused)
-    for (name, title), panel in zip(columns.items(), axes.ravel(), strict=False):
-        of_set = select(records, set=name)
-        for place, method in enumerate(rows):
-            of_one = select(of_set, method=method)
-            values = found(of_one, measure)
-            if len(values):
-                colour = COLOURS.get(method, OTHER_COLOUR)
-                _draw_bar(panel, place, values, colour)
-            elif len(of_one):
-                text, at = of_one["message"].iloc[0] or "none", (0.02, place)
-                panel.annotate(
-                    text,
-                    at,
-                    xycoords=("axes fraction", "data"),
-                    va="center",
-                    fontsize="small",
-                )
-        panel.set_title(title, fontsize="medium")
-        if log:
-            counted = found(of_set, measure)
-            counted = counted[counted > LEAST_SHARE * counted.max()]
-            low, high = np.log10([counted.min(), counted.max()])
-            limits = 10 ** np.floor(low - 0.05), 10 ** np.ceil(high + 0.05)
-            panel.set(xscale="log", xlim=limits)
-            panel.minorticks_off()
-        panel.set_yticks(range(len(rows)), rows.values())
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.grid(axis="x", linewidth=0.4, alpha=0.6)
-        panel.set_axisbelow(True)
-    axes[0, 0].invert_yaxis()
-    figure.supxlabel(label, fontsize="medium")
-    save(figure, path)
-
-
-def _draw_bar(panel, place, values, colour):
-    """Draw the median as a bar and the range as a line."""
-    least, median, most = np.percentile(values, (0, 50, 100))
-    panel.barh(place, median, color=colour, height=0.7)
-    panel.plot((least, most), (place, place), color="black", linewidth=1.0)
-    if median >= ROUNDING:
-        text, style = f" {number(median)}", {"va": "center", "fontsize": "x-small"}
-        panel.annotate(text, (most, place), **style)
 
 
 def draw_curves(panels, titles, measures, path, log=False):

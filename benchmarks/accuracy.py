@@ -26,24 +26,15 @@ from benchmarks._sets import (
     is_present,
     load,
     load_arrays,
-    load_table,
     rotations_and_scales,
     shapes_in_camera,
 )
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
-PAPER = {
-    "PooledFastICA": {},
-    "FastISA": {"isa": FastISA()},
-    **{
-        f"no refinement, {name}": {"block_recovery": name, "refinement": None}
-        for name in ("generalized_eigen", "eigen", "irls")
-    },
-}
 # Sets, camera and K of calibrated fits, with frames that are not scaled where the
 # camera is orthographic. True rotations of the first four are known.
 CALIBRATED = (
@@ -76,24 +67,6 @@ def fit(case, X, seed=0, **parameters):
     """Return the fit of a table as the case says."""
     settings = {"scale_frames": case.scale_frames, "random_state": seed, **parameters}
     return AffineNRSfM(case.n_components, **settings).fit(X)
-
-
-def paper(options):
-    """The paper's refinement: inverse SNR over the seeds, and what choices change."""
-    for case in CASES:
-        X = load_table(case)
-        if X is None:
-            continue
-        print(f"\n{case.title:36}{'min':>9}{'median':>9}{'max':>9}")
-        for title, parameters in PAPER.items():
-            models = [
-                fit(case, X, seed, **{"refinement": "alternating", **parameters})
-                for seed in range(options.seeds)
-            ]
-            values = [100 * model.inverse_snr_ for model in models]
-            least, median, most = np.percentile(values, [0, 50, 100])
-            print(f"{title:36}{least:9.4f}{median:9.4f}{most:9.4f}", flush=True)
-        print(f"{'rank floor':36}{100 * models[0].rank_floor_:9.4f}")
 
 
 def tables(options):
@@ -405,7 +378,6 @@ SECTIONS = {
     "cameras": cameras,
     "calibrated": calibrated,
     "webcam": webcam,
-    "paper": paper,
 }
 
 if __name__ == "__main__":

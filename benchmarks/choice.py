@@ -18,6 +18,7 @@ from sklearn.model_selection import KFold, cross_val_score
 
 from benchmarks._run import run_sections
 from benchmarks._sets import Case, load_table
+from benchmarks.speed import processor_seconds
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -55,13 +56,6 @@ FACES = (
 HANDS = table("hands", "hands_kazuhito_21", 12, 5)
 
 
-def cpu_seconds(function):
-    """Return the seconds of CPU of a call."""
-    start = time.process_time()
-    function()
-    return time.process_time() - start
-
-
 def against_plain_search(options, camera, tables):
     """Print a line for each table: costs, choices and differences of the errors."""
     print(
@@ -80,7 +74,7 @@ def against_plain_search(options, camera, tables):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             pairs = [
-                [cpu_seconds(partial(each.fit, X)) for each in (search, single)]
+                [processor_seconds(partial(each.fit, X)) for each in (search, single)]
                 for _ in range(options.pairs)
             ]
             plain, seconds = plain_search(single, X, tried)

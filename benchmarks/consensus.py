@@ -11,21 +11,24 @@ RMS of the errors of the depths over the standard deviations of
 import time
 
 import numpy as np
+from scipy.linalg import orthogonal_procrustes
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from benchmarks._run import run_sections
 from benchmarks._sets import (
     SETS,
-    instance,
+    Case,
+    as_table,
     is_present,
     load,
+    load_arrays,
     rotations_and_scales,
     shapes_in_camera,
     spoiled as spoiled_table,
 )
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
+from isa_nrsfm.metrics import mean_shape_error_3d
 
 CAPTURED = ("yoga", "pickup", "drink")
 # Markers near 15 joints of the body, of the 41 of the motion capture.
@@ -220,19 +223,34 @@ def new_frames(options):
             print(f"{title:20}" + "".join(f"{each:8.2f}" for each in found), flush=True)
 
 
-def synthetic(options):
-    """Affine errors of synthetic tables with the true K and 2 % noise."""
-    for seed in range(options.seeds):
-        tracks = instance(seed, 68, 3, 0.02, camera="weak_perspective")
-        errors = []
-        for refinement in ("joint", "consensus"):
-            model, _ = fitted(tracks.data, refinement, 3, "weak_perspective")
-            errors.append(
-                affine_shape_error(tracks.shapes, model.reconstruct(tracks.data))
-            )
+def bodies(options):
+    """CMU, 28 joints in mm: hip on hip, and after a similarity of each frame, mirrored.
+
+    The hip is the first joint.
+    """
+    arrays = load_arrays(Case("CMU", "cmu_body", 12))
+    if arrays is None:
+        return
+    truth, X = arrays["S3d"].astype(float), as_table(arrays["W2d"].astype(float))
+    columns = "".join(f"{name:>9}" for name in (*CONVENTIONS, "hip, mm", "turned"))
+    print(f"{'refinement, K':24}{columns}")
+    cases = [("joint", K) for K in (8, 12, 24)] + [("consensus", "auto")]
+    for refinement, K in cases:
+        model, _ = fitted(X, refinement, K, "orthographic", options.jobs)
+        shapes, true = in_camera(model, X)[0], truth - truth[:, :1]
+        shapes = shapes - shapes[:, :1]
+        shapes *= (1, 1, np.sign(np.sum(shapes[:, :, 2] * true[:, :, 2])))
+        hip = np.linalg.norm(shapes - true, axis=2).mean()
+        shapes, true = (S - S.mean(axis=1, keepdims=True) for S in (shapes, true))
+        distances = []
+        for S, T in zip(shapes, true, strict=True):
+            turn, scale = orthogonal_procrustes(S, T)
+            moved = scale / np.sum(S**2) * S @ turn
+            distances.append(np.linalg.norm(moved - T, axis=1).mean())
         print(
-            f"seed {seed}: joint {errors[0]:.5f}, consensus {errors[1]:.5f}, ratio "
-            f"{errors[1] / errors[0]:.3f}",
+            f"{f'{refinement}, {len(model.basis_)}':24}"
+            + "".join(f"{error:9.4f}" for error in errors_3d(truth, shapes))
+            + f"{hip:9.1f}{np.mean(distances):9.1f}",
             flush=True,
         )
 
@@ -242,7 +260,7 @@ SECTIONS = {
     "spoiled": spoiled,
     "smoothed": smoothed,
     "new": new_frames,
-    "synthetic": synthetic,
+    "bodies": bodies,
 }
 
 if __name__ == "__main__":

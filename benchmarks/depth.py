@@ -13,22 +13,26 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
 from isa_nrsfm.export import frame_poses
 
-# Spread of pitch, yaw and roll, relative to that of yaw; of the scales of cameras.
-SHARES, SCALES = (0.7, 1.0, 0.5), 0.2
+# Spread of pitch, yaw and roll, relative to that of yaw; of the scales of cameras;
+# noise, a share of the size of a frame.
+SHARES, SCALES, NOISE = (0.7, 1.0, 0.5), 0.2, 0.01
 
 
-def shapes_of(kind, n_frames, seed, ict):
-    """Return true shapes (n_frames, n_points, 3), or None if they are not there."""
-    if kind == "ICT-68 faces":
-        if ict is None:
-            return None
-        rng = np.random.default_rng(seed)
-        return ict["S3d"][rng.choice(len(ict["S3d"]), n_frames, replace=False)]
-    make = make_body_tracks if kind == "bodies" else make_face_tracks
+def made(n_frames, seed, make):
+    """Return shapes (n_frames, n_points, 3) of a generator of tracks."""
     return make(n_frames, random_state=seed).shapes
 
 
-def seen(shapes, degrees, noise, seed):
+def rendered(n_frames, seed):
+    """Return shapes (n_frames, 68, 3) of ICT-68, or None where it is absent."""
+    arrays = load_arrays(ICT)
+    if arrays is None:
+        return None
+    rng = np.random.default_rng(seed)
+    return arrays["S3d"][rng.choice(len(arrays["S3d"]), n_frames, replace=False)]
+
+
+def seen(shapes, degrees, seed):
     """Return a table, points in the axes of the camera, and rotations."""
     rng, n_frames = np.random.default_rng(seed), len(shapes)
     shapes = shapes - shapes.mean(axis=1, keepdims=True)
@@ -37,7 +41,7 @@ def seen(shapes, degrees, noise, seed):
     points = shapes @ rotations.transpose(0, 2, 1)
     points *= np.exp(SCALES * rng.normal(size=(n_frames, 1, 1)))
     size = np.sqrt(np.mean(points[:, :, :2] ** 2, axis=(1, 2), keepdims=True))
-    tracks = points[:, :, :2] + noise * size * rng.normal(size=points[:, :, :2].shape)
+    tracks = points[:, :, :2] + NOISE * size * rng.normal(size=points[:, :, :2].shape)
     return tracks.reshape(n_frames, -1), points, rotations
 
 
@@ -65,8 +69,9 @@ def rotation_ratio(model, X, rotations):
     return min(found)[::-1]
 
 
-def animal(n_frames, rng):
+def animal(n_frames, seed):
     """Return shapes (n_frames, 18, 3) of a walking animal: x ahead, y down, z aside."""
+    rng = np.random.default_rng(seed)
     body = [(x, y, z) for x in (-60, 0, 60) for y in (-15, 15) for z in (-12, 12)]
     points = np.tile(np.array(body[:10], dtype=float), (n_frames, 1, 1))
     phase = 2 * np.pi * np.cumsum(rng.uniform(0.6, 1.4, n_frames)) / 30
@@ -79,8 +84,9 @@ def animal(n_frames, rng):
     return points
 
 
-def sheet(n_frames, rng):
+def sheet(n_frames, seed):
     """Return shapes (n_frames, 49, 3) of a sheet with two waves, across and along."""
+    rng = np.random.default_rng(seed)
     x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-1, 1, 7)]))
     a, b = 0.3 * rng.normal(size=(2, n_frames, 1))
     z = a * np.sin(2 * x) + b * np.cos(2 * y)
@@ -88,15 +94,16 @@ def sheet(n_frames, rng):
     return np.concatenate([flat, z[:, :, None]], axis=2)
 
 
-def flat_hand(n_frames, rng):
+def flat_hand(n_frames, seed):
     """Return shapes (n_frames, 21, 3) of hands whose fingers move in one plane."""
-    shapes = make_hand_tracks(n_frames, random_state=rng.integers(2**31)).shapes
+    hands = np.random.default_rng(seed).integers(2**31)
+    shapes = made(n_frames, hands, make_hand_tracks)
     flat = (shapes - shapes.mean(axis=(0, 1))).reshape(-1, 3)
     axes = np.linalg.svd(flat, full_matrices=False)[2]
     return (shapes @ axes.T) * (1.0, 1.0, 0.02)
 
 
-def captured(n_frames, rng, file):
+def captured(n_frames, seed, file):
     """Return shapes of a file at equal distances, or None where it is absent."""
     arrays = load_arrays(Case(file, file, 8))
     if arrays is None:
@@ -105,8 +112,12 @@ def captured(n_frames, rng, file):
     return shapes[np.linspace(0, len(shapes) - 1, n_frames).astype(int)]
 
 
-# Objects whose depth is invented easily if they hardly turn, and numbers of shapes
+# Shapes and numbers of basis shapes; in the second half depths are invented easily if
+# the objects hardly turn.
 OBJECTS = {
+    "ICT-68 faces": (rendered, 3, 9),
+    "generated faces": (partial(made, make=make_face_tracks), 3, 9),
+    "bodies": (partial(made, make=make_body_tracks), 3, 12),
     "animals from the side": (animal, 4),
     "flat hands": (flat_hand, 4),
     "sheets": (sheet, 2),
@@ -117,24 +128,18 @@ OBJECTS = {
 }
 
 
-def measured(kind, n_components, degrees, noise, seed, n_frames, ict):
+def measured(kind, n_components, degrees, seed, options):
     """Return the figures of one table, None if its shapes are not there."""
-    if kind in OBJECTS:
-        shapes = OBJECTS[kind][0](n_frames, np.random.default_rng(seed))
-    else:
-        shapes = shapes_of(kind, n_frames, seed, ict)
+    shapes = OBJECTS[kind][0](options.frames, seed)
     if shapes is None:
         return None
-    X, points, rotations = seen(shapes, degrees, noise, seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    X, points, rotations = seen(shapes, degrees, seed)
+    with warnings.catch_warnings(action="ignore"):
         model = AffineNRSfM(n_components, camera="weak_perspective", random_state=0)
         model.fit(X)
+        given = np.isfinite(frame_poses(model).yaw).all()
     ratio, angle = rotation_ratio(model, X, rotations)
     error = depth_error(model, X, points)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        given = np.isfinite(frame_poses(model).yaw).all()
     return *error, model.depth_uncertainty_, ratio, angle, given
 
 
@@ -143,51 +148,23 @@ def main(argv=None):
     parser = argparse.ArgumentParser(prog="python -m benchmarks.depth")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--noise", type=float, nargs="+", default=[0.01])
-    parser.add_argument(
-        "--degrees", type=float, nargs="+", default=[2, 4, 6, 10, 20, 40]
-    )
+    every = [2, 4, 6, 10, 20, 40]
+    parser.add_argument("--degrees", type=float, nargs="+", default=every)
     parser.add_argument("--kinds", nargs="+", default=[])
     options = parser.parse_args(argv)
-    ict = load_arrays(ICT)
-    cases = [("ICT-68 faces", 3), ("ICT-68 faces", 9)]
-    cases += [
-        ("generated faces", 3),
-        ("generated faces", 9),
-        ("bodies", 3),
-        ("bodies", 12),
-        *((kind, K) for kind, (_, K) in OBJECTS.items()),
-    ]
-    cases = [case for case in cases if not options.kinds or case[0] in options.kinds]
-    print(
-        "| shapes | K | noise | turned by | error of depths, relative to the true "
-        "depths | relative to the fitted depths | estimated (`depth_uncertainty_`) | "
-        "error below twice the estimate | depth determined | "
-        "error of rotations, degrees | RMS of this error over its standard deviation |"
-    )
-    print("|---" * 11 + "|")
-    for kind, n_components in cases:
-        for noise in options.noise:
-            for degrees in options.degrees:
-                found = [
-                    measured(
-                        kind, n_components, degrees, noise, seed, options.frames, ict
-                    )
-                    for seed in range(options.seeds)
-                ]
-                if found[0] is None:
-                    continue
-                true, error, stated, ratio, angle, given = np.array(
-                    found, dtype=float
-                ).T
-                within = int(np.sum(error < 2 * stated))
+    cases = [(kind, K) for kind, (_, *numbers) in OBJECTS.items() for K in numbers]
+    print(f"{'shapes':22} K turned  of true  of fitted  stated  given  degrees  e/std")
+    for kind, K in cases:
+        for degrees in options.degrees if kind in (options.kinds or [kind]) else ():
+            seeds = range(options.seeds)
+            found = [measured(kind, K, degrees, seed, options) for seed in seeds]
+            if None not in found:
+                true, error, stated, ratio, angle, given = np.array(found, float).T
+                root = [np.sqrt(np.mean(x**2)) for x in (true, error, stated, ratio)]
                 print(
-                    f"| {kind} | {n_components} | {100 * noise:g} % | {degrees:g} | "
-                    f"{np.sqrt(np.mean(true**2)):.3f} | "
-                    f"{np.sqrt(np.mean(error**2)):.3f} | "
-                    f"{np.sqrt(np.mean(stated**2)):.3f} | {within} of {len(error)} | "
-                    f"{int(given.sum())} of {len(error)} | {np.median(angle):.1f} | "
-                    f"{np.sqrt(np.mean(ratio**2)):.1f} |",
+                    f"{kind:22}{K:2}{degrees:7g}{root[0]:9.3f}{root[1]:11.3f}"
+                    f"{root[2]:8.3f}{given.sum():7.0f}{np.median(angle):9.1f}"
+                    f"{root[3]:7.1f}",
                     flush=True,
                 )
 

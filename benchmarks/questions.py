@@ -2,7 +2,8 @@
 Print what fits say of labels, people, time and head pose, and levels of p-values.
 
 Run ``python -m benchmarks.questions [section ...] [--seeds N]``: about two minutes, and
-ten for ``chance``. The figures of docs/questions.md are those of the first seed.
+ten for ``chance`` and ``turned`` each. Figures of the pages are those of the first
+seed. The generated faces of ``turned`` need no data.
 """
 
 import warnings
@@ -10,16 +11,22 @@ import warnings
 import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
+from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.linear_model import LinearRegression
+from sklearn.model_selection import GroupKFold
+from sklearn.neighbors import KNeighborsClassifier
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from benchmarks._run import run_sections
 from benchmarks._sets import (
     DRINK,
     EXPRESSIONS,
+    FACES,
     ICT,
+    MUCT,
     PICKUP,
     YOGA,
     Case,
@@ -42,6 +49,7 @@ from isa_nrsfm.analysis import (
 from isa_nrsfm.calibration import view_angles
 from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.export import frame_poses
+from isa_nrsfm.skeletons import get_skeleton
 
 # Numbers of basis shapes of motion capture.
 K_OF_BODIES = (6, 12)
@@ -53,6 +61,14 @@ NOISE, MISSING = 0.02, 0.3
 # The y axis of ICT-68 points up and its z axis to the viewer; angles are told of images
 # whose y axis points down.
 Y_DOWN = np.diag([1.0, -1.0, -1.0])
+# Degrees from the front, and to the side; which views are predicted from which.
+NEAR, FRONTAL, TURNED, ASIDE = 10, 15, 25, 15
+LEARNT = {
+    "all": ("all",),
+    "frontal": ("frontal", "turned"),
+    "left": ("left", "right"),
+    "near": ("turned",),
+}
 
 
 def told(features, labels, groups, seed):
@@ -365,9 +381,122 @@ def studies(options):
                 show(f"face prior, {adapt}, K={K}", both)
 
 
-SECTIONS = {
-    each.__name__: each for each in (labels, chance, people, smoothing, poses, studies)
-}
+def views_of(rotations):
+    """Return which faces are seen from where, by name; y and z may point backwards."""
+    side, front = rotations[:, [0, 2], 2].T * np.sign(rotations[:, 2, 2])
+    turned, yaw = np.degrees([np.arccos(front), np.arctan2(side, front)])
+    return {
+        "all": turned >= 0,
+        "near": turned < NEAR,
+        "frontal": turned < FRONTAL,
+        "turned": turned > TURNED,
+        "left": yaw < -ASIDE,
+        "right": yaw > ASIDE,
+    }
+
+
+def features_of(layout, numbers, seed=0):
+    """Return steps from points of a layout to features, by name."""
+    columns = {"indices": get_skeleton(layout).inner_columns, "axis": 1}
+    inner = FunctionTransformer(np.take, kw_args=columns)
+    alpha = AffineNRSfM(camera="weak_perspective", random_state=seed)
+    features = {
+        f"alpha, K={K}": [clone(alpha).set_params(n_components=K)] for K in numbers
+    }
+    for n in (9, 18, 30):
+        pca = [AlignedFrames(), PCA(n, random_state=seed)]
+        features[f"PCA of aligned points, {n}"] = pca
+    return {
+        f"{name}{ending}": make_pipeline(*first, *steps, StandardScaler())
+        for ending, first in (("", ()), (", inner points", (inner,)))
+        for name, steps in features.items()
+    }
+
+
+def scores_of(steps, X, y, people, views):
+    """Return scores of other people by kinds of views, (learnt, predicted)."""
+    numbers = y.dtype.kind == "f"
+    last = LinearRegression() if numbers else LinearDiscriminantAnalysis()
+    scores = {(learnt, other): [] for learnt in LEARNT for other in LEARNT[learnt]}
+    folds = GroupKFold(5, shuffle=True, random_state=0)
+    for learn, test in folds.split(X, y, people):
+        for learnt, others in LEARNT.items():
+            rows = learn[views[learnt][learn]]
+            with warnings.catch_warnings(action="ignore"):  # of depths, other people
+                model = make_pipeline(steps, last).fit(X[rows], y[rows])
+                for other in others:
+                    rows = test[views[other][test]]
+                    scores[learnt, other].append(model.score(X[rows], y[rows]))
+    return {kinds: np.mean(values) for kinds, values in scores.items()}
+
+
+def seen_faces(seed):
+    """Yield title, table, what is predicted, people and rotations of faces."""
+    faces = make_face_tracks(1000, n_components=8, random_state=seed)
+    rotations, _ = rotations_and_scales(faces.motion)
+    each = np.arange(len(rotations))
+    yield "generated faces of one person", faces.data, faces.labels, each, rotations
+    arrays = load_arrays(ICT)
+    if arrays is not None:
+        rest = (arrays[name] for name in ("labels", "subjects", "R"))
+        yield "ICT-68", load_table(ICT), *rest
+    photos = load_table(FACES)
+    if photos is not None:
+        photos = photos[::4]
+        with warnings.catch_warnings(action="ignore"):  # of another annotator
+            cameras = load_face_prior(9).decompose(photos).motion
+        points = photos.reshape(len(photos), -1, 2)
+        lips, nose = np.linalg.norm(points[:, [62, 27]] - points[:, [66, 33]], axis=2).T
+        rotations, _ = rotations_and_scales(cameras)
+        title = "photos: R^2 of the root of (opening of the mouth / length of the nose)"
+        yield title, photos, np.sqrt(lips / nose), np.arange(len(photos)), rotations
+
+
+def listed(name, figures):
+    """Print a row of texts or shares."""
+    cells = (f"{c:>10}" if isinstance(c, str) else f"{c:10.3f}" for c in figures)
+    print(f"{name:40}" + "".join(cells), flush=True)
+
+
+def turned(options):
+    """Faces of other people in other views: share right; all is learnt in one view.
+
+    Near and frontal: within 10 and 15 degrees; turned: by more than 25; left and right:
+    a yaw of more than 15. Linear discriminant analysis, five folds of people.
+    """
+    kinds = [(learnt, other) for learnt in LEARNT for other in LEARNT[learnt]]
+    for seed in range(options.seeds):
+        for title, X, y, people, rotations in seen_faces(seed):
+            views = views_of(rotations)
+            print(f"{title}: " + ", ".join(f"{v.sum()} {k}" for k, v in views.items()))
+            listed("learnt", [learnt for learnt, _ in kinds])
+            listed("predicted", [other for _, other in kinds])
+            for name, steps in features_of("ibug-68", [9], seed).items():
+                listed(name, scores_of(steps, X, y, people, views).values())
+
+
+def identity(options):
+    """MUCT: share of the people of the frontal camera a that other cameras find.
+
+    The nearest neighbour among the people that camera a shows completely.
+    """
+    arrays = load_arrays(MUCT)
+    if arrays is None:
+        return
+    complete = arrays["visible"].all(axis=1)
+    people, camera = arrays["subjects"][complete], arrays["camera"][complete]
+    known, X = camera == "a", load_table(MUCT)
+    listed("camera", "bcde")
+    for name, steps in features_of("xm2vts-68", [9, 18]).items():
+        with warnings.catch_warnings(action="ignore"):  # of depths
+            features = steps.fit_transform(X)
+        nearest = KNeighborsClassifier(1).fit(features[known], people[known])
+        others = (camera == other for other in "bcde")
+        listed(name, [nearest.score(features[rows], people[rows]) for rows in others])
+
+
+ALL = labels, chance, people, smoothing, poses, studies, turned, identity
+SECTIONS = {each.__name__: each for each in ALL}
 
 if __name__ == "__main__":
     run_sections(__doc__, SECTIONS)

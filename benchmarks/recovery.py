@@ -9,7 +9,7 @@ affine), the number of frames (300, 400, 500) and the amplitude (15 to 20 %).
 import numpy as np
 
 from benchmarks._run import run_sections
-from benchmarks._sets import CAMERAS, as_table, instance
+from benchmarks._sets import CAMERAS, instance
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.metrics import (
     affine_shape_error,
@@ -110,41 +110,6 @@ def noisy(options):
                 )
 
 
-def calibrated(options):
-    """2 % noise, weak-perspective truth: 3D error of calibrated to affine cameras."""
-    print("points  K   affine: median  calibrated: median   ratio: median     max")
-    for n_points in options.points:
-        for K in options.components:
-            rows = []
-            for seed in range(options.seeds):
-                tracks = instance(seed, n_points, K, 0.02, camera="weak_perspective")
-                free = fitted(tracks, K)[1]
-                held = fitted(tracks, K, camera="weak_perspective")[1]
-                rows.append((free, held, held / free))
-            free, held, ratio = np.array(rows).T
-            print(
-                f"{n_points:6}{K:3}{np.median(free):17.5f}{np.median(held):20.5f}"
-                f"{np.median(ratio):16.3f}{ratio.max():8.3f}",
-                flush=True,
-            )
-
-
-def components(options):
-    """n_components="auto" at 2 % noise, 68 points: how often it finds K of 1 to 8."""
-    for camera in CAMERAS:
-        for K in range(1, 9):
-            found = []
-            for seed in range(options.seeds):
-                X = instance(seed, 68, K, 0.02, camera=camera).data
-                model = AffineNRSfM("auto", camera=camera, random_state=0).fit(X)
-                found.append(len(model.basis_))
-            numbers, times = np.unique(found, return_counts=True)
-            listed = ", ".join(
-                f"{n} {count} times" for n, count in zip(numbers, times, strict=True)
-            )
-            print(f"{camera} K={K}: {listed}", flush=True)
-
-
 def rigid(options):
     """Rigid objects at 1 % noise: the largest reliability, and what "auto" finds."""
     for camera in CAMERAS:
@@ -163,87 +128,6 @@ def rigid(options):
                     f"{max(largest):.2f} at most, K = {max(counts)} at most",
                     flush=True,
                 )
-
-
-def coefficient_kinds(rng, n_frames, n_components):
-    """Return coefficients of several distributions, by name."""
-    normal = rng.standard_normal((n_frames, n_components))
-    mixing = np.eye(n_components) + 0.5 * rng.standard_normal(2 * (n_components,)) / (
-        np.sqrt(n_components)
-    )
-    waves = np.arange(n_frames)[:, None] * np.linspace(0.05, 0.2, n_components)
-    return {
-        "normal": normal,
-        "Laplace": rng.laplace(size=normal.shape),
-        "Student (3)": rng.standard_t(3, size=normal.shape),
-        "uniform": rng.uniform(-1, 1, size=normal.shape),
-        "correlated": normal @ mixing,
-        "waves": np.sin(waves + rng.uniform(0, 6, n_components)),
-        "one sided": rng.exponential(size=normal.shape),
-    }
-
-
-def with_coefficients(tracks, alpha, noise, rng):
-    """Replace the coefficients of tracks, of unit variance, and observe them again."""
-    alpha = (alpha - alpha.mean(axis=0)) / alpha.std(axis=0)
-    shapes = tracks.mean_shape + np.tensordot(alpha, tracks.basis, 1)
-    images = shapes @ tracks.motion.transpose(0, 2, 1)
-    size = np.sqrt(np.mean(images**2))
-    images = images + noise * size * rng.standard_normal(images.shape)
-    images = images + tracks.translation[:, None]
-    return type(tracks)(
-        data=as_table(images),
-        shapes=shapes,
-        basis=tracks.basis,
-        mean_shape=tracks.mean_shape,
-        alpha=alpha,
-    )
-
-
-def independence(options):
-    """Lowest similarity of a basis shape, 1 % noise, 68 points, by independence."""
-    print("independent shapes, independence='shapes', 400 frames")
-    print("coefficients     K    lowest: median     min  modulo   3D error")
-    for K in (3, 5):
-        rows = {}
-        for seed in range(options.seeds):
-            tracks = instance(seed, 68, K, 0.01, n_frames=400)
-            rng = np.random.default_rng(seed)
-            for name, alpha in coefficient_kinds(rng, 400, K).items():
-                drawn = with_coefficients(tracks, alpha, 0.01, rng)
-                model, error = fitted(drawn, K)
-                similarity = least_similarity(drawn, model)
-                rows.setdefault(name, []).append((*similarity, error))
-        for name, values in rows.items():
-            plain, modulo, error = np.array(values).T
-            print(
-                f"{name:15}{K:3}{np.median(plain):18.4f}{plain.min():8.4f}"
-                f"{modulo.min():8.4f}{error.max():11.5f}",
-                flush=True,
-            )
-    print("Gaussian shapes, Laplace coefficients, independence='coefficients'")
-    print("frames    K    lowest: median     min  modulo")
-    for K in (3, 5):
-        for n_frames in (400, 1500):
-            values = []
-            for seed in range(options.seeds):
-                tracks = instance(
-                    seed,
-                    68,
-                    K,
-                    0.01,
-                    n_frames=n_frames,
-                    shapes="gaussian",
-                    coefficients="heavy_tailed",
-                )
-                model, _ = fitted(tracks, K, independence="coefficients")
-                values.append(least_similarity(tracks, model))
-            plain, modulo = np.array(values).T
-            print(
-                f"{n_frames:6}{K:5}{np.median(plain):18.4f}{plain.min():8.4f}"
-                f"{modulo.min():8.4f}",
-                flush=True,
-            )
 
 
 def in_the_basis_of(alpha, truth):
@@ -290,10 +174,7 @@ def calibration(options):
 SECTIONS = {
     "exact": exact,
     "noisy": noisy,
-    "calibrated": calibrated,
-    "components": components,
     "rigid": rigid,
-    "independence": independence,
     "calibration": calibration,
 }
 

@@ -7,13 +7,11 @@ drifts.
 """
 
 import copy
-import gc
 import os
 import resource
 import subprocess
 import sys
 import time
-import tracemalloc
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -26,15 +24,14 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks._run import run_isolated, run_sections
 from benchmarks._sets import CASES, YOGA, load_table, measurement_matrix
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.export import pose_function
 from isa_nrsfm.io import save_model, write_table
 
-# Section frames: new frames, how many are taken one by one to time one, frames of a
-# stream, and the least number of pairs.
-N_FRAMES, SINGLE, STREAM, FRAME_PAIRS = 8000, 100, 10_000, 10
+# Frames that are timed one by one, half of them.
+SINGLE = 100
 
 
 def seconds(function, repeats=1):
@@ -148,54 +145,6 @@ def each(function, rows):
         function(row)
 
 
-def heap_after_stream(model, X, n_frames):
-    """Return the growth and the peak, in bytes, of the heap over single frames."""
-
-    def stream(n_frames):
-        for i in range(n_frames):
-            model.transform(X[i % len(X)][None])
-        gc.collect()
-
-    tracemalloc.start()
-    stream(100)  # whatever is made once
-    before, _ = tracemalloc.get_traced_memory()
-    tracemalloc.reset_peak()
-    stream(n_frames)
-    after, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    return after - before, peak - before
-
-
-def frames(options):
-    """New frames, many and one by one, relative to a thin SVD; memory of a stream.
-
-    The frames have 68 points, and the model 9 basis shapes. The SVD is that of all
-    complete frames. Milliseconds of single frames are those of all of them. Two jobs
-    are held against one.
-    """
-    n_pairs = max(options.pairs, FRAME_PAIRS)
-
-    heading(f"{N_FRAMES}", "ms", "ms of")
-    for camera in ("weak_perspective", "affine"):
-        X = drawn(N_FRAMES, 68, 9, camera=camera)
-        tables = {"complete": X, "20 % missing": with_holes(X, 0.2)}
-        model = AffineNRSfM(9, camera=camera, random_state=0).fit(X[:3000])
-        two, svd = copy.copy(model).set_params(n_jobs=2), svd_of(X)
-        for title, table in tables.items():
-            title, transform = f"{camera[:6]} {title}", partial(model.transform, table)
-            compare(title, transform, svd, n_pairs, "SVD")
-            other = partial(two.transform, table)
-            compare(f"{title}, 2 jobs", other, transform, n_pairs, "1 job")
-    for title, table in tables.items():
-        rows = [table[i : i + 1] for i in range(SINGLE)]
-        singles = partial(each, model.transform, rows)
-        compare(f"{SINGLE} single, {title}", singles, svd, n_pairs, "SVD")
-    growth, peak = heap_after_stream(model, tables["20 % missing"], STREAM)
-    print(
-        f"stream of {STREAM} frames: {growth} bytes kept, {peak / 1e3:.0f} kB at most"
-    )
-
-
 def live(options):
     """One frame: transform relative to small SVDs, pose and shape to transform.
 
@@ -234,24 +183,6 @@ def live(options):
         ):
             title = f"{camera[:9]:10}{title}"
             compare(title, candidate, reference, against=what, **options)
-
-
-def fastisa_iteration(options):
-    """FastISA, 68 x 27: a step of one start, relative to an SVD of a 27 x 27 matrix."""
-    heading("signals", "step ms", "SVD ms")
-    random = np.random.default_rng(0)
-    matrix = random.normal(size=(27, 27))
-    tables = {"Laplace, artificial": random.laplace(size=(68, 27))}
-    for case in CASES:
-        if case.n_components == 9 and (X := load_table(case)) is not None:
-            _, _, Vt = svd_of(X)()
-            tables[case.title] = np.sqrt(len(Vt.T)) * Vt[3:30].T
-    for title, signals in tables.items():
-        isa = FastISA(random_state=0)
-        steps = isa.fit(signals).n_iters_.sum()
-        svds = partial(each, np.linalg.svd, [matrix] * steps)
-        fit = partial(isa.fit, signals)
-        compare(title, fit, svds, options.pairs, per=steps)
 
 
 def write_long_table(path, n_frames):
@@ -410,12 +341,10 @@ def jobs(options):
 
 SECTIONS = {
     "start": start,
-    "frames": frames,
     "fits": fits,
     "large": large,
     "long": long,
     "live": live,
-    "fastisa": fastisa_iteration,
     "threads": threads,
     "jobs": jobs,
 }

@@ -53,7 +53,7 @@ autosummary_ignore_module_all = False
 autodoc_member_order = "bysource"
 
 myst_heading_anchors = 3
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["attrs_block", "dollarmath"]
 
 # Formulas need no network, either.
 html_math_renderer = "mathml"

@@ -132,7 +132,7 @@ def test_figures_of_the_readme_are_those_of_the_benchmarks():
 
 
 def test_each_picture_is_shown_and_has_its_script():
-    pages = "".join(text(f"docs/{page}.md") for page in ("index", "real_photos"))
+    pages = "".join(page.read_text("utf-8") for page in (ROOT / "docs").glob("*.md"))
     pictures = sorted((ROOT / "docs" / "figures").glob("*.png"))
     assert pictures
     for picture in pictures:
@@ -264,8 +264,8 @@ def test_variables_of_matlab_are_the_model(sequence):
 # Of these pages each runs in a test of its own.
 WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
 REFERENCE = (
-    *("conventions", "depth", "export", "formats", "large_tables", "perspective"),
-    *("skeletons", "two_studies"),
+    *("conventions", "depth", "export", "formats", "index", "large_tables"),
+    *("perspective", "skeletons", "two_studies"),
 )
 # Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
 OF_OTHERS = ("from_movement", "dask")

@@ -1,7 +1,7 @@
 """Draw what goes into a fit and what comes out: ``python docs/figures/NAME.py``.
 
-The picture at the top of the README and of the documentation. The face is generated;
-its table is that of ``isa-nrsfm demo``.
+The picture of the page of the method and of the paper. The face is generated; its table
+is that of ``isa-nrsfm demo``.
 """
 
 from pathlib import Path
