@@ -55,7 +55,7 @@ axes[0].set_ylabel("found angle, degrees")
 # %%
 # The same on the command line, which writes the angles to ``cameras.csv``::
 #
-#     isa-nrsfm fit photos/ --n-components 4 --camera weak_perspective --output out
+#     isa-nrsfm fit photos/ --n-components 4 --output out
 #
 # Tables with columns ``x_0, y_0, x_1, ...`` are read in the same way:
 # ``read_landmarks("dlib.csv")``.

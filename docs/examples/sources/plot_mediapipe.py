@@ -86,5 +86,4 @@ ReprojectionDisplay.from_estimator(model, people.points, frames=[0, 100, 180])
 # %%
 # On the command line::
 #
-#     isa-nrsfm fit mesh.csv --image-size 1920x1080 --n-components 4 \
-#         --camera weak_perspective --output out
+#     isa-nrsfm fit mesh.csv --image-size 1920x1080 --n-components 4 --output out

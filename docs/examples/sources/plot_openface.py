@@ -64,5 +64,4 @@ axes[0].set_ylabel("lips, in distances of the eyes")
 # %%
 # The same on the command line::
 #
-#     isa-nrsfm fit openface.csv --n-components 4 --camera weak_perspective \
-#         --distance 62,66 --output out
+#     isa-nrsfm fit openface.csv --n-components 4 --distance 62,66 --output out
