@@ -187,12 +187,12 @@ def fit_table(
         )
         attributes = {"n_iter_": n_iter}
     # The mirror image in depth
-    probability = np.nan
+    probability = settings.mirror_certainty
     if settings.hidden_points and not table.complete and settings.prior is None:
         probability = fitted.mirror_certainty(table.rows, frames)
-    if probability < 0.5:
-        probability = 1.0 - probability
-        fitted, frames, measures = mirror_image(fitted, frames, measures)
+        if probability < 0.5:
+            probability = 1.0 - probability
+            fitted, frames, measures = mirror_image(fitted, frames, measures)
     attributes["mirror_certainty_"] = probability
     # 6. Measures of the fit
     attributes |= measures | _measures(table, factorised, fitted, frames, settings)
@@ -342,6 +342,7 @@ def _joint_frames(
     else:
         uncertainty = prior.inverse(information[None], noise)[0]
     certainty = frame_certainty(model, fits, table.n_seen, weight, prior)
+    certainty = certainty._replace(weighted=table.weights is not None)
     model = replace(model, gauge=gauge, certainty=certainty)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
     parts, *chance = zip(
@@ -354,8 +355,7 @@ def _joint_frames(
         sight = line_of_sight(cameras)
         errors = prior.depth_errors(information, noise, sight, frames.alpha)
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
-        certainty = certainty.of_prior(errors.mean(), np.mean(depths**2))
-        model = replace(model, certainty=certainty)
+        model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
     attributes = {
         "mode_covariance_": square * mode_covariance(cameras, frames.alpha),

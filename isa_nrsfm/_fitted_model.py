@@ -191,11 +191,7 @@ class TableModel(NamedTuple):
         size of a frame. Few outliers have no effect.
         """
         assert isinstance(self.frames, PosteriorFrames)
-        fit = self.decompose(rows, weights, False, np.float64)
-        distance = self.distances(rows, *fit[:3])
-        if weights is not None:
-            weights = np.where(weights > 0, weights, np.nan)
-            distance *= np.sqrt(weights / np.nanmean(weights))
+        distance = self.own_distances(rows, weights)
         constant, slope = self.frames.certainty.images
         ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
         expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)
@@ -270,18 +266,30 @@ class TableModel(NamedTuple):
             return project(shapes, motion, translation)
         return self.pinhole.projected(shapes, motion, translation)
 
-    def distances(self, rows: NDArray, *fitted: NDArray) -> NDArray:
+    def distances(
+        self,
+        rows: NDArray,
+        motion: NDArray,
+        translation: NDArray,
+        alpha: NDArray,
+        weights: NDArray | None = None,
+    ) -> NDArray:
         """Return lengths of residuals (n, n_points), in sizes of their frames.
 
-        Cameras, positions and coefficients of the rows are fitted, if not given.
+        They are multiplied by the roots of the weights if the fitted table had weights.
         """
         usable, _, _, sizes, _ = self._ready(rows)
-        fit = fitted or self.decompose(rows, deviations=False, dtype=np.float64)
-        motion, translation, alpha, *_ = fit
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation).swapaxes(1, 2)
         distance = np.linalg.norm(rows - images, axis=1)
+        if weights is not None and self.frames.certainty.weighted:
+            distance *= np.sqrt(weights)
         return distance / of_all_rows(sizes, usable)[:, None]
+
+    def own_distances(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
+        """Return lengths of residuals (n, n_points) of the fits of rows."""
+        fit = self.decompose(rows, weights, False, np.float64)
+        return self.distances(rows, *fit[:3], weights)
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of the error and the signal of held-out points.

@@ -29,40 +29,55 @@ OTHER_POINTS, LARGEST_MISFIT, OF_AFFINE = 0.15, 1.8, 5.0
 def warn_if_foreign(
     model: TableModel, table: FrameBlocks, weights: NDArray | None = None
 ) -> None:
-    """Warn if frames lie farther from the shapes of a model than its noise explains."""
-    if table.n_frames < FEWEST_COMPARED:
+    """Warn if frames lie farther from the shapes of a model than its noise explains.
+
+    Without weights the noise of a fit with weights does not tell.
+    """
+    certainty, camera = model.frames.certainty, model.frames.camera
+    unknown = certainty.weighted and weights is None
+    if table.n_frames < FEWEST_COMPARED or unknown:
         return
     some = spread(np.arange(table.n_frames), 100)
     weights = None if weights is None else weights[some]
-    misfit, camera = model.misfit(table.take(some), weights), model.frames.camera
+    misfit = model.misfit(table.take(some), weights)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X by itself"
-        if camera != "affine" and model.frames.certainty.determined:
-            planar = ", layout='planar'" if model.layout == "planar" else ""
+        if camera != "affine" and certainty.determined:
+            given = f"camera={camera!r}"
+            if model.pinhole is not None:
+                centre = model.pinhole.principal_point
+                given = f"camera='perspective', principal_point={centre}"
+            if model.layout == "planar":
+                given += ", layout='planar'"
             way = (
-                "Adapt the model to X: AffineNRSfM(n_components='auto', camera="
-                f"{camera!r}, prior=model{planar}).fit(X)"
+                "Adapt the model to X: AffineNRSfM(n_components='auto', "
+                f"{given}, prior=model).fit(X)"
             )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "
             "model as its noise explains: they come from another annotator or tracker, "
-            "show other people or objects, or move as the fitted table does not show. "
-            f"Shapes, depths and coefficients may be wrong. {way}"
+            "show other objects or people (a model of one person fits no other), or "
+            "move as the fitted table does not show. Shapes, depths and coefficients "
+            f"may be wrong. {way}"
         )
 
 
-def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
-    """Return the fitted model that is the prior of a table's fit, or raise."""
-    prior, n_components = estimator.prior, estimator.n_components
-    if prior is None:
-        return None
+def fitted_prior(prior: Any) -> Any:
+    """Return the estimator in a search or in a FrozenEstimator."""
+    return getattr(prior, "best_estimator_", getattr(prior, "estimator", prior))
+
+
+def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
+    """Return the settings of the prior of a table's fit, or raise."""
+    prior, n_components = fitted_prior(estimator.prior), estimator.n_components
+    if estimator.prior is None:
+        return {}
     if estimator.refinement != "joint" or estimator.camera == "affine":
         raise ValueError(
             "prior needs calibrated cameras and refinement='joint'; got camera="
             f"{estimator.camera!r}, refinement={estimator.refinement!r}. Set camera="
             "'weak_perspective' and refinement='joint'"
         )
-    prior = getattr(prior, "estimator", prior)  # of a FrozenEstimator
     model = getattr(prior, "_model", None)
     if not isinstance(model, TableModel):
         raise ValueError(
@@ -97,7 +112,8 @@ def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
             f"n_components must be that of the prior, {K}, or 'auto', which takes it; "
             f"got {n_components}"
         )
-    return model
+    certainty = getattr(prior, "mirror_certainty_", np.nan)
+    return {"prior": model, "mirror_certainty": certainty}
 
 
 def prior_start(

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr
+from scipy.special import expit, logit, stdtr
 
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
@@ -216,7 +216,24 @@ class PerspectiveTable(NamedTuple):
         """Return the fits for 1/f and -1/f from a first fit."""
         images, pinhole = (first, first.mirrored()), self.pinhole(f)
         better, worse = self.settled(pinhole, first.n_components, *images)
+        if self.log_odds(better, worse) < 0:
+            better, worse = worse, better
         return {1.0 / f: better, -1.0 / f: worse}
+
+    def log_odds(self, fit: PerspectiveFit, image: PerspectiveFit) -> float:
+        """Return the log odds of a fit against its mirror image.
+
+        The evidence is a test of E over groups of points, and the prior, if any.
+        """
+        gain = image.energies - fit.energies
+        gain = np.bincount(neighbours(fit.model.mean_shape.T), gain)
+        t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
+        odds = float(logit(stdtr(len(gain) - 1, t)))
+        if np.isnan(self.settings.mirror_certainty):
+            return odds
+        prior = self.settings.prior.mean_shape
+        sign = np.sign(np.vdot(fit.model.mean_shape[:, 2], prior[:, 2]))
+        return odds + float(sign * logit(self.settings.mirror_certainty))
 
     def started(self, model: TableModel, n_components: Any) -> PerspectiveFit:
         """Return the fit from the model of a similar table, with its focal length."""
@@ -340,12 +357,8 @@ def fit_perspective(
         total = float(np.hypot(certainty.total, error))
         certainty = certainty._replace(total=total)
         model = model._replace(frames=replace(model.frames, certainty=certainty))
-        # The mirror image has a larger E: a test over groups of points
         least = min(abs(g) for g in fits if g < 0)
-        gain = fits[-least].energies - fits[least].energies
-        gain = np.bincount(neighbours(fits[least].model.mean_shape.T), gain)
-        t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
-        probability = float(stdtr(len(gain) - 1, t))
+        probability = float(expit(table.log_odds(fits[least], fits[-least])))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
     # Frames as new tables have them
     weights = () if table.weights is None else (table.weights,)

@@ -88,7 +88,7 @@ def model_report(
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     is_joint = estimator.refinement in JOINT_REFINEMENTS
-    found = estimator.diagnostics(X) if is_joint else None
+    found = estimator.diagnostics(X, **frames.weighting) if is_joint else None
     for message in () if found is None else _advice(found, estimator, frames):
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)
@@ -178,9 +178,11 @@ def _perspective_advice(
     weak, *_, error = errors
     if not error < MUCH_LOWER * weak or np.isinf(model.focal_length_):
         return ""
+    joint = ', refinement="joint"' * (estimator.refinement == "consensus")
     return (
         f"perspective explains the table better: error of held-out points "
-        f'{100 * error:.2g} % instead of {100 * weak:.2g} %. Use camera="perspective"'
+        f"{100 * error:.2g} % instead of {100 * weak:.2g} %. Use "
+        f'camera="perspective"{joint}'
     )
 
 
