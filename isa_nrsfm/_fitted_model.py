@@ -184,14 +184,13 @@ class TableModel(NamedTuple):
         whole.put(usable, self.frames.posterior(unit, weights=weights))
         return whole
 
-    def misfit(self, rows: NDArray, weights: NDArray | None = None) -> float:
-        """Return the typical distance of points from fits over the expected one.
+    def misfit(self, distance: NDArray) -> float:
+        """Return the typical distance of points (n, J) from fits over the expected one.
 
         Noise and errors of the shapes are expected, and distances that are tiny for the
         size of a frame. Few outliers have no effect.
         """
         assert isinstance(self.frames, PosteriorFrames)
-        distance = self.own_distances(rows, weights)
         constant, slope = self.frames.certainty.images
         ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
         expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)

@@ -17,7 +17,6 @@ from isa_nrsfm._prepare.checks import FEWEST_COMPARED
 from isa_nrsfm._prepare.robust import median_noise
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm._tables.tracks import seen_points
 
 # Distance of points from the shapes of a prior, in sizes of frames, beyond its noise,
 # from which they are other points; misfit of frames, with calibrated and with affine
@@ -39,10 +38,16 @@ def warn_if_foreign(
         return
     some = spread(np.arange(table.n_frames), 100)
     weights = None if weights is None else weights[some]
-    misfit = model.misfit(table.take(some), weights)
+    distance = model.own_distances(table.take(some), weights)
+    misfit = model.misfit(distance)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X by itself"
-        if camera != "affine" and certainty.determined:
+        if far_points(distance, model.frames):
+            way = (
+                "Check whether X has the same points in the same order as the fitted "
+                "table, or fit X by itself"
+            )
+        elif camera != "affine" and certainty.determined:
             given = f"camera={camera!r}"
             if model.pinhole is not None:
                 centre = model.pinhole.principal_point
@@ -60,6 +65,17 @@ def warn_if_foreign(
             "move as the fitted table does not show. Shapes, depths and coefficients "
             f"may be wrong. {way}"
         )
+
+
+def far_points(distance: NDArray, frames: PosteriorFrames) -> float:
+    """Return how far points (n, J) lie from shapes; zero if they are these points."""
+    if frames.loss == "linear":
+        shown = distance[np.isfinite(distance).any(axis=1)]
+        square = np.median(np.nanmean(shown**2, axis=1))
+    else:  # without outliers
+        square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2
+    others = square > OTHER_POINTS**2 + 2.0 * frames.noise_variance
+    return float(others and np.sqrt(square))
 
 
 def fitted_prior(prior: Any) -> Any:
@@ -130,17 +146,12 @@ def prior_start(
     weights = None if table.weights is None else table.weights[some]
     frames = replace(frames, camera="weak_perspective", loss=settings.loss)
     fit = frames.posterior(rows, False, weights)
-    if settings.loss == "linear":
-        weights = seen_points(rows) if weights is None else weights
-        square = np.nanmedian(frames.squares(fit, weights.sum(axis=1)))
-    else:  # without outliers
-        distance = distances(rows, frames.shapes, *fit[:3])
-        square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2
-    if checked and square > OTHER_POINTS**2 + 2.0 * frames.noise_variance:
+    far = far_points(distances(rows, frames.shapes, *fit[:3]), frames)
+    if checked and far:
         raise ValueError(
-            "the table does not show the points of the prior: they lie "
-            f"{np.sqrt(square):.0%} of the size of the object from its shapes. Check "
-            "whether the columns have the same points in the same order"
+            f"the table does not show the points of the prior: they lie {far:.0%} of "
+            "the size of the object from its shapes. Check whether the columns have "
+            "the same points in the same order"
         )
     gauge, scale = frames.gauge, 1.0
     if settings.camera == "orthographic":

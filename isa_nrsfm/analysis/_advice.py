@@ -200,7 +200,7 @@ def depth_advice(facts: Facts) -> str:
         remedy = f"make sure that {SAME_UNIT}, then {remedy}"
     return (
         f"{text}, because {why}. {remedy[0].upper()}{remedy[1:]}. If coefficients "
-        f"suffice, use affine cameras ({facts.affine}). See \"How reliable is the "
+        f'suffice, use affine cameras ({facts.affine}). See "How reliable is the '
         'depth?" in the documentation'
     )
 
