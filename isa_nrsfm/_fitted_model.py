@@ -265,30 +265,25 @@ class TableModel(NamedTuple):
             return project(shapes, motion, translation)
         return self.pinhole.projected(shapes, motion, translation)
 
-    def distances(
-        self,
-        rows: NDArray,
-        motion: NDArray,
-        translation: NDArray,
-        alpha: NDArray,
-        weights: NDArray | None = None,
-    ) -> NDArray:
+    def distances(self, rows: NDArray, *fit: NDArray) -> NDArray:
         """Return lengths of residuals (n, n_points), in sizes of their frames.
 
-        They are multiplied by the roots of the weights if the fitted table had weights.
+        Fits are cameras, positions, coefficients and weights of the points, if any.
+        Residuals are multiplied by the roots of these if the fitted table had weights.
         """
+        motion, translation, alpha, *weights = fit
         usable, _, _, sizes, _ = self._ready(rows)
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation).swapaxes(1, 2)
         distance = np.linalg.norm(rows - images, axis=1)
-        if weights is not None and self.frames.certainty.weighted:
-            distance *= np.sqrt(weights)
+        if weights and self.frames.certainty.weighted:
+            distance *= np.sqrt(weights[0])
         return distance / of_all_rows(sizes, usable)[:, None]
 
-    def own_distances(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
+    def own_distances(self, rows: NDArray, *weights: Any) -> NDArray:
         """Return lengths of residuals (n, n_points) of the fits of rows."""
-        fit = self.decompose(rows, weights, False, np.float64)
-        return self.distances(rows, *fit[:3], weights)
+        fit = self.decompose(rows, *weights, deviations=False, dtype=np.float64)
+        return self.distances(rows, *fit[:3], *weights)
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of the error and the signal of held-out points.

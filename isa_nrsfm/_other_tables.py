@@ -25,20 +25,16 @@ from isa_nrsfm._tables.blocks import FrameBlocks, spread
 OTHER_POINTS, LARGEST_MISFIT, OF_AFFINE = 0.15, 1.8, 5.0
 
 
-def warn_if_foreign(
-    model: TableModel, table: FrameBlocks, weights: NDArray | None = None
-) -> None:
+def warn_if_foreign(model: TableModel, table: FrameBlocks, *weights: NDArray) -> None:
     """Warn if frames lie farther from the shapes of a model than its noise explains.
 
     Without weights the noise of a fit with weights does not tell.
     """
     certainty, camera = model.frames.certainty, model.frames.camera
-    unknown = certainty.weighted and weights is None
-    if table.n_frames < FEWEST_COMPARED or unknown:
+    if table.n_frames < FEWEST_COMPARED or (certainty.weighted and not weights):
         return
     some = spread(np.arange(table.n_frames), 100)
-    weights = None if weights is None else weights[some]
-    distance = model.own_distances(table.take(some), weights)
+    distance = model.own_distances(table.take(some), *(w[some] for w in weights))
     misfit = model.misfit(distance)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X by itself"
@@ -48,15 +44,9 @@ def warn_if_foreign(
                 "table, or fit X by itself"
             )
         elif camera != "affine" and certainty.determined:
-            given = f"camera={camera!r}"
-            if model.pinhole is not None:
-                centre = model.pinhole.principal_point
-                given = f"camera='perspective', principal_point={centre}"
-            if model.layout == "planar":
-                given += ", layout='planar'"
             way = (
-                "Adapt the model to X: AffineNRSfM(n_components='auto', "
-                f"{given}, prior=model).fit(X)"
+                "Adapt the model to X: sklearn.base.clone(model).set_params("
+                "n_components='auto', refinement='joint', prior=model).fit(X)"
             )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "
@@ -67,7 +57,7 @@ def warn_if_foreign(
         )
 
 
-def far_points(distance: NDArray, frames: PosteriorFrames) -> float:
+def far_points(distance: NDArray, frames: Any) -> float:
     """Return how far points (n, J) lie from shapes; zero if they are these points."""
     if frames.loss == "linear":
         shown = distance[np.isfinite(distance).any(axis=1)]

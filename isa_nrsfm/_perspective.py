@@ -416,7 +416,7 @@ def _straight(
 
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
-    square = model.distances(rows, *model.in_table_cameras(rows, *fit)) ** 2
+    square = model.distances(rows, *model.in_table_cameras(rows, *fit)[:3]) ** 2
     if isinstance(model.frames, PosteriorFrames) and model.frames.loss != "linear":
         square = robust_square(square, model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

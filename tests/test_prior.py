@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import sklearn.base
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from scenes import likelihood_of, random_scene, with_gaps
@@ -288,7 +289,7 @@ def test_the_face_prior_shows_faces_as_images_do():
     refused("must be <= 40", load_face_prior, 41)
     with pytest.raises(TypeError, match="n_components must be an instance of int"):
         load_face_prior(2.0)
-    refused("prior that is loaded has no frames", prior.diagnostics)
+    refused("The face prior has no frames", prior.diagnostics)
 
 
 # --- refusals -------------------------------------------------------------------------
@@ -398,7 +399,9 @@ def test_foreign_tables_are_warned_of_once(params, other):
     elif params.get("camera") == "affine":
         assert way == "Fit X by itself"
     else:  # the way works
-        assert eval(way.removeprefix("Adapt the model to X: ")).prior_std_[0] > 0.01
+        code = way.removeprefix("Adapt the model to X: ")
+        names = {"sklearn": sklearn, "model": model, "X": X}
+        assert eval(code, names).prior_std_[0] > 0.01
 
 
 def test_weights_of_points_and_other_tables():

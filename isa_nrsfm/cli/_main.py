@@ -71,7 +71,10 @@ def _with_options(text: str, args: Namespace) -> str:
     text = " ".join(text.split())
     model = f"--prior {getattr(args, 'model', 'model.npz')}"
     for way, option in (
-        (r"AffineNRSfM\(.*prior=model\)\.fit\(X\)", f"{PROGRAM} fit TABLE {model}"),
+        (
+            r"sklearn\.base\.\S* .*prior=model\)\.fit\(X\)",
+            f"{PROGRAM} fit TABLE {model}",
+        ),
         (r"prior=model", model),
         (r"prior=[\w.]+\(\)", f"--prior {FACE_PRIOR}"),
     ):
