@@ -310,22 +310,18 @@ def fit_perspective(
     has the mean of several. A fit from the model of a similar table has that of it.
     """
     fits: dict[float, PerspectiveFit] = {}
-    deviation, why, with_prior = 0.0, "", table.settings.prior is not None
+    deviation, why = 0.0, ""
     with warnings.catch_warnings(action="ignore"):  # the last fit warns
         if start is not None:
             best = table.started(start, n_components)
         elif given is not None:
             f = common(given)
-            if with_prior:
-                prior = table.settings.prior._replace(pinhole=table.pinhole(f))
-                first = table.of_model(prior)
-            else:
-                virtual = table.pinhole(f, near=False)
-                first = table.fit(virtual, n_components, progress=progress)
+            virtual = table.pinhole(f, near=False)
+            first = table.fit(virtual, n_components, progress=progress)
             fits = {0.0: first, **table.images(first, f)}
             best = fits[1.0 / f]
             unsteady = best.changes[-1] > UNSETTLED or best.energy > first.energy
-            if unsteady and not with_prior:
+            if unsteady and table.settings.prior is None:
                 why = UNSTEADY
             elif errors:  # neighbours tell how far a focal length contradicts the table
                 places = 0.8 / f, 1.25 / f
