@@ -126,27 +126,26 @@ def fit_table(
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
-    given, gauge = None, FrameMap.identity(n_components)
+    given = None
     if settings.prior is not None:
         # Perspective images are right for the last fit, which has errors.
-        given, settings, gauge = prior_start(table, settings, checked=errors)
-        isa, shapes = None, given.shapes
-        if start is not None:
-            given = _started(table, start, n_components)
-    elif start is None:
+        given, settings = prior_start(table, settings, checked=errors)
+    if start is not None:
+        given = _started(table, start, n_components)
+    if given is None:
         isa = clone(isa)
         shapes, covariance, n_iter, converged = run_paper_pipeline(
             factorised.factors, n_components, isa, settings, progress
         )
     else:
-        isa, given = None, _started(table, start, n_components)
-        shapes = given.shapes
+        isa, shapes = None, given.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
         settings = settings._replace(on_step=progress.step)
         fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
         (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
         settings = settings._replace(shape_prior=fit.prior)
+        gauge = FrameMap.identity(n_components)
         model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
         progress(JOINT_STAGE)
         attributes = {
@@ -156,9 +155,7 @@ def fit_table(
             "n_iter_": len(fit.history) - 1,
         }
         if errors and camera != "affine":
-            certainty = depth_certainty(
-                model, table.rows, table.weights, settings.limits, fit.prior
-            )
+            certainty = depth_certainty(model, table.rows, table.weights, settings)
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             # A residual below the noise of the spectrum leaves nothing for groups.
@@ -332,7 +329,7 @@ def _joint_frames(
             model.shapes, motion, alpha, s.independence, s.camera, unit
         )
     else:
-        gauge = model.gauge
+        gauge = prior.gauge
         mean_shape, basis = gauge.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share, slices = weight / table.n_points, posteriors.slices
@@ -381,19 +378,16 @@ def _measures(
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
     reference = mean_camera(frames, table.sizes, settings.camera)
+    shapes = np.concatenate([mean_shape[None], basis]).mT
+    place = (frames.translation - table.translation) / table.sizes[:, None]
+    fit = shapes, cameras, place, frames.alpha
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
         "rank_floor_": factorised.rest_share,
         "singular_values_": (table.unit or 1.0) * factorised.singular_values,
         "energy_share_": energy / (energy.sum() or 1.0),
-        "inverse_snr_": reprojection_error(
-            table.rows,
-            np.concatenate([mean_shape[None], basis]).mT,
-            cameras,
-            (frames.translation - table.translation) / table.sizes[:, None],
-            frames.alpha,
-        ),
+        "inverse_snr_": reprojection_error(table.rows, *fit),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import distances, full_rotations
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
@@ -124,8 +124,8 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
 
 def prior_start(
     table: ScaledTable, settings: FitSettings, checked: bool
-) -> tuple[JointState, FitSettings, FrameMap]:
-    """Return a start from the shapes of a prior, settings of its fit, and its gauge.
+) -> tuple[JointState, FitSettings]:
+    """Return a start from the shapes of a prior, and settings of its fit.
 
     `checked`: raise if the table does not show the points of the prior.
     """
@@ -154,4 +154,4 @@ def prior_start(
         limits=settings.limits._replace(least_noise=LEAST_NOISE),
         tol=TOL_SHARE * settings.tol,
     )
-    return start, settings, gauge
+    return start, settings

@@ -206,12 +206,6 @@ class PerspectiveTable(NamedTuple):
         agrees = change < SETTLED * self.settings.tol / JOINT_TOL
         return agrees or n_repeats >= (2 if fit.energy > WORSE * best else most)
 
-    def of_model(self, model: TableModel) -> PerspectiveFit:
-        """Return the frames of the shapes of a fitted model, with its focal length."""
-        frames = self.source.joined(model.in_virtual_cameras)
-        squares = np.full(len(model.mean_shape), np.inf)
-        return PerspectiveFit(model, frames, True, {"isa_": None}, energies=squares)
-
     def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
         """Return the fits for 1/f and -1/f from a first fit."""
         images, pinhole = (first, first.mirrored()), self.pinhole(f)
@@ -237,7 +231,8 @@ class PerspectiveTable(NamedTuple):
 
     def started(self, model: TableModel, n_components: Any) -> PerspectiveFit:
         """Return the fit from the model of a similar table, with its focal length."""
-        fit = self.of_model(model)
+        frames = self.source.joined(model.in_virtual_cameras)
+        fit = PerspectiveFit(model, frames, True, {"isa_": None})
         return self.settled(fit.pinhole, n_components, fit)[0]
 
     def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:

@@ -114,7 +114,7 @@ def problem_of(table, adapt):
     model = clone(table.model).set_params(adapt=adapt)
     source, _, settings = model._ready(table.X)
     scaled = scaled_table(source, None, 2, settings)
-    start, settings, _ = prior_start(scaled, settings, checked=True)
+    start, settings = prior_start(scaled, settings, checked=True)
     frames = JointFrames.from_points(scaled.rows, True)
     problem = JointProblem(frames, settings._replace(tol=1e-4), True)
     return problem, problem.aligned(start, problem.cameras)
