@@ -380,14 +380,15 @@ def _measures(
     reference = mean_camera(frames, table.sizes, settings.camera)
     shapes = np.concatenate([mean_shape[None], basis]).mT
     place = (frames.translation - table.translation) / table.sizes[:, None]
-    fit = shapes, cameras, place, frames.alpha
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
         "rank_floor_": factorised.rest_share,
         "singular_values_": (table.unit or 1.0) * factorised.singular_values,
         "energy_share_": energy / (energy.sum() or 1.0),
-        "inverse_snr_": reprojection_error(table.rows, *fit),
+        "inverse_snr_": reprojection_error(
+            table.rows, shapes, cameras, place, frames.alpha
+        ),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 

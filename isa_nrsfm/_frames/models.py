@@ -359,8 +359,8 @@ class PosteriorFrames:
         known = covariance.shape[1] == len(self.shapes) - 1
         widened = self.widened(alpha, covariance)[0] if known else None
         motion, alpha, deviation = self.gauge.apply(motion, alpha, widened)
-        cameras = motion * sizes[:, None, None], translation * sizes[:, None]
-        return Decomposition(*cameras, alpha, deviation)
+        motion = motion * sizes[:, None, None]
+        return Decomposition(motion, translation * sizes[:, None], alpha, deviation)
 
     def widened(self, alpha: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
         """Return covariances (n, K, K) with the errors of the shapes.
@@ -404,8 +404,10 @@ class PosteriorFrames:
         precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         covariance, ratio = self.widened(fit.alpha, fit.covariance)
-        fitted = motion, fit.translation * sizes[:, None], fit.alpha
-        return LinearisedFrames(*fitted, covariance, precision / ratio, slope)
+        translation = fit.translation * sizes[:, None]
+        return LinearisedFrames(
+            motion, translation, fit.alpha, covariance, precision / ratio, slope
+        )
 
     def depth_deviations(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
