@@ -202,6 +202,10 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path, adapt):
     assert "Choice" not in text
     alpha, *_ = transforms(found.path, table)
     assert_allclose(alpha[ALPHA], model.alpha_, atol=1e-9)
+    off = np.random.default_rng(0).normal(size=X.shape[1]) * 0.02 * X.std()
+    other = saved(pd.DataFrame(X + off, columns=LANDMARKS), tmp_path)
+    *_, err = transforms(found.path, other)
+    assert f"Adapt the model to X: isa-nrsfm fit TABLE --prior {found.path}" in err
     again = ["fit", table, "-o", tmp_path, "--prior", found.path, "--no-figures"]
     assert f"{found.path} would be overwritten by the results" in fails(*again)
     again[5] = path
