@@ -49,7 +49,10 @@ def main():
     annotated.fit(W.reshape(len(W), -1))
     weights = vertex_weights(faces["S3d"].mean(axis=0), dense, annotated.mean_shape_)
     shapes = landmarks(dense, weights)
-    model = fitted(shapes - shapes.mean(axis=1, keepdims=True), faces["R"][:, :2])
+    # y points up in the model, and z to the viewer. In images y points down.
+    turn = np.diag([1.0, -1.0, -1.0])
+    shapes = (shapes - shapes.mean(axis=1, keepdims=True)) @ turn
+    model = fitted(shapes, (turn @ faces["R"] @ turn)[:, :2])
     path = Path(__file__).parents[1] / "isa_nrsfm" / "datasets" / "face_prior.npz"
     np.savez(path, **stored(model))
     print(f"{path}: {path.stat().st_size} bytes")

@@ -237,9 +237,9 @@ default="affine"
         (calibrated cameras with the joint refinement only). Above 0.55, depths and
         angles are withheld. It contains what deformation explains as well as turning.
     mirror_certainty_ : float
-        Probability that the depth has the right sign, if perspective decides it, or
-        missing points do: a test of whether they are farther away is significant at
-        1 %. Otherwise NaN, and the sign is a convention; see `mirrored`.
+        Probability that the depth has the right sign, if perspective, the prior or
+        missing points decide it: a test of whether these are farther away is
+        significant at 1 %. Otherwise NaN, and the sign is a convention; see `mirrored`.
     rotations_ : ndarray of shape (n_frames, 3, 3)
         Rotations of calibrated cameras, with determinant one. The rows are the axes of
         the image, x, y and z. Like `scales_`, only with such cameras.
@@ -609,7 +609,8 @@ default="affine"
             del attributes["_frame_sizes"]
         opened.__dict__.update(attributes)
         if errors and not model.frames.certainty.determined:
-            share, _ = gross_residuals(source.joined(model.distances, *frames[:3]))
+            parts = frames[:3] if weights is None else (*frames[:3], weights)
+            share, _ = gross_residuals(source.joined(model.distances, *parts))
             warn_caller(depth_advice(facts_of(opened, outlier_share=share)))
         self.__dict__.update(vars(opened))
 
@@ -635,6 +636,7 @@ default="affine"
         check_camera(self)
         source, weights = self._opened(X, point_weight, reset=True)
         params = self.get_params(deep=False)
+        params |= checked_prior(self, source.empty.shape[2])
         if self.tol is None:
             params["tol"] = JOINT_TOL if joint else PAPER_TOL
         settings = FitSettings(
@@ -643,8 +645,6 @@ default="affine"
             silent_isa=joint and self.isa is None,
             limits=self._limits,
         )
-        prior = checked_prior(self, source.empty.shape[2])
-        settings = settings._replace(prior=prior)
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
         elif self.camera == "perspective":  # fits of images without perspective
@@ -667,7 +667,7 @@ default="affine"
         plain = copy.copy(self)
         plain.prior = None
         plain = super(AffineNRSfM, plain).__sklearn_clone__()
-        plain.prior = self.prior
+        plain.prior = copy.copy(self.prior)  # for `set_params`
         return plain
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -800,9 +800,8 @@ default="affine"
         table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("smooth")
         alone = table.joined(self._model.linearised, *weights)
-        camera, limits = CAMERAS[frames.camera], (max_gap, max_iter, tol)
-        dtype = table.empty.dtype
-        result = smooth(alone, frames.gauge, camera, time, groups, *limits, dtype)
+        how = frames.gauge, CAMERAS[frames.camera], time, groups
+        result = smooth(alone, *how, max_gap, max_iter, tol, table.empty.dtype)
         if self._model.pinhole is None:
             return result
         in_table = table.joined(self._model.in_table_cameras, *result.decomposition)
@@ -1093,11 +1092,11 @@ default="affine"
             points it is also left out if the camera of the others adds more than
             twice the noise variance to its prediction.
         """
-        table, weights = self._opened(X, point_weight)
+        table, weights = self._opened(X, point_weight, judged=False)
         noise, signal = table.joined(self._model.held_out, *weights).sum(axis=0)
         return -float(noise / signal) if signal > 0 else float("nan")
 
-    def diagnostics(self, X: Any = None) -> Diagnostics:
+    def diagnostics(self, X: Any = None, *, point_weight: Any = None) -> Diagnostics:
         """
         Return diagnostics of how well the fitted table determines its fit.
 
@@ -1105,6 +1104,8 @@ default="affine"
         ----------
         X : array-like of shape (n_frames, 2 * n_points), default=None
             The fitted table. If given, it is searched for outliers.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
 
         Returns
         -------
@@ -1120,9 +1121,10 @@ default="affine"
         check_is_fitted(self)
         self._jointly_fitted("diagnostics")
         check_frames_kept(self, "diagnostics")
-        distance = (
-            None if X is None else self._opened(X)[0].joined(self._model.distances)
-        )
+        distance = None
+        if X is not None:
+            table, weights = self._opened(X, point_weight)
+            distance = table.joined(self._model.own_distances, *weights)
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
         return diagnose(self, distance, rows)
 
@@ -1139,12 +1141,13 @@ default="affine"
         return frames
 
     def _opened(
-        self, X: Any, point_weight: Any = None, reset: bool = False
+        self, X: Any, point_weight: Any = None, reset: bool = False, judged: bool = True
     ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
         """Return the rows (n, 2, J) of a table, and the weights (n, J) of their points.
 
         There are no weights if all visible points have weight one. Unless `reset`, the
         table must match the fit: parameters that are set after it have no effect.
+        `judged`: warn if it does not fit the model.
         """
         layout, loss = self.layout, str(self.loss)
         joint = self.refinement in choices.JOINT_REFINEMENTS
@@ -1170,7 +1173,7 @@ default="affine"
         weights: tuple[NDArray, ...] = ()
         if point_weight is not None:
             table, weights = weighted_rows(table, point_weight)
-        if not reset and joint and not is_on_dask(X):
+        if judged and joint and not (reset or is_on_dask(X)):
             warn_if_foreign(self._model, table, *weights)
         return table, weights
 

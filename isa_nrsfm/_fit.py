@@ -126,27 +126,26 @@ def fit_table(
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
-    given, gauge = None, FrameMap.identity(n_components)
+    given = None
     if settings.prior is not None:
         # Perspective images are right for the last fit, which has errors.
-        given, settings, gauge = prior_start(table, settings, checked=errors)
-        isa, shapes = None, given.shapes
-        if start is not None:
-            given = _started(table, start, n_components)
-    elif start is None:
+        given, settings = prior_start(table, settings, checked=errors)
+    if start is not None:
+        given = _started(table, start, n_components)
+    if given is None:
         isa = clone(isa)
         shapes, covariance, n_iter, converged = run_paper_pipeline(
             factorised.factors, n_components, isa, settings, progress
         )
     else:
-        isa, given = None, _started(table, start, n_components)
-        shapes = given.shapes
+        isa, shapes = None, given.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
         settings = settings._replace(on_step=progress.step)
         fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
         (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
         settings = settings._replace(shape_prior=fit.prior)
+        gauge = FrameMap.identity(n_components)
         model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
         progress(JOINT_STAGE)
         attributes = {
@@ -156,9 +155,7 @@ def fit_table(
             "n_iter_": len(fit.history) - 1,
         }
         if errors and camera != "affine":
-            certainty = depth_certainty(
-                model, table.rows, table.weights, settings.limits, fit.prior
-            )
+            certainty = depth_certainty(model, table.rows, table.weights, settings)
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             # A residual below the noise of the spectrum leaves nothing for groups.
@@ -187,12 +184,12 @@ def fit_table(
         )
         attributes = {"n_iter_": n_iter}
     # The mirror image in depth
-    probability = np.nan
+    probability = settings.mirror_certainty
     if settings.hidden_points and not table.complete and settings.prior is None:
         probability = fitted.mirror_certainty(table.rows, frames)
-    if probability < 0.5:
-        probability = 1.0 - probability
-        fitted, frames, measures = mirror_image(fitted, frames, measures)
+        if probability < 0.5:
+            probability = 1.0 - probability
+            fitted, frames, measures = mirror_image(fitted, frames, measures)
     attributes["mirror_certainty_"] = probability
     # 6. Measures of the fit
     attributes |= measures | _measures(table, factorised, fitted, frames, settings)
@@ -332,7 +329,7 @@ def _joint_frames(
             model.shapes, motion, alpha, s.independence, s.camera, unit
         )
     else:
-        gauge = model.gauge
+        gauge = prior.gauge
         mean_shape, basis = gauge.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share, slices = weight / table.n_points, posteriors.slices
@@ -342,6 +339,7 @@ def _joint_frames(
     else:
         uncertainty = prior.inverse(information[None], noise)[0]
     certainty = frame_certainty(model, fits, table.n_seen, weight, prior)
+    certainty = certainty._replace(weighted=table.weights is not None)
     model = replace(model, gauge=gauge, certainty=certainty)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
     parts, *chance = zip(
@@ -354,8 +352,7 @@ def _joint_frames(
         sight = line_of_sight(cameras)
         errors = prior.depth_errors(information, noise, sight, frames.alpha)
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
-        certainty = certainty.of_prior(errors.mean(), np.mean(depths**2))
-        model = replace(model, certainty=certainty)
+        model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
     attributes = {
         "mode_covariance_": square * mode_covariance(cameras, frames.alpha),
@@ -381,6 +378,8 @@ def _measures(
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
     reference = mean_camera(frames, table.sizes, settings.camera)
+    shapes = np.concatenate([mean_shape[None], basis]).mT
+    place = (frames.translation - table.translation) / table.sizes[:, None]
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
@@ -388,11 +387,7 @@ def _measures(
         "singular_values_": (table.unit or 1.0) * factorised.singular_values,
         "energy_share_": energy / (energy.sum() or 1.0),
         "inverse_snr_": reprojection_error(
-            table.rows,
-            np.concatenate([mean_shape[None], basis]).mT,
-            cameras,
-            (frames.translation - table.translation) / table.sizes[:, None],
-            frames.alpha,
+            table.rows, shapes, cameras, place, frames.alpha
         ),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 

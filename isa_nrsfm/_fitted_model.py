@@ -184,18 +184,13 @@ class TableModel(NamedTuple):
         whole.put(usable, self.frames.posterior(unit, weights=weights))
         return whole
 
-    def misfit(self, rows: NDArray, weights: NDArray | None = None) -> float:
-        """Return the typical distance of points from fits over the expected one.
+    def misfit(self, distance: NDArray) -> float:
+        """Return the typical distance of points (n, J) from fits over the expected one.
 
         Noise and errors of the shapes are expected, and distances that are tiny for the
         size of a frame. Few outliers have no effect.
         """
         assert isinstance(self.frames, PosteriorFrames)
-        fit = self.decompose(rows, weights, False, np.float64)
-        distance = self.distances(rows, *fit[:3])
-        if weights is not None:
-            weights = np.where(weights > 0, weights, np.nan)
-            distance *= np.sqrt(weights / np.nanmean(weights))
         constant, slope = self.frames.certainty.images
         ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
         expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)
@@ -270,18 +265,26 @@ class TableModel(NamedTuple):
             return project(shapes, motion, translation)
         return self.pinhole.projected(shapes, motion, translation)
 
-    def distances(self, rows: NDArray, *fitted: NDArray) -> NDArray:
+    def distances(self, rows: NDArray, *fit: NDArray) -> NDArray:
         """Return lengths of residuals (n, n_points), in sizes of their frames.
 
-        Cameras, positions and coefficients of the rows are fitted, if not given.
+        Fits are cameras, positions, coefficients and weights of the points, if any.
+        Residuals are multiplied by the roots of these if the fitted table had weights.
         """
+        motion, translation, alpha, *weights = fit
         usable, _, _, sizes, _ = self._ready(rows)
-        fit = fitted or self.decompose(rows, deviations=False, dtype=np.float64)
-        motion, translation, alpha, *_ = fit
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation).swapaxes(1, 2)
         distance = np.linalg.norm(rows - images, axis=1)
+        if weights and self.frames.certainty.weighted:
+            distance *= np.sqrt(weights[0])
         return distance / of_all_rows(sizes, usable)[:, None]
+
+    def own_distances(self, rows: NDArray, *weights: NDArray) -> NDArray:
+        """Return lengths of residuals (n, n_points) of the fits of rows."""
+        given = weights[0] if weights else None
+        fit = self.decompose(rows, given, False, np.float64)
+        return self.distances(rows, *fit[:3], *weights)
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of the error and the signal of held-out points.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import distances, full_rotations
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
@@ -17,7 +17,6 @@ from isa_nrsfm._prepare.checks import FEWEST_COMPARED
 from isa_nrsfm._prepare.robust import median_noise
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm._tables.tracks import seen_points
 
 # Distance of points from the shapes of a prior, in sizes of frames, beyond its noise,
 # from which they are other points; misfit of frames, with calibrated and with affine
@@ -26,43 +25,65 @@ from isa_nrsfm._tables.tracks import seen_points
 OTHER_POINTS, LARGEST_MISFIT, OF_AFFINE = 0.15, 1.8, 5.0
 
 
-def warn_if_foreign(
-    model: TableModel, table: FrameBlocks, weights: NDArray | None = None
-) -> None:
-    """Warn if frames lie farther from the shapes of a model than its noise explains."""
-    if table.n_frames < FEWEST_COMPARED:
+def warn_if_foreign(model: TableModel, table: FrameBlocks, *weights: NDArray) -> None:
+    """Warn if frames lie farther from the shapes of a model than its noise explains.
+
+    Without weights the noise of a fit with weights does not tell.
+    """
+    certainty, camera = model.frames.certainty, model.frames.camera
+    if table.n_frames < FEWEST_COMPARED or (certainty.weighted and not weights):
         return
     some = spread(np.arange(table.n_frames), 100)
-    weights = None if weights is None else weights[some]
-    misfit, camera = model.misfit(table.take(some), weights), model.frames.camera
+    distance = model.own_distances(table.take(some), *(w[some] for w in weights))
+    misfit = model.misfit(distance)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X by itself"
-        if camera != "affine" and model.frames.certainty.determined:
-            planar = ", layout='planar'" if model.layout == "planar" else ""
+        if far_points(distance, model.frames):
             way = (
-                "Adapt the model to X: AffineNRSfM(n_components='auto', camera="
-                f"{camera!r}, prior=model{planar}).fit(X)"
+                "Check whether X has the same points in the same order as the fitted "
+                "table, or fit X by itself"
+            )
+        elif camera != "affine" and certainty.determined:
+            way = (
+                "Adapt the model to X: sklearn.base.clone(model).set_params("
+                "n_components='auto', refinement='joint', prior=model).fit(X)"
             )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "
             "model as its noise explains: they come from another annotator or tracker, "
-            "show other people or objects, or move as the fitted table does not show. "
-            f"Shapes, depths and coefficients may be wrong. {way}"
+            "show other objects or people (a model of one person fits no other), or "
+            "move as the fitted table does not show. Shapes, depths and coefficients "
+            f"may be wrong. {way}"
         )
 
 
-def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
-    """Return the fitted model that is the prior of a table's fit, or raise."""
-    prior, n_components = estimator.prior, estimator.n_components
-    if prior is None:
-        return None
+def far_points(distance: NDArray, frames: Any) -> float:
+    """Return how far points (n, J) lie from shapes; zero if they are these points."""
+    if frames.loss == "linear":
+        shown = distance[np.isfinite(distance).any(axis=1)]
+        square = np.median(np.nanmean(shown**2, axis=1))
+    else:  # without outliers
+        square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2
+    others = square > OTHER_POINTS**2 + 2.0 * frames.noise_variance
+    return float(others and np.sqrt(square))
+
+
+def fitted_prior(prior: Any) -> Any:
+    """Return the estimator in a search or in a FrozenEstimator."""
+    return getattr(prior, "best_estimator_", getattr(prior, "estimator", prior))
+
+
+def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
+    """Return the settings of the prior of a table's fit, or raise."""
+    prior, n_components = fitted_prior(estimator.prior), estimator.n_components
+    if estimator.prior is None:
+        return {}
     if estimator.refinement != "joint" or estimator.camera == "affine":
         raise ValueError(
             "prior needs calibrated cameras and refinement='joint'; got camera="
             f"{estimator.camera!r}, refinement={estimator.refinement!r}. Set camera="
             "'weak_perspective' and refinement='joint'"
         )
-    prior = getattr(prior, "estimator", prior)  # of a FrozenEstimator
     model = getattr(prior, "_model", None)
     if not isinstance(model, TableModel):
         raise ValueError(
@@ -97,13 +118,14 @@ def checked_prior(estimator: Any, n_points: int) -> TableModel | None:
             f"n_components must be that of the prior, {K}, or 'auto', which takes it; "
             f"got {n_components}"
         )
-    return model
+    certainty = getattr(prior, "mirror_certainty_", np.nan)
+    return {"prior": model, "mirror_certainty": certainty}
 
 
 def prior_start(
     table: ScaledTable, settings: FitSettings, checked: bool
-) -> tuple[JointState, FitSettings, FrameMap]:
-    """Return a start from the shapes of a prior, settings of its fit, and its gauge.
+) -> tuple[JointState, FitSettings]:
+    """Return a start from the shapes of a prior, and settings of its fit.
 
     `checked`: raise if the table does not show the points of the prior.
     """
@@ -114,17 +136,12 @@ def prior_start(
     weights = None if table.weights is None else table.weights[some]
     frames = replace(frames, camera="weak_perspective", loss=settings.loss)
     fit = frames.posterior(rows, False, weights)
-    if settings.loss == "linear":
-        weights = seen_points(rows) if weights is None else weights
-        square = np.nanmedian(frames.squares(fit, weights.sum(axis=1)))
-    else:  # without outliers
-        distance = distances(rows, frames.shapes, *fit[:3])
-        square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2
-    if checked and square > OTHER_POINTS**2 + 2.0 * frames.noise_variance:
+    far = far_points(distances(rows, frames.shapes, *fit[:3]), frames)
+    if checked and far:
         raise ValueError(
-            "the table does not show the points of the prior: they lie "
-            f"{np.sqrt(square):.0%} of the size of the object from its shapes. Check "
-            "whether the columns have the same points in the same order"
+            f"the table does not show the points of the prior: they lie {far:.0%} of "
+            "the size of the object from its shapes. Check whether the columns have "
+            "the same points in the same order"
         )
     gauge, scale = frames.gauge, 1.0
     if settings.camera == "orthographic":
@@ -137,4 +154,4 @@ def prior_start(
         limits=settings.limits._replace(least_noise=LEAST_NOISE),
         tol=TOL_SHARE * settings.tol,
     )
-    return start, settings, gauge
+    return start, settings

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr
+from scipy.special import expit, logit, stdtr
 
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
@@ -206,21 +206,33 @@ class PerspectiveTable(NamedTuple):
         agrees = change < SETTLED * self.settings.tol / JOINT_TOL
         return agrees or n_repeats >= (2 if fit.energy > WORSE * best else most)
 
-    def of_model(self, model: TableModel) -> PerspectiveFit:
-        """Return the frames of the shapes of a fitted model, with its focal length."""
-        frames = self.source.joined(model.in_virtual_cameras)
-        squares = np.full(len(model.mean_shape), np.inf)
-        return PerspectiveFit(model, frames, True, {"isa_": None}, energies=squares)
-
     def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
         """Return the fits for 1/f and -1/f from a first fit."""
         images, pinhole = (first, first.mirrored()), self.pinhole(f)
         better, worse = self.settled(pinhole, first.n_components, *images)
+        if self.log_odds(better, worse) < 0:
+            better, worse = worse, better
         return {1.0 / f: better, -1.0 / f: worse}
+
+    def log_odds(self, fit: PerspectiveFit, image: PerspectiveFit) -> float:
+        """Return the log odds of a fit against its mirror image.
+
+        The evidence is a test of E over groups of points, and the prior, if any.
+        """
+        gain = image.energies - fit.energies
+        gain = np.bincount(neighbours(fit.model.mean_shape.T), gain)
+        t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
+        odds = float(logit(stdtr(len(gain) - 1, t)))
+        if np.isnan(self.settings.mirror_certainty):
+            return odds
+        prior = self.settings.prior.mean_shape
+        sign = np.sign(np.vdot(fit.model.mean_shape[:, 2], prior[:, 2]))
+        return odds + float(sign * logit(self.settings.mirror_certainty))
 
     def started(self, model: TableModel, n_components: Any) -> PerspectiveFit:
         """Return the fit from the model of a similar table, with its focal length."""
-        fit = self.of_model(model)
+        frames = self.source.joined(model.in_virtual_cameras)
+        fit = PerspectiveFit(model, frames, True, {"isa_": None})
         return self.settled(fit.pinhole, n_components, fit)[0]
 
     def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
@@ -293,22 +305,18 @@ def fit_perspective(
     has the mean of several. A fit from the model of a similar table has that of it.
     """
     fits: dict[float, PerspectiveFit] = {}
-    deviation, why, with_prior = 0.0, "", table.settings.prior is not None
+    deviation, why = 0.0, ""
     with warnings.catch_warnings(action="ignore"):  # the last fit warns
         if start is not None:
             best = table.started(start, n_components)
         elif given is not None:
             f = common(given)
-            if with_prior:
-                prior = table.settings.prior._replace(pinhole=table.pinhole(f))
-                first = table.of_model(prior)
-            else:
-                virtual = table.pinhole(f, near=False)
-                first = table.fit(virtual, n_components, progress=progress)
+            virtual = table.pinhole(f, near=False)
+            first = table.fit(virtual, n_components, progress=progress)
             fits = {0.0: first, **table.images(first, f)}
             best = fits[1.0 / f]
             unsteady = best.changes[-1] > UNSETTLED or best.energy > first.energy
-            if unsteady and not with_prior:
+            if unsteady and table.settings.prior is None:
                 why = UNSTEADY
             elif errors:  # neighbours tell how far a focal length contradicts the table
                 places = 0.8 / f, 1.25 / f
@@ -340,12 +348,8 @@ def fit_perspective(
         total = float(np.hypot(certainty.total, error))
         certainty = certainty._replace(total=total)
         model = model._replace(frames=replace(model.frames, certainty=certainty))
-        # The mirror image has a larger E: a test over groups of points
         least = min(abs(g) for g in fits if g < 0)
-        gain = fits[-least].energies - fits[least].energies
-        gain = np.bincount(neighbours(fits[least].model.mean_shape.T), gain)
-        t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
-        probability = float(stdtr(len(gain) - 1, t))
+        probability = float(expit(table.log_odds(fits[least], fits[-least])))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
     # Frames as new tables have them
     weights = () if table.weights is None else (table.weights,)
@@ -403,7 +407,7 @@ def _straight(
 
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
-    square = model.distances(rows, *model.in_table_cameras(rows, *fit)) ** 2
+    square = model.distances(rows, *model.in_table_cameras(rows, *fit)[:3]) ** 2
     if isinstance(model.frames, PosteriorFrames) and model.frames.loss != "linear":
         square = robust_square(square, model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

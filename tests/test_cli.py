@@ -202,11 +202,27 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path, adapt):
     assert "Choice" not in text
     alpha, *_ = transforms(found.path, table)
     assert_allclose(alpha[ALPHA], model.alpha_, atol=1e-9)
+    off = np.random.default_rng(0).normal(size=X.shape[1]) * 0.02 * X.std()
+    other = saved(pd.DataFrame(X + off, columns=LANDMARKS), tmp_path)
+    *_, err = transforms(found.path, other)
+    assert f"Adapt the model to X: isa-nrsfm fit TABLE --prior {found.path}" in err
     again = ["fit", table, "-o", tmp_path, "--prior", found.path, "--no-figures"]
     assert f"{found.path} would be overwritten by the results" in fails(*again)
     again[5] = path
     assert "n-components must be that of the prior, 2" in fails(*again, "-k", 3)
+    assert "--prior needs one number of basis shapes" in fails(*again, "-k", "1-2")
     assert "--adapt shapes needs --prior" in fails(*again[:4], "--adapt", "shapes")
+
+
+def test_the_face_prior_that_a_warning_names(fits, tmp_path):
+    X = make_face_tracks(60, n_components=2, random_state=0).shapes[..., :2] - 500
+    table = saved(pd.DataFrame(X.reshape(60, -1), columns=LANDMARKS), tmp_path)
+    given = [table, "--camera", "weak_perspective", "-k", 3, "--no-figures"]
+    (remedy,) = re.findall(r"68 points of faces, use (.*?)\. ", fits(*given).err)
+    assert remedy == "--prior face-68 --n-components auto"
+    found = fits(*given, "--force", *remedy.split())
+    assert len(found.model.basis_) == 40
+    assert "mirror image in depth: the one of the prior" in " ".join(found.out.split())
 
 
 @pytest.mark.parametrize("camera", slow_after(1, ["orthographic", "weak_perspective"]))

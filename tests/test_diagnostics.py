@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
+import isa_nrsfm
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.models import DepthCertainty
 from isa_nrsfm._joint.uncertainty import reliabilities
@@ -422,6 +423,50 @@ class TestAdvice:
     def test_one_remedy(self, known, expected):
         (message,) = advice(facts(**known))
         assert expected in message
+
+    @pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+    def test_parameters_that_are_named_are_accepted(self, camera):
+        cases = product(
+            [camera] if camera == "orthographic" else [camera, "perspective"],
+            ["joint", "consensus"],
+            [3, "auto"],
+            [None, "prior", "weights"],
+            [16] if camera == "orthographic" else [16, 68],
+            [1.0, 20.0],
+            ["deformation", "parts"],
+        )
+        own = make_nonrigid_tracks(60, 16, 2, camera=camera, random_state=0).data
+        model = AffineNRSfM(2, camera=camera, random_state=0).fit(own)
+        names = {"isa_nrsfm": isa_nrsfm, "model": model}
+        n_tried = 0
+        for camera, refinement, K, extra, n_points, ratio, depth in cases:
+            seen = camera == "perspective"
+            other = {"prior": model} if extra == "prior" else {}
+            fit = AffineNRSfM(
+                2 if other and K == 3 else K,
+                camera=camera,
+                refinement=refinement,
+                principal_point=(0, 0) if seen else None,
+                focal_length=1.0 if seen else None,
+                **other,
+            )
+            X = np.random.default_rng(0).normal(size=(40, 2 * n_points))
+            given = np.full((40, n_points), 2.0) if extra == "weights" else None
+            try:
+                fit._ready(X, given)
+            except ValueError:  # there is no such fit
+                continue
+            known = {"n_points": n_points, "prior": bool(other), "auto": K == "auto"}
+            known |= {"camera": camera, "consensus": refinement == "consensus"}
+            certainty = UNKNOWN[depth]._replace(weighted=extra == "weights")
+            known |= {"certainty": certainty, "noise_ratio": ratio}
+            for wrong in ({}, {"outlier_share": 0.01, "outliers": "wrong points"}):
+                for sentence in ". ".join(advice(facts(**known | wrong))).split(". "):
+                    parameters = re.findall(r'(\w+)=("\w+"|[\w.]+\(\)|\w+)', sentence)
+                    values = {name: eval(value, names) for name, value in parameters}
+                    clone(fit).set_params(**values)._ready(X, given)
+                    n_tried += len(values) > 0
+        assert n_tried > 50
 
     def test_a_consensus_has_components_that_are_noise(self):
         known = {"consensus": True, "auto": True}

@@ -28,6 +28,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._joint.likelihood import JointFrames, extent_penalty
 from isa_nrsfm._joint.problem import JointState
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.uncertainty import (
     N_GROUPS,
     depth_certainty,
@@ -677,7 +678,8 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
         starts, gauge = np.zeros((0, 1)), FrameMap.identity(1)
         given = shapes, noise**2, starts, loss, gauge
         frames = PosteriorFrames(*given, camera="weak_perspective")
-        return depth_certainty(frames, FrameBlocks.of_array(rows, 8)).total
+        blocks = FrameBlocks.of_array(rows, 8)
+        return depth_certainty(frames, blocks, None, FitSettings()).total
 
     expected = error(hidden)
     assert_allclose(error(spoilt), expected, rtol=0.002)

@@ -1,11 +1,13 @@
 """A fitted model as the prior of another table, and tables that do not fit a model."""
 
+import copy
 import pickle
 import warnings
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import sklearn.base
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from scenes import likelihood_of, random_scene, with_gaps
@@ -25,6 +27,8 @@ from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._other_tables import prior_start
 from isa_nrsfm._parameters.choices import ADAPTED
 from isa_nrsfm._prepare.scaling import scaled_table
+from isa_nrsfm.datasets import load_face_prior
+from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 N_POINTS = 16
@@ -110,7 +114,7 @@ def problem_of(table, adapt):
     model = clone(table.model).set_params(adapt=adapt)
     source, _, settings = model._ready(table.X)
     scaled = scaled_table(source, None, 2, settings)
-    start, settings, _ = prior_start(scaled, settings, checked=True)
+    start, settings = prior_start(scaled, settings, checked=True)
     frames = JointFrames.from_points(scaled.rows, True)
     problem = JointProblem(frames, settings._replace(tol=1e-4), True)
     return problem, problem.aligned(start, problem.cameras)
@@ -210,6 +214,21 @@ def test_missing_points_weights_and_few_frames(frontal):
     assert reached(X[:3]) < 2.5
 
 
+def test_deviations_have_the_width_of_the_prior_without_a_jackknife(turned, tmp_path):
+    table = study(1, 10, 4, change=0.04)
+    X = table.X.reshape(10, -1, 2).copy()
+    hidden = np.random.default_rng(0).permuted(
+        np.tile(range(N_POINTS), (10, 1)), axis=1
+    )
+    X[hidden >= 4] = np.nan  # each part of the points is too few
+    model = fitted(X.reshape(10, -1), turned.model)
+    assert np.isnan(model.depth_uncertainty_)
+    save_model(model, tmp_path / "model.npz")
+    frames = load_model(tmp_path / "model.npz")._model.frames
+    assert frames.certainty.turns is None
+    assert (np.sqrt(frames.certainty.points) > 0.2 * model.prior_std_[0]).all()
+
+
 @pytest.mark.parametrize(("loss", "adapt"), [("huber", "shapes"), ("cauchy", "mean")])
 def test_outliers(frontal, loss, adapt):
     rng = np.random.default_rng(3)
@@ -248,6 +267,31 @@ def test_perspective_cameras(turned, focal_length):
     assert_allclose(model.basis_ * sign, turned.model.basis_, atol=1e-12)
 
 
+@pytest.mark.parametrize("certainty", [1.0, 0.5])
+def test_prior_and_perspective_decide_the_mirror_image(turned, certainty):
+    table, same = study(1, 20, 10, focal=4000), []
+    for prior in (copy.copy(turned.model), turned.model.mirrored()):
+        prior.mirror_certainty_ = certainty
+        model = fitted(table.X, prior, focal_length=4000, **PERSPECTIVE)
+        same.append(np.vdot(model.mean_shape_[:, 2], prior.mean_shape_[:, 2]) > 0)
+        assert model.mirror_certainty_ > 0.9
+    assert sum(same) == (2 if certainty == 1 else 1)
+    weak = fitted(table.X, prior)
+    assert weak.mirror_certainty_ == certainty
+
+
+def test_the_face_prior_shows_faces_as_images_do():
+    prior = load_face_prior(9)
+    chin, nose, eyes = (prior.mean_shape_[i] for i in (8, 30, slice(36, 48)))
+    assert eyes[:, 1].max() < nose[1] < chin[1]  # y down
+    assert nose[2] < eyes[:, 2].min()  # depths away from the viewer
+    assert prior.mirror_certainty_ == 1
+    refused("must be <= 40", load_face_prior, 41)
+    with pytest.raises(TypeError, match="n_components must be an instance of int"):
+        load_face_prior(2.0)
+    refused("The face prior has no frames", prior.diagnostics)
+
+
 # --- refusals -------------------------------------------------------------------------
 
 
@@ -283,9 +327,10 @@ def test_other_points_are_refused(turned, frontal):
 # --- as an estimator ------------------------------------------------------------------
 
 
-def test_searches_pipelines_and_copies(turned, frontal):
+def test_searches_pipelines_and_copies(turned, frontal, tmp_path):
     X, model, prior = frontal.X, frontal.model, turned.model
-    assert clone(model).prior is prior
+    cloned = clone(model).set_params(prior__verbose=1)
+    assert (cloned.prior.verbose, prior.verbose) == (1, 0)
     for copied in (clone(model).fit(X), pickle.loads(pickle.dumps(model))):
         assert_array_equal(copied.transform(X), model.alpha_)
     piped = make_pipeline(FunctionTransformer(), clone(model))
@@ -296,6 +341,12 @@ def test_searches_pipelines_and_copies(turned, frontal):
     assert np.isfinite(search.cv_results_["mean_test_score"]).all()
     assert search.best_estimator_.prior_std_.shape == (2,)
     refused("prior", AffineNRSfMCV((1, 2), estimator=clone(model)).fit, X)
+    searched = AffineNRSfMCV([2], estimator=clone(prior)).fit(turned.X)
+    of_search = fitted(X, searched)
+    assert_array_equal(of_search.alpha_, model.alpha_)
+    save_model(of_search, tmp_path / "model.npz")
+    stored = load_model(tmp_path / "model.npz").prior
+    assert_array_equal(stored.basis_, prior.basis_)
 
 
 # --- tables that do not fit a model ---------------------------------------------------
@@ -310,26 +361,65 @@ def test_new_frames_fit_their_model(turned, seed):
     model.transform(turned.X[:3])
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
-@pytest.mark.parametrize("other", ["order", "object"])
-def test_foreign_tables_are_warned_of_once(turned, camera, other):
-    model = turned.model if camera != "affine" else fitted(turned.X, camera=camera)
-    X = study(3, 40, 30, change=0.1 * (other == "object")).X
+@pytest.mark.parametrize(
+    ("params", "other"),
+    [
+        ({}, "order"),
+        ({}, "object"),
+        ({"camera": "affine"}, "order"),
+        ({"camera": "affine"}, "object"),
+        ({"layout": "planar"}, "object"),
+        pytest.param(
+            PERSPECTIVE | {"focal_length": 800}, "object", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_foreign_tables_are_warned_of_once(params, other):
+    focal = params.get("focal_length", np.inf)
+    X = study(3, 40, 30, change=0.04 * (other == "object"), focal=focal).X
     if other == "order":
         X = np.roll(X, 2, axis=1)
-    remedy = "Fit X by itself" if camera == "affine" else r"prior=model\).fit\(X\)"
-    methods = (model.transform, model.decompose, model.reconstruct, model.score)
-    if camera == "affine":
-        methods = methods[:2]
-    for method in methods:
+    own = study(0, 60, 30, focal=focal).X
+    if "layout" in params:
+        X, own = (
+            table.reshape(len(table), -1, 2).swapaxes(1, 2).reshape(table.shape)
+            for table in (X, own)
+        )
+    model = fitted(own, **params)
+    for method in (model.transform, model.decompose, model.diagnostics):
         with warnings.catch_warnings(record=True, action="always") as messages:
             method(X)
-        assert len(messages) == 1, method
-        with pytest.warns(UserWarning, match=remedy):
-            warnings.warn_explicit(messages[0].message, UserWarning, "", 0)
+        (message,) = [str(w.message) for w in messages if "as far" in str(w.message)]
+        assert "fits no other" in message
+    assert np.isfinite(model.score(X))  # which says it: no warning
     model.transform(X[:9])  # too few frames to tell
+    way = message.partition("may be wrong. ")[2]
+    if other == "order":
+        assert way.startswith("Check whether X has the same points")
+    elif params.get("camera") == "affine":
+        assert way == "Fit X by itself"
+    else:  # the way works
+        code = way.removeprefix("Adapt the model to X: ")
+        names = {"sklearn": sklearn, "model": model, "X": X}
+        assert eval(code, names).prior_std_[0] > 0.01
 
 
-def test_diagnostics_of_foreign_tables(turned):
-    X = study(3, 60, 30, change=0.1).X
-    warned("times as far from the shapes", turned.model.diagnostics, X)
+def test_weights_of_points_and_other_tables():
+    rng, table = np.random.default_rng(0), study(0, 60, 30, noise=0)
+    weights = np.exp(3 * rng.normal(size=(60, N_POINTS)))
+    noise = 0.5 * rng.normal(size=(60, N_POINTS, 2)) / np.sqrt(weights)[..., None]
+    X = table.X + noise.reshape(60, -1)
+    weights *= 0.05
+    model = AffineNRSfM(2, camera="weak_perspective", random_state=0)
+    model.fit(X, point_weight=weights)
+    tables = (
+        (X, {}),
+        (X, {"point_weight": weights}),
+        (table.X, {"point_weight": weights}),
+    )
+    for other, given in tables:
+        model.transform(other, **given)
+    assert not model.diagnostics(X, point_weight=weights).outlier_share
+    assert model.diagnostics(X).outlier_share
+    other = np.roll(X, 2, axis=1)
+    warned("as far from", model.transform, other, point_weight=weights)

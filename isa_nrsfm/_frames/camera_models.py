@@ -314,7 +314,7 @@ def distances(
 def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
     """Return the motion factor ``(1, alpha_i) (x) M_i`` (2 n, 3 K + 3)."""
     c = np.concatenate([np.ones((len(alpha), 1)), alpha], axis=1)
-    return np.einsum("ik,irc->irkc", c, motion).reshape(2 * len(alpha), -1)
+    return np.einsum("ik,irc->irkc", c, motion).reshape(-1, 3 * c.shape[1])
 
 
 def line_of_sight(motion: NDArray) -> NDArray:

@@ -58,6 +58,8 @@ class DepthCertainty(NamedTuple):
     images : tuple of two floats
         Error variance of a coordinate of an image, with the errors of the shapes, over
         the noise variance: the first plus the second times the leverage of the frame.
+    weighted : bool
+        Whether points had weights: `residual` and `images` are those of weight one.
     """
 
     total: float = np.nan
@@ -67,6 +69,7 @@ class DepthCertainty(NamedTuple):
     leverage: float | None = None
     residual: float = np.nan
     images: tuple[float, float] = (1.0, 0.0)
+    weighted: bool = False
 
     @property
     def determined(self) -> bool:
@@ -82,12 +85,11 @@ class DepthCertainty(NamedTuple):
         total = float(np.sqrt(points.sum() / depths.sum()))
         return self._replace(total=total, points=points, leverage=1.0)
 
-    def of_prior(self, error: float, depth: float) -> "DepthCertainty":
-        """Return that of a prior, with mean squares of its errors and of the depths."""
-        if self.points is None:
-            return self
-        total = float(np.hypot(self.total, np.sqrt(error / depth)))
-        return self._replace(total=total, points=self.points + error)
+    def of_prior(self, errors: NDArray, depths: NDArray) -> "DepthCertainty":
+        """Return that of a prior, with error variances (n,) of depths (n, J)."""
+        points = np.zeros(depths.shape[1]) if self.points is None else self.points
+        total = np.hypot(self.total, np.sqrt(errors.mean() / np.mean(depths**2)))
+        return self._replace(total=float(total), points=points + errors.mean())
 
     def variances(self, alpha: NDArray) -> NDArray:
         """Return variances of depths (n, n_points) of frames of size one."""
@@ -357,12 +359,8 @@ class PosteriorFrames:
         known = covariance.shape[1] == len(self.shapes) - 1
         widened = self.widened(alpha, covariance)[0] if known else None
         motion, alpha, deviation = self.gauge.apply(motion, alpha, widened)
-        return Decomposition(
-            motion * sizes[:, None, None],
-            translation * sizes[:, None],
-            alpha,
-            deviation,
-        )
+        motion = motion * sizes[:, None, None]
+        return Decomposition(motion, translation * sizes[:, None], alpha, deviation)
 
     def widened(self, alpha: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
         """Return covariances (n, K, K) with the errors of the shapes.
@@ -406,13 +404,9 @@ class PosteriorFrames:
         precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         covariance, ratio = self.widened(fit.alpha, fit.covariance)
+        translation = fit.translation * sizes[:, None]
         return LinearisedFrames(
-            motion,
-            fit.translation * sizes[:, None],
-            fit.alpha,
-            covariance,
-            precision / ratio,
-            slope,
+            motion, translation, fit.alpha, covariance, precision / ratio, slope
         )
 
     def depth_deviations(

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, compose, distances
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
-from isa_nrsfm._joint.prior import ROUNDS, TOL_SHARE
+from isa_nrsfm._joint.prior import ROUNDS, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,
     FactorisedTable,
@@ -113,8 +113,7 @@ def fit_jointly(
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
     if sampled:
         state = state._replace(motion=state.motion[table.parts[0]])
-    unknowns = None if fit.prior is None else fit.prior.n_determined
-    noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose, unknowns)
+    noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose, fit.prior)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
     fit = fit._replace(state=end, camera_noise_ratio=ratio)
     return fit, problem.frames, first.likelihood(*state).alpha
@@ -302,19 +301,19 @@ def unregularised(problem: JointProblem, state: JointState) -> JointFit:
 
 
 def _freedom_correction(
-    n_seen: NDArray, shape: tuple[int, int, int], n_pose: int, unknowns: float | None
+    n_seen: NDArray, shape: tuple[int, int, int], n_pose: int, prior: ShapePrior | None
 ) -> float:
     """Return the number of seen coordinates N over the residual's degrees of freedom.
 
     Each frame has n_pose unknowns; coefficients are integrated out. The n centred
     shapes have ``3 n (J - 1)`` unknowns, less the ``n^2 + 8`` of the gauge: the mixing
     and the affinity of space, which share one scale. At least ``N / 10`` degrees are
-    assumed. With a prior the unknowns of the shapes are given.
+    assumed. A prior knows the unknowns of its shapes.
     """
     n_shapes, _, n_points = shape
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
-    if unknowns is None:
-        unknowns = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
+    free = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
+    unknowns = prior.n_determined if prior else free
     freedom = n_numbers - n_pose * n_frames - unknowns
     return float(n_numbers / max(freedom, 0.1 * n_numbers))
 

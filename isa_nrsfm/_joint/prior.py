@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.camera_models import stacked_motion
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred
@@ -71,10 +72,8 @@ class ShapePrior(NamedTuple):
     @property
     def variances(self) -> NDArray:
         """Prior variances (n,) of the free public shapes."""
-        mean_shape, basis = np.square(self.widths)
-        n_free = self.changes.shape[1]
-        variances = np.r_[mean_shape, np.full(n_free - 1, basis)]
-        return np.maximum(variances, OF_DISTANCES**2)
+        widths = np.repeat(self.widths, (1, self.changes.shape[1] - 1))
+        return np.maximum(widths, OF_DISTANCES) ** 2
 
     def of_points(self, kept: NDArray) -> "ShapePrior":
         """Return the prior of some of the points."""
@@ -105,13 +104,10 @@ class ShapePrior(NamedTuple):
         self, shapes: NDArray, curvature: NDArray, noise: float
     ) -> "ShapePrior":
         """Return the prior with the widths that follow from a fit."""
-        n_free, n_points = len(self.variances), shapes.shape[2]
-        E, _ = self.differences(shapes)
-        squares = np.sum(E**2, axis=(1, 2))
-        covariance = self.covariance(curvature, noise)
-        covariance = covariance.mean(axis=0).reshape(n_free, 3, n_free, 3)
-        trace = np.einsum("kaka->k", covariance)
-        numbers = n_points * np.maximum(3.0 - trace / self.variances, 1e-9)
+        squares = np.sum(self.differences(shapes)[0] ** 2, axis=(1, 2))
+        covariance = self.covariance(curvature, noise).mean(axis=0)
+        trace = np.diagonal(covariance).reshape(-1, 3).sum(axis=1)
+        numbers = shapes.shape[2] * np.maximum(3.0 - trace / self.variances, 1e-9)
         tau = np.sqrt(squares[0] / numbers[0])
         rho = 0.0 if self.fixed else np.sqrt(squares[1:].sum() / numbers[1:].sum())
         widths, n_determined = (float(tau), float(rho)), float(numbers.sum())
@@ -134,7 +130,6 @@ class ShapePrior(NamedTuple):
         if self.fixed:
             known[3:] = known[:, 3:] = 0.0
         covariance = np.linalg.inv(known + np.diag(1.0 / variances.ravel()))
-        c = np.insert(alpha, 0, 1.0, axis=1)
-        sight = np.cbrt(abs(np.linalg.det(self.gauge.space))) * sight
-        X = (c[:, :, None] * sight[:, None]).reshape(len(c), -1)
+        size = np.cbrt(abs(np.linalg.det(self.gauge.space)))
+        X = size * stacked_motion(sight[:, None], alpha)
         return np.vecdot(X @ covariance, X)

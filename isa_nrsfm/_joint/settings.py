@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._joint.prior import ShapePrior
@@ -72,6 +73,7 @@ class FitSettings(NamedTuple):
 
     scale_frames: False with orthographic cameras. names: those of the columns, if any.
     prior: the `TableModel` of the estimator, or None; shape_prior: made from it.
+    mirror_certainty: that of the prior.
     silent_isa: whether a strategy that only starts the joint fit may end early.
     on_step: called before each step of the joint fit.
     """
@@ -89,6 +91,7 @@ class FitSettings(NamedTuple):
     n_jobs: int | None = None
     names: NDArray | None = None
     prior: Any = None
+    mirror_certainty: float = np.nan
     adapt: str = "mean"
     shape_prior: ShapePrior | None = None
     silent_isa: bool = True

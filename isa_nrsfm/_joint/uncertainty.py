@@ -42,7 +42,7 @@ from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointState, refine_joint
-from isa_nrsfm._joint.settings import LIMITS, Limits
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
@@ -150,9 +150,8 @@ def frame_certainty(
     """
     *_, alpha, covariance, residual = fits
     certainty, mean = frames.certainty, float(leverages(alpha).mean())
-    unknowns, numbers = float(frames.shapes.size), 2.0 * n_seen.sum()
-    if prior is not None:
-        unknowns = prior.n_determined
+    unknowns = prior.n_determined if prior else float(frames.shapes.size)
+    numbers = 2.0 * n_seen.sum()
     n_own = 2 + CAMERAS[frames.camera].n_parameters + np.trace(1 - covariance)
     left = max(numbers - len(alpha) * n_own, 0.1 * numbers)
     noise = frames.noise_variance
@@ -246,15 +245,14 @@ def n_reliable(reliability: NDArray) -> int:
 def depth_certainty(
     frames: PosteriorFrames,
     rows: FrameBlocks,
-    weights: NDArray | None = None,
-    limits: Limits = LIMITS,
-    prior: ShapePrior | None = None,
+    weights: NDArray | None,
+    settings: FitSettings,
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
-    Weights (I, J) are numbers of observations; without them each is one. A fit has at
-    most so many steps.
+    Weights (I, J) are numbers of observations; without them each is one.
     """
+    limits = settings.limits
     part, fit, w = inlying_rows(frames, rows, MOST_FRAMES, weights)
     n_points = frames.shapes.shape[2]
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
@@ -268,7 +266,7 @@ def depth_certainty(
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], fit.motion[known]
-    prior = None if prior is None else prior.of_points(points)
+    prior = settings.shape_prior and settings.shape_prior.of_points(points)
     tracks, camera = part[known], CAMERAS[frames.camera]
 
     def refit(
@@ -284,15 +282,12 @@ def depth_certainty(
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
-        if prior is None:
-            penalty = part.basis_penalty(limits.basis_std)
-            likelihood = MarginalLikelihood(part, penalty, extents)
-        else:
-            likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
+        own = prior and prior.of_points(kept)
+        penalty = 0.0 if own else part.basis_penalty(limits.basis_std)
+        likelihood = MarginalLikelihood(part, penalty, extents, own)
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         least = min(noise * n_numbers / energy, limits.least_noise)
-        if start is None:
-            start = JointState(centred(shapes[:, :, kept]), motion, noise)
+        start = start or JointState(centred(shapes[:, :, kept]), motion, noise)
         start = start._replace(noise=noise)
         ends: Any = {"least_noise": least, "max_iter": limits.error_steps, "tol": TOL}
         state = refine_joint(likelihood, start, camera, **ends).state
@@ -303,7 +298,8 @@ def depth_certainty(
         return state, rotations, centred(z), terms.value / len(rows)
 
     every = np.ones(len(points), dtype=bool)
-    whole, rotations, depths, value = refit(every, extents=EXTENT_WEIGHT)
+    extents = 0.0 if prior else EXTENT_WEIGHT
+    whole, rotations, depths, value = refit(every, extents=extents)
     deformation = 0.0
     if prior is None:  # which does not let depths grow
         *_, far_value = refit(every, far_state(whole, camera))
@@ -318,12 +314,8 @@ def depth_certainty(
     # Each point is left out of one of the fits: its factor is one.
     variances += deformation * np.mean(depths**2, axis=0)
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
-    return DepthCertainty(
-        float(np.sqrt(factor * total + deformation)),
-        deformation,
-        factor * turns,
-        variances[nearest],
-    )
+    total = float(np.sqrt(factor * total + deformation))
+    return DepthCertainty(total, deformation, factor * turns, variances[nearest])
 
 
 def differences(

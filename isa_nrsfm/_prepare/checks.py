@@ -338,5 +338,6 @@ def check_frames_kept(estimator: Any, what: str) -> None:
     if not hasattr(estimator, "motion_"):
         raise ValueError(
             f"{what} needs the cameras and coefficients of the fitted table, which "
-            "were not kept: got keep_frames=False. Fit again with keep_frames=True"
+            "were not kept. Fit again with keep_frames=True. The face prior has no "
+            "frames: fit a table with it"
         )

@@ -78,6 +78,22 @@ class Facts(NamedTuple):
     prior: bool = False
 
     @property
+    def affine(self) -> str:
+        """Parameters of a fit with affine cameras."""
+        others = {
+            'refinement="joint"': self.consensus,
+            "prior=None": self.prior,
+            "focal_length=None, principal_point=None": self.camera == "perspective",
+        }
+        return ", ".join(['camera="affine"', *(n for n, i in others.items() if i)])
+
+    @property
+    def robust(self) -> str:
+        """What to do if points are wrong."""
+        weighted = self.certainty.weighted
+        return "give them weight zero" if weighted else 'use loss="cauchy"'
+
+    @property
     def bent(self) -> bool:
         """Whether outliers have their full influence on the fit."""
         return self.loss == "linear" and self.outlier_share > MOST_GROSS
@@ -110,8 +126,8 @@ def advice(facts: Facts) -> tuple[str, ...]:
 def _messages(facts: Facts) -> Iterator[str]:
     """Yield messages that do not contradict each other, the most important first."""
     if facts.bent:
-        bent = 'they bend the shapes. Use loss="cauchy", or correct them'
-        yield f"{facts.outliers}: {bent}"
+        remedy = f"{facts.robust.capitalize()}, or correct them"
+        yield f"{facts.outliers}: they bend the shapes. {remedy}"
     yield (depth := depth_advice(facts))
     if facts.bent:  # outliers may cause all that follows
         return
@@ -120,7 +136,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         return
     n_components, n_supported = len(facts.reliability), facts.n_supported
     if not n_supported:
-        outliers = '. If some points are wrong, use loss="cauchy"'
+        outliers = f". If some points are wrong, {facts.robust}"
         yield (
             "no deformation was found beyond the noise: the object may be rigid. Do "
             f"not interpret the coefficients{outliers * (facts.loss == 'linear')}"
@@ -133,7 +149,7 @@ def _messages(facts: Facts) -> Iterator[str]:
             f"probably noise. Use at most n_components={n_supported}"
         )
     elif facts.camera != "affine" and not depth and facts.noise_ratio >= SAME_NOISE:
-        other_fit = 'affine cameras (camera="affine")'
+        other_fit = f"affine cameras ({facts.affine})"
         if not facts.auto and facts.noise_ratio < OTHER_CAMERAS:
             other_fit = 'more basis shapes (n_components="auto" finds how many)'
         meaning = camera_meaning(facts.noise_ratio)
@@ -164,25 +180,27 @@ def depth_advice(facts: Facts) -> str:
     why, remedy = "parts of the points lead to different depths", "fit more points"
     if turned := certainty.deformation > LARGEST_SHARE**2:
         why = "deformation explains the images as well as rotations do"
-    auto = "" if facts.auto else ', n_components="auto"'
+    given = "" if facts.auto else ', n_components="auto"'
+    given += ', refinement="joint"' * facts.consensus
+    grouped = facts.camera != "perspective" and not certainty.weighted
     if facts.prior:
         remedy = "fit more frames, best of objects that turn further"
     elif facts.n_points == 68 and facts.camera != "orthographic":
-        face = f"prior=isa_nrsfm.datasets.load_face_prior(){auto}"
+        face = f"prior=isa_nrsfm.datasets.load_face_prior(){given}"
         remedy = f"if these are the 68 points of faces, use {face}"
     elif turned:
-        remedy = f"fit a table in which the objects turn, then use prior=model{auto}"
+        remedy = f"fit a table in which the objects turn, then use prior=model{given}"
     elif most < len(facts.reliability):
         remedy = f"use at most n_components={most}"
     elif not facts.auto:
         remedy = 'use n_components="auto"'
-    elif not facts.consensus:
+    elif grouped and not facts.consensus:
         remedy = 'use refinement="consensus"'
     if facts.noise_ratio >= SAME_NOISE:
         remedy = f"make sure that {SAME_UNIT}, then {remedy}"
     return (
         f"{text}, because {why}. {remedy[0].upper()}{remedy[1:]}. If coefficients "
-        'suffice, use affine cameras (camera="affine"). See "How reliable is the '
+        f'suffice, use affine cameras ({facts.affine}). See "How reliable is the '
         'depth?" in the documentation'
     )
 

@@ -194,11 +194,16 @@ def _check_options(args: Namespace) -> None:
                 f"{option} needs --refinement joint or consensus; got --refinement "
                 f"{args.refinement}"
             )
-    if args.weights is not None and len(args.n_components) > 1:
-        raise ValueError(
-            "--weights needs one number of basis shapes, because numbers are compared "
-            "without weights; give it with --n-components, or auto"
-        )
+    one = {
+        "weights": "numbers are compared without weights",
+        "prior": "a fit has those of the prior",
+    }
+    for name, why in one.items():
+        if getattr(args, name) is not None and len(args.n_components) > 1:
+            raise ValueError(
+                f"{flag_of(name)} needs one number of basis shapes, because {why}; "
+                "give it with --n-components, or auto"
+            )
 
 
 def _seconds(clock: dict[str, float]) -> dict[str, float]:

@@ -71,15 +71,21 @@ def _with_options(text: str, args: Namespace) -> str:
     text = " ".join(text.split())
     model = f"--prior {getattr(args, 'model', 'model.npz')}"
     for way, option in (
-        (r"AffineNRSfM\([^)]*prior=model\)\.fit\(X\)", f"{PROGRAM} fit TABLE {model}"),
-        (r"prior=model(, n_components=.auto.)?", model),
-        (r"prior=[\w.]+\(\)(, n_components=.auto.)?", f"--prior {FACE_PRIOR}"),
+        (
+            r"sklearn\.base\.\S* .*prior=model\)\.fit\(X\)",
+            f"{PROGRAM} fit TABLE {model}",
+        ),
+        (r"prior=model", model),
+        (r"prior=[\w.]+\(\)", f"--prior {FACE_PRIOR}"),
     ):
         text = re.sub(way, option.replace("\\", r"\\"), text)
     for name in filter(partial(hasattr, args), _PARAMETERS):
         value = r"=(?P<quote>['\"]?)(?P<value>[\w.-]*\w)(?P=quote)"
         option = rf"{flag_of(name)} \g<value>"
         text = re.sub(rf"(?<![\w/\\-]){name}{value}", option, text)
+    for name in ("prior", "focal_length", "principal_point"):
+        text = text.replace(f"{name}=None", f"no {flag_of(name)}")
+    text = re.sub(r"(--[\w-]+ [^\s,]+), (?=--)", r"\1 ", text)  # as they are typed
     if hasattr(args, "n_components"):
         text = re.sub(r"(?<![\w'\"-])n_components\b", "--n-components", text)
     return text

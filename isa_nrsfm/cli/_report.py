@@ -93,7 +93,7 @@ def model_report(
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     is_joint = estimator.refinement in JOINT_REFINEMENTS
-    found = estimator.diagnostics(X) if is_joint else None
+    found = estimator.diagnostics(X, **frames.weighting) if is_joint else None
     messages = () if found is None else found.messages
     if perspective and estimator.camera_ == "weak_perspective":
         joint = ', refinement="joint"' * (estimator.refinement == "consensus")
@@ -160,7 +160,7 @@ def perspective_advice(estimator: AffineNRSfM, frames: Frames) -> str:
     point = frames.principal_point
     if point is None or estimator.camera_ != "weak_perspective":
         return ""
-    share = estimator.diagnostics(frames.X).outlier_share
+    share = estimator.diagnostics(frames.X, **frames.weighting).outlier_share
     if facts_of(estimator, outlier_share=share).bent:
         return ""
     show_stage("comparison with perspective")

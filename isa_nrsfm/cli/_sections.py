@@ -341,13 +341,15 @@ def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Secti
     if mirror and math.isfinite(mirror):
         least = min(math.floor(1000 * mirror) / 10, 99.9)
         probability = f"right with a probability of at least {least:g} %"
-        parts.append(
-            f"mirror image in depth: the one that fits perspective, {probability}"
-            if model["mirror_decided_by_perspective"]
-            else "mirror image in depth: the one in which missing points are farther "
-            f"away, {probability} if the object hides them. If it does not, use "
-            "--no-hidden-points."
+        which = (
+            f"one in which missing points are farther away, {probability} if the "
+            "object hides them. If it does not, use --no-hidden-points."
         )
+        if model["mirror_decided_by_perspective"]:
+            which = f"one that fits perspective, {probability}"
+        elif model["parameters"]["prior"] is not None:
+            which = f"one of the prior, {probability}"
+        parts.append(f"mirror image in depth: the {which}")
     meaning = model["camera_meaning"]
     return [*parts, _sentence(meaning)] if meaning else parts
 

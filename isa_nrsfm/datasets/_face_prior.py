@@ -1,8 +1,10 @@
 """The face prior: a fitted model of faces for tables that do not determine depths."""
 
 from importlib.resources import files
+from numbers import Integral
 
 import numpy as np
+from sklearn.utils import check_scalar
 
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
@@ -25,13 +27,14 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     Returns
     -------
     AffineNRSfM
-        A fitted model with weak-perspective cameras and no frames of its own. Depths
-        point away from the viewer, y down.
+        A fitted model with weak-perspective cameras. Depths point away from the viewer,
+        y down. It has no frames of its own: figures, exports and diagnostics need a
+        fit of a table with this prior.
 
     Raises
     ------
-    ValueError
-        If `n_components` is not between 1 and 40.
+    ValueError, TypeError
+        If `n_components` is not a whole number between 1 and 40.
 
     Notes
     -----
@@ -56,10 +59,7 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
         stored = {name: arrays[name].astype(np.float64) for name in arrays.files}
     most = len(stored["basis"])
     K = most if n_components is None else n_components
-    if not 1 <= K <= most:
-        raise ValueError(
-            f"n_components must be between 1 and {most}; got {n_components}"
-        )
+    check_scalar(K, "n_components", Integral, min_val=1, max_val=most)
     mean_shape, basis = stored["mean_shape"], stored["basis"][:K]
     noise, inverse_snr, rank_floor, *certain = stored["numbers"].tolist()
     # Components that are left out become noise of the two coordinates of an image.
@@ -83,9 +83,7 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
         ),
     )
     share, n_features = stored["energy_share"][:K], 2 * len(mean_shape)
-    model = AffineNRSfM(
-        K, camera="weak_perspective", independence=None, keep_frames=False
-    )
+    model = AffineNRSfM(K, camera="weak_perspective")
     model.__dict__ |= {
         "_model": TableModel(frames, mean_shape, basis, "interleaved", None),
         "_n_features_out": K,
@@ -97,7 +95,7 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
         "basis_": basis,
         "noise_variance_": noise + left,
         "depth_uncertainty_": total,
-        "mirror_certainty_": np.nan,
+        "mirror_certainty_": 1.0,
         "reliability_": stored["reliability"][:K],
         "energy_share_": share / share.sum(),
         "mode_covariance_": np.kron(np.eye(K), C) / 2,

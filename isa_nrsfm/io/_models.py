@@ -33,6 +33,7 @@ from isa_nrsfm._frames.models import (
     RigidFrames,
 )
 from isa_nrsfm._frames.pinhole import Pinhole
+from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.sources import LARGEST, SMALLEST
 from isa_nrsfm._tables.tracks import LAYOUTS
@@ -345,6 +346,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "leverage": frames.certainty.leverage,
         "residual": frames.certainty.residual,
         "image_errors": np.array(frames.certainty.images),
+        "weighted": frames.certainty.weighted,
     }
 
 
@@ -378,6 +380,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
             entries.get("leverage"),
             entries.get("residual", np.nan),
             tuple(entries.get("image_errors", (1.0, 0.0))),
+            entries.get("weighted") is True,
         ),
     )
 
@@ -406,8 +409,8 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
     elif type(value) in STORED.values():
         parts = packed_parts(value, f"{name}.", arrays)
         return {"object": {"class": type(value).__name__, **parts}}
-    elif type(model := getattr(value, "estimator", value)) is AffineNRSfM:
-        return {"model": packed_model(model, f"{name}.", arrays)}  # the prior
+    elif type(model := fitted_prior(value)) is AffineNRSfM:
+        return {"model": packed_model(model, f"{name}.", arrays)}
     elif name.rpartition(".")[2] in ("isa", "isa_", "density"):
         named = NamedStrategy(full_name(type(value)))
         for key, item in fitted_attributes(value).items():
