@@ -334,12 +334,12 @@ default="affine"
     --------
     >>> from isa_nrsfm import AffineNRSfM
     >>> from isa_nrsfm.datasets import make_face_tracks
-    >>> faces = make_face_tracks(n_frames=200, random_state=0)
-    >>> model = AffineNRSfM(n_components=4, random_state=0).fit(faces.data)
+    >>> faces = make_face_tracks(n_frames=100, n_components=2, random_state=0)
+    >>> model = AffineNRSfM(n_components=2, random_state=0).fit(faces.data)
     >>> model.mean_shape_.shape, model.basis_.shape, model.alpha_.shape
-    ((68, 3), (4, 68, 3), (200, 4))
+    ((68, 3), (2, 68, 3), (100, 2))
     >>> model.transform(faces.data[:5]).shape
-    (5, 4)
+    (5, 2)
     """
 
     mean_shape_: NDArray
@@ -977,8 +977,8 @@ default="affine"
         --------
         >>> from isa_nrsfm import AffineNRSfM
         >>> from isa_nrsfm.datasets import make_face_tracks
-        >>> faces = make_face_tracks(n_frames=100, random_state=0)
-        >>> model = AffineNRSfM(2, camera="weak_perspective").fit(faces.data)
+        >>> faces = make_face_tracks(40, n_components=1, random_state=0)
+        >>> model = AffineNRSfM(1, camera="weak_perspective").fit(faces.data)
         >>> bool((model.mirrored().mean_shape_[:, 2] == -model.mean_shape_[:, 2]).all())
         True
         """

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from scenes import likelihood_of, random_scene, with_gaps
@@ -143,8 +144,10 @@ def test_first_widths_make_no_difference(frontal, adapt):
 # --- shapes ---------------------------------------------------------------------------
 
 
-@BOTH
-@pytest.mark.parametrize("degrees", [3, 20])
+@pytest.mark.parametrize(
+    ("adapt", "degrees"),
+    slow_after(2, [("mean", 3), ("shapes", 20), ("mean", 20), ("shapes", 3)]),
+)
 def test_accuracy(turned, adapt, degrees):
     table = study(2, 40, degrees, change=0.04, noise=0.6)
     with warnings.catch_warnings(action="ignore"):  # of depth, and of other objects
@@ -210,7 +213,9 @@ def test_missing_points_weights_and_few_frames(frontal):
     assert reached(X[:3]) < 2.5
 
 
-@pytest.mark.parametrize(("loss", "adapt"), [("huber", "shapes"), ("cauchy", "mean")])
+@pytest.mark.parametrize(
+    ("loss", "adapt"), slow_after(1, [("cauchy", "mean"), ("huber", "shapes")])
+)
 def test_outliers(frontal, loss, adapt):
     rng = np.random.default_rng(3)
     X = frontal.X.reshape(len(frontal.X), -1, 2).copy()
@@ -310,8 +315,16 @@ def test_new_frames_fit_their_model(turned, seed):
     model.transform(turned.X[:3])
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
-@pytest.mark.parametrize("other", ["order", "object"])
+@pytest.mark.parametrize(
+    ("camera", "other"),
+    slow_after(
+        2,
+        [
+            *(("weak_perspective", "object"), ("affine", "order")),
+            *(("weak_perspective", "order"), ("affine", "object")),
+        ],
+    ),
+)
 def test_foreign_tables_are_warned_of_once(turned, camera, other):
     model = turned.model if camera != "affine" else fitted(turned.X, camera=camera)
     X = study(3, 40, 30, change=0.1 * (other == "object")).X
