@@ -144,10 +144,8 @@ def test_first_widths_make_no_difference(frontal, adapt):
 # --- shapes ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("adapt", "degrees"),
-    slow_after(2, [("mean", 3), ("shapes", 20), ("mean", 20), ("shapes", 3)]),
-)
+@BOTH
+@pytest.mark.parametrize("degrees", slow_after(1, [3, 20]))
 def test_accuracy(turned, adapt, degrees):
     table = study(2, 40, degrees, change=0.04, noise=0.6)
     with warnings.catch_warnings(action="ignore"):  # of depth, and of other objects
@@ -315,16 +313,8 @@ def test_new_frames_fit_their_model(turned, seed):
     model.transform(turned.X[:3])
 
 
-@pytest.mark.parametrize(
-    ("camera", "other"),
-    slow_after(
-        2,
-        [
-            *(("weak_perspective", "object"), ("affine", "order")),
-            *(("weak_perspective", "order"), ("affine", "object")),
-        ],
-    ),
-)
+@pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
+@pytest.mark.parametrize("other", slow_after(1, ["object", "order"]))
 def test_foreign_tables_are_warned_of_once(turned, camera, other):
     model = turned.model if camera != "affine" else fitted(turned.X, camera=camera)
     X = study(3, 40, 30, change=0.1 * (other == "object")).X
