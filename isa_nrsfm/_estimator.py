@@ -335,12 +335,12 @@ default="affine"
     --------
     >>> from isa_nrsfm import AffineNRSfM
     >>> from isa_nrsfm.datasets import make_face_tracks
-    >>> faces = make_face_tracks(n_frames=200, random_state=0)
-    >>> model = AffineNRSfM(n_components=4, random_state=0).fit(faces.data)
+    >>> faces = make_face_tracks(n_frames=100, n_components=2, random_state=0)
+    >>> model = AffineNRSfM(n_components=2, random_state=0).fit(faces.data)
     >>> model.mean_shape_.shape, model.basis_.shape, model.alpha_.shape
-    ((68, 3), (4, 68, 3), (200, 4))
+    ((68, 3), (2, 68, 3), (100, 2))
     >>> model.transform(faces.data[:5]).shape
-    (5, 4)
+    (5, 2)
     """
 
     n_components_: int

@@ -37,6 +37,9 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
 # tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
 SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
+# Factor of the tolerance of all fits but the last one, and of SETTLED for focal lengths
+# that are only compared.
+ROUGH, COMPARED = 4.0, 5.0
 # A mirror image is given up if E is larger than this multiple of the other one's.
 WORSE = 1.3
 # Focal lengths of the weak-perspective fit and of the first perspective one, in largest
@@ -116,6 +119,13 @@ class PerspectiveFit(NamedTuple):
         square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
         return float(np.copysign(np.sqrt(square), common))
 
+    def ends(self, settled: float, best: float) -> bool:
+        """Return whether further repeats would not help: for the best E of others."""
+        n_repeats, change = len(self.changes), self.changes[-1]
+        most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
+        most = 2 if self.energy > WORSE * best else most
+        return change < settled or n_repeats >= most
+
     def mirrored(self) -> "PerspectiveFit":
         """Return the mirror image in depth."""
         image = mirror_image(self.model, self.frames, self.attributes)
@@ -152,14 +162,19 @@ class PerspectiveTable(NamedTuple):
         pinhole: Pinhole,
         n_components: int | None,
         before: PerspectiveFit | None = None,
+        last: bool = False,
         **options: Any,
     ) -> PerspectiveFit:
         """Return the fit of images that are corrected for the depths of another fit.
 
         It has the mirror image with those depths. None stands for as many basis shapes
-        as are relevant. Options are those of `fit_table`.
+        as are relevant. Fits before the last one have principal axes and a larger
+        tolerance. Options are those of `fit_table`.
         """
         isa, settings = self.isa, self.settings
+        if not last:
+            tol = ROUGH * settings.tol
+            settings = settings._replace(independence=None, tol=tol)
         options["free"] = n_components is None
         options.setdefault("progress", NoProgress())
         if n_components is None:
@@ -182,12 +197,17 @@ class PerspectiveTable(NamedTuple):
         return fit._replace(energies=square / counts.sum())
 
     def settled(
-        self, pinhole: Pinhole, n_components: int, *fits: PerspectiveFit
+        self,
+        pinhole: Pinhole,
+        n_components: int,
+        *fits: PerspectiveFit,
+        settled: float = SETTLED,
     ) -> list[PerspectiveFit]:
         """Repeat fits until depths and fits agree; return them, the best first.
 
         A fit also ends if it is clearly worse than the best one.
         """
+        settled *= self.settings.tol / JOINT_TOL
         running = [fit._replace(changes=(), earlier=()) for fit in fits]
         ended: list[PerspectiveFit] = []
         while running:
@@ -195,16 +215,9 @@ class PerspectiveTable(NamedTuple):
                 self.fit(pinhole, n_components, fit, start=fit.model) for fit in running
             ]
             best = min(fit.energy for fit in [*running, *ended])
-            ended += [fit for fit in running if self._ends(fit, best)]
-            running = [fit for fit in running if not self._ends(fit, best)]
+            ended += [fit for fit in running if fit.ends(settled, best)]
+            running = [fit for fit in running if not fit.ends(settled, best)]
         return sorted(ended, key=lambda fit: fit.energy)
-
-    def _ends(self, fit: PerspectiveFit, best: float) -> bool:
-        """Return whether further repeats of a fit would not help."""
-        n_repeats, change = len(fit.changes), fit.changes[-1]
-        most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
-        agrees = change < SETTLED * self.settings.tol / JOINT_TOL
-        return agrees or n_repeats >= (2 if fit.energy > WORSE * best else most)
 
     def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
         """Return the fits for 1/f and -1/f from a first fit."""
@@ -238,7 +251,8 @@ class PerspectiveTable(NamedTuple):
     def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
         """Return the fit for g, from that with the nearest one."""
         fit = fits[min((g for g in fits if g > 0), key=lambda g: abs(g - place))]
-        return self.settled(self.pinhole(1.0 / place), fit.n_components, fit)[0]
+        pinhole, settled = self.pinhole(1.0 / place), COMPARED * SETTLED
+        return self.settled(pinhole, fit.n_components, fit, settled=settled)[0]
 
     def searched(
         self, n_components: int | None, progress: FitProgress | NoProgress
@@ -337,7 +351,7 @@ def fit_perspective(
     # The last fit, with warnings and errors of depths
     before = None if why else best
     options = {"start": best.model, "errors": errors}
-    fit = table.fit(best.pinhole, best.n_components, before, **options)
+    fit = table.fit(best.pinhole, best.n_components, before, True, **options)
     model, _, converged, attributes, *_ = fit
     f = best.pinhole.focal_length
     if why:

@@ -154,12 +154,12 @@ class AffineNRSfMCV(
     --------
     >>> from isa_nrsfm import AffineNRSfMCV
     >>> from isa_nrsfm.datasets import make_nonrigid_tracks
-    >>> tracks = make_nonrigid_tracks(90, 25, 2, noise=0.01, random_state=0)
+    >>> tracks = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0)
     >>> search = AffineNRSfMCV(range(1, 4), cv=3).fit(tracks.data)
     >>> search.n_components_
     2
     >>> search.transform(tracks.data).shape
-    (90, 2)
+    (60, 2)
     """
 
     # `groups` go to the splitter, not to this estimator.

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import Results
-from layers import one_start
+from layers import one_start, slow_after
 from matplotlib.figure import Figure
 from scenes import waving_scene
 from sklearn.model_selection import GroupKFold
@@ -295,7 +295,7 @@ ESTIMATOR = AffineNRSfM(isa=FastISA(n_init=1), refinement=None, random_state=0)
 UNREFINED = "--no-figures --refinement none --isa fast --n-init 1".split()
 
 
-@pytest.mark.parametrize("groups", [False, True])
+@pytest.mark.parametrize("groups", slow_after(1, [True, False]))
 def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
     table, path = table_of(), tmp_path / "table.csv"
     table.to_csv(path, index=False)

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from exported_files import Read, content_of
 from fit_runs import Results
-from layers import one_start
+from layers import one_start, slow_after
 
 from isa_nrsfm import datasets
 from isa_nrsfm.cli import main
@@ -189,7 +189,7 @@ def faces(tmp_path_factory):
     return write(scene, tmp_path_factory.mktemp("faces") / "faces.csv")
 
 
-@pytest.mark.parametrize("options", [[], ["--skeleton", "ibug-68"]])
+@pytest.mark.parametrize("options", slow_after(1, [[], ["--skeleton", "ibug-68"]]))
 def test_inner_points_are_fitted_and_drawn(fits, transforms, faces, tmp_path, options):
     found = fits(faces, "--points", "inner", *options, "--no-figures", *QUICK)
     assert "60 frames of 51 points" in found.out

@@ -27,6 +27,8 @@ from isa_nrsfm.metrics import mean_shape_error_3d
 pytestmark = one_start
 
 K = 3
+# Of fits that are compared with each other
+FEW_STEPS = {"max_iter": 5, "tol": 0.0}
 
 
 def some_dynamics(n_walks=0, share=0.3, n_shares=K):
@@ -166,7 +168,7 @@ class TestSmoother:
 
 
 class TestEstimation:
-    @pytest.mark.parametrize("noise", [0.2, 1e-6])
+    @pytest.mark.parametrize("noise", slow_after(1, [0.2, 1e-6]))
     def test_finds_the_rates(self, noise):
         rng, true = np.random.default_rng(0), some_dynamics(1, n_shares=0)
         data = [observed(simulated(150, rng, true), rng, noise) for _ in range(2)]
@@ -192,7 +194,7 @@ class TestPeople:
         x += np.sqrt(0.2) * rng.normal(size=x.shape)
         assert not len(smooth_people(alone(x, rng), person).time_scales)
 
-    @pytest.mark.parametrize("groups", [None, np.zeros(150)])
+    @pytest.mark.parametrize("groups", slow_after(1, [None, np.zeros(150)]))
     def test_photos_of_one_unusual_person_have_none(self, groups):
         rng = np.random.default_rng(0)
         frames = alone(1.5 + 0.4 * rng.normal(size=(150, K)), rng)
@@ -224,7 +226,7 @@ def test_steps_between_cameras_move_one_to_the_other(name):
 
 
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", slow_after(1, CAMERAS))
 def test_likelihood_of_frames_is_linearised(name, loss):
     rng = np.random.default_rng(0)
     scene = make_nonrigid_tracks(
@@ -319,8 +321,8 @@ class TestSmooth:
         blank = table.copy()
         blank[60:66] = np.nan
         dates = np.datetime64("2026-01-01") + kept * np.timedelta64(40, "ms")
-        expected = model.smooth(blank, time=0.04 * np.arange(160))
-        found = model.smooth(table[kept], time=dates)
+        expected = model.smooth(blank, time=0.04 * np.arange(160), **FEW_STEPS)
+        found = model.smooth(table[kept], time=dates, **FEW_STEPS)
         assert_allclose(found.alpha, expected.alpha[kept], atol=1e-12)
         assert_allclose(found.time_scales, expected.time_scales)
         # Rows that nobody saw are filled in, and less certain.
@@ -330,29 +332,30 @@ class TestSmooth:
     def test_uneven_times_are_rounded_but_stay_apart(self, waving):
         model, table = waving
         time = np.r_[0.0, 0.9, 2.0, 2.2, 4.3 + np.arange(156)]
-        found = model.smooth(table, time=time)
-        expected = model.smooth(table, time=np.r_[0:4, 5:161])
+        found = model.smooth(table, time=time, **FEW_STEPS)
+        expected = model.smooth(table, time=np.r_[0:4, 5:161], **FEW_STEPS)
         assert_allclose(found.alpha, expected.alpha, atol=1e-12)
 
     def test_nothing_goes_from_group_to_group(self, waving):
         model, table = waving
         groups = np.repeat(["a", "b"], 80)
-        found = model.smooth(table, groups=groups, max_iter=5, tol=0.0)
+        found = model.smooth(table, groups=groups, **FEW_STEPS)
         mixed = np.argsort(np.tile(np.arange(80), 2), kind="stable")
-        other = model.smooth(table[mixed], groups=groups[mixed], max_iter=5, tol=0.0)
+        other = model.smooth(table[mixed], groups=groups[mixed], **FEW_STEPS)
         assert_allclose(other.alpha, found.alpha[mixed], atol=1e-10)
 
     def test_frames_of_four_points_have_no_weight(self, waving):
         model, table = waving
         few, blank = table.copy(), table.copy()
         few.reshape(160, 20, 2)[50, 4:], blank[50] = np.nan, np.nan
-        assert_allclose(model.smooth(few).alpha, model.smooth(blank).alpha, atol=1e-12)
+        found, expected = (model.smooth(X, **FEW_STEPS).alpha for X in (few, blank))
+        assert_allclose(found, expected, atol=1e-12)
 
     def test_groups_without_points_have_no_coefficients(self, waving):
         model, table = waving
         groups = np.repeat([0, 1], [120, 40])
         unseen = np.where(groups[:, None] == 1, np.nan, table)
-        found = model.smooth(unseen, groups=groups)
+        found = model.smooth(unseen, groups=groups, **FEW_STEPS)
         assert found.time_scales.shape == (2,)
         assert_allclose(np.isnan(found.alpha).any(axis=1), groups == 1)
 

@@ -944,7 +944,7 @@ def test_outliers_are_no_components(rng):
 
 
 @pytest.mark.parametrize("camera", slow_after(1, ["affine", "weak_perspective"]))
-@pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+@pytest.mark.parametrize("loss", slow_after(2, ["linear", "cauchy", "huber"]))
 def test_intervals_of_coefficients_hold(loss, camera, rng):
     truth = make_nonrigid_tracks(200, 10, 2, camera=camera, random_state=0)
     tracks = truth.clean - truth.clean.mean(axis=1, keepdims=True)
@@ -962,7 +962,9 @@ def test_intervals_of_coefficients_hold(loss, camera, rng):
     assert 0.92 < np.mean(inside) < 0.98
 
 
-@pytest.mark.parametrize(("loss", "missing"), [("linear", 0.3), ("cauchy", 0.0)])
+@pytest.mark.parametrize(
+    ("loss", "missing"), slow_after(1, [("linear", 0.3), ("cauchy", 0.0)])
+)
 def test_intervals_contain_the_errors_of_shapes(loss, missing):
     options = {"camera": "orthographic", "random_state": 0}
     truth = make_nonrigid_tracks(640, 20, 5, noise=0.02, missing=missing, **options)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from frame_parts import fit_posterior
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import warned
 from scenes import random_rotation, with_gaps
@@ -556,7 +557,7 @@ class TestTurnedFaces:
         _, error = error_of_depths(model, X, points)
         assert error / 3 < model.depth_uncertainty_ < 3 * error
 
-    @pytest.mark.parametrize("missing", [0.0, 0.2])
+    @pytest.mark.parametrize("missing", slow_after(1, [0.2, 0.0]))
     def test_deviations_of_depths_are_the_errors(self, missing):
         X, points, _ = faces_turned_by(20, missing=missing)
         model = fitted(X)

@@ -1,6 +1,7 @@
 """The joint fit of a table: cameras, samples, robust losses, noise."""
 
 from functools import cache
+from itertools import product
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -27,12 +28,14 @@ DEVIATION = 0.03
 # mean square, is 3e-6 of the size of a frame.
 EXACT = 5e-6
 
-EACH = pytest.mark.parametrize("camera", slow_after(2, CAMERAS))
+SEEN_BY = ["weak_perspective", "affine", "orthographic"]
+EACH = pytest.mark.parametrize("camera", slow_after(1, SEEN_BY))
 CALIBRATED = pytest.mark.parametrize(
     "camera", slow_after(1, ["weak_perspective", "orthographic"])
 )
-GAPS = pytest.mark.parametrize("gaps", [False, True])
-ROBUST = pytest.mark.parametrize("loss", LOSSES[1:])
+KINDS = pytest.mark.parametrize(
+    ("camera", "gaps"), slow_after(1, [*product(SEEN_BY, [True, False])])
+)
 # Errors of depths are tested in test_frame_fit.py.
 QUICK = Limits(error_steps=3)
 QuickNRSfM = limited(QUICK)
@@ -126,8 +129,7 @@ def test_noise_level_and_missing_share_of_the_spectrum(n_components, n_points):
 class TestCameras:
     """Tables of each camera model, fitted with it."""
 
-    @EACH
-    @GAPS
+    @KINDS
     def test_without_noise_shapes_are_exact(self, camera, gaps):
         tracks, truth, model = fit_of(camera, 0, gaps, 0.0)
         assert error_of(model, tracks, truth) < EXACT
@@ -135,7 +137,7 @@ class TestCameras:
         assert model.noise_variance_ < 1e-9
         assert_allclose(model.transform(table_of(tracks)), model.alpha_, atol=1e-10)
 
-    @pytest.mark.parametrize("n_components", [2, 4])
+    @pytest.mark.parametrize("n_components", slow_after(1, [2, 4]))
     def test_without_noise_few_faces_are_nearly_exact(self, n_components):
         # Faces that hardly turn: depths are determined ten to a hundred times worse.
         options = {"noise": 0.0, "random_state": 0}
@@ -155,8 +157,7 @@ class TestCameras:
         model = fitted(tracks, 3, camera=camera)
         assert euclidean_error(model, tracks, truth) < largest
 
-    @EACH
-    @GAPS
+    @KINDS
     @pytest.mark.parametrize("seed", slow_after(1, range(2)))
     def test_noise_is_true_within_the_error_of_sampling(self, camera, gaps, seed):
         tracks, _, model = fit_of(camera, seed, gaps)
@@ -192,7 +193,7 @@ class TestNoiseVariance:
     @pytest.mark.parametrize(
         ("loss", "n_frames", "n_points", "n_components", "largest"),
         slow_after(
-            2,
+            1,
             [
                 ("huber", 150, 40, 2, 0.15),
                 ("cauchy", 300, 8, 1, 0.2),
@@ -280,7 +281,7 @@ class TestRobustLoss:
         got = residual_deviations(state, scene.alpha, scene.weights, model)
         assert_allclose(got, expected, rtol=1e-6)
 
-    @ROBUST
+    @pytest.mark.parametrize("loss", slow_after(1, LOSSES[1:]))
     def test_tables_without_noise(self, loss):
         tracks, truth = random_table(deviation=0.0)
         rng = np.random.default_rng(5)
@@ -297,7 +298,7 @@ class TestRobustLoss:
 
 class TestDegenerate:
     @CALIBRATED
-    @pytest.mark.parametrize("deviation", [0.0, DEVIATION])
+    @pytest.mark.parametrize("deviation", slow_after(1, [0.0, DEVIATION]))
     def test_flat_objects_seen_by_calibrated_cameras(self, camera, deviation):
         truth = make_nonrigid_tracks(40, 25, 2, camera=camera, random_state=0)
         flat = truth.shapes * [1.0, 1.0, 0.0]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from layers import one_start
+from layers import one_start, slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
@@ -29,9 +29,10 @@ def fits(X, **options):
 
 
 @pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
-@pytest.mark.parametrize("options", KINDS.values(), ids=KINDS)
-@pytest.mark.parametrize("side", [1, -1])
-def test_missing_points_are_farther_away(side, options):
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("side", slow_after(1, [-1, 1]))
+def test_missing_points_are_farther_away(side, kind):
+    options = KINDS[kind]
     face = make_face_tracks(60, n_components=1, random_state=0)
     sight = np.cross(face.motion[:, 0], face.motion[:, 1])
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
@@ -54,7 +55,9 @@ def test_missing_points_are_farther_away(side, options):
 
 @pytest.mark.parametrize(
     ("make", "share"),
-    [(make_face_tracks, 0.6), (make_hand_tracks, 0.2), (make_body_tracks, 0.3)],
+    slow_after(
+        1, [(make_face_tracks, 0.6), (make_hand_tracks, 0.2), (make_body_tracks, 0.3)]
+    ),
 )
 def test_points_missing_at_random_change_nothing(make, share):
     convention, model = fits(make(60, missing=share, random_state=1).data)
@@ -76,7 +79,7 @@ def event(rng, depths, turned):
     return (time >= 0) & (time < 50) & np.isin(np.arange(25), points)
 
 
-@pytest.mark.parametrize("missing", [profile, event])
+@pytest.mark.parametrize("missing", slow_after(1, [profile, event]))
 def test_level(missing):
     rng, decided = np.random.default_rng(0), 0
     shape = rng.normal(size=(25, 3))

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sklearn.base
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from scenes import likelihood_of, random_scene, with_gaps
@@ -148,7 +149,7 @@ def test_first_widths_make_no_difference(frontal, adapt):
 
 
 @BOTH
-@pytest.mark.parametrize("degrees", [3, 20])
+@pytest.mark.parametrize("degrees", slow_after(1, [3, 20]))
 def test_accuracy(turned, adapt, degrees):
     table = study(2, 40, degrees, change=0.04, noise=0.6)
     with warnings.catch_warnings(action="ignore"):  # of depth, and of other objects
@@ -229,7 +230,9 @@ def test_deviations_have_the_width_of_the_prior_without_a_jackknife(turned, tmp_
     assert (np.sqrt(frames.certainty.points) > 0.2 * model.prior_std_[0]).all()
 
 
-@pytest.mark.parametrize(("loss", "adapt"), [("huber", "shapes"), ("cauchy", "mean")])
+@pytest.mark.parametrize(
+    ("loss", "adapt"), slow_after(1, [("cauchy", "mean"), ("huber", "shapes")])
+)
 def test_outliers(frontal, loss, adapt):
     rng = np.random.default_rng(3)
     X = frontal.X.reshape(len(frontal.X), -1, 2).copy()

@@ -14,6 +14,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pandas as pd
 import pytest
+from fit_runs import QUICK
 from layers import slow_after
 from refusals import refused, warned
 
@@ -57,13 +58,15 @@ def test_commands_replace_files_only_by_force(table, succeeds, fails, tmp_path):
         assert path.read_bytes() != before
 
 
+@pytest.mark.subprocess
 @pytest.mark.parametrize("streams", ["2>&- <&-", "2>/dev/full"])
 def test_commands_need_no_standard_error(streams, table, tmp_path):
-    argv = f"fit {table} -k 1 --no-figures -o {tmp_path}/o {streams} >&-"
+    argv = f"fit {table} {' '.join(QUICK)} 1 -o {tmp_path}/o {streams} >&-"
     run = subprocess.run(" ".join([*PROGRAM, argv]), shell=True, check=False)
     assert (run.returncode, (tmp_path / "o" / "alpha.csv").exists()) == (0, True)
 
 
+@pytest.mark.subprocess
 @pytest.mark.parametrize("name", slow_after(1, ["SIGTERM", "SIGHUP"]))
 def test_a_stopped_fit_leaves_no_folder(name, table, tmp_path):
     folder = tmp_path / "new" / "results"
@@ -146,7 +149,7 @@ def test_forks_while_other_threads_transform_do_not_hang():
 
 
 @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
-@pytest.mark.parametrize("weight", [1e-4, 1e-8, 1e-20])
+@pytest.mark.parametrize("weight", slow_after(1, [1e-8, 1e-4, 1e-20]))
 def test_points_of_any_weight_converge(camera, weight):
     table = make_nonrigid_tracks(60, 20, 1, noise=0.02, random_state=0).data
     weights = np.where(np.arange(20) < 5, weight, 1.0) * np.ones((60, 1))

@@ -81,15 +81,15 @@ WRONG = HOLES | {"outliers": True}
 # Kind, megabytes of a block (few frames, more, all), limits, parameters, table.
 FITS = [
     ("memmap", 0.1, SAMPLED, {}, HOLES),
-    ("memmap", 0.1, SAMPLED, {"loss": "huber"}, WRONG),
+    ("memmap", 0.4, SAMPLED, {"loss": "huber", "tol": 1e3}, WRONG),
     # Shapes along directions, and with the more points a Krylov method, too.
     ("memmap", 1, KRYLOV, {}, {"n_points": 100, "n_frames": 160}),
-    ("npy", 0.1, ALL, {}, HOLES),
     ("parquet", 0.1, ALL, {}, HOLES),
     ("memmap", 0.1, ALL, {"layout": "planar", "scale_frames": False}, {"planar": True}),
     ("dask", None, ALL, {}, HOLES),
 ]
 SLOW_FITS = [
+    ("npy", 0.1, ALL, {}, HOLES),
     *(("memmap", memory, SAMPLED, {}, HOLES) for memory in (0.02, 1000)),
     *(("memmap", memory, SAMPLED, {}, {}) for memory in (0.02, 0.1, 1000)),
     ("memmap", 0.02, SAMPLED, {"loss": "cauchy"}, WRONG),
@@ -158,7 +158,7 @@ def test_rows_that_show_nothing_are_left_out(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", [None, "memmap"])
 def test_threads_make_no_difference(tmp_path, kind):
-    X = np.tile(table(), (15, 1))  # two blocks in memory
+    X = table() if kind else np.tile(table(), (15, 1))  # two blocks in memory
     X = X if kind is None else stored(X, tmp_path)
     params = {"limits": SAMPLED, "working_memory": 0.1, "max_iter": 5, "tol": 1e3}
     one, two = (estimator(n_jobs=n, **params).fit(X) for n in (1, 2))

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from fit_runs import QUICK
 from landmark_files import BODYPARTS, TRACKS
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 
@@ -87,7 +88,7 @@ def test_parts_of_one_body_are_no_individuals():
     refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
 
 
-@pytest.mark.parametrize("seen", [1.0, 0.6, 0.3])
+@pytest.mark.parametrize("seen", slow_after(1, [0.6, 1.0, 0.3]))
 def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
     tracks = tracks - tracks.min((0, 1))

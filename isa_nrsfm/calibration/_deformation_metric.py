@@ -185,8 +185,8 @@ def euclidean_frames(
     >>> from isa_nrsfm.calibration import deformation_metric, euclidean_frames
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.metrics import mean_shape_error_3d
-    >>> faces = make_face_tracks(n_frames=200, random_state=0)
-    >>> model = AffineNRSfM(n_components=4, random_state=0).fit(faces.data)
+    >>> faces = make_face_tracks(n_frames=100, n_components=2, random_state=0)
+    >>> model = AffineNRSfM(n_components=2, random_state=0).fit(faces.data)
     >>> metric = deformation_metric(model.motion_, model.alpha_)
     >>> frames = euclidean_frames(
     ...     metric, model.motion_, model.alpha_, model.mean_shape_, model.basis_

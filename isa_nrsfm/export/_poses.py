@@ -115,10 +115,11 @@ def frame_poses(
     >>> from isa_nrsfm import AffineNRSfM
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.export import frame_poses
-    >>> faces = make_face_tracks(100, camera="weak_perspective", random_state=0)
-    >>> model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    >>> options = {"camera": "weak_perspective", "random_state": 0}
+    >>> faces = make_face_tracks(40, n_components=1, **options)
+    >>> model = AffineNRSfM(1, **options)
     >>> frame_poses(model.fit(faces.data)).yaw.shape
-    (100,)
+    (40,)
     """
     return pose_function(
         model, camera=camera, edges=edges, origin=origin, mirrored=mirrored
@@ -167,8 +168,9 @@ def pose_function(
     >>> from isa_nrsfm import AffineNRSfM
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.export import pose_function
-    >>> faces = make_face_tracks(100, camera="weak_perspective", random_state=0)
-    >>> model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    >>> options = {"camera": "weak_perspective", "random_state": 0}
+    >>> faces = make_face_tracks(40, n_components=1, **options)
+    >>> model = AffineNRSfM(1, **options)
     >>> poses = pose_function(model.fit(faces.data))
     >>> for row in faces.data[:2]:
     ...     frame = model.decompose(row[None])
@@ -250,11 +252,12 @@ def point_distances(
     >>> from isa_nrsfm import AffineNRSfM
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.export import point_distances
-    >>> faces = make_face_tracks(100, camera="weak_perspective", random_state=0)
-    >>> model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    >>> options = {"camera": "weak_perspective", "random_state": 0}
+    >>> faces = make_face_tracks(40, n_components=1, **options)
+    >>> model = AffineNRSfM(1, **options)
     >>> model = model.fit(faces.data)
     >>> point_distances(model, [(48, 54), (62, 66)]).shape  # of the mouth
-    (100, 2)
+    (40, 2)
     """
     if camera is None:
         raise ValueError("distances need calibrated cameras; got camera=None")

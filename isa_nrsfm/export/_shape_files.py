@@ -265,11 +265,11 @@ def point_distribution_model(
     >>> from isa_nrsfm import AffineNRSfM
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.export import point_distribution_model
-    >>> faces = make_face_tracks(n_frames=100, n_components=2, random_state=0)
-    >>> model = AffineNRSfM(n_components=2, random_state=0).fit(faces.data)
+    >>> faces = make_face_tracks(n_frames=40, n_components=1, random_state=0)
+    >>> model = AffineNRSfM(n_components=1, random_state=0).fit(faces.data)
     >>> pdm = point_distribution_model(model)
     >>> pdm.mean.shape, pdm.modes.shape, pdm.eigenvalues.shape
-    ((68, 3), (2, 68, 3), (2,))
+    ((68, 3), (1, 68, 3), (1,))
     """
     space = upright_space(model, camera, origin, mirrored)
     shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes

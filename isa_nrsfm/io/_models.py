@@ -122,8 +122,8 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     >>> from isa_nrsfm import AffineNRSfM
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.io import load_model, save_model
-    >>> table = make_face_tracks(n_frames=50, random_state=0).data
-    >>> model = AffineNRSfM(n_components=2, random_state=0).fit(table)
+    >>> table = make_face_tracks(n_frames=40, n_components=1, random_state=0).data
+    >>> model = AffineNRSfM(n_components=1, random_state=0).fit(table)
     >>> with TemporaryDirectory() as folder:
     ...     save_model(model, Path(folder, "faces.npz"))
     ...     loaded = load_model(Path(folder, "faces.npz"))

@@ -50,7 +50,7 @@ print("held-out errors, %:", -100 * search.cv_results_["mean_test_score"].round(
 # person together:
 
 person = np.arange(200) // 4
-by_person = AffineNRSfMCV(range(2, 5), cv=GroupKFold(5))
+by_person = AffineNRSfMCV(range(2, 5), cv=GroupKFold(3))
 print(by_person.fit(tracks.data, groups=person).n_components_)
 
 # %%
