@@ -503,8 +503,7 @@ default="affine"
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
-            stages = stages_of(self.refinement, self.prior is not None)
-            progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
+            progress = FitProgress(self, stages_of(self), stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, errors=True)
         progress.end()
         return self
@@ -559,10 +558,9 @@ default="affine"
         n_components = n_components if prior is None else len(prior.basis)
         auto, most = n_components == "auto", None
         if self.camera == "perspective":
-            of_fit = source, weights, isa, settings, self.principal_point
-            options = self.focal_length, progress, start, errors
-            number = None if auto else n_components
-            fit = fit_perspective(PerspectiveTable(*of_fit), number, *options)
+            point, number = self.principal_point, None if auto else n_components
+            images = PerspectiveTable(source, weights, isa, settings, point, progress)
+            fit = fit_perspective(images, number, self.focal_length, start, errors)
         else:
             if auto:
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again

@@ -83,20 +83,22 @@ from isa_nrsfm._tables.tracks import of_all_rows
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
+PERSPECTIVE_STAGE = "perspective"
 # Stages that report steps.
-STEPWISE = JOINT_STAGE, CONSENSUS_STAGE
+STEPWISE = JOINT_STAGE, CONSENSUS_STAGE, PERSPECTIVE_STAGE
 
 
-def stages_of(refinement: str | None, prior: bool = False) -> list[str]:
+def stages_of(estimator: Any) -> list[str]:
     """Return the names of the stages of a fit, in order."""
     stages = ["table", "factorisation"]
-    if not prior:
+    if estimator.prior is None:
         stages += ["independent subspaces", "block structure and refinement"]
-    if refinement in JOINT_REFINEMENTS:
+    if estimator.refinement in JOINT_REFINEMENTS:
         stages.append(JOINT_STAGE)
-    if refinement == "consensus":
+    if estimator.refinement == "consensus":
         stages.append(CONSENSUS_STAGE)
-    return [*stages, "gauge and coefficients"]
+    stages.append("gauge and coefficients")
+    return stages + [PERSPECTIVE_STAGE] * (estimator.camera == "perspective")
 
 
 @one_blas_thread

@@ -23,7 +23,13 @@ from scipy.special import expit, logit, stdtr
 
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._fit import fit_table, mean_camera, mirror_image, supported_components
+from isa_nrsfm._fit import (
+    PERSPECTIVE_STAGE,
+    fit_table,
+    mean_camera,
+    mirror_image,
+    supported_components,
+)
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.pinhole import Pinhole, common
@@ -140,6 +146,7 @@ class PerspectiveTable(NamedTuple):
     isa: Any
     settings: FitSettings
     principal_point: Any
+    progress: FitProgress | NoProgress
 
     def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
         """Return the camera with a focal length."""
@@ -211,6 +218,7 @@ class PerspectiveTable(NamedTuple):
         running = [fit._replace(changes=(), earlier=()) for fit in fits]
         ended: list[PerspectiveFit] = []
         while running:
+            self.progress.step()
             running = [
                 self.fit(pinhole, n_components, fit, start=fit.model) for fit in running
             ]
@@ -254,12 +262,11 @@ class PerspectiveTable(NamedTuple):
         pinhole, settled = self.pinhole(1.0 / place), COMPARED * SETTLED
         return self.settled(pinhole, fit.n_components, fit, settled=settled)[0]
 
-    def searched(
-        self, n_components: int | None, progress: FitProgress | NoProgress
-    ) -> dict[float, PerspectiveFit]:
+    def searched(self, n_components: int | None) -> dict[float, PerspectiveFit]:
         """Return fits around the minimum of E; 0 is the weak-perspective fit."""
         f = FIRST * max(self.source.map(self._reach))
-        first = self.fit(self.pinhole(f, near=False), n_components, progress=progress)
+        virtual = self.pinhole(f, near=False)
+        first = self.fit(virtual, n_components, progress=self.progress)
         far = self.fit(self.pinhole(ENDLESS * f, near=False), first.n_components)
         fits = {0.0: far, **self.images(first, f)}
         if far.energy < fits[1.0 / f].energy:  # a long focal length, or none
@@ -309,7 +316,6 @@ def fit_perspective(
     table: PerspectiveTable,
     n_components: int | None,
     given: Any,
-    progress: FitProgress | NoProgress,
     start: TableModel | None = None,
     errors: bool = False,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
@@ -326,7 +332,7 @@ def fit_perspective(
         elif given is not None:
             f = common(given)
             virtual = table.pinhole(f, near=False)
-            first = table.fit(virtual, n_components, progress=progress)
+            first = table.fit(virtual, n_components, progress=table.progress)
             fits = {0.0: first, **table.images(first, f)}
             best = fits[1.0 / f]
             unsteady = best.changes[-1] > UNSETTLED or best.energy > first.energy
@@ -336,7 +342,7 @@ def fit_perspective(
                 places = 0.8 / f, 1.25 / f
                 fits |= {place: table.near(fits, place) for place in places}
         else:
-            fits = table.searched(n_components, progress)
+            fits = table.searched(n_components)
             place, deviation = minimum(fits)
             deviation = float(np.hypot(deviation, 0.5 * NEAR * place))  # of the search
             if best_of(fits) > 0 and place > 2.0 * deviation:
@@ -383,6 +389,7 @@ def fit_perspective(
     if why == NO_PERSPECTIVE:
         attributes["focal_length_"] = np.inf
     frames = Decomposition(*(part.astype(dtype) for part in frames))
+    table.progress(PERSPECTIVE_STAGE)
     return model, frames, converged, attributes
 
 
