@@ -25,6 +25,7 @@ from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._gauge import canonical_rotation
+from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
@@ -133,8 +134,13 @@ class ShapeSequenceNRSfM(
         cameras, shapes = signs[:, None, None] * cameras, signs[:, None, None] * shapes
         space = canonical_rotation(shapes.mean(axis=0), cameras)
         cameras, shapes = cameras @ space.T, shapes @ space.T
-        mean_shape, basis, coefficients = principal_shapes(shapes, self.n_components)
-        model = compose(mean_shape, basis, coefficients)
+        components, coefficients, _ = principal_shapes(shapes, self.n_components)
+        mean_shape, basis = components[0], components[1:]
+        # Smaller deformations are rounding errors.
+        moving = np.linalg.norm(basis, axis=(1, 2)) > 1e-12 * np.linalg.norm(mean_shape)
+        signs = np.where(moving, orientations(coefficients.T), 0.0)
+        basis = signs[:, None, None] * basis
+        model = compose(mean_shape, basis, signs * coefficients)
         noise, error = (
             np.mean((W - (cameras @ each.transpose(0, 2, 1)).reshape(W.shape)) ** 2)
             for each in (model, shapes)
@@ -155,24 +161,6 @@ class ShapeSequenceNRSfM(
         self.alpha_ = self._decompose(X).alpha
         self._n_features_out = self.n_components
         return self
-
-    def fit_transform(self, X: Any, y: Any = None) -> NDArray:
-        """
-        Factorise a table and return the coefficients of its frames.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            The table, one frame a row, in the order of `layout`.
-        y : None
-            Ignored.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_components)
-            `alpha_`.
-        """
-        return self.fit(X).alpha_.copy()
 
     def transform(self, X: Any) -> NDArray:
         """
@@ -299,9 +287,7 @@ def shape_signs(shapes: NDArray) -> NDArray:
     left singular vector.
     """
     rows = shapes.reshape(len(shapes), -1)
-    tall = len(rows) > rows.shape[1]
-    first = np.linalg.eigh(rows.T @ rows if tall else rows @ rows.T)[1][:, -1]
-    signs = _sign(rows @ first if tall else first)
+    signs = _sign(np.linalg.svd(rows, full_matrices=False)[0][:, 0])
     for _ in range(100):  # each round increases the sum, a few are enough
         changed = _sign(rows @ (signs @ rows))
         if (changed == signs).all():
@@ -319,24 +305,3 @@ def camera_signs(cameras: NDArray) -> NDArray:
 def _sign(values: NDArray) -> NDArray:
     """Return 1.0 or -1.0 for each value."""
     return np.where(values < 0, -1.0, 1.0)
-
-
-def principal_shapes(
-    shapes: NDArray, n_components: int
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Return mean, principal components and coefficients of shapes.
-
-    The components (K, J, 3) are orthogonal, decreasing, one standard deviation each.
-    The coefficients (I, K) are white, with non-negative skewness. Zero without
-    variation.
-    """
-    mean_shape = shapes.mean(axis=0)
-    rest = (shapes - mean_shape).reshape(len(shapes), -1)
-    U, S, Vt = np.linalg.svd(rest, full_matrices=False)
-    U, S, Vt = U[:, :n_components], S[:n_components], Vt[:n_components]
-    root = np.sqrt(len(shapes))
-    # Smaller deformations are rounding errors.
-    moving = S > 1e-12 * root * np.linalg.norm(mean_shape)
-    signs = np.where(moving, orientations(U.T), 0.0)
-    basis = (signs * S / root)[:, None] * Vt
-    return mean_shape, basis.reshape(-1, *mean_shape.shape), root * signs * U
