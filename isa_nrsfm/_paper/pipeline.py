@@ -38,7 +38,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import has_fit_parameter
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import energies, orientations
+from isa_nrsfm._linalg.small_matrices import energies, orientations, polar
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 
 # Larger matrices, with more rows and more columns, are not factorised as a whole.
@@ -274,8 +274,7 @@ def _independent_subspaces(
             f"got {isa.components_.shape}"
         )
     # The nearest orthogonal matrix: the signals are white, up to rounding.
-    U, _, Vt = np.linalg.svd(isa.components_)
-    return U @ Vt
+    return polar(isa.components_)[0]
 
 
 # Products of the rigid motion M_0^i and the motion M^i of n_signals signals: ``M_0^iT

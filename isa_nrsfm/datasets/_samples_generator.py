@@ -524,7 +524,7 @@ def make_nonrigid_tracks(
     """
     rng = check_random_state(random_state)
     mean_shape = centre_shapes(rng.standard_normal((n_points, 3)) * (1.0, 0.8, 0.6))
-    mean_shape /= _root_mean_square_length(mean_shape)
+    mean_shape /= np.sqrt(np.mean(np.sum(mean_shape**2, axis=-1)))
     basis = rng.standard_normal((n_components, n_points, 3))
     if shapes == "heavy_tailed":
         basis *= rng.standard_normal((n_components, n_points, 1))
@@ -533,19 +533,14 @@ def make_nonrigid_tracks(
     draw = rng.laplace if coefficients == "heavy_tailed" else rng.standard_normal
     alpha = standardise(draw(size=(n_frames, n_components)))
     if n_components:
-        size = _root_mean_square_length(np.tensordot(alpha, basis, 1))
-        basis *= amplitude / size
+        square = np.sum(np.tensordot(alpha, basis, 1) ** 2, axis=-1)
+        basis *= amplitude / np.sqrt(np.mean(square))
     rotations = Rotation.from_quat(rng.standard_normal((n_frames, 4))).as_matrix()
     motion = draw_motion(rotations, camera, (2 / 3, 3 / 2), rng)
     translation = rng.standard_normal((n_frames, 2))
     frames = mean_shape + np.tensordot(alpha, basis, 1)
     table = observe(frames, motion, translation, rng, noise, missing, layout)
     return Bunch(**table, mean_shape=mean_shape, basis=basis, alpha=alpha)
-
-
-def _root_mean_square_length(vectors: NDArray) -> float:
-    """Return the root mean square length of the vectors along the last axis."""
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))
 
 
 OF_PEOPLE = PARAMETERS | {"n_people": [Interval(Integral, 1, None, closed="left")]}

@@ -115,11 +115,9 @@ class SubspaceDensity(Protocol):
 
     def log_density(self, energy: NDArray) -> NDArray:
         """Return F(u)."""
-        ...
 
     def derivatives(self, energy: NDArray) -> tuple[NDArray, NDArray]:
         """Return F'(u) and F''(u)."""
-        ...
 
 
 class SqrtDensity(BaseEstimator):

@@ -1,12 +1,10 @@
 """Measures of the reprojection of a table."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.sources import CHECKS, unmasked
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
@@ -93,7 +91,7 @@ def frame_energies(
     X: ArrayLike, X_hat: ArrayLike, layout: Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
-    checks: dict[str, Any] = {"dtype": np.float64, "ensure_all_finite": "allow-nan"}
+    checks = CHECKS | {"dtype": np.float64}
     tables = [
         check_array(unmasked(table), input_name=name, **checks)
         for table, name in ((X, "X"), (X_hat, "X_hat"))
