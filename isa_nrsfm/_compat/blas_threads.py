@@ -88,8 +88,7 @@ def one_blas_thread(function: Function) -> Function:
 
 def _pools() -> list[Any]:
     """Return the controllers of the loaded BLAS libraries."""
-    controllers: list[Any] = threadpool_controller().lib_controllers
-    return [pool for pool in controllers if pool.user_api == "blas"]
+    return threadpool_controller().select(user_api="blas").lib_controllers
 
 
 def _set_threads(pool: Any, number: int) -> None:

@@ -76,12 +76,16 @@ def refuse_infinite(name: str, labels: NDArray, rows: NDArray) -> None:
         )
 
 
-def group_numbers(groups: Any, n_frames: int) -> NDArray:
-    """Return numbers of groups from zero (n_frames,), one group for None."""
+def group_names(groups: Any, n_frames: int) -> NDArray:
+    """Return the group of each frame (n_frames,), zero for None."""
     if groups is None:
         return np.zeros(n_frames, dtype=int)
-    names = checked_column("groups", groups, n_frames)
-    return np.asarray(np.unique(names, return_inverse=True)[1])
+    return checked_column("groups", groups, n_frames)
+
+
+def group_numbers(groups: Any, n_frames: int) -> NDArray:
+    """Return numbers of groups from zero (n_frames,), one group for None."""
+    return np.unique(group_names(groups, n_frames), return_inverse=True)[1]
 
 
 def checked_times(time: Any, n_rows: int) -> NDArray:

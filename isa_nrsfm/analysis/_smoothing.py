@@ -376,11 +376,9 @@ def _log_density(moments: NDArray, covariance: NDArray, number: int) -> NDArray:
 
     For the summed second moments (2, 2, k) of a number of samples, and covariances.
     """
-    (a, b), (c, d) = covariance
-    determinant = a * d - b * c
-    square = d * moments[0, 0] - b * moments[0, 1] - c * moments[1, 0]
-    square += a * moments[1, 1]
-    return np.asarray(-0.5 * (number * np.log(determinant) + square / determinant))
+    log_determinant = np.linalg.slogdet(covariance.T)[1]
+    square = np.einsum("kab,abk->k", np.linalg.inv(covariance.T), moments)
+    return np.asarray(-0.5 * (number * log_determinant + square))
 
 
 def _symmetric(matrix: NDArray) -> NDArray:

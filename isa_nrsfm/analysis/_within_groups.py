@@ -10,7 +10,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.sources import CHECKS
-from isa_nrsfm.analysis._frame_columns import checked_column, group_numbers
+from isa_nrsfm.analysis._frame_columns import checked_column, group_names, group_numbers
+from isa_nrsfm.analysis._permutations import indicators
 
 
 class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
@@ -107,7 +108,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         """
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, **CHECKS)
-        names = _names(groups, len(X))
+        names = group_names(groups, len(X))
         place = np.searchsorted(self.groups_, names)
         place = np.minimum(place, len(self.groups_) - 1)
         known = self.groups_[place] == names
@@ -165,16 +166,9 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         return tags
 
 
-def _names(groups: Any, n_frames: int) -> NDArray:
-    """Return the group of each frame (n_frames,)."""
-    if groups is None:
-        return np.zeros(n_frames, dtype=int)
-    return checked_column("groups", groups, n_frames)
-
-
 def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArray]:
     """Return the groups, sorted, and the means (n_groups, n_features) of each."""
-    names = _names(groups, len(X))
+    names = group_names(groups, len(X))
     used = np.isfinite(X).all(axis=1)
     if neutral is not None:
         used &= checked_column("neutral", neutral, len(X)).astype(bool)
@@ -190,10 +184,7 @@ def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArra
             f"{', '.join(empty[:5])}). Their coefficients have nothing to be compared "
             f"with. Remove these groups{remedy}"
         )
-    sums = np.stack(
-        [np.bincount(numbers[used], column, len(found)) for column in X[used].T], axis=1
-    )
-    return found, sums / sizes[:, None]
+    return found, indicators(numbers[used]).T @ X[used] / sizes[:, None]
 
 
 def _warn_of_single_frames(names: NDArray) -> None:
@@ -274,8 +265,7 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
             f"frames; got {n_groups} groups of {n_frames} frames"
         )
     # Mean squares of the analysis of variance, and the typical size of a group
-    sums = np.stack([np.bincount(numbers, column) for column in X.T], axis=1)
-    means = sums / sizes[:, None]
+    means = indicators(numbers).T @ X / sizes[:, None]
     within = np.sum((X - means[numbers]) ** 2, axis=0) / (n_frames - n_groups)
     apart = sizes @ (means - X.mean(axis=0)) ** 2 / (n_groups - 1)
     size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
