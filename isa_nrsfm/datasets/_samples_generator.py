@@ -124,8 +124,7 @@ def draw_motion(
 
 def standardise(coefficients: NDArray) -> NDArray[np.float64]:
     """Return coefficients with zero mean and unit variance over the frames."""
-    centred = coefficients - coefficients.mean(axis=0)
-    return centred / np.sqrt(np.mean(centred**2, axis=0))
+    return (coefficients - coefficients.mean(axis=0)) / coefficients.std(axis=0)
 
 
 def centre_shapes(shapes: NDArray) -> NDArray[np.float64]:
@@ -344,12 +343,11 @@ default="weak_perspective"
     rng = check_random_state(random_state)
     names = COMPONENT_NAMES[:n_components]
     strength = rng.beta(0.4, 2.0, (n_frames, n_components))
-    expressions = [k for k in range(n_components) if names[k] not in SIGNED_COMPONENTS]
-    for k in set(range(n_components)).difference(expressions):
-        strength[:, k] = 2 * rng.beta(2.0, 2.0, n_frames) - 1
+    signed = np.isin(names, SIGNED_COMPONENTS)
+    strength[:, signed] = 2 * rng.beta(2.0, 2.0, (n_frames, signed.sum())) - 1
     labels = np.full(n_frames, "rest")
-    if expressions:
-        labels = np.array(names)[expressions][strength[:, expressions].argmax(axis=1)]
+    if not signed.all():
+        labels = np.array(names)[~signed][strength[:, ~signed].argmax(axis=1)]
     alpha = standardise(strength)
     shapes = centre_shapes(_drawn_shapes(["neutral", *names]))
     neutral, full = shapes[0], shapes[1:]  # deformations at full strength
