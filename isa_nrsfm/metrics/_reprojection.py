@@ -92,14 +92,11 @@ def frame_energies(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
     checks = CHECKS | {"dtype": np.float64}
-    tables = [
-        check_array(unmasked(table), input_name=name, **checks)
-        for table, name in ((X, "X"), (X_hat, "X_hat"))
-    ]
-    check_same_shape("X", tables[0], "X_hat", tables[1])
-    truth, fitted = (
-        without_half_points(table_to_rows(table, layout))[0] for table in tables
-    )
+    truth = check_array(unmasked(X), input_name="X", **checks)
+    fitted = check_array(unmasked(X_hat), input_name="X_hat", **checks)
+    check_same_shape("X", truth, "X_hat", fitted)
+    both = (table_to_rows(table, layout) for table in (truth, fitted))
+    truth, fitted = (without_half_points(rows)[0] for rows in both)
     seen = seen_points(truth)
     lost = seen & ~seen_points(fitted)
     if lost.any():
