@@ -11,11 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import (
-    check_array,
-    check_scalar,
-    estimator_html_repr,
-)
+from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
@@ -640,14 +636,13 @@ default="affine"
         params = self.get_params(deep=False)
         if self.tol is None:
             params["tol"] = JOINT_TOL if joint else PAPER_TOL
+        params["prior"] = checked_prior(self, source.empty.shape[2])
         settings = FitSettings(
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),
             silent_isa=joint and self.isa is None,
             limits=self._limits,
         )
-        prior = checked_prior(self, source.empty.shape[2])
-        settings = settings._replace(prior=prior)
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
         elif self.camera == "perspective":  # fits of images without perspective

@@ -141,8 +141,7 @@ def coefficient_sizes(alpha: NDArray) -> NDArray:
 
 def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
     """Return ``sum_i ||alpha_ik M_i B_k||^2`` (K,) of basis shapes (K, J, 3)."""
-    cameras = motion.mT @ motion
-    weighted = np.tensordot(alpha**2, cameras, axes=(0, 0))
+    weighted = np.tensordot(alpha**2, motion.mT @ motion, axes=(0, 0))
     return np.einsum("kab,kab->k", weighted, basis.mT @ basis)
 
 

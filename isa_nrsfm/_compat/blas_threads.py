@@ -49,9 +49,8 @@ class OneBlasThread:
         with self._lock:
             self._users.discard(self)
             last = not len(self._users)
-            for pool, own, first in zip(
-                pools, self._before, self._of_process, strict=True
-            ):
+            numbers = zip(pools, self._before, self._of_process, strict=True)
+            for pool, own, first in numbers:
                 if getattr(pool, "threading_layer", None) == "openmp":
                     _set_threads(pool, own)
                 elif last:

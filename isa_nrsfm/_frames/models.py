@@ -221,16 +221,10 @@ class RigidFrames:
 
     def mirrored(self) -> "RigidFrames":
         """Return the model with shapes mirrored in depth."""
-        return replace(
-            self, mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
-        )
+        return RigidFrames(self.mean_shape * MIRROR, self.basis * MIRROR, self.camera)
 
     def fit(
-        self,
-        rows: NDArray,
-        sizes: NDArray,
-        deviations: bool = True,
-        weights: NDArray | None = None,
+        self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
     ) -> Decomposition:
         """Return the camera of the rigid fit and the coefficients of least squares.
 
@@ -338,11 +332,7 @@ class PosteriorFrames:
         return replace(self, shapes=centred(self.shapes[:, :, kept]))
 
     def fit(
-        self,
-        rows: NDArray,
-        sizes: NDArray,
-        deviations: bool = True,
-        weights: NDArray | None = None,
+        self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
     ) -> Decomposition:
         """Return the fit of rows (n, 2, J), NaN where missing, of sizes (n,).
 
@@ -357,12 +347,9 @@ class PosteriorFrames:
         known = covariance.shape[1] == len(self.shapes) - 1
         widened = self.widened(alpha, covariance)[0] if known else None
         motion, alpha, deviation = self.gauge.apply(motion, alpha, widened)
-        return Decomposition(
-            motion * sizes[:, None, None],
-            translation * sizes[:, None],
-            alpha,
-            deviation,
-        )
+        motion = motion * sizes[:, None, None]
+        translation = translation * sizes[:, None]
+        return Decomposition(motion, translation, alpha, deviation)
 
     def widened(self, alpha: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
         """Return covariances (n, K, K) with the errors of the shapes.
@@ -406,13 +393,9 @@ class PosteriorFrames:
         precision = T @ T.mT
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         covariance, ratio = self.widened(fit.alpha, fit.covariance)
+        translation = fit.translation * sizes[:, None]
         return LinearisedFrames(
-            motion,
-            fit.translation * sizes[:, None],
-            fit.alpha,
-            covariance,
-            precision / ratio,
-            slope,
+            motion, translation, fit.alpha, covariance, precision / ratio, slope
         )
 
     def depth_deviations(
@@ -491,8 +474,7 @@ class PosteriorFrames:
             part = rows[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
-            change = np.abs(new - weights[changing]).max(axis=1)
-            unsettled = change > 1e-4
+            unsettled = np.abs(new - weights[changing]).max(axis=1) > 1e-4
             weights[changing] = new
             changing = padded(np.unique(changing[unsettled]))
             if not len(changing):
@@ -517,6 +499,5 @@ def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
     while len(chosen) < n_starts and distance.max(initial=0.0) > 0:
         chosen.append(int(np.argmax(distance)))
         difference = alpha - alpha[chosen[-1]]
-        nearest = np.einsum("ik,ik->i", difference, difference)
-        distance = np.minimum(distance, nearest)
+        distance = np.minimum(distance, np.einsum("ik,ik->i", difference, difference))
     return alpha[chosen]

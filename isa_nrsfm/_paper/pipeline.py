@@ -295,8 +295,7 @@ def _blocks_of(cross: NDArray) -> NDArray:
     """Return ``M_0^iT M_ik`` as (n_blocks, n_frames, 9), each matrix row by row."""
     n_frames, _, n_signals = cross.shape
     split = cross.reshape(n_frames, 3, n_signals // 3, 3)
-    blocks = np.ascontiguousarray(split.transpose(2, 0, 1, 3))
-    return blocks.reshape(-1, n_frames, 9)
+    return np.ascontiguousarray(split.transpose(2, 0, 1, 3)).reshape(-1, n_frames, 9)
 
 
 def recover_blocks(products: MotionProducts, method: str) -> NDArray:
