@@ -54,15 +54,14 @@ def kind_of(y: NDArray, kind: str) -> Kind:
         raise ValueError(f"all {len(y)} labels are {y[0]}: there is nothing to compare")
     if kind == "number" and y.dtype.kind not in "biuf":
         raise ValueError(f"labels must be numbers; got {str(y[0])!r}")
-    found: Kind = "classes"
     if kind == "number" or (kind == "auto" and type_of_target(y) == "continuous"):
-        found = "number"
-    if found == "classes" and n_values == len(y):
+        return "number"
+    if n_values == len(y):
         raise ValueError(
             f"the {len(y)} labels are all different, so that no class has two frames; "
             "for a measured quantity use kind='number'"
         )
-    return found
+    return "classes"
 
 
 def refuse_infinite(name: str, labels: NDArray, rows: NDArray) -> None:
@@ -127,9 +126,8 @@ def sequences_of(
     found = []
     for rows in rows_of:
         lengths = np.maximum(np.rint(np.diff(time[rows]) / unit), 1).astype(int)
-        for part in np.split(
-            np.arange(len(rows)), np.flatnonzero(lengths > max_gap) + 1
-        ):
+        gaps = np.flatnonzero(lengths > max_gap) + 1
+        for part in np.split(np.arange(len(rows)), gaps):
             steps = np.cumsum(np.append(0, lengths[part[:-1]]))
             found.append((rows[part], steps))
     return found, unit

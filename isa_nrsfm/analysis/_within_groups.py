@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.sources import CHECKS
 from isa_nrsfm.analysis._frame_columns import checked_column, group_names, group_numbers
-from isa_nrsfm.analysis._permutations import indicators
+from isa_nrsfm.analysis._permutations import between_shares, indicators
 
 
 class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
@@ -109,8 +109,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, **CHECKS)
         names = group_names(groups, len(X))
-        place = np.searchsorted(self.groups_, names)
-        place = np.minimum(place, len(self.groups_) - 1)
+        place = np.searchsorted(self.groups_, names).clip(max=len(self.groups_) - 1)
         known = self.groups_[place] == names
         means = np.asarray(self.means_[place], dtype=X.dtype)
         if not known.all():
@@ -264,13 +263,7 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
             "variances between and within groups need two groups, and one with two "
             f"frames; got {n_groups} groups of {n_frames} frames"
         )
-    # Mean squares of the analysis of variance, and the typical size of a group
     means = indicators(numbers).T @ X / sizes[:, None]
-    within = np.sum((X - means[numbers]) ** 2, axis=0) / (n_frames - n_groups)
-    apart = sizes @ (means - X.mean(axis=0)) ** 2 / (n_groups - 1)
-    size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
-    # Variance components
-    between = np.maximum(apart - within, 0.0) / size
-    total = between + within
-    share = np.divide(between, total, where=total > 0, out=np.zeros_like(total))
+    within = np.sum((X - means[numbers]) ** 2, axis=0)
+    share = between_shares(within, sizes @ (means - X.mean(axis=0)) ** 2, sizes)
     return BetweenShare(share, 1.0 - share, n_groups, n_frames)
