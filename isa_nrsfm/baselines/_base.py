@@ -119,11 +119,9 @@ class ShapeSequenceNRSfM(
             column names that contradict `layout`.
         """
         X = self._checked(X, reset=True)
+        names, scaled = getattr(self, "feature_names_in_", None), self.scale_frames
         settings = FitSettings(
-            refinement=None,
-            layout=self.layout,
-            names=getattr(self, "feature_names_in_", None),
-            scale_frames=self.scale_frames,
+            refinement=None, layout=self.layout, names=names, scale_frames=scaled
         )
         rows = open_table(X, self.layout)
         table = scaled_table(rows, None, self.n_components, settings)
@@ -141,10 +139,8 @@ class ShapeSequenceNRSfM(
         signs = np.where(moving, orientations(coefficients.T), 0.0)
         basis = signs[:, None, None] * basis
         model = compose(mean_shape, basis, signs * coefficients)
-        noise, error = (
-            np.mean((W - (cameras @ each.transpose(0, 2, 1)).reshape(W.shape)) ** 2)
-            for each in (model, shapes)
-        )
+        rests = [W - (cameras @ each.mT).reshape(W.shape) for each in (model, shapes)]
+        noise, error = np.mean(np.square(rests), axis=(1, 2))
         self.inverse_snr_ = float(error / np.mean(W**2))
 
         # Without the scaling of frames the shapes have the unit of the table.
@@ -269,11 +265,8 @@ class ShapeSequenceNRSfM(
             sizes = report.size
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
         search = frame_search("orthographic", shapes.transpose(0, 2, 1).astype(float))
-        fits = search.fit_rows(
-            rows / sizes[:, None, None],
-            self.noise_variance_ / self._unit**2,
-            covariances=False,
-        )
+        noise = self.noise_variance_ / self._unit**2
+        fits = search.fit_rows(rows / sizes[:, None, None], noise, covariances=False)
         motion = (sizes / self._unit)[:, None, None] * fits.motion
         translation = sizes[:, None] * fits.translation
         found = (motion, translation, fits.alpha, np.full_like(fits.alpha, np.nan))
