@@ -11,11 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import (
-    check_array,
-    check_scalar,
-    estimator_html_repr,
-)
+from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
@@ -637,6 +633,7 @@ default="affine"
         params |= checked_prior(self, source.empty.shape[2])
         if self.tol is None:
             params["tol"] = JOINT_TOL if joint else PAPER_TOL
+        params["prior"] = checked_prior(self, source.empty.shape[2])
         settings = FitSettings(
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),

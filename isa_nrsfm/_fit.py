@@ -355,13 +355,11 @@ def _joint_frames(
         errors = prior.depth_errors(information, noise, sight, frames.alpha)
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
-    square = (table.unit or 1.0) ** 2
+    square, chances = (table.unit or 1.0) ** 2, (sum(part) for part in chance)
     attributes = {
         "mode_covariance_": square * mode_covariance(cameras, frames.alpha),
         "noise_variance_": square * noise,
-        "reliability_": reliabilities(
-            alpha, covariance, *(sum(part) for part in chance)
-        ),
+        "reliability_": reliabilities(alpha, covariance, *chances),
     }
     frames = frames._replace(translation=frames.translation + table.translation)
     fitted = TableModel(model, mean_shape, basis, s.layout, table.unit)
@@ -379,18 +377,17 @@ def _measures(
     mean_shape, basis = model.mean_shape, model.basis
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
-    reference = mean_camera(frames, table.sizes, settings.camera)
+    position = (frames.translation - table.translation) / table.sizes[:, None]
     shapes = np.concatenate([mean_shape[None], basis]).mT
-    place = (frames.translation - table.translation) / table.sizes[:, None]
+    error = reprojection_error(table.rows, shapes, cameras, position, frames.alpha)
+    reference = mean_camera(frames, table.sizes, settings.camera)
     return {
         "mean_shape_": mean_shape,
         "basis_": basis,
         "rank_floor_": factorised.rest_share,
         "singular_values_": (table.unit or 1.0) * factorised.singular_values,
         "energy_share_": energy / (energy.sum() or 1.0),
-        "inverse_snr_": reprojection_error(
-            table.rows, shapes, cameras, place, frames.alpha
-        ),
+        "inverse_snr_": error,
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 

@@ -250,8 +250,7 @@ class TableModel(NamedTuple):
         """
         weights = by_frame[-1] if weighted else None
         shares = by_frame[: len(by_frame) - weighted]
-        fit = self.decompose(rows, weights, deviations=False)
-        motion, translation, alpha, _ = fit
+        motion, translation, alpha, _ = self.decompose(rows, weights, deviations=False)
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation)
         if self.pinhole is not None and shares:
@@ -326,7 +325,7 @@ class TableModel(NamedTuple):
                 assert isinstance(frames, PosteriorFrames)
                 kept = frames.of_points(~held)  # their centroid is the origin
                 visible = np.ascontiguousarray(rows[usable][..., ~held])
-                fit = kept.fit(visible, sizes[usable], False)
+                fit = kept.fit(visible, sizes[usable], False, None)
                 mean = mean - self.mean_shape[~held].mean(axis=0)
                 others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
             else:
@@ -375,6 +374,4 @@ def _camera_leverage(mean_shape: NDArray, seen: NDArray) -> NDArray:
     normal = np.einsum("ij,ja,jb->iab", seen, points, points, optimize=True)
     # A tiny ridge: if the seen points are coplanar, the variance is huge.
     inverse = np.linalg.inv(normal + np.finfo(float).eps * np.eye(4))
-    return np.asarray(
-        np.einsum("ja,iab,jb->ij", points, inverse, points, optimize=True)
-    )
+    return np.einsum("ja,iab,jb->ij", points, inverse, points, optimize=True)

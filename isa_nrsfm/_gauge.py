@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import mean_view
 from isa_nrsfm._frames.models import Decomposition, FrameMap
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
-from isa_nrsfm._linalg.small_matrices import orientations
+from isa_nrsfm._linalg.small_matrices import orientations, polar
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
 
 
@@ -42,8 +42,7 @@ def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
         rows = cameras.reshape(-1, 3)
         axes = np.linalg.eigh(rows.T @ rows)[1][:, ::-1].T
         return axes * orientations(axes @ mean_shape.T)[:, None]
-    U, _, Vt = np.linalg.svd(view, full_matrices=False)
-    across = U @ Vt
+    across = polar(view)[0]
     axes = np.vstack([across, np.cross(*across)])
     axes[2] *= orientations(axes[2:] @ mean_shape.T)[0]
     return axes
@@ -142,8 +141,7 @@ def coefficient_sizes(alpha: NDArray) -> NDArray:
 
 def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
     """Return ``sum_i ||alpha_ik M_i B_k||^2`` (K,) of basis shapes (K, J, 3)."""
-    cameras = motion.mT @ motion
-    weighted = np.tensordot(alpha**2, cameras, axes=(0, 0))
+    weighted = np.tensordot(alpha**2, motion.mT @ motion, axes=(0, 0))
     return np.einsum("kab,kab->k", weighted, basis.mT @ basis)
 
 

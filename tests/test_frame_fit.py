@@ -75,7 +75,8 @@ def random_fit(seed, noise=0.0, n_frames=12, n_components=2):
 def rigid(tracks, mean_shape, basis, camera="affine"):
     """Return the fit of the paper's model of a frame."""
     rows = tracks.transpose(0, 2, 1)
-    return RigidFrames(mean_shape, basis, camera).fit(rows, np.ones(len(rows)))
+    frames, sizes = RigidFrames(mean_shape, basis, camera), np.ones(len(rows))
+    return frames.fit(rows, sizes, True, None)
 
 
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
@@ -161,7 +162,8 @@ class TestPosteriorFrames:
         frames, tracks = posterior_frames(0)
         frames, tracks = replace(frames, camera=camera), with_gaps(tracks, missing)
         sizes = np.linspace(0.5, 200.0, len(tracks))
-        fitted = frames.fit((tracks * sizes[:, None, None]).transpose(0, 2, 1), sizes)
+        rows = (tracks * sizes[:, None, None]).transpose(0, 2, 1)
+        fitted = frames.fit(rows, sizes, True, None)
         expected = fit_posterior(
             tracks, frames.shapes, NOISE**2, camera=camera, starts=frames.starts
         )
@@ -176,9 +178,9 @@ class TestPosteriorFrames:
     def test_errors_of_shapes_lower_the_precision_of_the_images(self):
         frames, tracks = posterior_frames(0)
         rows, sizes = tracks.transpose(0, 2, 1), np.ones(len(tracks))
-        alone = frames.fit(rows, sizes)
+        alone = frames.fit(rows, sizes, True, None)
         certainty = DepthCertainty(images=(1.5, 0.2))
-        fitted = replace(frames, certainty=certainty).fit(rows, sizes)
+        fitted = replace(frames, certainty=certainty).fit(rows, sizes, True, None)
         assert_array_equal(fitted.alpha, alone.alpha)
         ratio = 1.5 + 0.2 * (1 + np.sum(alone.alpha**2, axis=1))
         prior = np.eye(2)

@@ -19,7 +19,7 @@ from isa_nrsfm._joint.problem import (
     JointProblem,
     JointState,
 )
-from isa_nrsfm._joint.settings import FitSettings
+from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
@@ -82,11 +82,14 @@ def test_rigid_start_of_a_rigid_object_is_the_truth(camera):
     assert_allclose(motion @ shapes[0], scene.rows, atol=1e-8)
 
 
+WIDTHS = LIMITS.widths
+
+
 class TestMixedCameras:
     @pytest.mark.parametrize("seed", range(4))
     def test_exact_cameras_are_among_them(self, seed):
         scene = random_scene(seed=seed)
-        found = list(mixed_cameras(scene.rows, None, np.arange(60)))
+        found = list(mixed_cameras(scene.rows, None, np.arange(60), WIDTHS))
         errors = [camera_error(motion, scene.motion) for motion in found]
         rigid = rigid_start(scene.factors, scene.shapes, False)[0]
         # The cost is of fourth order in some directions.
@@ -95,14 +98,14 @@ class TestMixedCameras:
 
     def test_known_scales_give_exact_cameras_of_weak_perspective(self):
         scene = random_scene("weak_perspective")
-        found = mixed_cameras(scene.rows, scene.scales, np.arange(60))
+        found = mixed_cameras(scene.rows, scene.scales, np.arange(60), WIDTHS)
         assert min(camera_error(motion, scene.motion) for motion in found) < 1e-4
 
     @BOTH
     def test_are_calibrated(self, camera):
         scene = random_scene(camera, noise=0.05)
         scales = scene.scales if camera == "weak_perspective" else None
-        found = list(mixed_cameras(scene.rows, scales, np.arange(60)))
+        found = list(mixed_cameras(scene.rows, scales, np.arange(60), WIDTHS))
         # Of up to 6, 9, 12, 18, 24 and 36 columns of the 39 there are.
         assert len(found) == 6
         for motion in found:

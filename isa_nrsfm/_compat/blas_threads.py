@@ -49,9 +49,8 @@ class OneBlasThread:
         with self._lock:
             self._users.discard(self)
             last = not len(self._users)
-            for pool, own, first in zip(
-                pools, self._before, self._of_process, strict=True
-            ):
+            numbers = zip(pools, self._before, self._of_process, strict=True)
+            for pool, own, first in numbers:
                 if getattr(pool, "threading_layer", None) == "openmp":
                     _set_threads(pool, own)
                 elif last:
@@ -88,8 +87,7 @@ def one_blas_thread(function: Function) -> Function:
 
 def _pools() -> list[Any]:
     """Return the controllers of the loaded BLAS libraries."""
-    controllers: list[Any] = threadpool_controller().lib_controllers
-    return [pool for pool in controllers if pool.user_api == "blas"]
+    return threadpool_controller().select(user_api="blas").lib_controllers
 
 
 def _set_threads(pool: Any, number: int) -> None:

@@ -42,20 +42,16 @@ class ShownEstimator(BaseEstimator):
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:
     """Return a decorator of `fit` that checks parameters, nested ones included."""
-    decorate: Callable[[Function], Function] = _fit_context(
-        prefer_skip_nested_validation=not nested
-    )
-    return decorate
+    return _fit_context(prefer_skip_nested_validation=not nested)
 
 
 def checked_parameters(
     constraints: dict[str, list[Any]],
 ) -> Callable[[Function], Function]:
     """Return a decorator that checks parameters of a function against constraints."""
-    decorate: Callable[[Function], Function] = _param_validation.validate_params(
+    return _param_validation.validate_params(
         constraints, prefer_skip_nested_validation=True
     )
-    return decorate
 
 
 class CoefficientsMixin(ClassNamePrefixFeaturesOutMixin):

@@ -55,8 +55,7 @@ def array_in(content: bytes) -> NDArray:
     objects, or if the number of entries differs from the header.
     """
     stored = io.BytesIO(content)
-    version = np.lib.format.read_magic(stored)
-    if version == (1, 0):
+    if np.lib.format.read_magic(stored) == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(stored)
     else:
         shape, _, dtype = np.lib.format.read_array_header_2_0(stored)

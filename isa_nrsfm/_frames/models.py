@@ -223,16 +223,10 @@ class RigidFrames:
 
     def mirrored(self) -> "RigidFrames":
         """Return the model with shapes mirrored in depth."""
-        return replace(
-            self, mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
-        )
+        return RigidFrames(self.mean_shape * MIRROR, self.basis * MIRROR, self.camera)
 
     def fit(
-        self,
-        rows: NDArray,
-        sizes: NDArray,
-        deviations: bool = True,
-        weights: NDArray | None = None,
+        self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
     ) -> Decomposition:
         """Return the camera of the rigid fit and the coefficients of least squares.
 
@@ -340,11 +334,7 @@ class PosteriorFrames:
         return replace(self, shapes=centred(self.shapes[:, :, kept]))
 
     def fit(
-        self,
-        rows: NDArray,
-        sizes: NDArray,
-        deviations: bool = True,
-        weights: NDArray | None = None,
+        self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
     ) -> Decomposition:
         """Return the fit of rows (n, 2, J), NaN where missing, of sizes (n,).
 
@@ -485,8 +475,7 @@ class PosteriorFrames:
             part = rows[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
-            change = np.abs(new - weights[changing]).max(axis=1)
-            unsettled = change > 1e-4
+            unsettled = np.abs(new - weights[changing]).max(axis=1) > 1e-4
             weights[changing] = new
             changing = padded(np.unique(changing[unsettled]))
             if not len(changing):
@@ -511,6 +500,5 @@ def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
     while len(chosen) < n_starts and distance.max(initial=0.0) > 0:
         chosen.append(int(np.argmax(distance)))
         difference = alpha - alpha[chosen[-1]]
-        nearest = np.einsum("ik,ik->i", difference, difference)
-        distance = np.minimum(distance, nearest)
+        distance = np.minimum(distance, np.einsum("ik,ik->i", difference, difference))
     return alpha[chosen]

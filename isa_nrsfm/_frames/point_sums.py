@@ -371,13 +371,10 @@ def coefficient_posterior(
         left = equations[1:n_shapes] - _product(equations[n_shapes:], alpha)
         alpha -= _product(H[n_shapes:], left)
         objective -= np.einsum("ki,ki->i", alpha, left)
-    return CoefficientPosterior(
-        with_one(alpha),
-        H,
-        np.maximum(objective, 0.0),  # less is rounding errors
-        log_determinant - len(alpha) * np.log(noise),
-        image_energy,
-    )
+    objective = np.maximum(objective, 0.0)  # less is rounding errors
+    log_determinant = log_determinant - len(alpha) * np.log(noise)
+    c = with_one(alpha)
+    return CoefficientPosterior(c, H, objective, log_determinant, image_energy)
 
 
 def _product(packed: NDArray, vectors: NDArray) -> NDArray:

@@ -217,5 +217,4 @@ class SingleSearch:
 
 def _sum(c: NDArray, matrices: NDArray) -> NDArray:
     """Return ``sum_k c_k A_k`` of matrices (k, m, n), faster than `np.tensordot`."""
-    rows = matrices.reshape(len(c), -1)
-    return np.asarray(c @ rows).reshape(matrices.shape[1:])
+    return np.asarray(c @ matrices.reshape(len(c), -1)).reshape(matrices.shape[1:])

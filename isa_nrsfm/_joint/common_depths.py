@@ -100,8 +100,7 @@ def aligning_rotations(S: NDArray, s2: float) -> NDArray:
     """
     R = np.repeat(np.eye(3)[:, :, None], len(S), axis=2)
     for _ in range(STEPS):
-        shapes = np.einsum("iaj,abi->jbi", S, R)
-        R = rotated(R, _turns(shapes, s2)[-1])
+        R = rotated(R, _turns(np.einsum("iaj,abi->jbi", S, R), s2)[-1])
     return frames_first(R)
 
 

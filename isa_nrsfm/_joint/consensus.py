@@ -198,14 +198,12 @@ def fitted_groups(
     tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
     quiet, rows, first = settings._replace(on_step=None), scene.rows, scene.first
     # In the order of memory that pickled arrays have, else rounding errors differ.
-    fits = Parallel(n_jobs=settings.n_jobs, return_as="generator")(
-        delayed(group_fit)(
-            scene._replace(rows=rows.take(points, 2), first=first.take(points, 2)),
-            n_components,
-            quiet,
-        )
+    parts = (
+        scene._replace(rows=rows.take(points, 2), first=first.take(points, 2))
         for points, _ in tasks
     )
+    run = Parallel(n_jobs=settings.n_jobs, return_as="generator")
+    fits = run(delayed(group_fit)(part, n_components, quiet) for part in parts)
     groups = []
     for (points, count), fit in zip(tasks, fits, strict=True):
         if settings.on_step is not None:
@@ -294,8 +292,7 @@ def group_fit(
 
 def frames_showing(rows: NDArray) -> NDArray:
     """Return the frames of rows (I, 2, n) with at least four visible points."""
-    seen = np.isfinite(rows[:, 0]).sum(axis=1)
-    return np.flatnonzero(seen >= FEWEST_POINTS)
+    return np.flatnonzero(np.isfinite(rows[:, 0]).sum(axis=1) >= FEWEST_POINTS)
 
 
 def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
@@ -339,8 +336,7 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
         images = group.weight * group.coordinates[:, :2]
         total[np.ix_(frames, np.arange(2), points)] += images
     fitted = total / weight[:, None]
-    visible = np.isfinite(scene.rows)
-    images = np.where(visible, scene.rows, fitted)
+    images = np.where(np.isfinite(scene.rows), scene.rows, fitted)
     depths = np.linalg.solve(A, b[:, :, None])
     images = images + share * (fitted - images)
     return np.concatenate([images, depths.mT], axis=1)
@@ -380,5 +376,4 @@ def principal_shapes(
     basis[:n] = (values[:n, None] * Vt[:n]).reshape(n, *mean_shape.shape)
     basis /= np.sqrt(len(S))
     alpha[:, :n] = np.sqrt(len(S)) * U[:, :n]
-    shapes = np.concatenate([mean_shape[None], basis])
-    return shapes, alpha, float(left[n])
+    return np.concatenate([mean_shape[None], basis]), alpha, float(left[n])

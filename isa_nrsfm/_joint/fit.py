@@ -144,8 +144,7 @@ def relevant_components(problem: JointProblem, state: JointState) -> int:
         basis = np.tensordot(axes.T, state.shapes[1:], 1)
         shapes = np.concatenate([state.shapes[:1], basis])
         start = state._replace(shapes=shapes)
-        tol = part.settings.tol
-        state = part.refined(start, max_iter=30, tol=tol).state
+        state = part.refined(start, max_iter=30, tol=part.settings.tol).state
         C, images = _image_moments(state)
         energy = np.diagonal(images)
         if not energy.any():
@@ -359,8 +358,7 @@ def reweighted(
         deviation = max(median_noise(distance[np.isfinite(distance)]), OF_DISTANCES)
         # Weights from the residuals, and convergence test
         new = partial(_weighted, shapes=shapes, loss=loss, deviation=deviation)
-        change = max(weighted.map(partial(_change, new=new), *model))
-        if change < 1e-2:
+        if max(weighted.map(partial(_change, new=new), *model)) < 1e-2:
             break
         # Refinement with the new weights
         weighted = rows.derive(new, *model)

@@ -308,8 +308,7 @@ def _terms(
     cameras = camera_gram(M)
     # With respect to the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
     motion_curvature = products.gram.moments(moments)
-    A = unpack3(motion_curvature)
-    G = np.einsum("rbi,bai->rai", M, A)
+    G = np.einsum("rbi,bai->rai", M, unpack3(motion_curvature))
     G -= np.einsum("ki,kari->rai", c, products.cross)
     # With respect to the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
     X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)

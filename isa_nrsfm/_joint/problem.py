@@ -365,10 +365,8 @@ def _inverse_hessian_product(iterate: _Iterate, memory: Memory) -> NDArray:
         weights.append(step @ vector / curvature)
         vector -= weights[-1] * change
     vector = iterate.precondition(vector)
-    for (step, change, curvature), weight in zip(
-        memory, reversed(weights), strict=True
-    ):
-        vector += (weight - change @ vector / curvature) * step
+    for step, change, curvature in memory:
+        vector += (weights.pop() - change @ vector / curvature) * step
     return vector
 
 

@@ -20,7 +20,6 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState
-from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._paper.pipeline import Factorisation, rigid_energy
@@ -53,10 +52,7 @@ def rigid_start(
 
 
 def mixed_cameras(
-    rows: NDArray,
-    scales: NDArray | None,
-    chosen: NDArray,
-    widths: tuple[int, ...] = LIMITS.widths,
+    rows: NDArray, scales: NDArray | None, chosen: NDArray, widths: tuple[int, ...]
 ) -> Iterator[NDArray]:
     """Yield calibrated cameras (I, 2, 3), mixtures of more and more columns.
 
@@ -86,8 +82,7 @@ def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
     M_i^T W_i``. `extended_shapes` computes the basis shapes.
     """
     gram = np.einsum("ira,irb->ab", motion, motion)
-    right = np.einsum("ira,irj->aj", motion, rows)
-    mean_shape = np.linalg.lstsq(gram, right)[0][None]
+    mean_shape = np.linalg.lstsq(gram, np.einsum("ira,irj->aj", motion, rows))[0][None]
     none = np.zeros((len(rows), 0))
     return extended_shapes(rows, mean_shape, motion, none, n_components)
 

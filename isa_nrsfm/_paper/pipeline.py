@@ -38,7 +38,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import has_fit_parameter
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import energies, orientations
+from isa_nrsfm._linalg.small_matrices import energies, orientations, polar
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 
 # Larger matrices, with more rows and more columns, are not factorised as a whole.
@@ -274,8 +274,7 @@ def _independent_subspaces(
             f"got {isa.components_.shape}"
         )
     # The nearest orthogonal matrix: the signals are white, up to rounding.
-    U, _, Vt = np.linalg.svd(isa.components_)
-    return U @ Vt
+    return polar(isa.components_)[0]
 
 
 # Products of the rigid motion M_0^i and the motion M^i of n_signals signals: ``M_0^iT
@@ -296,8 +295,7 @@ def _blocks_of(cross: NDArray) -> NDArray:
     """Return ``M_0^iT M_ik`` as (n_blocks, n_frames, 9), each matrix row by row."""
     n_frames, _, n_signals = cross.shape
     split = cross.reshape(n_frames, 3, n_signals // 3, 3)
-    blocks = np.ascontiguousarray(split.transpose(2, 0, 1, 3))
-    return blocks.reshape(-1, n_frames, 9)
+    return np.ascontiguousarray(split.transpose(2, 0, 1, 3)).reshape(-1, n_frames, 9)
 
 
 def recover_blocks(products: MotionProducts, method: str) -> NDArray:

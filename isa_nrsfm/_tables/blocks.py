@@ -63,14 +63,10 @@ class FrameBlocks:
 
     @classmethod
     def read_later(
-        cls,
-        rows: Callable[[slice], Any],
-        n_frames: int,
-        block_frames: int,
-        n_threads: int,
+        cls, rows: Callable[[slice], Any], n_frames: int, length: int, n_threads: int
     ) -> Self:
-        """Return blocks that a function of a slice of rows reads."""
-        parts = block_slices(n_frames, block_frames)
+        """Return blocks, `length` frames each, that a function of row slices reads."""
+        parts = block_slices(n_frames, length)
         lengths = [part.stop - part.start for part in parts]
         return cls(lambda number: rows(parts[number]), lengths, False, n_threads)
 
@@ -319,6 +315,5 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     shown = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))
     for point in np.flatnonzero(shown < fewest).tolist():
         shows = rows.joined(lambda block, j=point: ~np.isnan(block[:, 0, j]))
-        showing = order[shows[order]]
-        chosen[spread(showing, fewest)] = True
+        chosen[spread(order[shows[order]], fewest)] = True
     return np.flatnonzero(chosen)

@@ -108,9 +108,8 @@ def is_on_dask(X: Any) -> bool:
 
 def checked_rows(rows: Any) -> NDArray:
     """Return rows of a table as float32 or float64, without infinite values."""
-    return checked_range(
-        check_array(unmasked(rows), input_name="X", ensure_min_features=0, **CHECKS)
-    )
+    X = check_array(unmasked(rows), input_name="X", ensure_min_features=0, **CHECKS)
+    return checked_range(X)
 
 
 def unmasked(X: Any) -> Any:

@@ -224,6 +224,5 @@ def weighted_sizes(rows: NDArray, weights: NDArray) -> NDArray:
     place = np.vecdot(rows, shares[:, None])
     off = np.where(weights[:, None] > 0, rows - place[..., None], 0.0)
     square = np.vecdot(shares, (off**2).sum(axis=1)) / 2
-    eps = 4 * np.finfo(float).eps
-    enough = square > (eps * report.size) ** 2
+    enough = square > (4 * np.finfo(float).eps * report.size) ** 2
     return np.where(enough, np.sqrt(square), report.size)

@@ -54,15 +54,14 @@ def kind_of(y: NDArray, kind: str) -> Kind:
         raise ValueError(f"all {len(y)} labels are {y[0]}: there is nothing to compare")
     if kind == "number" and y.dtype.kind not in "biuf":
         raise ValueError(f"labels must be numbers; got {str(y[0])!r}")
-    found: Kind = "classes"
     if kind == "number" or (kind == "auto" and type_of_target(y) == "continuous"):
-        found = "number"
-    if found == "classes" and n_values == len(y):
+        return "number"
+    if n_values == len(y):
         raise ValueError(
             f"the {len(y)} labels are all different, so that no class has two frames; "
             "for a measured quantity use kind='number'"
         )
-    return found
+    return "classes"
 
 
 def refuse_infinite(name: str, labels: NDArray, rows: NDArray) -> None:
@@ -76,12 +75,16 @@ def refuse_infinite(name: str, labels: NDArray, rows: NDArray) -> None:
         )
 
 
-def group_numbers(groups: Any, n_frames: int) -> NDArray:
-    """Return numbers of groups from zero (n_frames,), one group for None."""
+def group_names(groups: Any, n_frames: int) -> NDArray:
+    """Return the group of each frame (n_frames,), zero for None."""
     if groups is None:
         return np.zeros(n_frames, dtype=int)
-    names = checked_column("groups", groups, n_frames)
-    return np.asarray(np.unique(names, return_inverse=True)[1])
+    return checked_column("groups", groups, n_frames)
+
+
+def group_numbers(groups: Any, n_frames: int) -> NDArray:
+    """Return numbers of groups from zero (n_frames,), one group for None."""
+    return np.unique(group_names(groups, n_frames), return_inverse=True)[1]
 
 
 def checked_times(time: Any, n_rows: int) -> NDArray:
@@ -123,8 +126,8 @@ def sequences_of(
     found = []
     for rows in rows_of:
         lengths = np.maximum(np.rint(np.diff(time[rows]) / unit), 1).astype(int)
-        cuts = np.flatnonzero(lengths > max_gap) + 1
-        for part in np.split(np.arange(len(rows)), cuts):
+        gaps = np.flatnonzero(lengths > max_gap) + 1
+        for part in np.split(np.arange(len(rows)), gaps):
             steps = np.cumsum(np.append(0, lengths[part[:-1]]))
             found.append((rows[part], steps))
     return found, unit

@@ -151,7 +151,14 @@ def permuted_energies(
         rest = unexplained(alpha, labels, order)
         length, in_runs = independent_length(rest), _are_sorted(labels, order)
         units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
-        shuffled = _shuffled(alpha, order, length, n_permutations, rng)
+        # Blocks of frames, permuted within groups
+        block = order.blocks(length)
+        places = (
+            rng.random_sample(block[-1] + 1)[block] for _ in range(n_permutations)
+        )
+        shuffled: Iterator[NDArray] = (
+            alpha[np.lexsort((place, order.groups))] for place in places
+        )
         if length == 1:
             units = "frames"
         elif not in_runs:
@@ -199,19 +206,6 @@ def _one_event(alpha: NDArray, labels: csr_array, order: FrameOrder) -> bool:
     return bool(np.sum(shared) ** 2 < 2 * np.sum(shared**2))
 
 
-def _shuffled(
-    alpha: NDArray,
-    order: FrameOrder,
-    length: int,
-    n_permutations: int,
-    rng: np.random.RandomState,
-) -> Iterator[NDArray]:
-    """Yield ordered coefficients whose blocks of frames are permuted within groups."""
-    block = order.blocks(length)
-    for _ in range(n_permutations):
-        yield alpha[np.lexsort((rng.random_sample(block[-1] + 1)[block], order.groups))]
-
-
 def _waves(
     alpha: NDArray, order: FrameOrder, n_permutations: int, rng: np.random.RandomState
 ) -> Iterator[NDArray]:
@@ -236,20 +230,22 @@ def _weights(labels: csr_array, means: csr_array, order: FrameOrder) -> NDArray:
     if (sizes == sizes[0]).all():
         return np.ones(sizes.shape)
     square, of_means = labels.power(2).sum(axis=0), (sizes.T @ means.power(2))[0]
-    total = square - labels.sum(axis=0) ** 2 / labels.shape[0]
-    between, within = variances(square - of_means, of_means - square + total, sizes)
-    share = np.average(between / (between + within), weights=total)
+    total = square - labels.sum(axis=0) ** 2 / len(order.rows)
+    within = square - of_means
+    share = np.average(between_shares(within, total - within, sizes), weights=total)
     return np.asarray(1.0 / np.sqrt(share + (1.0 - share) / sizes))
 
 
-def variances(
-    within: NDArray, between: NDArray, sizes: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Return variances (k,) between and within groups, from sums of squares (k,)."""
-    n_frames, n_apart = np.sum(sizes), len(sizes) - 1
-    size = (n_frames - np.sum(sizes**2) / n_frames) / n_apart  # the typical one
-    within = within / (n_frames - len(sizes))
-    return np.maximum(between / n_apart - within, 0.0) / size, within
+def between_shares(within: NDArray, apart: NDArray, sizes: NDArray) -> NDArray:
+    """Return shares of variances between groups, from sums of squares."""
+    n_frames, n_groups = sizes.sum(), len(sizes)
+    # Mean squares of the analysis of variance, and the typical size of a group
+    within, apart = within / (n_frames - n_groups), apart / (n_groups - 1)
+    size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
+    # Variance components
+    between = np.maximum(apart - within, 0.0) / size
+    total = between + within
+    return np.divide(between, total, where=total > 0, out=np.zeros_like(total))
 
 
 def _standard(means: NDArray, weights: NDArray) -> NDArray:

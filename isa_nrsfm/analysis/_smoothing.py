@@ -99,14 +99,12 @@ class Dynamics(NamedTuple):
         """
         K, n = len(self.shares), len(self.rates) + len(self.walks)
         rest = np.ones(K), np.zeros(K), self.between
+        blocks = ([[np.diag(b) for b in row] for row in each] for each in self.blocks())
         F, Q, first = (
-            block_diag(
-                np.block([[np.diag(b) for b in row] for row in each]), np.diag(r)
-            )
-            for each, r in zip(self.blocks(), rest, strict=True)
+            block_diag(np.block(each), np.diag(r))
+            for each, r in zip(blocks, rest, strict=True)
         )
-        shown = np.hstack([np.eye(n), np.zeros((n, n)), np.eye(n, K)])
-        return F, Q, first, shown
+        return F, Q, first, np.hstack([np.eye(n), np.zeros((n, n)), np.eye(n, K)])
 
 
 class SmoothedCoefficients(NamedTuple):
@@ -184,9 +182,8 @@ def _smoothed_frames(
     known = np.isfinite(alone.precision[:, 0, 0])
     if not known.any():
         return alone, none
-    origins, observed = zip(
-        *(_observations(alone, camera, known, *each) for each in sequences), strict=True
-    )
+    pairs = (_observations(alone, camera, *each) for each in sequences)
+    origins, observed = zip(*pairs, strict=True)
     # Parameters of cameras in units of their changes and deviations
     precision = np.median(np.diagonal(alone.precision[known], 0, 1, 2), axis=0)
     square = np.mean(np.concatenate([each[2] for each in observed]) ** 2, axis=0)
@@ -217,11 +214,7 @@ def _smoothed_frames(
 
 
 def _observations(
-    alone: LinearisedFrames,
-    camera: CameraModel,
-    known: NDArray,
-    rows: NDArray,
-    steps: NDArray,
+    alone: LinearisedFrames, camera: CameraModel, rows: NDArray, steps: NDArray
 ) -> tuple[NDArray, Observations]:
     """Return the origin of each row of a sequence, and the likelihoods of its steps.
 
@@ -229,7 +222,7 @@ def _observations(
     """
     n_steps, (_, n, _), K = steps[-1] + 1, alone.precision.shape, alone.alpha.shape[1]
     precision, fit, change = np.zeros((n_steps, n, n)), *np.zeros((2, n_steps, n))
-    seen = known[rows]
+    seen = np.isfinite(alone.precision[rows, 0, 0])
     chosen, at = rows[seen], steps[seen]
     if len(chosen) > 1:
         motion = alone.motion[chosen]
@@ -306,22 +299,16 @@ def estimated_dynamics(
         slope = expected_gradient(dynamics, total, n_pairs, len(sequences))
         return -sum(values), -slope
 
+    search = partial(minimize, minus_log_likelihood, jac=True, method="L-BFGS-B")
+    options = {"maxiter": max_iter, "gtol": tol, "ftol": 1e-12}
     # With dynamics, and independent frames with an intercept
     for rate, shares in (LEAST_RATE, intercepts), (LARGEST_RATE, True):
         least = np.log(rate)
         lengths = n_components, n_walks, n_components * shares
         start = np.repeat([max(least, FIRST_RATE), 0.0, 0.0], lengths)
         limits = [(least, np.log(LARGEST_RATE)), (-40.0, 10.0), (-7.0, 7.0)]
-        found.append(
-            minimize(
-                minus_log_likelihood,
-                start,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=[limits[i] for i in np.repeat([0, 1, 2], lengths)],
-                options={"maxiter": max_iter, "gtol": tol, "ftol": 1e-12},
-            )
-        )
+        bounds = np.repeat(limits, lengths, axis=0)
+        found.append(search(start, bounds=bounds, options=options))
     # Akaike's criterion: one rate for each coefficient
     if found[1].fun - found[0].fun <= n_components + STRONG_EVIDENCE:
         return None
@@ -338,15 +325,10 @@ def expected_gradient(
     """
 
     def difference(name: str) -> NDArray:
-        ends = [
-            expected_log_density(
-                dynamics._replace(**{name: getattr(dynamics, name) + change}),
-                moments,
-                n_pairs,
-                n_sequences,
-            )
-            for change in (1e-4, -1e-4)
-        ]
+        ends = []
+        for change in (1e-4, -1e-4):
+            near = dynamics._replace(**{name: getattr(dynamics, name) + change})
+            ends.append(expected_log_density(near, moments, n_pairs, n_sequences))
         return (ends[0] - ends[1]) / 2e-4
 
     K = len(dynamics.rates)
@@ -376,11 +358,9 @@ def _log_density(moments: NDArray, covariance: NDArray, number: int) -> NDArray:
 
     For the summed second moments (2, 2, k) of a number of samples, and covariances.
     """
-    (a, b), (c, d) = covariance
-    determinant = a * d - b * c
-    square = d * moments[0, 0] - b * moments[0, 1] - c * moments[1, 0]
-    square += a * moments[1, 1]
-    return np.asarray(-0.5 * (number * np.log(determinant) + square / determinant))
+    log_determinant = np.linalg.slogdet(covariance.T)[1]
+    square = np.einsum("kab,abk->k", np.linalg.inv(covariance.T), moments)
+    return np.asarray(-0.5 * (number * log_determinant + square))
 
 
 def _symmetric(matrix: NDArray) -> NDArray:

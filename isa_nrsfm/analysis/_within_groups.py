@@ -10,8 +10,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.sources import CHECKS
-from isa_nrsfm.analysis._frame_columns import checked_column, group_numbers
-from isa_nrsfm.analysis._permutations import indicators, variances
+from isa_nrsfm.analysis._frame_columns import checked_column, group_names, group_numbers
+from isa_nrsfm.analysis._permutations import between_shares, indicators
 
 
 class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
@@ -108,9 +108,8 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         """
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, **CHECKS)
-        names = _names(groups, len(X))
-        place = np.searchsorted(self.groups_, names)
-        place = np.minimum(place, len(self.groups_) - 1)
+        names = group_names(groups, len(X))
+        place = np.searchsorted(self.groups_, names).clip(max=len(self.groups_) - 1)
         known = self.groups_[place] == names
         means = np.asarray(self.means_[place], dtype=X.dtype)
         if not known.all():
@@ -166,16 +165,9 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         return tags
 
 
-def _names(groups: Any, n_frames: int) -> NDArray:
-    """Return the group of each frame (n_frames,)."""
-    if groups is None:
-        return np.zeros(n_frames, dtype=int)
-    return checked_column("groups", groups, n_frames)
-
-
 def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArray]:
     """Return the groups, sorted, and the means (n_groups, n_features) of each."""
-    names = _names(groups, len(X))
+    names = group_names(groups, len(X))
     used = np.isfinite(X).all(axis=1)
     if neutral is not None:
         used &= checked_column("neutral", neutral, len(X)).astype(bool)
@@ -191,8 +183,7 @@ def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArra
             f"{', '.join(empty[:5])}). Their coefficients have nothing to be compared "
             f"with. Remove these groups{remedy}"
         )
-    sums = indicators(numbers)[used].T @ X[used]
-    return found, sums / sizes[:, None]
+    return found, indicators(numbers[used]).T @ X[used] / sizes[:, None]
 
 
 def _warn_of_single_frames(names: NDArray) -> None:
@@ -273,8 +264,6 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
             f"frames; got {n_groups} groups of {n_frames} frames"
         )
     means = indicators(numbers).T @ X / sizes[:, None]
-    inside = np.sum((X - means[numbers]) ** 2, axis=0)
-    between, within = variances(inside, sizes @ (means - X.mean(axis=0)) ** 2, sizes)
-    total = between + within
-    share = np.divide(between, total, where=total > 0, out=np.zeros_like(total))
+    within = np.sum((X - means[numbers]) ** 2, axis=0)
+    share = between_shares(within, sizes @ (means - X.mean(axis=0)) ** 2, sizes)
     return BetweenShare(share, 1.0 - share, n_groups, n_frames)

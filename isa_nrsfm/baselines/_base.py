@@ -25,6 +25,7 @@ from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._gauge import canonical_rotation
+from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
@@ -118,11 +119,9 @@ class ShapeSequenceNRSfM(
             column names that contradict `layout`.
         """
         X = self._checked(X, reset=True)
+        names, scaled = getattr(self, "feature_names_in_", None), self.scale_frames
         settings = FitSettings(
-            refinement=None,
-            layout=self.layout,
-            names=getattr(self, "feature_names_in_", None),
-            scale_frames=self.scale_frames,
+            refinement=None, layout=self.layout, names=names, scale_frames=scaled
         )
         rows = open_table(X, self.layout)
         table = scaled_table(rows, None, self.n_components, settings)
@@ -133,12 +132,15 @@ class ShapeSequenceNRSfM(
         cameras, shapes = signs[:, None, None] * cameras, signs[:, None, None] * shapes
         space = canonical_rotation(shapes.mean(axis=0), cameras)
         cameras, shapes = cameras @ space.T, shapes @ space.T
-        mean_shape, basis, coefficients = principal_shapes(shapes, self.n_components)
-        model = compose(mean_shape, basis, coefficients)
-        noise, error = (
-            np.mean((W - (cameras @ each.transpose(0, 2, 1)).reshape(W.shape)) ** 2)
-            for each in (model, shapes)
-        )
+        components, coefficients, _ = principal_shapes(shapes, self.n_components)
+        mean_shape, basis = components[0], components[1:]
+        # Smaller deformations are rounding errors.
+        moving = np.linalg.norm(basis, axis=(1, 2)) > 1e-12 * np.linalg.norm(mean_shape)
+        signs = np.where(moving, orientations(coefficients.T), 0.0)
+        basis = signs[:, None, None] * basis
+        model = compose(mean_shape, basis, signs * coefficients)
+        rests = [W - (cameras @ each.mT).reshape(W.shape) for each in (model, shapes)]
+        noise, error = np.mean(np.square(rests), axis=(1, 2))
         self.inverse_snr_ = float(error / np.mean(W**2))
 
         # Without the scaling of frames the shapes have the unit of the table.
@@ -155,24 +157,6 @@ class ShapeSequenceNRSfM(
         self.alpha_ = self._decompose(X).alpha
         self._n_features_out = self.n_components
         return self
-
-    def fit_transform(self, X: Any, y: Any = None) -> NDArray:
-        """
-        Factorise a table and return the coefficients of its frames.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            The table, one frame a row, in the order of `layout`.
-        y : None
-            Ignored.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_components)
-            `alpha_`.
-        """
-        return self.fit(X).alpha_.copy()
 
     def transform(self, X: Any) -> NDArray:
         """
@@ -281,11 +265,8 @@ class ShapeSequenceNRSfM(
             sizes = report.size
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
         search = frame_search("orthographic", shapes.transpose(0, 2, 1).astype(float))
-        fits = search.fit_rows(
-            rows / sizes[:, None, None],
-            self.noise_variance_ / self._unit**2,
-            covariances=False,
-        )
+        noise = self.noise_variance_ / self._unit**2
+        fits = search.fit_rows(rows / sizes[:, None, None], noise, covariances=False)
         motion = (sizes / self._unit)[:, None, None] * fits.motion
         translation = sizes[:, None] * fits.translation
         found = (motion, translation, fits.alpha, np.full_like(fits.alpha, np.nan))
@@ -299,9 +280,7 @@ def shape_signs(shapes: NDArray) -> NDArray:
     left singular vector.
     """
     rows = shapes.reshape(len(shapes), -1)
-    tall = len(rows) > rows.shape[1]
-    first = np.linalg.eigh(rows.T @ rows if tall else rows @ rows.T)[1][:, -1]
-    signs = _sign(rows @ first if tall else first)
+    signs = _sign(np.linalg.svd(rows, full_matrices=False)[0][:, 0])
     for _ in range(100):  # each round increases the sum, a few are enough
         changed = _sign(rows @ (signs @ rows))
         if (changed == signs).all():
@@ -319,24 +298,3 @@ def camera_signs(cameras: NDArray) -> NDArray:
 def _sign(values: NDArray) -> NDArray:
     """Return 1.0 or -1.0 for each value."""
     return np.where(values < 0, -1.0, 1.0)
-
-
-def principal_shapes(
-    shapes: NDArray, n_components: int
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Return mean, principal components and coefficients of shapes.
-
-    The components (K, J, 3) are orthogonal, decreasing, one standard deviation each.
-    The coefficients (I, K) are white, with non-negative skewness. Zero without
-    variation.
-    """
-    mean_shape = shapes.mean(axis=0)
-    rest = (shapes - mean_shape).reshape(len(shapes), -1)
-    U, S, Vt = np.linalg.svd(rest, full_matrices=False)
-    U, S, Vt = U[:, :n_components], S[:n_components], Vt[:n_components]
-    root = np.sqrt(len(shapes))
-    # Smaller deformations are rounding errors.
-    moving = S > 1e-12 * root * np.linalg.norm(mean_shape)
-    signs = np.where(moving, orientations(U.T), 0.0)
-    basis = (signs * S / root)[:, None] * Vt
-    return mean_shape, basis.reshape(-1, *mean_shape.shape), root * signs * U

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils import check_random_state
+from sklearn.utils import check_random_state, gen_batches
 
 from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.rounding import OF_RANKS
@@ -88,7 +88,7 @@ def _within_unit_norm(rows: NDArray, n_atoms: int) -> NDArray:
 
 
 def code_frames(
-    frames: NDArray, atoms: NDArray, sparsity: int, ridge: float, batch: int = 1000
+    frames: NDArray, atoms: NDArray, sparsity: int, ridge: float
 ) -> tuple[NDArray, NDArray]:
     """Find at most `sparsity` blocks for each frame by reweighted ridge regression.
 
@@ -106,8 +106,7 @@ def code_frames(
     gram = (rows @ rows.T).reshape(n_atoms, 3, n_atoms, 3).transpose(0, 2, 1, 3)
     blocks = np.zeros((n_frames, n_atoms, 2, 3))
     active = np.zeros((n_frames, n_atoms), dtype=bool)
-    for first in range(0, n_frames, batch):
-        part = slice(first, first + batch)
+    for part in gen_batches(n_frames, 1000):
         norms = np.linalg.norm(frames[part], axis=(1, 2))[:, None, None]
         right = (frames[part] / norms) @ rows.T
         right = right.reshape(-1, 2, n_atoms, 3).transpose(0, 2, 3, 1)
@@ -118,8 +117,8 @@ def code_frames(
 
         lost = np.flatnonzero(~kept.any(axis=1))
         best = np.linalg.norm(right[lost], axis=(2, 3)).argmax(axis=1)
-        active[first + lost, best] = True
-        blocks[first + lost, best] = right[lost, best].transpose(0, 2, 1) * norms[lost]
+        active[part][lost, best] = True
+        blocks[part][lost, best] = right[lost, best].transpose(0, 2, 1) * norms[lost]
     return blocks, active
 
 
@@ -193,8 +192,7 @@ def update_atoms(
 def _main_directions(frames: NDArray) -> NDArray:
     """Return the first three right singular vectors of frames, three rows or more."""
     rows = frames.reshape(-1, frames.shape[2])
-    triangle = np.linalg.qr(rows, mode="r") if len(rows) > rows.shape[1] else rows
-    return np.linalg.svd(triangle, full_matrices=False)[2][:3]
+    return np.linalg.svd(rows, full_matrices=False)[2][:3]
 
 
 def metric_correction(blocks: NDArray) -> NDArray:
@@ -459,8 +457,7 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
                 f"atoms, n_atoms={n_atoms}"
             )
         # Frames over an orthonormal basis (rank >= 3, n_points) of the rows of W
-        triangle = np.linalg.qr(W, mode="r") if len(W) > n_points else W
-        _, values, basis = np.linalg.svd(triangle, full_matrices=False)
+        _, values, basis = np.linalg.svd(W, full_matrices=False)
         basis = basis[: max(3, int(np.sum(values > OF_RANKS * values[0])))]
         unit = np.sqrt(2 * n_points)  # the mean square norm of a frame is 2J
         frames = (W @ basis.T).reshape(n_frames, 2, -1) / unit

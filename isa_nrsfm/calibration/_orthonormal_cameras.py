@@ -154,8 +154,7 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         )
     basis, triangle = np.linalg.qr(motion[:, kept])
     root = np.sqrt(len(motion) / 3)
-    inverse = solve_triangular(triangle, root * np.eye(len(kept)))
-    return kept, root * basis, inverse
+    return kept, root * basis, solve_triangular(triangle, root * np.eye(len(kept)))
 
 
 def orthonormal_mixture(
@@ -206,10 +205,8 @@ def _linearised(Q: NDArray, basis: NDArray, L: NDArray) -> tuple[NDArray, NDArra
     residuals = orthonormality_residuals(R[:, :, 0]).ravel() / np.sqrt(n_frames)
     rows = np.stack([2.0 * p1 * r1, 2.0 * p2 * r2, np.sqrt(2.0) * (p1 * r2 + p2 * r1)])
     rows = rows.reshape(3 * n_frames, -1) / np.sqrt(n_frames)
-    return (
-        np.concatenate([residuals, (L @ Q).ravel()]),
-        np.concatenate([rows, np.kron(L, np.eye(3))]),
-    )
+    residuals = np.concatenate([residuals, (L @ Q).ravel()])
+    return residuals, np.concatenate([rows, np.kron(L, np.eye(3))])
 
 
 def principal_columns(W: NDArray) -> NDArray:

@@ -132,10 +132,9 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
     deviations = np.full((3, n_frames), np.nan)
     known = np.isfinite(angles.yaw) & np.isfinite(C).all(axis=(1, 2))
     if known.any():
-        Y = Rotation.from_euler("y", -angles.yaw[known, None], degrees=True).as_matrix()
-        x = Rotation.from_euler("x", -angles.pitch[known, None], degrees=True)
-        X = x.as_matrix()
-        along_x, along_z = Y.swapaxes(1, 2)[:, :, 0], (X @ Y)[:, 2]
+        Y = Rotation.from_euler("y", -angles.yaw[known, None], degrees=True)
+        X = Rotation.from_euler("x", -angles.pitch[known, None], degrees=True)
+        along_x, along_z = Y.as_matrix()[:, 0], (X * Y).as_matrix()[:, 2]
         along_y = np.broadcast_to([0.0, 1.0, 0.0], along_x.shape)
         # w = slope (dy, dx, d roll)
         slope = np.stack([along_y, along_x, along_z], axis=2)

@@ -66,34 +66,26 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     C, others = stored["moments"], stored["basis"][K:]
     left = np.einsum("ab,kja,kjb->", C, others, others) / (2 * len(mean_shape))
     total, residual, constant, slope = certain
-    frames = PosteriorFrames(
-        np.ascontiguousarray(np.concatenate([mean_shape[None], basis]).mT),
-        noise + left,
-        np.zeros((0, K)),
-        "linear",
-        FrameMap.identity(K),
-        "weak_perspective",
-        DepthCertainty(
-            total,
-            0.0,
-            stored["turns"],
-            stored["points"],
-            residual=residual + 2.0 * left,
-            images=(constant, slope),
-        ),
+    noise, residual, camera = noise + left, residual + 2.0 * left, "weak_perspective"
+    turns, points = stored["turns"], stored["points"]
+    certainty = DepthCertainty(
+        total, 0.0, turns, points, residual=residual, images=(constant, slope)
     )
+    shapes = np.ascontiguousarray(np.concatenate([mean_shape[None], basis]).mT)
+    gauge, starts = FrameMap.identity(K), np.zeros((0, K))
+    frames = PosteriorFrames(shapes, noise, starts, "linear", gauge, camera, certainty)
     share, n_features = stored["energy_share"][:K], 2 * len(mean_shape)
-    model = AffineNRSfM(K, camera="weak_perspective")
+    model = AffineNRSfM(K, camera=camera)
     model.__dict__ |= {
         "_model": TableModel(frames, mean_shape, basis, "interleaved", None),
         "_n_features_out": K,
         "n_components_": K,
         "n_features_in_": n_features,
-        "camera_": "weak_perspective",
+        "camera_": camera,
         "frames_scaled_": True,
         "mean_shape_": mean_shape,
         "basis_": basis,
-        "noise_variance_": noise + left,
+        "noise_variance_": noise,
         "depth_uncertainty_": total,
         "mirror_certainty_": 1.0,
         "reliability_": stored["reliability"][:K],

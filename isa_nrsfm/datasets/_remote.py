@@ -27,10 +27,8 @@ def fetch_file(
     An existing file with the right checksum is used, and never overwritten. A failed
     download leaves nothing in the folder.
     """
-    if data_home is None:
-        folder = Path(get_data_home(), "isa_nrsfm")
-    else:
-        folder = Path(data_home).expanduser()
+    home = Path(get_data_home(), "isa_nrsfm") if data_home is None else data_home
+    folder = Path(home).expanduser()
     path = folder / url.rpartition("/")[2]
     by_hand = f"To put it there by hand, take it from {url}; its sha256 is {sha256}"
     absent = f"{path.name} is not in the folder {folder}, and"

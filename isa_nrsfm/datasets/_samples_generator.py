@@ -124,8 +124,7 @@ def draw_motion(
 
 def standardise(coefficients: NDArray) -> NDArray[np.float64]:
     """Return coefficients with zero mean and unit variance over the frames."""
-    centred = coefficients - coefficients.mean(axis=0)
-    return centred / np.sqrt(np.mean(centred**2, axis=0))
+    return (coefficients - coefficients.mean(axis=0)) / coefficients.std(axis=0)
 
 
 def centre_shapes(shapes: NDArray) -> NDArray[np.float64]:
@@ -344,12 +343,11 @@ default="weak_perspective"
     rng = check_random_state(random_state)
     names = COMPONENT_NAMES[:n_components]
     strength = rng.beta(0.4, 2.0, (n_frames, n_components))
-    expressions = [k for k in range(n_components) if names[k] not in SIGNED_COMPONENTS]
-    for k in set(range(n_components)).difference(expressions):
-        strength[:, k] = 2 * rng.beta(2.0, 2.0, n_frames) - 1
+    signed = np.isin(names, SIGNED_COMPONENTS)
+    strength[:, signed] = 2 * rng.beta(2.0, 2.0, (n_frames, signed.sum())) - 1
     labels = np.full(n_frames, "rest")
-    if expressions:
-        labels = np.array(names)[expressions][strength[:, expressions].argmax(axis=1)]
+    if not signed.all():
+        labels = np.array(names)[~signed][strength[:, ~signed].argmax(axis=1)]
     alpha = standardise(strength)
     shapes = centre_shapes(_drawn_shapes(["neutral", *names]))
     neutral, full = shapes[0], shapes[1:]  # deformations at full strength
@@ -524,7 +522,7 @@ def make_nonrigid_tracks(
     """
     rng = check_random_state(random_state)
     mean_shape = centre_shapes(rng.standard_normal((n_points, 3)) * (1.0, 0.8, 0.6))
-    mean_shape /= _root_mean_square_length(mean_shape)
+    mean_shape /= np.sqrt(np.mean(np.sum(mean_shape**2, axis=-1)))
     basis = rng.standard_normal((n_components, n_points, 3))
     if shapes == "heavy_tailed":
         basis *= rng.standard_normal((n_components, n_points, 1))
@@ -533,19 +531,14 @@ def make_nonrigid_tracks(
     draw = rng.laplace if coefficients == "heavy_tailed" else rng.standard_normal
     alpha = standardise(draw(size=(n_frames, n_components)))
     if n_components:
-        size = _root_mean_square_length(np.tensordot(alpha, basis, 1))
-        basis *= amplitude / size
+        square = np.sum(np.tensordot(alpha, basis, 1) ** 2, axis=-1)
+        basis *= amplitude / np.sqrt(np.mean(square))
     rotations = Rotation.from_quat(rng.standard_normal((n_frames, 4))).as_matrix()
     motion = draw_motion(rotations, camera, (2 / 3, 3 / 2), rng)
     translation = rng.standard_normal((n_frames, 2))
     frames = mean_shape + np.tensordot(alpha, basis, 1)
     table = observe(frames, motion, translation, rng, noise, missing, layout)
     return Bunch(**table, mean_shape=mean_shape, basis=basis, alpha=alpha)
-
-
-def _root_mean_square_length(vectors: NDArray) -> float:
-    """Return the root mean square length of the vectors along the last axis."""
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))
 
 
 OF_PEOPLE = PARAMETERS | {"n_people": [Interval(Integral, 1, None, closed="left")]}

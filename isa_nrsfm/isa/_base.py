@@ -42,18 +42,15 @@ class BaseSubspaceAnalysis(
     @one_blas_thread
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
+        signals, size = unmasked(signals), self.subspace_size
         signals = validate_data(
-            self,
-            unmasked(signals),
-            dtype=np.float64,
-            ensure_min_samples=2,
-            ensure_min_features=self.subspace_size,
+            self, signals, dtype=float, ensure_min_samples=2, ensure_min_features=size
         )
         n_signals = signals.shape[1]
-        if n_signals % self.subspace_size:
+        if n_signals % size:
             raise ValueError(
-                f"the number of signals must be a multiple of subspace_size="
-                f"{self.subspace_size}; got n_features={n_signals}"
+                f"the number of signals must be a multiple of subspace_size={size}; "
+                f"got n_features={n_signals}"
             )
         self.mean_ = signals.mean(axis=0)
         Z, whitening = whiten(signals - self.mean_)
@@ -115,11 +112,9 @@ class SubspaceDensity(Protocol):
 
     def log_density(self, energy: NDArray) -> NDArray:
         """Return F(u)."""
-        ...
 
     def derivatives(self, energy: NDArray) -> tuple[NDArray, NDArray]:
         """Return F'(u) and F''(u)."""
-        ...
 
 
 class SqrtDensity(BaseEstimator):

@@ -163,10 +163,8 @@ class FastISA(BaseSubspaceAnalysis):
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
         density = SqrtDensity() if self.density is None else self.density
         random_state = check_random_state(self.random_state)
-        n_signals = len(Z)
-        starts = orthogonalise(
-            random_state.standard_normal((self.n_init, n_signals, n_signals))
-        )
+        starts = random_state.standard_normal((self.n_init, len(Z), len(Z)))
+        starts = orthogonalise(starts)
         # Batches that reduce the overhead of NumPy, with arrays that fit into the
         # cache.
         batches = [starts[first : first + 16] for first in range(0, self.n_init, 16)]
@@ -181,9 +179,8 @@ class FastISA(BaseSubspaceAnalysis):
                 done = sum(len(W) for W, *_ in results)
                 best = max(values.max() for _, values, *_ in results)
                 print(f"[FastISA] {done}/{self.n_init} starts, best {best:.6g}")
-        W, log_likelihoods, n_iters, converged = map(
-            np.concatenate, zip(*results, strict=True)
-        )
+        of_starts = map(np.concatenate, zip(*results, strict=True))
+        W, log_likelihoods, n_iters, converged = of_starts
         best = int(np.argmax(log_likelihoods))
         if not converged[best]:
             warn_caller(
@@ -400,20 +397,16 @@ class PooledFastICA(BaseSubspaceAnalysis):
             )
         return W
 
-    def _components(self, Z: NDArray, start: NDArray) -> tuple[NDArray, int, bool]:
+    def _components(self, Z: NDArray, W: NDArray) -> tuple[NDArray, int, bool]:
         """Return unmixing, steps and convergence of one run on white signals.
 
-        Z is (n_signals, n_samples), start and unmixing (n_signals, n_signals).
+        Z is (n_signals, n_samples), the start W (n_signals, n_signals).
         """
         # This imports all linear models, which `transform` does not need.
         from sklearn.decomposition import FastICA
 
         ica = FastICA(
-            whiten=False,
-            fun=self.fun,
-            max_iter=self.max_iter,
-            tol=self.tol,
-            w_init=start,
+            whiten=False, fun=self.fun, max_iter=self.max_iter, tol=self.tol, w_init=W
         )
         with warnings.catch_warnings(record=True, action="always") as caught:
             ica.fit(Z.T)

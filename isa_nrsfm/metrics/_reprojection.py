@@ -1,12 +1,10 @@
 """Measures of the reprojection of a table."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.sources import CHECKS, unmasked
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
@@ -93,15 +91,12 @@ def frame_energies(
     X: ArrayLike, X_hat: ArrayLike, layout: Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
-    checks: dict[str, Any] = {"dtype": np.float64, "ensure_all_finite": "allow-nan"}
-    tables = [
-        check_array(unmasked(table), input_name=name, **checks)
-        for table, name in ((X, "X"), (X_hat, "X_hat"))
-    ]
-    check_same_shape("X", tables[0], "X_hat", tables[1])
-    truth, fitted = (
-        without_half_points(table_to_rows(table, layout))[0] for table in tables
-    )
+    checks = CHECKS | {"dtype": np.float64}
+    truth = check_array(unmasked(X), input_name="X", **checks)
+    fitted = check_array(unmasked(X_hat), input_name="X_hat", **checks)
+    check_same_shape("X", truth, "X_hat", fitted)
+    both = (table_to_rows(table, layout) for table in (truth, fitted))
+    truth, fitted = (without_half_points(rows)[0] for rows in both)
     seen = seen_points(truth)
     lost = seen & ~seen_points(fitted)
     if lost.any():

@@ -86,18 +86,15 @@ def _orthonormal_blocks(name: str, components: ArrayLike, size: int) -> NDArray:
             f"{name} must be of the shape (n_components, n_features) with a multiple "
             f"of subspace_size={size} rows; got the shape {rows.shape}"
         )
-    n_features = rows.shape[1]
-    blocks = rows.reshape(-1, size, n_features)
-    _, singular_values, bases = np.linalg.svd(blocks, full_matrices=False)
-    tolerance = max(size, n_features) * np.finfo(float).eps
-    ranks = np.sum(singular_values > tolerance * singular_values[:, :1], axis=1)
+    blocks = rows.reshape(-1, size, rows.shape[1])
+    ranks = np.linalg.matrix_rank(blocks)
     if (ranks < size).any():
         block = np.flatnonzero(ranks < size)[0]
         raise ValueError(
             f"each group of {size} rows of {name} must be linearly independent; "
             f"group {block} has rank {ranks[block]}"
         )
-    return bases
+    return np.linalg.svd(blocks, full_matrices=False)[2]
 
 
 def _bottleneck(costs: NDArray) -> float:

@@ -98,12 +98,10 @@ def names_layout(
         return "other" if not axes and alike and not all(pairs) else None
     if rest:
         return None if all(pairs) else "other"
-    n_points = len(set(points))
-    if axes == [0, 1] * n_points and points[0::2] == points[1::2]:
+    n = len(set(points))
+    if axes == [0, 1] * n and points[0::2] == points[1::2]:
         return "interleaved"
-    if axes == [0] * n_points + [1] * n_points and (
-        points[:n_points] == points[n_points:]
-    ):
+    if axes == [0] * n + [1] * n and points[:n] == points[n:]:
         return "planar"
     return "other"
 

@@ -5,15 +5,17 @@ of the person's right eye, which an image shows on its left.
 """
 
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 
 import numpy as np
 
 from isa_nrsfm.skeletons._skeleton import Pairs, Skeleton, listed, run
 
-IBUG_68 = Skeleton(
+_FACE = partial(Skeleton, kind="face")
+
+IBUG_68 = _FACE(
     name="ibug-68",
-    kind="face",
     n_points=68,
     curves=(
         run(0, 16),  # jaw
@@ -48,9 +50,8 @@ IBUG_51 = _without_contour(
 # Points 31 and 36 are the pupils, 46, 47 and 67 nostrils and tip of the nose, 66 the
 # middle of the mouth: drawn, not joined.
 _XM2VTS_EYES = (run(27, 30, closed=True), run(32, 35, closed=True))
-XM2VTS_68 = Skeleton(
+XM2VTS_68 = _FACE(
     name="xm2vts-68",
-    kind="face",
     n_points=68,
     curves=(
         run(0, 14),  # jaw
@@ -94,9 +95,8 @@ MUCT_76 = replace(
 )
 MUCT_61 = _without_contour(MUCT_76, "muct-61", **_XM2VTS_INNER)
 
-WFLW_98 = Skeleton(
+WFLW_98 = _FACE(
     name="wflw-98",
-    kind="face",
     n_points=98,
     curves=(
         run(0, 32),  # jaw
@@ -162,9 +162,8 @@ _LEFT_HALVES = (
 _BRIDGE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2)
 _SIDES = chain(*_RIGHT, *_RIGHT_HALVES), chain(*_LEFT, *_LEFT_HALVES)
 _MIRROR = {right: left for right, left in zip(*_SIDES, strict=True) if right != left}
-MESH_468 = Skeleton(
+MESH_468 = _FACE(
     name="mediapipe-face-468",
-    kind="face",
     n_points=468,
     curves=(*_RIGHT, *_LEFT, *_RIGHT_HALVES, *_LEFT_HALVES, _BRIDGE),
     source="Y. Kartynnik et al., Real-time Facial Surface Geometry from Monocular "

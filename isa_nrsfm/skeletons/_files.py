@@ -108,9 +108,6 @@ def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> S
                 "chin], [chin, neck]]"
             )
         # A curve may be written as more than two bodyparts in turn.
-        return skeleton_of_names(
-            [pair for edge in edges for pair in pairwise(edge)],
-            point_names,
-            name=Path(path).name,
-            source=f"DeepLabCut, {Path(path).name}",
-        )
+        pairs = [pair for edge in edges for pair in pairwise(edge)]
+        name, source = Path(path).name, f"DeepLabCut, {Path(path).name}"
+        return skeleton_of_names(pairs, point_names, name=name, source=source)

@@ -13,9 +13,7 @@ from isa_nrsfm.skeletons._bodies import BODIES
 from isa_nrsfm.skeletons._faces import FACES
 from isa_nrsfm.skeletons._skeleton import Skeleton
 
-SKELETONS: Mapping[str, Skeleton] = MappingProxyType(
-    {skeleton.name: skeleton for skeleton in (*FACES, *BODIES)}
-)
+SKELETONS = MappingProxyType({each.name: each for each in (*FACES, *BODIES)})
 
 # The layouts in which the readers of `isa_nrsfm.io` find points without names.
 LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = {

@@ -14,7 +14,7 @@ KINDS: tuple[Kind, ...] = ("face", "hand", "body", "whole body", "other")
 MIDDLE, LEFT, RIGHT = 0, 1, 2
 
 Pairs = tuple[tuple[int, int], ...]
-_LEFT_WORD = re.compile(r"left", re.IGNORECASE)
+_RIGHT_OF = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,8 @@ def listed(points: NDArray) -> tuple[int, ...]:
 def sides_of_names(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the points called left, and those called right otherwise by that name."""
     place = {name: j for j, name in enumerate(names)}
-    mirror = [place.get(_LEFT_WORD.sub(_right_word, name)) for name in names]
+    swapped = (re.sub("left|Left|LEFT", lambda m: _RIGHT_OF[m[0]], n) for n in names)
+    mirror = [place.get(name) for name in swapped]
     pairs = [(j, k) for j, k in enumerate(mirror) if k not in (j, None)]
     return tuple(j for j, _ in pairs), tuple(k for _, k in pairs)
 
@@ -269,11 +270,3 @@ def named_skeleton(name: str, names: Sequence[str], **parts: Any) -> Skeleton:
         right=right,
         **parts,
     )
-
-
-def _right_word(match: re.Match[str]) -> str:
-    """Return right, written as left was."""
-    word = match[0]
-    if word.isupper():
-        return "RIGHT"
-    return "Right" if word[0].isupper() else "right"
