@@ -633,7 +633,6 @@ default="affine"
         params |= checked_prior(self, source.empty.shape[2])
         if self.tol is None:
             params["tol"] = JOINT_TOL if joint else PAPER_TOL
-        params["prior"] = checked_prior(self, source.empty.shape[2])
         settings = FitSettings(
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),

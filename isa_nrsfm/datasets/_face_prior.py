@@ -75,7 +75,7 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     gauge, starts = FrameMap.identity(K), np.zeros((0, K))
     frames = PosteriorFrames(shapes, noise, starts, "linear", gauge, camera, certainty)
     share, n_features = stored["energy_share"][:K], 2 * len(mean_shape)
-    model = AffineNRSfM(K, camera=camera)
+    model = AffineNRSfM(K, camera="weak_perspective")
     model.__dict__ |= {
         "_model": TableModel(frames, mean_shape, basis, "interleaved", None),
         "_n_features_out": K,
