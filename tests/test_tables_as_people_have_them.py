@@ -18,7 +18,7 @@ from refusals import refused, warned
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.datasets import make_body_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import from_mediapipe, from_sleap_io, landmark_table, read_landmarks
+from isa_nrsfm.io import from_mediapipe, from_sleap_io, landmark_table, read_landmarks, read_table
 
 N = 40
 POINTS = make_nonrigid_tracks(N, 8, 1, noise=0.01, random_state=0).data
@@ -30,6 +30,55 @@ def table_of(name, tracks, parts=BODYPARTS):
     """Return a table of points under names such as "{part}_{axis}"."""
     names = [name.format(part=part, axis=axis) for part in parts for axis in "xy"]
     return pd.DataFrame(tracks.reshape(len(tracks), -1), columns=names)
+
+
+COMMA, THOUSANDS = "decimal commas: ", "commas between thousands: "
+QUESTION = r"can be (.*) or (\d*), and no other number decides it"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "sign", "numbers", "told"),
+    [
+        (".csv", ";", "4,25 912,5 7", COMMA),
+        (".csv", ";", "0,280 1,912", COMMA),
+        (".tsv", "\t", "4280,125 -,5", COMMA),
+        (".csv", ",", "4,2e2 1,5", COMMA),  # in quotation marks
+        (".csv", "|", "4,280 1,5", COMMA),
+        (".csv", ";", "4,280.5 912", THOUSANDS),
+        (".csv", ";", "4,280 912.5", THOUSANDS),
+        (".tsv", "\t", "-1,234,567 4,280", THOUSANDS),
+        (".csv", ";", "4,280 2,912 13", QUESTION),
+        (".csv", ";", "4,280,1 1,5", "like 1234.5"),
+        (".csv", ";", "4.5 1,5", "like 1234.5"),
+        (".csv", ";", "4.25 1e3", ""),
+    ],
+)
+@pytest.mark.parametrize("title", ["note", "note, or text"])
+@pytest.mark.filterwarnings("ignore:(the cells|numbers have)")
+def test_commas_in_numbers(tmp_path, suffix, sign, numbers, told, title):
+    cells = np.resize(numbers.split(), (3, 16))
+    table = table_of("{part}_{axis}", cells).assign(**{title: ["1,2", "3,4", "a, b"]})
+    table["p"], path = ["0,5", "27,5", "3"], tmp_path / f"a{suffix}"
+    table.to_csv(path, sep=sign, index=False)
+    if told in (QUESTION, "like 1234.5"):
+        error = refused(told, read_landmarks, path)
+        if told == QUESTION:  # as advised
+            numbers = re.search(told, str(error)).groups()
+            words = re.findall(r"pd.read_csv\(..., (\w+)=','\)", str(error))
+            for word, number in zip(words, numbers, strict=True):
+                again = pd.read_csv(path, sep=sign, **{word: ","})
+                again.to_csv(tmp_path / "new.csv", index=False)
+                found = landmark_table(read_table(tmp_path / "new.csv")).points
+                assert found.iloc[0, 0] == float(number)
+        return
+    text, found = warnings_of(read_landmarks, path)
+    assert ("numbers have " in text) == bool(told)
+    assert told in text
+    assert list(found.frames[title]) == ["1,2", "3,4", "a, b"]
+    assert list(found.frames["p"]) == ["0,5", "27,5", "3"]
+    by = "." if told == COMMA else ""
+    expected = [float(each.replace(",", by)) for each in cells.ravel()]
+    assert_array_equal(found.points.to_numpy().ravel(), expected)
 
 
 def warnings_of(call, *args, **kwargs):
@@ -85,6 +134,22 @@ def test_parts_of_one_body_are_no_individuals():
             options["columns"] = re.search("columns='(.*?)'", told)[1]
         assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
     refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
+
+
+@pytest.mark.parametrize("decimal", [",", "."])
+def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
+    path = files.write_openface(tmp_path / "a.csv", TRACKS)
+    expected = read_landmarks(path)
+    table = pd.read_csv(path)
+    table.to_csv(path, sep=";", decimal=decimal, index=False)
+    text, found = warnings_of(read_landmarks, path)
+    assert ("decimal commas" in text) == (decimal == ",")
+    pd.testing.assert_frame_equal(found.frames, expected.frames)
+    table = table_of("{part}_{axis}", POINTS).assign(age=np.arange(N) % 7 + 0.5)
+    path = tmp_path / "b.csv"
+    table.assign(t=0.04 * np.arange(N)).to_csv(path, sep=";", decimal=decimal)
+    found = fits(path, "-k", 1, "--no-figures", "--label", "age", "--time", "t").report
+    assert found["labels"][0]["kind"] == "number"
 
 
 @pytest.mark.parametrize("seen", [1.0, 0.6, 0.3])

@@ -1,6 +1,7 @@
 """Times of frames: numbers, dates and durations, each in one reading for all rows."""
 
 import re
+import warnings
 from itertools import product
 from typing import Any
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import FRAME, IMAGE, IMAGE_NAME, frame_numbers
+from isa_nrsfm.io._tables import with_points
 
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
 _DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
@@ -37,7 +39,7 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
         dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
         return np.asarray(dates), "seconds"
     known = column.dropna().astype(str)
-    numbers = pd.to_numeric(known, errors="coerce")
+    numbers = as_numbers(known)
     if format is None and numbers.notna().all():
         of_frames = re.fullmatch(FRAME, str(column.name).strip(), re.IGNORECASE)
         unit = "frames" if of_frames else f"in the unit of the column {column.name}"
@@ -75,6 +77,13 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
             "row decides it: choose one with --time-format"
         )
     return np.asarray(first.reindex(column.index)), "seconds"
+
+
+def as_numbers(cells: "pd.Series") -> "pd.Series":
+    """Return the numbers in cells, also with decimal commas; NaN in other cells."""
+    with warnings.catch_warnings(action="ignore"):  # of commas
+        written = with_points(cells.to_frame("cells"), ["cells"])["cells"]
+    return pd.to_numeric(written, errors="coerce")
 
 
 def image_numbers(table: "pd.DataFrame") -> "pd.Series":

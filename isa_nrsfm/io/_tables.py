@@ -28,7 +28,9 @@ from isa_nrsfm.skeletons._column_names import (
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
-_DECIMAL_COMMA = r"^(\s*[+-]?\d*),(\d+(?:[eE][+-]?\d+)?\s*)$"
+# Numbers with a decimal comma, and with commas between thousands.
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
+_THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = (
     *("", "na", "nan", "n/a", "null", "none"),
@@ -274,6 +276,7 @@ def tracks_in(
 
     Those with one of the numbers in `missing` as x and y become NaN.
     """
+    frame = with_points(frame, names)
     values = np.stack([_as_numbers(frame[name]) for name in names], axis=1)
     tracks = values.reshape(len(frame), len(names) // 2, 2)
     for number in _codes(missing):
@@ -313,7 +316,9 @@ def confidences_in(
     frame: "pd.DataFrame", x: Iterable[str], y: Iterable[str]
 ) -> "pd.DataFrame | None":
     """Return the confidences (n_frames, n_points) of points of x and y columns."""
-    found = {name: _as_numbers(frame[name]) for name in confidence_columns(frame, x, y)}
+    names = confidence_columns(frame, x, y)
+    frame = with_points(frame, names)
+    found = {name: _as_numbers(frame[name]) for name in names}
     return pd.DataFrame(found, index=frame.index) if found else None
 
 
@@ -344,10 +349,20 @@ def first_lines(path: Path, n_lines: int) -> list[str]:
 
 
 def separator_of(path: Path) -> str:
-    """Return what separates the cells of a text: the usual sign, or one it has."""
-    line = "".join(first_lines(path, 1))
-    signs = (SEPARATORS.get(path.suffix.lower(), ","), *";\t,|")
-    return next((sign for sign in signs if sign in line), signs[0])
+    """Return what separates the cells of a text: the usual sign, or a better one.
+
+    The header and the first row have as many cells, and the most.
+    """
+    usual, lines = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 2)
+
+    def fit(sign: str) -> tuple[bool, int]:
+        lengths = [len(row) for row in csv.reader(lines, delimiter=sign) if row]
+        return 1 < min(lengths) == max(lengths), lengths[0]
+
+    try:
+        return max((usual, *";\t,|"), key=fit)
+    except (csv.Error, ValueError):
+        return usual
 
 
 def header_rows(path: Path, n_rows: int) -> list[list[str]]:
@@ -380,8 +395,7 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     """
     n_rows, n_columns = 0, 0
     if separator != SEPARATORS.get(path.suffix.lower()):
-        commas = ", and its decimal commas are read as points" * (separator == ";")
-        warn_caller(f"the cells of {path.name} end with {separator!r}{commas}")
+        warn_caller(f"the cells of {path.name} end with {separator!r}")
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = csv.reader(_without_nulls(file), delimiter=separator)
         for row in rows:
@@ -444,52 +458,96 @@ def read_columns(
     if path.suffix.lower() == ".parquet":
         frame = read_parquet(path).rename(columns=lambda name: str(name).strip())
         frame = frame.drop(columns=[name for name in frame if name in leave_out])
-        frame = pd.DataFrame(
-            {n: frame[n] if n in text else _numbers_if_all(frame[n]) for n in frame}
-        )
     else:
         separator = separator_of(path)
         if sum(1 for _ in checked_rows(path, separator)) <= n_header:
             raise ValueError("it has a header but no rows")
-        given: dict[str, Any] = {
-            "sep": separator,
-            "decimal": "," if separator == ";" else ".",
-            "header": None,
-            "names": names,
-            "skiprows": n_header,
-            "index_col": False,
-            "skipinitialspace": True,
-            "encoding": "utf-8-sig",
-            # As C and C++ programs on Windows write a number that is none.
-            "na_values": ["nan(ind)", "-nan(ind)"],
-            "low_memory": False,
-        }
-        used = [name for name in names if name not in leave_out]
-        frame = pd.read_csv(path, dtype=dict.fromkeys(text, str), usecols=used, **given)
-        whole = frame.select_dtypes("integer").columns.difference(numbers)
-        for name, cells in pd.read_csv(path, dtype=str, usecols=whole, **given).items():
-            if _of_codes(cells):
-                frame[name] = cells
-    kinds = dict(frame.dtypes)
+        frame = pd.read_csv(
+            path,
+            sep=separator,
+            header=None,
+            names=names,
+            skiprows=n_header,
+            usecols=[name for name in names if name not in leave_out],
+            dtype={name: str for name in names if name not in numbers},
+            index_col=False,
+            skipinitialspace=True,
+            encoding="utf-8-sig",
+            low_memory=False,
+        )
+    others = [name for name in frame if name not in {*numbers, *text}]
+    frame = with_points(frame, numbers, others)
+    found: dict[str, Any] = {name: _numbers_if_all(frame[name]) for name in others}
     for name in numbers:
-        if kinds[name].kind not in "iuf":
-            frame[name] = _as_numbers(frame[name])
-    return frame
+        is_number = frame[name].dtype.kind in "iuf"
+        found[name] = frame[name] if is_number else _as_numbers(frame[name])
+    return frame.assign(**found)
 
 
 def _numbers_if_all(column: "pd.Series") -> "pd.Series":
     """Return a column of texts as numbers, if all are and none is a code."""
-    if not pd.api.types.is_string_dtype(column):
+    if pd.api.types.infer_dtype(column) not in ("string", "empty"):
         return column
     column = column.replace("", None)
     numbers = pd.to_numeric(column, errors="coerce")
-    is_number = numbers.notna().equals(column.notna()) and not _of_codes(column)
+    is_number = numbers.notna().equals(column.notna())
+    whole = is_number and (numbers.dropna() % 1 == 0).all()
+    # Codes are whole numbers with zeros before them.
+    if whole and column.str.match(r"\s*[+-]?0\d+\s*$").any():
+        return column
     return numbers if is_number else column
 
 
-def _of_codes(cells: "pd.Series") -> bool:
-    """Return whether texts of whole numbers begin with zeros, as codes do."""
-    return bool(cells.str.match(r"\s*[+-]?0\d+\s*$").any())
+def with_points(
+    frame: "pd.DataFrame", names: Collection[str], others: Iterable[str] = ()
+) -> "pd.DataFrame":
+    """Return a table with the numbers in some columns written without commas.
+
+    Either all commas are decimal, or all are between thousands; raise if both can be.
+    Other columns are written so where all their cells are such numbers.
+    """
+    texts = frame[[*names]].select_dtypes(["object", "string"]).astype(str)
+    if not any(texts[name].str.contains(",", regex=False).any() for name in texts):
+        return frame
+    cells = {*texts.to_numpy(object).ravel()}
+    decimal, thousands = (
+        {cell for cell in cells if expression.fullmatch(cell)}
+        for expression in (_DECIMAL_COMMA, _THOUSANDS)
+    )
+    if not (decimal or thousands):
+        return frame
+    fractions = frame[[*names]].select_dtypes("float") % 1
+    has_points = fractions.any(axis=None) or any("." in c for c in cells - thousands)
+    is_decimal, is_thousands = decimal >= thousands, thousands >= decimal
+    is_decimal &= not has_points
+    first = max(decimal | thousands).strip()
+    if is_decimal and is_thousands:
+        raise ValueError(
+            f"{first!r} can be {first.replace(',', '.')} or {first.replace(',', '')}, "
+            "and no other number decides it: write numbers like 1234.5. In pandas, "
+            "read the file with pd.read_csv(..., decimal=',') if the commas are "
+            "decimal, otherwise with pd.read_csv(..., thousands=','), and save it with "
+            "to_csv"
+        )
+    if not (is_decimal or is_thousands):
+        return frame
+    expression, sign = (_DECIMAL_COMMA, ".") if is_decimal else (_THOUSANDS, "")
+    warn_caller(
+        f"numbers have {'decimal commas' if sign else 'commas between thousands'}: "
+        f"{first} is read as {first.replace(',', sign)}"
+    )
+
+    def written(cell: Any) -> Any:
+        """Return a cell without its comma."""
+        is_number = isinstance(cell, str) and expression.fullmatch(cell)
+        return cell.replace(",", sign) if is_number else cell
+
+    found = {name: frame[name].map(written) for name in texts}
+    for name in others:
+        column = frame[name].map(written)
+        if pd.to_numeric(column, errors="coerce").notna().equals(column.notna()):
+            found[name] = column
+    return frame.assign(**found)
 
 
 def _without_nulls(lines: Iterator[str]) -> Iterator[str]:
@@ -516,7 +574,8 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     second = [cell.strip().lower() for cell in next(rows)]
     if second.count("x") == second.count("y") > 1:
         index = "" if second[0] in ("x", "y") else ", index_col=0"
-        decimal = ", decimal=','" if separator == ";" else ""
+        commas = any("," in cell for cell in next(rows, []))
+        decimal = ", decimal=','" * commas
         way = (
             f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}, "
             f"sep={separator!r}{decimal}), "
@@ -538,15 +597,12 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         keep_default_na=False,
         encoding="utf-8-sig",
     )
-    if separator == ";":
-        frame = frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
     frame.columns = pd.Index(header)
-    for name in header:
-        if parse_coordinate(name) is not None:
-            values = _parsed(frame[name])
-            if values is not None:
-                frame[name] = values
-    return frame
+    coordinates = [name for name in header if parse_coordinate(name) is not None]
+    frame = with_points(frame, coordinates)
+    found = {name: _parsed(frame[name]) for name in coordinates}
+    numbers = {name: each for name, each in found.items() if each is not None}
+    return frame.assign(**numbers)
 
 
 def _refuse_one_column(path: Path, separator: str, line: str) -> None:
