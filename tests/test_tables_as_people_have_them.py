@@ -4,6 +4,7 @@ import re
 import shlex
 import warnings
 from itertools import pairwise
+from string import ascii_lowercase, ascii_uppercase
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -18,7 +19,13 @@ from refusals import refused, warned
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.datasets import make_body_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import from_mediapipe, from_sleap_io, landmark_table, read_landmarks, read_table
+from isa_nrsfm.io import (
+    from_mediapipe,
+    from_sleap_io,
+    landmark_table,
+    read_landmarks,
+    read_table,
+)
 
 N = 40
 POINTS = make_nonrigid_tracks(N, 8, 1, noise=0.01, random_state=0).data
@@ -311,9 +318,32 @@ def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
     assert found.frames.empty
     if word == "p":
         options = [*QUICK, "1", *size, "--format", "mediapipe" if size else "table"]
-        told = re.search(r"(\d+) % of .* with (--min.*)", fits(path, *options).err)
-        assert int(told[1]) == round(100 * (score < 0.6).mean())
+        told = re.search(r"(\S+) % of .* with (--min.*)", fits(path, *options).err)
+        assert told[1] == f"{100 * (score < 0.6).mean():.3g}"
         assert fits(path, *options, *told[2].split()).err == ""
+
+
+@pytest.mark.parametrize("word", ["p", "v", "c", "V"])
+@pytest.mark.parametrize(
+    "numbers", ["-3 310", "0 1013.2", "2 3", "0.2 1", "0 1 2", "0.5"]
+)
+def test_pressures_and_velocities_are_no_confidences(
+    tmp_path, fits, fails, word, numbers
+):
+    values, path = np.resize(np.float64(numbers.split()), (N, 8)), tmp_path / "a.csv"
+    points = table_of("{axis}_{part}", POINTS, range(8))
+    names = [f"{word}_{j}" for j in range(8)]
+    points.join(pd.DataFrame(values, columns=names)).to_csv(path, index=False)
+    found = read_landmarks(path)
+    if values.max() > 2 or values.min() < 0:
+        assert found.confidence is None
+        assert list(found.frames) == names
+        told = fails("fit", path, "-o", tmp_path, "--min-confidence", 0.5)
+        assert f"{word}_0, ... are no confidences" in told
+    else:
+        assert_array_equal(found.confidence, values)
+        if numbers == "0.5":
+            assert ": 100 % of the points" in fits(path, *QUICK, "1").err
 
 
 def labelled(xy, **known):
@@ -396,3 +426,16 @@ def test_corners_of_boxes_are_no_points(box, name):
         told = str(refused("--columns", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
     assert_array_equal(landmark_table(table, **options).points, FLAT)
+
+
+@pytest.mark.parametrize("letters", [ascii_lowercase, ascii_uppercase])
+@pytest.mark.parametrize(
+    "name",
+    ["{part}_{axis}", "{axis}_{part}", "{part}.{axis}", "{axis}{part}", "{part}{axis}"],
+)
+def test_points_w_and_h_are_no_sizes_of_boxes(letters, name):
+    table, options = table_of(name, files.scene(2, 26), letters), {}
+    if not {*"_."} & {*name}:
+        told = str(refused("--columns", landmark_table, table))
+        options["columns"] = told.rpartition("such as ")[2].strip("'")
+    assert_array_equal(landmark_table(table, **options).points, table)

@@ -1,6 +1,5 @@
 """Read the table of a command: landmarks, layout, other columns, unusable rows."""
 
-import contextlib
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +30,6 @@ from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
     LandmarkColumns,
-    confidence_columns,
     find_landmark_columns,
     landmark_sets,
 )
@@ -138,7 +136,7 @@ def read_frames(
     cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
     tracks = cleaned.mT
     confidence = np.full(tracks.shape[:2], np.nan)
-    if sure is not None:
+    if not sure.empty:
         confidence = sure[list(columns.x)].to_numpy(np.float64)[rows]
     weighting = {}
     if args.weights is not None:
@@ -151,7 +149,7 @@ def read_frames(
     unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
     if unsure.any() and args.min_confidence is None and args.weights is None:
         warn_caller(
-            f"{100 * unsure.mean():.2g} % of the points have a confidence below "
+            f"{100 * unsure.mean():.3g} % of the points have a confidence below "
             f"{UNSURE:g}, and count like all others. If they are wrong, leave them out "
             f"with --min-confidence {UNSURE:g}"
         )
@@ -245,7 +243,7 @@ def _with_confidences(
     table: "pd.DataFrame",
     columns: LandmarkColumns,
     known: "pd.DataFrame | None",
-) -> tuple["pd.DataFrame", "pd.DataFrame | None", dict[str, int]]:
+) -> tuple["pd.DataFrame", "pd.DataFrame", dict[str, int]]:
     """Take confidences out of a table, and leave out the points that are not sure.
 
     Those of other formats are known, by the names of x. Returns the table, the
@@ -255,20 +253,17 @@ def _with_confidences(
     option = option if args.min_confidence is None else "--min-confidence"
     names = []
     if known is None:
-        names = confidence_columns(table.columns, columns.x, columns.y)
-        # Texts are no confidences, unless these are asked for.
-        with contextlib.suppress(*() if option else (ValueError,)):
-            known = confidences_in(table, columns.x, columns.y)
-    if known is None and option:
+        known = confidences_in(table, columns.x, columns.y, strict=bool(option))
+        names = [*known]
+        known = known.set_axis([*columns.x][: len(names)], axis=1)
+    if known.empty and option:
         raise ValueError(
             f"{option}: {args.table} ({args.format}) has no confidences of all points. "
             "Their columns need the names of the x columns, with one of the "
             f"words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
         )
     rest = table.drop(columns=names)
-    if known is not None and names:
-        known = known.set_axis(list(columns.x), axis=1)
-    if known is not None and args.min_confidence is not None:
+    if not known.empty and args.min_confidence is not None:
         unsure = known[list(columns.x)].to_numpy() < args.min_confidence
         points = table[columns.interleaved]
         rest[columns.interleaved] = points.mask(np.repeat(unsure, 2, axis=1))

@@ -1,6 +1,5 @@
 """Read tables of 2D landmarks from files, and take the landmarks out of them."""
 
-import contextlib
 import csv
 import os
 import re
@@ -299,27 +298,42 @@ def read_named_columns(
     points, other = landmark_table(
         parse_table(path), columns=columns, missing=missing, individuals=individuals
     )
-    confidence, names = None, points.columns
-    with contextlib.suppress(ValueError):  # texts are no confidences
-        confidence = confidences_in(other, names[::2], names[1::2])
+    names = points.columns
+    confidence = confidences_in(other, names[::2], names[1::2])
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
         point_names(names[::2]),
-        other if confidence is None else other.drop(columns=confidence.columns),
+        other.drop(columns=confidence.columns),
         format="table",
         columns=list(names),
-        confidence=confidence,
+        confidence=None if confidence.empty else confidence,
     )
 
 
 def confidences_in(
-    frame: "pd.DataFrame", x: Iterable[str], y: Iterable[str]
-) -> "pd.DataFrame | None":
-    """Return the confidences (n_frames, n_points) of points of x and y columns."""
+    frame: "pd.DataFrame", x: Sequence[str], y: Sequence[str], strict: bool = False
+) -> "pd.DataFrame":
+    """Return the confidences (n_frames, n_points) of points of x and y columns, if any.
+
+    No columns if there are none, or, unless strict, if they are no confidences.
+    """
     names = confidence_columns(frame, x, y)
-    frame = with_points(frame, names)
-    found = {name: _as_numbers(frame[name]) for name in names}
-    return pd.DataFrame(found, index=frame.index) if found else None
+    try:
+        frame = with_points(frame, names)
+        found = {name: _as_numbers(frame[name]) for name in names}
+        values = pd.DataFrame(found, frame.index)
+        # p may be a pressure, and v a velocity; in COCO it is 0, 1 or 2.
+        is_letter = bool(names) and len(names[0].strip()) == len(x[0].strip())
+        known = values.to_numpy()[values.notna()]
+        if is_letter and not ((known == known.clip(0, 1)) | (known == 2)).all():
+            raise ValueError(
+                f"{names[0]}, ... are no confidences: they are not all from 0 to 1"
+            )
+        return values
+    except ValueError:
+        if strict:
+            raise
+        return frame[[]]
 
 
 def table_suffix(path: str | os.PathLike[str]) -> str:

@@ -29,7 +29,8 @@ _AXIS_LABEL = re.compile(rf"([xyzXYZ])({_SEPARATORS})([^ _.\-].*)", re.DOTALL)
 _TRAILING_NUMBER = re.compile(r"(.*?)(\d+)", re.DOTALL)
 # The sizes of boxes, named like the x of their corner.
 _HEIGHTS = {"w": "h", "W": "H", "width": "height", "Width": "Height"}
-_WIDTH = re.compile("[wW](?:idth)?")
+# Not of points that are called w and h.
+_WIDTH = re.compile(r"(?<!\b[xyzXYZ])[wW](?:idth)?(?![xyzXYZ]\b)")
 # Parts of names, with the separator after them: words, or numbers in words.
 _PARTS = (r"[^ _.\-]+[ _.\-]*", r"\d+|\D+")
 # Words that tell parts of one body apart, and letters of axes.
@@ -139,7 +140,8 @@ def checked_names(parameter: str, names: Any, default: Any) -> list[str]:
 def without_boxes(names: Sequence[Hashable]) -> list[Hashable]:
     """Leave out columns with the corner of a box: x beside w and h, x_min and x_max."""
     texts = {str(name).strip() for name in names}
-    found = ((name, size) for name in texts for size in _WIDTH.finditer(name))
+    others = [name for name in texts if parse_coordinate(name) is None]
+    found = ((name, size) for name in others for size in _WIDTH.finditer(name))
     corners = {
         f"{name[: size.start()]}{axis}{name[size.end() :]}"
         for name, size in found
