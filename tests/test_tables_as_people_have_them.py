@@ -205,10 +205,30 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
         ("a/1.png a/5.png b/1.png b/5.png", [1, 5, 1, 5]),
         ("e3a1.png 77b0.png 0c9d.png", [0, 1, 2]),  # no numbers of frames
         ("anna.png bob.png anna.png", [0, 1, 0]),
+        ("2023-05-01_12-00-30.png 2023-05-01_12-00-31.png", [0, 1]),
+        ("20230501120030.png 20230501120130.png 20230501120230.png", [0, 1, 2]),
+        ("v/20230501_120030.png v/20230501_120031.png", [0, 1]),
+        ("12h00m30s.png 12h00m50s.png 12h01m10s.png", [0, 1, 2]),
+        ("frame_0.04.png frame_0.96.png frame_1.04.png", [0, 1, 2]),
+        ("1682935230040.jpg 1682935230080.jpg", [0, 1]),
+        ("20230501_120030_12.png 20230501_120030_15.png", [12, 15]),
+        ("cam1.012.png cam1.015.png cam2.012.png cam2.015.png", [12, 15] * 2),
+        ("000000000139.jpg 000000000785.jpg", [139, 785]),
     ],
 )
 def test_numbers_in_names_are_those_of_frames(names, numbers):
     assert list(image_numbers(pd.DataFrame({"image": names.split()}))) == numbers
+
+
+def test_times_in_names_of_images_are_told(tmp_path, fits):
+    times = pd.Series(pd.date_range("2023-05-01 12:00:30", periods=N, freq="2s"))
+    names = times.dt.strftime("%Y-%m-%d_%H-%M-%S.png")
+    path = tmp_path / "a.csv"
+    table_of("{part}_{axis}", POINTS).assign(image=names).to_csv(path, index=False)
+    told = fits(path, *QUICK, "1", "--fps", 25).err
+    option, form = re.search("use (--time .*) with a (--.*), such as", told).groups()
+    form = [form, re.search(r"such as (\S*),", told)[1]]
+    fits(path, *QUICK, "1", *option.split(), *form)
 
 
 LISTS = "keypoints foot_kpts face_kpts lefthand_kpts righthand_kpts".split()

@@ -91,9 +91,9 @@ def column_results(
             X, time=frames.times, groups=frames.groups, **frames.weighting
         )
         found, images = smooth.alpha, frames.images[X.index]
-        seen = f"frames {images.min():g} to {images.max():g} by {images.name or 'row'}"
         report["time"] = {
-            "column": args.time or seen,
+            "column": args.time or images.name,
+            "frames": None if args.time else [images.min(), images.max()],
             "unit": frames.time_unit,
             "time_scales": smooth.time_scales,
             "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),

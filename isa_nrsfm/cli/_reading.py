@@ -167,7 +167,7 @@ def read_frames(
         not_used=not_used,
         left_out=[out for out in left_out if len(out[1])],
         skeleton=layout,
-        images=image_numbers(table),
+        images=image_numbers(table, vars(args).get("fps")),
         weighting={name: each[report.usable] for name, each in weighting.items()},
         principal_point=_principal_point(args, other),
     )
