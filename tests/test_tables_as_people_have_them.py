@@ -3,7 +3,7 @@
 import re
 import shlex
 import warnings
-from itertools import pairwise
+from itertools import pairwise, product
 from string import ascii_lowercase, ascii_uppercase
 from types import SimpleNamespace
 
@@ -126,20 +126,81 @@ def test_individuals_in_a_row_are_a_question(tmp_path, fits, name, who):
         assert found in fits(path, *QUICK, "1", *shlex.split(option)).out
 
 
-def test_parts_of_one_body_are_no_individuals():
-    hand = ["wrist", *(f"{f}_{j}" for f in ("thumb", "index", "ring") for j in "1234")]
-    sides = [f"{side}_{part}" for side in ("left", "right") for part in BODYPARTS]
-    legs = [f"leg{i}_{part}" for i in range(6) for part in ("hip", "knee", "foot")]
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+LEGS = ("coxa", "femur", "tibia", "tarsus", "claw")
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "second"),
+    [
+        ("{}_{}", ("thumb", "index", "ring"), range(4)),
+        ("{}_{}", ("left", "right"), BODYPARTS),
+        ("{}_{}", ("lefthand", "righthand"), range(21)),
+        ("{}{}", ("LeftHand", "RightHand"), range(21)),
+        ("{}_{}", ("links", "rechts"), range(17)),
+        ("{1}_{0}", ("gauche", "droite"), range(17)),
+        ("hand{}_{}", "LR", range(21)),
+        ("{}_{}", FINGERS, "123"),
+        ("{}{}", FINGERS, range(1, 4)),
+        ("{}_{}", ("finger1", "finger2", "finger3"), range(7)),
+        ("leg{}_{}", range(6), ("hip", "knee", "foot")),
+        ("L{}_{}", "123", LEGS),
+        ("{}_{}", ("L1", "L2", "L3", "R1", "R2", "R3"), LEGS),
+        ("{}_{}", (f"leg{i}" for i in range(1, 7)), range(8)),
+        ("row{}_{}", range(8), range(8)),
+    ],
+)
+def test_parts_of_one_body_are_no_individuals(name, first, second):
+    parts = [name.format(a, b) for a, b in product([*first], [*second])]
+    parts += [part.replace("L", "R") for part in parts if name[0] == "L"]
+    table, options = table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts), {}
+    if name[:3] != "{1}" and isinstance(second, range) and len(second) > 6:
+        told = str(refused("more than one set", landmark_table, table))
+        options["columns"] = told.rpartition("such as ")[2].strip("'")
+    assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "second"),
+    [
+        ("m_{}_{}", range(8), range(8)),  # a grid of markers
+        ("{}{}", "ABCDEFGH", range(8)),
+        ("{}_{}", range(3), range(5)),
+        ("brow{1}_{0}", "123", range(5)),
+        ("{}_p{}", ("resident", "intruder"), range(8)),
+    ],
+)
+def test_motion_decides_where_names_do_not(tmp_path, fits, name, first, second):
+    parts = [name.format(a, b) for a, b in product(first, second)]
+    body = make_nonrigid_tracks(N, len(parts), 1, noise=0.01, random_state=0)
+    table, path = (
+        table_of("{part}_{axis}", body.data.round(4), parts),
+        tmp_path / "a.csv",
+    )
+    text, found = warnings_of(landmark_table, table)
+    assert "move together, and are read as those of one body" in text
+    assert found.points.shape == table.shape
+    if name[0] == "m":
+        path = tmp_path / "a.csv"
+        table.to_csv(path, index=False)
+        option = re.search(r"command line: (.*?)\)", text)[1]
+        assert f"{N} frames of 64" in fits(path, *QUICK, "1").out
+        apart = fits(path, *QUICK, "1", *shlex.split(option)).out
+        assert f"{8 * N} frames of 8" in apart
+    rng, n = np.random.default_rng(0), len(second)
+    for i in range(len(first)):  # those of individuals move on their own
+        places = rng.normal(size=(N, 1)).cumsum(axis=0)
+        table.iloc[:, 2 * n * i : 2 * n * (i + 1)] += 5 * places
+    refused("as those of several individuals", landmark_table, table)
+    refused("as those of several individuals", landmark_table, table[:9])
+
+
+def test_individuals_of_few_points_are_not_fitted():
     few = [f"{part}_{mouse}" for mouse in "12" for part in BODYPARTS[:5]]
-    for parts in (hand, sides, legs, few):
-        table, options = (
-            table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts),
-            {},
-        )
-        if parts is few:
-            told = str(refused("Their 5 points are too few", landmark_table, table))
-            options["columns"] = re.search("columns='(.*?)'", told)[1]
-        assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
+    table = table_of("{part}_{axis}", np.ones((2, len(few), 2)), few)
+    told = str(refused("Their 5 points are too few", landmark_table, table))
+    columns = re.search("columns='(.*?)'", told)[1]
+    assert landmark_table(table, columns=columns).points.shape == (2, 2 * len(few))
     refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
 
 

@@ -114,7 +114,7 @@ def read_frames(
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
     else:
-        columns = chosen or find_landmark_columns(table.columns)
+        columns = chosen or find_landmark_columns(table.columns, table=table)
     table, sure, not_used = _with_confidences(args, table, columns, sure)
     kept, left_out = _rows_to_keep(args, table)
     if estimator is not None and chosen is not None:
@@ -336,7 +336,7 @@ def _columns_of_model(
     fitted = getattr(estimator, "feature_names_in_", None)
     n_points = len(estimator.mean_shape_)
     if fitted is None:
-        found = chosen or find_landmark_columns(table.columns)
+        found = chosen or find_landmark_columns(table.columns, table=table)
         if len(found.points) != n_points:
             raise ValueError(
                 f"the model has {n_points} points, the table has {len(found.points)} "

@@ -215,7 +215,7 @@ def landmark_table(
             "(polars tables have a method to_pandas)"
         )
     frame = individuals_as_rows(frame, individuals)
-    names = find_landmark_columns(frame.columns, columns).interleaved
+    names = find_landmark_columns(frame.columns, columns, frame).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, missing).reshape(len(frame), len(names))
     return LandmarkTable(

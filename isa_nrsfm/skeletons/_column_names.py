@@ -33,9 +33,21 @@ _HEIGHTS = {"w": "h", "W": "H", "width": "height", "Width": "Height"}
 _WIDTH = re.compile(r"(?<!\b[xyzXYZ])[wW](?:idth)?(?![xyzXYZ]\b)")
 # Parts of names, with the separator after them: words, or numbers in words.
 _PARTS = (r"[^ _.\-]+[ _.\-]*", r"\d+|\D+")
-# Words that tell parts of one body apart, and letters of axes.
-_SIDES = frozenset(
-    "x left right l r upper lower front hind fore rear top bottom inner outer".split()
+# Words and letters that tell parts of one body apart, and the letter of an axis.
+_SIDE = re.compile(
+    "left|right|links|rechts|linke|rechte|gauche|droite?|izquierd[ao]|derech[ao]|"
+    "esquerd[ao]|direit[ao]|sinistr[ao]|destr[ao]|upper|lower|front|hind|fore|rear|"
+    "back|top|bottom|inner|outer|middle|^[lrx]|[lr]$"
+)
+# Parts that a body has several times, and parts that it has once.
+_SERIES = re.compile(
+    "(?<![a-z])(?:finger|thumb|index|middle|ring|pinky|pinkie|little|toe|leg|arm|limb|"
+    "wing|fin|coxa|trochanter|femur|tibia|tarsus|claw|antenna|tentacle|rib|vertebra|"
+    "daumen|zeigefinger|mittelfinger|ringfinger|klein|bein|row|col)"
+)
+_ONCE = re.compile(
+    "(?<![a-z])(?:nose|snout|beak|mouth|chin|head|neck|spine|back|body|cent(?:er|re)|"
+    "chest|thorax|abdomen|pelvis|tail|nase|mund|kinn|kopf|hals|schwanz)"
 )
 
 
@@ -173,14 +185,16 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
     Return what tells individuals apart in the names of x columns, if anything does.
 
     They have points of the same names, at least so many, and together nearly all; of
-    two or three with numbers, four. Points of one body differ by its sides.
+    two or three with numbers, four. Points of one body differ by its sides, fingers or
+    legs.
 
     >>> from isa_nrsfm.skeletons._column_names import individuals_in
     >>> names = [f"p{point}_{mouse}_x" for point in range(8) for mouse in "ab"]
     >>> individuals_in(names, least=7)
     ['a', 'b']
     """
-    found: list[list[str]] = []
+    found: list[tuple[frozenset, list[str]]] = []
+    of_one_body = set()
     for division in _divisions(names):
         keys = [key for key, each in division.items() if len(each) > 1]
         rests = [frozenset(division[key]) for key in keys] or [frozenset()]
@@ -189,9 +203,29 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
         whole &= max(map(len, rests)) <= 1.1 * len(common) + 1  # others are sets
         few = len(rests) < 4 and all(key[-1:].isdigit() for key in keys)
         enough = len(rests) > 1 and len(common) >= (4 if few else least)
-        if whole and enough and not _SIDES.issuperset(map(str.lower, keys)):
-            found.append(keys)
-    return min(found, key=len, default=[])
+        if whole and enough:
+            groups = frozenset(frozenset(division[key].values()) for key in keys)
+            found.append((groups, keys))
+            if _are_parts(keys, common):
+                of_one_body.add(groups)
+    apart = [keys for groups, keys in found if groups not in of_one_body]
+    return min(apart, key=len, default=[])
+
+
+def _are_parts(keys: Iterable[str], points: Iterable[str]) -> bool:
+    """Return whether names are of sides, or of parts that a body has several times."""
+    keys, points = [key.lower() for key in keys], [point.lower() for point in points]
+    without_sides = {_SIDE.sub("", point).strip(" _.-") for point in points}
+    words = {part[0] if (part := _SERIES.search(point)) else "" for point in points}
+    several = len(words) == 1 and all(key.isdigit() for key in keys)
+    of_points = "" not in words and (several or len(words) == len(without_sides))
+    of_keys = all(map(_SERIES.search, keys))
+    return of_points or of_keys or len({_SIDE.sub("", key) for key in keys}) < 2
+
+
+def has_single_parts(points: Iterable[str]) -> bool:
+    """Return whether one of some points is of a part that a body has once."""
+    return any(_ONCE.search(point.lower()) for point in points)
 
 
 def columns_of_individuals(
