@@ -230,7 +230,7 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     text, plain = warnings_of(read_landmarks, path)
     assert told in text
     for camera in ("affine", "weak_perspective"):
-        text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points)
+        text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points.values)
         assert (told in text) == (camera != "affine")
     n_outside = (shares > 1).any(axis=2).sum()
     for columns in ({}, {"columns": "LM#_x,LM#_y"}):
@@ -496,6 +496,60 @@ def test_the_recipe_for_a_row_a_point_has_the_names_of_the_table(names, further)
     points, other = landmark_table(scope["wide"])
     assert_array_equal(points.iloc[:: 1 + bool(further)], FLAT)
     assert {*other} == {frame, *further}
+
+
+@pytest.mark.parametrize(
+    ("keys", "index"),
+    [
+        ("frame", ["frame"]),
+        ("frame condition", ["frame", "condition"]),
+        ("landmark", ["frame"]),
+        ("frame landmark", ["frame", "individual"]),
+    ],
+)
+def test_the_recipe_counts_what_no_column_names(keys, index):
+    rows = [(i, j, *TRACKS[i, j], "a") for i in range(12) for j in range(8)]
+    table = pd.DataFrame(rows, columns=["frame", "landmark", "x", "y", "condition"])
+    table = pd.concat([table] * (1 + ("individual" in index)))[[*keys.split(), *"xy"]]
+    told = str(refused("one row for each point", landmark_table, table))
+    scope = {"table": table}
+    for line in told.partition("In pandas: ")[2].split(", and "):
+        exec(line, scope)
+    points, other = landmark_table(scope["wide"])
+    assert_array_equal(points.iloc[:: 1 + ("individual" in index)], FLAT)
+    assert list(other) == index
+    refused("add columns frame and point", landmark_table, table[["x", "y"]])
+
+
+@pytest.mark.parametrize("read_format", ["coco", "table"])
+def test_shares_are_warned_of_once_with_a_way_that_works(tmp_path, read_format):
+    tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
+    shares = (tracks - tracks.min((0, 1))) / np.ptp(tracks, axis=(0, 1)) * 0.8 + 0.1
+    path = tmp_path / "a.csv"
+    table_of("{part}_{axis}", shares, range(17)).to_csv(path, index=False)
+    if read_format == "coco":
+        names, path = [f"p{j}" for j in range(17)], tmp_path / "a.json"
+        files.write_json(path, files.coco_annotations(shares, names=names))
+    text, landmarks = warnings_of(read_landmarks, path)
+    assert "If they have another unit, such as metres, ignore this" in text
+    assert ("mediapipe" in text) == (read_format == "table")
+    if read_format == "coco":
+        line = re.search("In Python: (.*?), and", text)[1]
+        line = line.replace("WIDTH, HEIGHT", "640, 480")
+        exec(line, scope := {"landmarks": landmarks})
+        assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
+    fit = AffineNRSfM(1, camera="weak_perspective", refinement=None).fit
+    assert "shares" not in warnings_of(fit, landmarks.points)[0]
+    assert "shares" in warnings_of(fit, landmarks.points.to_numpy())[0]
+
+
+def test_individuals_of_a_fit_are_named_to_transform(tmp_path, fits, fails, transforms):
+    tables = [table_of(f"{{part}}_{who}_{{axis}}", POINTS + 9 * who) for who in (1, 2)]
+    pd.concat(tables, axis=1).to_csv(path := tmp_path / "a.csv", index=False)
+    model = fits(path, *QUICK, "1", "--individuals", "1,2").path
+    told = fails("transform", model, path, "-o", tmp_path / "b.csv")
+    option = re.search("in one row: (.*)", told)[1].split()
+    assert len(transforms(model, path, *option)[0]) == 2 * N
 
 
 @pytest.mark.parametrize("box", ["x y w h", "bbox_x bbox_y bbox_w bbox_h"])

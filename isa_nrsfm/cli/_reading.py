@@ -1,5 +1,6 @@
 """Read the table of a command: landmarks, layout, other columns, unusable rows."""
 
+import shlex
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,7 +36,11 @@ from isa_nrsfm.io._landmark_columns import (
 )
 from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
-from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
+from isa_nrsfm.skeletons._column_names import (
+    individuals_with,
+    names_of_points,
+    parse_coordinate,
+)
 
 # Options of some formats.
 _OF_FORMATS = ("image_size", "columns", "individuals", "part")
@@ -145,7 +150,7 @@ def read_frames(
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
-    warn_of_places(tracks[report.usable], confidence[report.usable])
+    warn_of_places(tracks[report.usable], confidence[report.usable], args.format)
     unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
     if unsure.any() and args.min_confidence is None and args.weights is None:
         warn_caller(
@@ -361,8 +366,12 @@ def _columns_of_model(
             for some, where in ((absent, "model"), (surplus, "table"))
             if some
         ]
+        own = individuals_with(table.columns, names[::2])
+        hint = f". Individuals in one row: --individuals {shlex.quote(','.join(own))}"
         raise ValueError(
-            "the table does not have the points of the model: " + "; ".join(differences)
+            "the table does not have the points of the model: "
+            + "; ".join(differences)
+            + hint * bool(own)
         )
     columns = [in_table[name] for name in names]
     x, y = tuple(columns[::2]), tuple(columns[1::2])

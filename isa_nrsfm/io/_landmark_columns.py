@@ -107,7 +107,7 @@ def find_landmark_columns(
     if not candidates:
         x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
         if x and y:
-            raise ValueError(_pivoted(names, [x[0], y[0]]))
+            raise ValueError(_pivoted(names, [x[0], y[0]], table))
         if any(isinstance(name, tuple) for name in names):
             raise ValueError(
                 "the names of the columns have several levels: join them to names such "
@@ -133,17 +133,30 @@ def find_landmark_columns(
     return _select(names, pattern.split(","))
 
 
-def _pivoted(names: Sequence[Hashable], values: list[Hashable]) -> str:
+def _pivoted(
+    names: Sequence[Hashable], values: list[Hashable], table: "pd.DataFrame | None"
+) -> str:
     """Return how a table with a row for each point gets one for each frame."""
+    told = (
+        "the table has one row for each point, with columns x and y; one row for each "
+        "frame is needed. Columns must tell frames and points apart"
+    )
     aside = {"x", "y", "z", "", *CONFIDENCES}
     keys = [name for name in names if str(name).strip().lower() not in aside]
     points = [name for name in keys if re.search(_POINT, str(name), re.IGNORECASE)]
     last = [name for name in keys if not re.search(_FRAME, str(name), re.IGNORECASE)]
-    points = points or last[-1:] or ["point"]
-    frames = [name for name in keys if name not in points] or ["frame"]
+    if not keys:
+        return f"{told}: add columns frame and point with their numbers"
+    several = table is not None and table.duplicated(keys).any()
+    points = points or ([] if several else last[-1:])
+    frames = [name for name in keys if name not in points]
+    absent = "individual" if frames and several else "" if frames else "frame"
+    absent, counted = absent if points else "point", ""
+    if absent:
+        counted = f"table[{absent!r}] = table.groupby({keys}).cumcount(), and "
+        frames, points = [*frames, *[absent] * bool(points)], points or [absent]
     return (
-        "the table has one row for each point, with columns x and y; one row for each "
-        "frame is needed. Columns must tell frames and points apart. In pandas: "
+        f"{told}. In pandas: {counted}"
         f"wide = table.pivot(index={frames}, columns={points[0]!r}, values={values}), "
         "and wide.columns = "
         "[f'{axis}_{j}' for axis, j in wide.columns], and wide = wide.reset_index()"

@@ -228,6 +228,14 @@ def has_single_parts(points: Iterable[str]) -> bool:
     return any(_ONCE.search(point.lower()) for point in points)
 
 
+def individuals_with(names: Sequence[Hashable], own: Iterable[str]) -> list[str]:
+    """Return individuals in one row that have columns of such names each, if any."""
+    for division in _divisions(names):
+        if who := [key for key, each in division.items() if each.keys() >= {*own}]:
+            return who
+    return []
+
+
 def columns_of_individuals(
     names: Iterable[Hashable], individuals: str | Sequence[str]
 ) -> dict[str, dict[Hashable, str]]:
