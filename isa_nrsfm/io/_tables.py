@@ -411,8 +411,11 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     if separator != SEPARATORS.get(path.suffix.lower()):
         warn_caller(f"the cells of {path.name} end with {separator!r}")
     with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.reader(_without_nulls(file), delimiter=separator)
+        rows = csv.reader(file, delimiter=separator)
         for row in rows:
+            if "\0" in "".join(row):
+                line = f"line {rows.line_num} has a null character"
+                raise ValueError(f"its text is not in UTF-8: {line}")
             if not row or (len(row) == 1 < n_columns and not row[0].strip()):
                 continue
             n_columns = n_columns or len(row)
@@ -564,14 +567,6 @@ def with_points(
     return frame.assign(**found)
 
 
-def _without_nulls(lines: Iterator[str]) -> Iterator[str]:
-    """Yield lines, and raise at a null character."""
-    for i, line in enumerate(lines, start=1):
-        if "\0" in line:
-            raise ValueError(f"its text is not in UTF-8: line {i} has a null character")
-        yield line
-
-
 def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     """Read a file of separated values."""
     rows = checked_rows(path, separator)
@@ -610,8 +605,7 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         index_col=False,
         keep_default_na=False,
         encoding="utf-8-sig",
-    )
-    frame.columns = pd.Index(header)
+    ).set_axis(header, axis=1)
     coordinates = [name for name in header if parse_coordinate(name) is not None]
     frame = with_points(frame, coordinates)
     found = {name: _parsed(frame[name]) for name in coordinates}
