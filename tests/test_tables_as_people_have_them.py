@@ -543,6 +543,56 @@ def test_shares_are_warned_of_once_with_a_way_that_works(tmp_path, read_format):
     assert "shares" in warnings_of(fit, landmarks.points.to_numpy())[0]
 
 
+PLAIN = table_of("{part}_{axis}", POINTS).assign(
+    age=np.arange(N),
+    who=["anna", "bob"] * (N // 2),
+    day=[f"0{1 + i % 9}.02.20{10 + i}" for i in range(N)],
+    team=["a", "b", "", "a"] * (N // 4),
+)
+VIDEOS = PLAIN.assign(image=[f"v{i // 2}.png" for i in range(N)])
+ZERO = PLAIN.assign(neck_x=0.0, neck_y=0.0)
+SETS = PLAIN.join(table_of("{axis}_{part}", POINTS[:, :7] / 2, range(7)))
+NO_EDGES, DAYS = "--edges no_edges.csv", "--time-format %d.%m.%Y"
+
+
+@pytest.mark.parametrize(
+    ("table", "options", "told", "advised"),
+    [
+        (ZERO, "--zeros-missing", r"the point: (.*)", "--zeros-missing {}"),
+        (ZERO, "--zeros-missing", r"of the coordinates, leave out (--zeros.*?)\.", ""),
+        (SETS, "", r"command line: (.*?)\), such as (.*)", "{} {}"),
+        (VIDEOS, "--fps 25", "apart with (.*?),", "--fps 25 {} who"),
+        (VIDEOS, "--fps 25", "others out with (.*)", "--fps 25 {} who=bob"),
+        (PLAIN, "--time day", r"\((.*?)\) or", "--time day {}"),
+        (PLAIN, "--time day", r" or .* \((.*?)\)", "--time day {}"),
+        (PLAIN, "--label age", r"command line: --label COLUMN(.*)\)", "--label age{}"),
+        (PLAIN, "--group team", "rows out with (.*)", "--group team {} team=^$"),
+        (PLAIN, "--distance neck,hip", "such as (--unit .*)", "--distance neck,hip {}"),
+        (PLAIN, "--unit neck,hip", "needs (.*?),", "--unit neck,hip {} neck,hip"),
+        (
+            PLAIN,
+            "--time-format %d.%m.%Y",
+            "needs (.*)",
+            "--time-format %d.%m.%Y {} day",
+        ),
+        (PLAIN, "--points neck,eye", "or (without:).*", "--points {}neck"),
+        (PLAIN, NO_EDGES, "use (.*) to draw", "{}"),
+        (PLAIN, "--image-size 640x480", "needs (.*?);", "--image-size 640x480 {}"),
+    ],
+)
+def test_options_that_messages_name_are_right(
+    tmp_path, monkeypatch, fits, fails, table, options, told, advised
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "no_edges.csv").write_text("\n")
+    if "--image-size" in options:
+        table = table.assign(**table.filter(regex="_[xy]$") / 1000)
+    table.to_csv("a.csv", index=False)
+    quick = [*QUICK, "1", "-o", "b"]
+    words = re.search(told, fails("fit", "a.csv", *quick, *options.split())).groups()
+    fits("a.csv", *quick[:-2], *shlex.split(advised.format(*words)))
+
+
 def test_individuals_of_a_fit_are_named_to_transform(tmp_path, fits, fails, transforms):
     tables = [table_of(f"{{part}}_{who}_{{axis}}", POINTS + 9 * who) for who in (1, 2)]
     pd.concat(tables, axis=1).to_csv(path := tmp_path / "a.csv", index=False)
