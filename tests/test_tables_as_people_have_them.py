@@ -333,6 +333,22 @@ def test_annotations_of_other_categories_are_counted(tmp_path):
     refused("12 annotations are of the category 4, 1", read_landmarks, path)
 
 
+def test_parts_and_categories_are_chosen_as_messages_say(tmp_path, fits, fails):
+    path, folder = tmp_path / "a.json", tmp_path / "people"
+    content = files.coco_annotations(TRACKS)
+    content["categories"].append({"id": 2, "name": "dog", "keypoints": ["nose"]})
+    files.write_json(path, content)
+    told = str(refused("have different keypoints", read_landmarks, path))
+    scope = {"read_landmarks": read_landmarks, "path": path}
+    found = eval(re.search(r"read_landmarks\(.*?\)", told)[0], scope)
+    assert_array_equal(found.points, FLAT)
+    both = {"pose": files.SCORED[0], "face": files.SCORED[1]}
+    files.write_openpose(folder, [[files.openpose_person(**both)]] * 9)
+    told = fails("fit", folder, *QUICK, "1", "-o", tmp_path / "b")
+    part, option = re.search(r"of (\w+), .*command line: (--part)\)", told).groups()
+    assert "9 frames of 8" in fits(folder, *QUICK, "1", option, part).out
+
+
 @pytest.mark.parametrize("kind", ["track_id", "name", "idx", "person_id"])
 def test_who_is_who_is_a_column_of_images_in_their_order(tmp_path, kind):
     who, path = [5, 6, 7] * 4, tmp_path / "a.json"

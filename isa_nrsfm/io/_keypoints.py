@@ -221,7 +221,7 @@ def _chosen_categories(
         if found != (points or found):
             raise ValueError(
                 f"the categories {', '.join(names)} have different keypoints: choose "
-                "one with category"
+                f"one in Python, such as read_landmarks(path, category={names[0]!r})"
             )
         points = found
     return _by_id(named, "categories"), points or None
