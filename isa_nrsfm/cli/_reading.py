@@ -138,12 +138,13 @@ def read_frames(
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
     tracks[kept] = tracks_in(table[kept], names, args.missing_value)
     _refuse_lost_points(args, table[kept], columns, tracks)
-    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
-    tracks = cleaned.mT
     confidence = np.full(tracks.shape[:2], np.nan)
     if not sure.empty:
-        confidence = sure[list(columns.x)].to_numpy(np.float64)[rows]
-    weighting = {}
+        confidence = sure[list(columns.x)].to_numpy(np.float64)
+    if args.min_confidence is not None:
+        tracks[confidence < args.min_confidence] = np.nan
+    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
+    tracks, confidence, weighting = cleaned.mT, confidence[rows], {}
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
@@ -249,12 +250,12 @@ def _with_confidences(
     columns: LandmarkColumns,
     known: "pd.DataFrame | None",
 ) -> tuple["pd.DataFrame", "pd.DataFrame", dict[str, int]]:
-    """Take confidences out of a table, and leave out the points that are not sure.
+    """Take confidences out of a table; those of other formats are known.
 
-    Those of other formats are known, by the names of x. Returns the table, the
-    confidences if there are any, and those of a plain table that are not used.
+    Returns the table, the confidences by the names of x, if there are any, and those of
+    a plain table that are not used.
     """
-    option = "" if args.weights is None else "--weights"
+    option = "--weights" * (args.weights is not None)
     option = option if args.min_confidence is None else "--min-confidence"
     names = []
     if known is None:
@@ -267,15 +268,8 @@ def _with_confidences(
             "Their columns need the names of the x columns, with one of the "
             f"words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
         )
-    rest = table.drop(columns=names)
-    if not known.empty and args.min_confidence is not None:
-        unsure = known[list(columns.x)].to_numpy() < args.min_confidence
-        points = table[columns.interleaved]
-        rest[columns.interleaved] = points.mask(np.repeat(unsure, 2, axis=1))
-    not_used = {}
-    if names and not option:
-        not_used[f"{names[0].strip()}, ... (confidences)"] = len(names)
-    return rest, known, not_used
+    not_used = {f"{names[0].strip()}, ... (confidences)": len(names)} if names else {}
+    return table.drop(columns=names), known, {} if option else not_used
 
 
 def _rows_to_keep(
