@@ -490,7 +490,7 @@ def _groups(groups: dict[str, Any]) -> Section:
 def _time(time: dict[str, Any]) -> Section:
     """Return the result of smoothing in time."""
     scales, name = np.asarray(time["time_scales"], dtype=float), time["column"]
-    if (frames := time["frames"]) is not None:
+    if (frames := time.get("frames")) is not None:
         name = f"frames {frames[0]:g} to {frames[1]:g} by {name or 'row'}"
     if not len(scales):
         return [f"{name}: no dynamics found, coefficients are not smoothed"]

@@ -1,5 +1,6 @@
 """Read tables of 2D landmarks from files, and take the landmarks out of them."""
 
+import contextlib
 import csv
 import os
 import re
@@ -32,7 +33,7 @@ _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = (
-    *("", "na", "nan", "n/a", "null", "none"),
+    *("", "na", "nan", "-nan", "n/a", "null", "none"),
     # Of spreadsheets, pandas, and C programs on Windows.
     *("#n/a", "<na>", "nan(ind)", "-nan(ind)"),
 )
@@ -575,7 +576,7 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         raise ValueError("it is empty; a first line with column names is needed")
     if len(header) == 1:
         _refuse_one_column(path, separator, header[0])
-    if _parsed(pd.Series(header)) is not None:
+    if pd.to_numeric(pd.Series(header).replace("", 0), errors="coerce").notna().all():
         raise ValueError(
             "its first line has numbers; a first line with column names is needed, "
             "such as x0, y0, x1, y1"
@@ -608,9 +609,10 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     ).set_axis(header, axis=1)
     coordinates = [name for name in header if parse_coordinate(name) is not None]
     frame = with_points(frame, coordinates)
-    found = {name: _parsed(frame[name]) for name in coordinates}
-    numbers = {name: each for name, each in found.items() if each is not None}
-    return frame.assign(**numbers)
+    for name in coordinates:
+        with contextlib.suppress(ValueError):
+            frame[name] = _as_numbers(frame[name])
+    return frame
 
 
 def _refuse_one_column(path: Path, separator: str, line: str) -> None:
@@ -625,20 +627,6 @@ def _refuse_one_column(path: Path, separator: str, line: str) -> None:
         )
 
 
-def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
-    """Return the numbers written in a column of text, or None."""
-    # A call of pandas takes longer than the cells of a column of a few frames.
-    cells = column.tolist()
-    # Python reads 1_000 as a number; in a table it is a mistake.
-    if "_" in "".join(cells):
-        return None
-    cells = ["nan" if cell.strip().lower() in _MISSING else cell for cell in cells]
-    try:
-        return np.array(cells, dtype=object).astype(np.float64)
-    except ValueError:
-        return None
-
-
 def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     """Return a landmark column as finite numbers and NaN."""
     types = pd.api.types
@@ -646,20 +634,20 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
         raise ValueError(
             f"column {column.name!r} should hold numbers; got {column.dtype}"
         )
-    if types.is_numeric_dtype(column):
-        values = column.to_numpy(dtype=np.float64, na_value=np.nan)
-    else:
+    numbers = column
+    if not types.is_numeric_dtype(column):
         text = column.astype(object).where(column.notna(), "").astype(str)
-        found = _parsed(text)
-        if found is None:
-            bad = next(i for i in range(len(text)) if _parsed(text.iloc[[i]]) is None)
+        numbers = pd.to_numeric(text, errors="coerce")
+        bad = text[numbers.isna()]
+        bad = bad[~bad.str.strip().str.lower().isin(_MISSING)]
+        if len(bad):
             raise ValueError(
                 f"column {column.name!r} should hold numbers, but in row "
-                f"{text.index[bad]} (counted from 0) it has {text.iloc[bad]!r}. Write "
+                f"{bad.index[0]} (counted from 0) it has {bad.iloc[0]!r}. Write "
                 "numbers like 1234.5, leave the cells of missing points empty, and "
                 "delete rows of units, means or repeated names"
             )
-        values = found
+    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
     if np.isinf(values).any():
         row = int(np.flatnonzero(np.isinf(values))[0])
         raise ValueError(
