@@ -168,6 +168,7 @@ def test_parts_of_one_body_are_no_individuals(name, first, second):
         ("{}_{}", range(3), range(5)),
         ("brow{1}_{0}", "123", range(5)),
         ("{}_p{}", ("resident", "intruder"), range(8)),
+        ("{}_mouse_{}", ("left", "right"), range(8)),
     ],
 )
 def test_motion_decides_where_names_do_not(tmp_path, fits, name, first, second):
@@ -269,6 +270,9 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
         ("2023-05-01_12-00-30.png 2023-05-01_12-00-31.png", [0, 1]),
         ("20230501120030.png 20230501120130.png 20230501120230.png", [0, 1, 2]),
         ("v/20230501_120030.png v/20230501_120031.png", [0, 1]),
+        ("2023-05-01.png 2023-05-02.png 2023-06-01.png", [0, 1, 2]),
+        ("2023-05-01_0001.png 2023-05-01_0130.png", [1, 130]),
+        ("20230501_01.png 20230501_02.png 20230502_01.png 20230502_02.png", [1, 2] * 2),
         ("12h00m30s.png 12h00m50s.png 12h01m10s.png", [0, 1, 2]),
         ("frame_0.04.png frame_0.96.png frame_1.04.png", [0, 1, 2]),
         ("1682935230040.jpg 1682935230080.jpg", [0, 1]),

@@ -9,11 +9,11 @@ from typing import Any
 FRAME = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number))?"
 IMAGE = r"(?:image|img|photo|frame)(?:[ _.]?(?:id|name|path|file))?"
 IMAGE_NAME = rf"{IMAGE}|file[ _.]?(?:name|path)?"
-# Times in names of images: dates with hours, times of day, seconds with decimals, and
-# seconds since 1970.
+# Times in names of images: dates, also with times of day; times of day alone; seconds
+# with decimals, and since 1970.
 _TIME = re.compile(
-    r"(?:19|20)\d\d[-_.]?[01]\d[-_.]?[0-3]\d[-_. T]*[0-2]\d[-_.:h]?[0-5]\d"
-    r"(?:[-_.:m]?[0-5]\d(?:\.\d+)?)?"
+    r"(?<!\d)(?:19|20)\d\d[-_.]?[01]\d[-_.]?[0-3]\d(?:(?=\.\D)|[-_. T]*[0-2]\d"
+    r"(?:[-_.:h]?[0-5]\d[-_.:m]?[0-5]\d(?:\.\d+)?|[-.:h][0-5]\d))(?!\d)"
     r"|(?<![^/\\])[0-2]\d[-_.:h][0-5]\d[-_.:m][0-5]\d(?=s?\.\D)"
     r"|(?:(?<![a-z\d])|(?<=frame)|(?<=image)|(?<=img)|(?<=time))\d+\.\d{1,3}(?=s?\.\D)"
     r"|(?<!\d)[1-9]\d{9,}(?!\d)",

@@ -45,6 +45,7 @@ _SERIES = re.compile(
     "wing|fin|coxa|trochanter|femur|tibia|tarsus|claw|antenna|tentacle|rib|vertebra|"
     "daumen|zeigefinger|mittelfinger|ringfinger|klein|bein|row|col)"
 )
+_ANIMAL = re.compile("mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|person")
 _ONCE = re.compile(
     "(?<![a-z])(?:nose|snout|beak|mouth|chin|head|neck|spine|back|body|cent(?:er|re)|"
     "chest|thorax|abdomen|pelvis|tail|nase|mund|kinn|kopf|hals|schwanz)"
@@ -220,7 +221,12 @@ def _are_parts(keys: Iterable[str], points: Iterable[str]) -> bool:
     several = len(words) == 1 and all(key.isdigit() for key in keys)
     of_points = "" not in words and (several or len(words) == len(without_sides))
     of_keys = all(map(_SERIES.search, keys))
-    return of_points or of_keys or len({_SIDE.sub("", key) for key in keys}) < 2
+    are_sides = len({_SIDE.sub("", key) for key in keys}) < 2
+    return (
+        of_points
+        or of_keys
+        or (are_sides and not any(map(_ANIMAL.search, [*keys, *points])))
+    )
 
 
 def has_single_parts(points: Iterable[str]) -> bool:
