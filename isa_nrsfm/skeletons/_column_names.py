@@ -35,9 +35,10 @@ _WIDTH = re.compile(r"(?<!\b[xyzXYZ])[wW](?:idth)?(?![xyzXYZ]\b)")
 _PARTS = (r"[^ _.\-]+[ _.\-]*", r"\d+|\D+")
 # Words and letters that tell parts of one body apart, and the letter of an axis.
 _SIDE = re.compile(
-    "left|right|links|rechts|linke|rechte|gauche|droite?|izquierd[ao]|derech[ao]|"
-    "esquerd[ao]|direit[ao]|sinistr[ao]|destr[ao]|upper|lower|front|hind|fore|rear|"
-    "back|top|bottom|inner|outer|middle|^[lrx]|[lr]$"
+    "left|right|links|rechts|linke|rechte|gauche|droite?|izq(?:uierd[ao])?|derech[ao]|"
+    "esquerd[ao]|direit[ao]|sinistr[ao]|destr[ao]|v[äe]nst(?:er|re)|h[öøo][gjy]e?re?|"
+    "lew[aey]|praw[aey]|upper|lower|front|hind|fore|rear|back|top|bottom|inner|outer|"
+    "middle|^(?:l[it]|r[et]|der)$|^[lrx]|[lr]$"
 )
 # Parts that a body has several times, and parts that it has once.
 _SERIES = re.compile(
@@ -217,7 +218,8 @@ def _are_parts(keys: Iterable[str], points: Iterable[str]) -> bool:
     """Return whether names are of sides, or of parts that a body has several times."""
     keys, points = [key.lower() for key in keys], [point.lower() for point in points]
     without_sides = {_SIDE.sub("", point).strip(" _.-") for point in points}
-    words = {part[0] if (part := _SERIES.search(point)) else "" for point in points}
+    found = [_SERIES.search(p) or _SERIES.search(_SIDE.sub("", p)) for p in points]
+    words = {part[0] if part else "" for part in found}
     several = len(words) == 1 and all(key.isdigit() for key in keys)
     of_points = "" not in words and (several or len(words) == len(without_sides))
     of_keys = all(map(_SERIES.search, keys))
