@@ -589,6 +589,9 @@ def test_tables_with_other_separators_are_read(tmp_path):
     path.write_text(path.read_text().replace(",", ";").replace(".", ","))
     found = warned("numbers have decimal commas", read_landmarks, path).points
     np.testing.assert_array_equal(found, expected)
+    names = [f"{name[0]}, {name[1:]}" for name in WIDE]
+    WIDE.set_axis(names, axis=1).to_csv(path, sep=";", decimal=",", index=False)
+    assert list(read_table(path)) == names
     for name, sign in (("a.csv", "\t"), ("a.csv", "|"), ("a.csv", ";"), ("a.tsv", ",")):
         WIDE.to_csv(tmp_path / name, sep=sign, index=False)
         told = re.escape(f"{name} end with {sign!r}")

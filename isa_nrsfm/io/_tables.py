@@ -4,6 +4,7 @@ import contextlib
 import csv
 import os
 import re
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -320,7 +321,8 @@ def confidences_in(
     """
     names = confidence_columns(frame, x, y)
     try:
-        frame = with_points(frame, names)
+        with warnings.catch_warnings(action="ignore"):  # of commas, as in coordinates
+            frame = with_points(frame, names)
         found = {name: _as_numbers(frame[name]) for name in names}
         values = pd.DataFrame(found, frame.index)
         # p may be a pressure, and v a velocity; in COCO it is 0, 1 or 2.
@@ -366,13 +368,14 @@ def first_lines(path: Path, n_lines: int) -> list[str]:
 def separator_of(path: Path) -> str:
     """Return what separates the cells of a text: the usual sign, or a better one.
 
-    The header and the first row have as many cells, and the most.
+    The header and the first row have as many cells, and the most; numbers and names may
+    have a comma each.
     """
     usual, lines = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 2)
 
-    def fit(sign: str) -> tuple[bool, int]:
+    def fit(sign: str) -> tuple[bool, float]:
         lengths = [len(row) for row in csv.reader(lines, delimiter=sign) if row]
-        return 1 < min(lengths) == max(lengths), lengths[0]
+        return 1 < min(lengths) == max(lengths), lengths[0] / (1 + (sign == ","))
 
     try:
         return max((usual, *";\t,|"), key=fit)
