@@ -172,6 +172,8 @@ def test_parts_of_one_body_are_no_individuals(name, first, second):
         ("brow{1}_{0}", "123", range(5)),
         ("{}_p{}", ("resident", "intruder"), range(8)),
         ("{}_mouse_{}", ("left", "right"), range(8)),
+        ("{}_{}", ("finch1", "finch2"), range(8)),
+        ("{}_{}", ("colony1", "colony2"), range(8)),
     ],
 )
 def test_motion_decides_where_names_do_not(tmp_path, fits, name, first, second):

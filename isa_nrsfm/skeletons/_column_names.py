@@ -42,9 +42,9 @@ _SIDE = re.compile(
 )
 # Parts that a body has several times, and parts that it has once.
 _SERIES = re.compile(
-    "(?<![a-z])(?:finger|thumb|index|middle|ring|pinky|pinkie|little|toe|leg|arm|limb|"
+    "(?<![a-z])(finger|thumb|index|middle|ring|pinky|pinkie|little|toe|leg|arm|limb|"
     "wing|fin|coxa|trochanter|femur|tibia|tarsus|claw|antenna|tentacle|rib|vertebra|"
-    "daumen|zeigefinger|mittelfinger|ringfinger|klein|bein|row|col)"
+    "daumen|zeige|mittel|kleiner|bein|row|col|column)(?:finger|tip|s)?(?![a-z])"
 )
 _ANIMAL = re.compile("mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|person")
 _ONCE = re.compile(
