@@ -375,7 +375,7 @@ def separator_of(path: Path) -> str:
 
     def fit(sign: str) -> tuple[bool, float]:
         lengths = [len(row) for row in csv.reader(lines, delimiter=sign) if row]
-        return 1 < min(lengths) == max(lengths), lengths[0] / (1 + (sign == ","))
+        return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / (1 + (sign == ","))
 
     try:
         return max((usual, *";\t,|"), key=fit)
