@@ -242,6 +242,8 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     assert f"Cameras    {camera.replace('_', '-')}: shapes are known up to " in out
     assert "true proportions" not in out
     assert "Time       frames 0 to 39 by row: " in out
+    time = found.report["time"]
+    assert (time["column"], time["frames"]) == (None, [0, 39])
 
     assert (model.n_components, model.camera, len(model.basis_)) == ("auto", camera, 1)
     assert (report["n_components"], report["camera"]) == (1, camera)

@@ -3,7 +3,8 @@
 import re
 import shlex
 import warnings
-from itertools import pairwise
+from itertools import pairwise, product
+from string import ascii_lowercase, ascii_uppercase
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -19,7 +20,13 @@ from refusals import refused, warned
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.datasets import make_body_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import from_mediapipe, from_sleap_io, landmark_table, read_landmarks
+from isa_nrsfm.io import (
+    from_mediapipe,
+    from_sleap_io,
+    landmark_table,
+    read_landmarks,
+    read_table,
+)
 
 N = 40
 POINTS = make_nonrigid_tracks(N, 8, 1, noise=0.01, random_state=0).data
@@ -31,6 +38,55 @@ def table_of(name, tracks, parts=BODYPARTS):
     """Return a table of points under names such as "{part}_{axis}"."""
     names = [name.format(part=part, axis=axis) for part in parts for axis in "xy"]
     return pd.DataFrame(tracks.reshape(len(tracks), -1), columns=names)
+
+
+COMMA, THOUSANDS = "decimal commas: ", "commas between thousands: "
+QUESTION = r"can be (.*) or (\d*), and no other number decides it"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "sign", "numbers", "told"),
+    [
+        (".csv", ";", "4,25 912,5 7", COMMA),
+        (".csv", ";", "0,280 1,912", COMMA),
+        (".tsv", "\t", "4280,125 -,5", COMMA),
+        (".csv", ",", "4,2e2 1,5", COMMA),  # in quotation marks
+        (".csv", "|", "4,280 1,5", COMMA),
+        (".csv", ";", "4,280.5 912", THOUSANDS),
+        (".csv", ";", "4,280 912.5", THOUSANDS),
+        (".tsv", "\t", "-1,234,567 4,280", THOUSANDS),
+        (".csv", ";", "4,280 2,912 13", QUESTION),
+        (".csv", ";", "4,280,1 1,5", "like 1234.5"),
+        (".csv", ";", "4.5 1,5", "like 1234.5"),
+        (".csv", ";", "4.25 1e3", ""),
+    ],
+)
+@pytest.mark.parametrize("title", ["note", "note, or text"])
+@pytest.mark.filterwarnings("ignore:(the cells|numbers have)")
+def test_commas_in_numbers(tmp_path, suffix, sign, numbers, told, title):
+    cells = np.resize(numbers.split(), (3, 16))
+    table = table_of("{part}_{axis}", cells).assign(**{title: ["1,2", "3,4", "a, b"]})
+    table["p"], path = ["0,5", "27,5", "3"], tmp_path / f"a{suffix}"
+    table.to_csv(path, sep=sign, index=False)
+    if told in (QUESTION, "like 1234.5"):
+        error = refused(told, read_landmarks, path)
+        if told == QUESTION:  # as advised
+            numbers = re.search(told, str(error)).groups()
+            words = re.findall(r"pd.read_csv\(..., (\w+)=','\)", str(error))
+            for word, number in zip(words, numbers, strict=True):
+                again = pd.read_csv(path, sep=sign, **{word: ","})
+                again.to_csv(tmp_path / "new.csv", index=False)
+                found = landmark_table(read_table(tmp_path / "new.csv")).points
+                assert found.iloc[0, 0] == float(number)
+        return
+    text, found = warnings_of(read_landmarks, path)
+    assert ("numbers have " in text) == bool(told)
+    assert told in text
+    assert list(found.frames[title]) == ["1,2", "3,4", "a, b"]
+    assert list(found.frames["p"]) == ["0,5", "27,5", "3"]
+    by = "." if told == COMMA else ""
+    expected = [float(each.replace(",", by)) for each in cells.ravel()]
+    assert_array_equal(found.points.to_numpy().ravel(), expected)
 
 
 def warnings_of(call, *args, **kwargs):
@@ -71,21 +127,104 @@ def test_individuals_in_a_row_are_a_question(tmp_path, fits, name, who):
         assert found in fits(path, *QUICK, "1", *shlex.split(option)).out
 
 
-def test_parts_of_one_body_are_no_individuals():
-    hand = ["wrist", *(f"{f}_{j}" for f in ("thumb", "index", "ring") for j in "1234")]
-    sides = [f"{side}_{part}" for side in ("left", "right") for part in BODYPARTS]
-    legs = [f"leg{i}_{part}" for i in range(6) for part in ("hip", "knee", "foot")]
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+LEGS = ("coxa", "femur", "tibia", "tarsus", "claw")
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "second"),
+    [
+        ("{}_{}", ("thumb", "index", "ring"), range(4)),
+        ("{}_{}", ("left", "right"), BODYPARTS),
+        ("{}_{}", ("lefthand", "righthand"), range(21)),
+        ("{}{}", ("LeftHand", "RightHand"), range(21)),
+        ("{}_{}", ("links", "rechts"), range(17)),
+        ("{1}_{0}", ("gauche", "droite"), range(17)),
+        ("{}_{}", ("izq", "der"), range(17)),
+        ("{}{}", ("vänster", "höger"), range(17)),
+        ("hand{}_{}", "LR", range(21)),
+        ("{}_{}", FINGERS, "123"),
+        ("{}{}", FINGERS, range(1, 4)),
+        ("{}_{}", ("finger1", "finger2", "finger3"), range(7)),
+        ("leg{}_{}", range(6), ("hip", "knee", "foot")),
+        ("L{}_{}", "123", LEGS),
+        ("L{}{}", "123", ("Coxa", "Femur", "Tibia", "Tarsus")),
+        ("{}_{}", ("L1", "L2", "L3", "R1", "R2", "R3"), LEGS),
+        ("{}_{}", (f"leg{i}" for i in range(1, 7)), range(8)),
+        ("row{}_{}", range(8), range(8)),
+    ],
+)
+def test_parts_of_one_body_are_no_individuals(name, first, second):
+    parts = [name.format(a, b) for a, b in product([*first], [*second])]
+    parts += [part.replace("L", "R") for part in parts if name[0] == "L"]
+    table, options = table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts), {}
+    if name[:3] != "{1}" and isinstance(second, range) and len(second) > 6:
+        told = str(refused("more than one set", landmark_table, table))
+        options["columns"] = told.rpartition("such as ")[2].strip("'")
+    assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "second"),
+    [
+        ("m_{}_{}", range(8), range(8)),  # a grid of markers
+        ("{}{}", "ABCDEFGH", range(8)),
+        ("{}_{}", range(3), range(5)),
+        ("brow{1}_{0}", "123", range(5)),
+        ("{}_p{}", ("resident", "intruder"), range(8)),
+        ("{}_mouse_{}", ("left", "right"), range(8)),
+        ("{}_{}", ("finch1", "finch2"), range(8)),
+        ("{}_{}", ("colony1", "colony2"), range(8)),
+    ],
+)
+def test_motion_decides_where_names_do_not(tmp_path, fits, name, first, second):
+    parts = [name.format(a, b) for a, b in product(first, second)]
+    body = make_nonrigid_tracks(N, len(parts), 1, noise=0.01, random_state=0)
+    table, path = (
+        table_of("{part}_{axis}", body.data.round(4), parts),
+        tmp_path / "a.csv",
+    )
+    text, found = warnings_of(landmark_table, table)
+    assert "move together, and are read as those of one body" in text
+    assert found.points.shape == table.shape
+    if name[0] == "m":
+        path = tmp_path / "a.csv"
+        table.to_csv(path, index=False)
+        option = re.search(r"command line: (.*?)\)", text)[1]
+        assert f"{N} frames of 64" in fits(path, *QUICK, "1").out
+        apart = fits(path, *QUICK, "1", *shlex.split(option)).out
+        assert f"{8 * N} frames of 8" in apart
+    rng, n = np.random.default_rng(0), len(second)
+    for i in range(len(first)):  # those of individuals move on their own
+        places = rng.normal(size=(N, 1)).cumsum(axis=0)
+        table.iloc[:, 2 * n * i : 2 * n * (i + 1)] += 5 * places
+    refused("as those of several individuals", landmark_table, table)
+    refused("as those of several individuals", landmark_table, table[:9])
+
+
+def test_individuals_of_few_points_are_not_fitted():
     few = [f"{part}_{mouse}" for mouse in "12" for part in BODYPARTS[:5]]
-    for parts in (hand, sides, legs, few):
-        table, options = (
-            table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts),
-            {},
-        )
-        if parts is few:
-            told = str(refused("Their 5 points are too few", landmark_table, table))
-            options["columns"] = re.search("columns='(.*?)'", told)[1]
-        assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
+    table = table_of("{part}_{axis}", np.ones((2, len(few), 2)), few)
+    told = str(refused("Their 5 points are too few", landmark_table, table))
+    columns = re.search("columns='(.*?)'", told)[1]
+    assert landmark_table(table, columns=columns).points.shape == (2, 2 * len(few))
     refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
+
+
+@pytest.mark.parametrize("decimal", [",", "."])
+def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
+    path = files.write_openface(tmp_path / "a.csv", TRACKS)
+    expected = read_landmarks(path)
+    table = pd.read_csv(path)
+    table.to_csv(path, sep=";", decimal=decimal, index=False)
+    text, found = warnings_of(read_landmarks, path)
+    assert ("decimal commas" in text) == (decimal == ",")
+    pd.testing.assert_frame_equal(found.frames, expected.frames)
+    table = table_of("{part}_{axis}", POINTS).assign(age=np.arange(N) % 7 + 0.5)
+    path = tmp_path / "b.csv"
+    table.assign(t=0.04 * np.arange(N)).to_csv(path, sep=";", decimal=decimal)
+    found = fits(path, "-k", 1, "--no-figures", "--label", "age", "--time", "t").report
+    assert found["labels"][0]["kind"] == "number"
 
 
 @pytest.mark.parametrize("seen", slow_after(1, [0.6, 1.0, 0.3]))
@@ -98,7 +237,7 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     text, plain = warnings_of(read_landmarks, path)
     assert told in text
     for camera in ("affine", "weak_perspective"):
-        text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points)
+        text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points.values)
         assert (told in text) == (camera != "affine")
     n_outside = (shares > 1).any(axis=2).sum()
     for columns in ({}, {"columns": "LM#_x,LM#_y"}):
@@ -134,10 +273,33 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
         ("a/1.png a/5.png b/1.png b/5.png", [1, 5, 1, 5]),
         ("e3a1.png 77b0.png 0c9d.png", [0, 1, 2]),  # no numbers of frames
         ("anna.png bob.png anna.png", [0, 1, 0]),
+        ("2023-05-01_12-00-30.png 2023-05-01_12-00-31.png", [0, 1]),
+        ("20230501120030.png 20230501120130.png 20230501120230.png", [0, 1, 2]),
+        ("v/20230501_120030.png v/20230501_120031.png", [0, 1]),
+        ("2023-05-01.png 2023-05-02.png 2023-06-01.png", [0, 1, 2]),
+        ("2023-05-01_0001.png 2023-05-01_0130.png", [1, 130]),
+        ("20230501_01.png 20230501_02.png 20230502_01.png 20230502_02.png", [1, 2] * 2),
+        ("12h00m30s.png 12h00m50s.png 12h01m10s.png", [0, 1, 2]),
+        ("frame_0.04.png frame_0.96.png frame_1.04.png", [0, 1, 2]),
+        ("1682935230040.jpg 1682935230080.jpg", [0, 1]),
+        ("20230501_120030_12.png 20230501_120030_15.png", [12, 15]),
+        ("cam1.012.png cam1.015.png cam2.012.png cam2.015.png", [12, 15] * 2),
+        ("000000000139.jpg 000000000785.jpg", [139, 785]),
     ],
 )
 def test_numbers_in_names_are_those_of_frames(names, numbers):
     assert list(image_numbers(pd.DataFrame({"image": names.split()}))) == numbers
+
+
+def test_times_in_names_of_images_are_told(tmp_path, fits):
+    times = pd.Series(pd.date_range("2023-05-01 12:00:30", periods=N, freq="2s"))
+    names = times.dt.strftime("%Y-%m-%d_%H-%M-%S.png")
+    path = tmp_path / "a.csv"
+    table_of("{part}_{axis}", POINTS).assign(image=names).to_csv(path, index=False)
+    told = fits(path, *QUICK, "1", "--fps", 25).err
+    option, form = re.search("use (--time .*) with a (--.*), such as", told).groups()
+    form = [form, re.search(r"such as (\S*),", told)[1]]
+    fits(path, *QUICK, "1", *option.split(), *form)
 
 
 LISTS = "keypoints foot_kpts face_kpts lefthand_kpts righthand_kpts".split()
@@ -179,6 +341,22 @@ def test_annotations_of_other_categories_are_counted(tmp_path):
     content["categories"][0]["id"] = 7
     files.write_json(path, content)
     refused("12 annotations are of the category 4, 1", read_landmarks, path)
+
+
+def test_parts_and_categories_are_chosen_as_messages_say(tmp_path, fits, fails):
+    path, folder = tmp_path / "a.json", tmp_path / "people"
+    content = files.coco_annotations(TRACKS)
+    content["categories"].append({"id": 2, "name": "dog", "keypoints": ["nose"]})
+    files.write_json(path, content)
+    told = str(refused("have different keypoints", read_landmarks, path))
+    scope = {"read_landmarks": read_landmarks, "path": path}
+    found = eval(re.search(r"read_landmarks\(.*?\)", told)[0], scope)
+    assert_array_equal(found.points, FLAT)
+    both = {"pose": files.SCORED[0], "face": files.SCORED[1]}
+    files.write_openpose(folder, [[files.openpose_person(**both)]] * 9)
+    told = fails("fit", folder, *QUICK, "1", "-o", tmp_path / "b")
+    part, option = re.search(r"of (\w+), .*command line: (--part)\)", told).groups()
+    assert "9 frames of 8" in fits(folder, *QUICK, "1", option, part).out
 
 
 @pytest.mark.parametrize("kind", ["track_id", "name", "idx", "person_id"])
@@ -247,9 +425,32 @@ def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
     assert found.frames.empty
     if word == "p":
         options = [*QUICK, "1", *size, "--format", "mediapipe" if size else "table"]
-        told = re.search(r"(\d+) % of .* with (--min.*)", fits(path, *options).err)
-        assert int(told[1]) == round(100 * (score < 0.6).mean())
+        told = re.search(r"(\S+) % of .* with (--min.*)", fits(path, *options).err)
+        assert told[1] == f"{100 * (score < 0.6).mean():.3g}"
         assert fits(path, *options, *told[2].split()).err == ""
+
+
+@pytest.mark.parametrize("word", ["p", "v", "c", "V"])
+@pytest.mark.parametrize(
+    "numbers", ["-3 310", "0 1013.2", "2 3", "0.2 1", "0 1 2", "0.5"]
+)
+def test_pressures_and_velocities_are_no_confidences(
+    tmp_path, fits, fails, word, numbers
+):
+    values, path = np.resize(np.float64(numbers.split()), (N, 8)), tmp_path / "a.csv"
+    points = table_of("{axis}_{part}", POINTS, range(8))
+    names = [f"{word}_{j}" for j in range(8)]
+    points.join(pd.DataFrame(values, columns=names)).to_csv(path, index=False)
+    found = read_landmarks(path)
+    if values.max() > 2 or values.min() < 0:
+        assert found.confidence is None
+        assert list(found.frames) == names
+        told = fails("fit", path, "-o", tmp_path, "--min-confidence", 0.5)
+        assert f"{word}_0, ... are no confidences" in told
+    else:
+        assert_array_equal(found.confidence, values)
+        if numbers == "0.5":
+            assert ": 100 % of the points" in fits(path, *QUICK, "1").err
 
 
 def labelled(xy, **known):
@@ -323,6 +524,110 @@ def test_the_recipe_for_a_row_a_point_has_the_names_of_the_table(names, further)
     assert {*other} == {frame, *further}
 
 
+@pytest.mark.parametrize(
+    ("keys", "index"),
+    [
+        ("frame", ["frame"]),
+        ("frame condition", ["frame", "condition"]),
+        ("landmark", ["frame"]),
+        ("frame landmark", ["frame", "individual"]),
+    ],
+)
+def test_the_recipe_counts_what_no_column_names(keys, index):
+    rows = [(i, j, *TRACKS[i, j], "a") for i in range(12) for j in range(8)]
+    table = pd.DataFrame(rows, columns=["frame", "landmark", "x", "y", "condition"])
+    table = pd.concat([table] * (1 + ("individual" in index)))[[*keys.split(), *"xy"]]
+    told = str(refused("one row for each point", landmark_table, table))
+    scope = {"table": table}
+    for line in told.partition("In pandas: ")[2].split(", and "):
+        exec(line, scope)
+    points, other = landmark_table(scope["wide"])
+    assert_array_equal(points.iloc[:: 1 + ("individual" in index)], FLAT)
+    assert list(other) == index
+    refused("add columns frame and point", landmark_table, table[["x", "y"]])
+
+
+@pytest.mark.parametrize("read_format", ["coco", "table"])
+def test_shares_are_warned_of_once_with_a_way_that_works(tmp_path, read_format):
+    tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
+    shares = (tracks - tracks.min((0, 1))) / np.ptp(tracks, axis=(0, 1)) * 0.8 + 0.1
+    path = tmp_path / "a.csv"
+    table_of("{part}_{axis}", shares, range(17)).to_csv(path, index=False)
+    if read_format == "coco":
+        names, path = [f"p{j}" for j in range(17)], tmp_path / "a.json"
+        files.write_json(path, files.coco_annotations(shares, names=names))
+    text, landmarks = warnings_of(read_landmarks, path)
+    assert "If they have another unit, such as metres, ignore this" in text
+    assert ("mediapipe" in text) == (read_format == "table")
+    if read_format == "coco":
+        line = re.search("In Python: (.*?), and", text)[1]
+        line = line.replace("WIDTH, HEIGHT", "640, 480")
+        exec(line, scope := {"landmarks": landmarks})
+        assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
+    fit = AffineNRSfM(1, camera="weak_perspective", refinement=None).fit
+    assert "shares" not in warnings_of(fit, landmarks.points)[0]
+    assert "shares" in warnings_of(fit, landmarks.points.to_numpy())[0]
+
+
+PLAIN = table_of("{part}_{axis}", POINTS).assign(
+    age=np.arange(N),
+    who=["anna", "bob"] * (N // 2),
+    day=[f"0{1 + i % 9}.02.20{10 + i}" for i in range(N)],
+    team=["a", "b", "", "a"] * (N // 4),
+)
+VIDEOS = PLAIN.assign(image=[f"v{i // 2}.png" for i in range(N)])
+ZERO = PLAIN.assign(neck_x=0.0, neck_y=0.0)
+SETS = PLAIN.join(table_of("{axis}_{part}", POINTS[:, :7] / 2, range(7)))
+NO_EDGES, DAYS = "--edges no_edges.csv", "--time-format %d.%m.%Y"
+
+
+@pytest.mark.parametrize(
+    ("table", "options", "told", "advised"),
+    [
+        (ZERO, "--zeros-missing", r"the point: (.*)", "--zeros-missing {}"),
+        (ZERO, "--zeros-missing", r"of the coordinates, leave out (--zeros.*?)\.", ""),
+        (SETS, "", r"command line: (.*?)\), such as (.*)", "{} {}"),
+        (VIDEOS, "--fps 25", "apart with (.*?),", "--fps 25 {} who"),
+        (VIDEOS, "--fps 25", "others out with (.*)", "--fps 25 {} who=bob"),
+        (PLAIN, "--time day", r"\((.*?)\) or", "--time day {}"),
+        (PLAIN, "--time day", r" or .* \((.*?)\)", "--time day {}"),
+        (PLAIN, "--label age", r"command line: --label COLUMN(.*)\)", "--label age{}"),
+        (PLAIN, "--group team", "rows out with (.*)", "--group team {} team=^$"),
+        (PLAIN, "--distance neck,hip", "such as (--unit .*)", "--distance neck,hip {}"),
+        (PLAIN, "--unit neck,hip", "needs (.*?),", "--unit neck,hip {} neck,hip"),
+        (
+            PLAIN,
+            "--time-format %d.%m.%Y",
+            "needs (.*)",
+            "--time-format %d.%m.%Y {} day",
+        ),
+        (PLAIN, "--points neck,eye", "or (without:).*", "--points {}neck"),
+        (PLAIN, NO_EDGES, "use (.*) to draw", "{}"),
+        (PLAIN, "--image-size 640x480", "needs (.*?);", "--image-size 640x480 {}"),
+    ],
+)
+def test_options_that_messages_name_are_right(
+    tmp_path, monkeypatch, fits, fails, table, options, told, advised
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "no_edges.csv").write_text("\n")
+    if "--image-size" in options:
+        table = table.assign(**table.filter(regex="_[xy]$") / 1000)
+    table.to_csv("a.csv", index=False)
+    quick = [*QUICK, "1", "-o", "b"]
+    words = re.search(told, fails("fit", "a.csv", *quick, *options.split())).groups()
+    fits("a.csv", *quick[:-2], *shlex.split(advised.format(*words)))
+
+
+def test_individuals_of_a_fit_are_named_to_transform(tmp_path, fits, fails, transforms):
+    tables = [table_of(f"{{part}}_{who}_{{axis}}", POINTS + 9 * who) for who in (1, 2)]
+    pd.concat(tables, axis=1).to_csv(path := tmp_path / "a.csv", index=False)
+    model = fits(path, *QUICK, "1", "--individuals", "1,2").path
+    told = fails("transform", model, path, "-o", tmp_path / "b.csv")
+    option = re.search("in one row: (.*)", told)[1].split()
+    assert len(transforms(model, path, *option)[0]) == 2 * N
+
+
 @pytest.mark.parametrize("box", ["x y w h", "bbox_x bbox_y bbox_w bbox_h"])
 @pytest.mark.parametrize("name", ["{part}_{axis}", "{part}{axis}"])
 def test_corners_of_boxes_are_no_points(box, name):
@@ -332,3 +637,16 @@ def test_corners_of_boxes_are_no_points(box, name):
         told = str(refused("--columns", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
     assert_array_equal(landmark_table(table, **options).points, FLAT)
+
+
+@pytest.mark.parametrize("letters", [ascii_lowercase, ascii_uppercase])
+@pytest.mark.parametrize(
+    "name",
+    ["{part}_{axis}", "{axis}_{part}", "{part}.{axis}", "{axis}{part}", "{part}{axis}"],
+)
+def test_points_w_and_h_are_no_sizes_of_boxes(letters, name):
+    table, options = table_of(name, files.scene(2, 26), letters), {}
+    if not {*"_."} & {*name}:
+        told = str(refused("--columns", landmark_table, table))
+        options["columns"] = told.rpartition("such as ")[2].strip("'")
+    assert_array_equal(landmark_table(table, **options).points, table)

@@ -105,7 +105,6 @@ def test_times_are_read_in_the_one_way_that_reads_all(asked, cells, steps):
         ("0:{:02d}", r"'0:01' in row 0 can be 1 s .*'%M:%S'\) or 60 s .*'%H:%M'\)"),
         ("T{}", "expected numbers or dates, .* 12 of 12 are not .*row 0, 'T1'"),
         ("{}st", "expected numbers or dates, .* 12 of 12 are not .*row 0, '1st'"),
-        ("0,{:02d}", "expected numbers or dates, .* 12 of 12 are not .*'0,01'"),
         ("00:00:01:{:02d}", "expected numbers or dates, .*'00:00:01:01'"),
     ],
 )
@@ -513,7 +512,6 @@ LONG = "frame,point,x,y\n" + "".join(f"{i // 8},{i % 8},{i},{-i}\n" for i in ran
     [
         ("a.csv", LONG, r"one row for each point, .* table\.pivot\("),
         ("a.csv", WIDE.to_csv(index=False, header=False), "line with column names"),
-        ("a.tsv", WIDE.to_csv(index=False, sep="\t", decimal=","), r"like 1234\.5"),
         ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
         ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
         ("a.csv", b"PK\3\4", r"a spreadsheet or .*: save it as \.csv"),
@@ -583,20 +581,18 @@ def test_the_way_from_another_header_or_separator_is_right(tmp_path, monkeypatch
     np.testing.assert_array_equal(read_landmarks(new).points, WIDE)
 
 
-def test_semicolons_and_decimal_commas_are_read(tmp_path):
-    told, path = "a.csv end with ';', and its decimal commas", tmp_path / "a.csv"
+@pytest.mark.filterwarnings("ignore:the cells of")
+def test_tables_with_other_separators_are_read(tmp_path):
+    path = tmp_path / "a.csv"
     write_deeplabcut(path, deeplabcut_frame(scene()))
     expected = read_landmarks(path).points
     path.write_text(path.read_text().replace(",", ";").replace(".", ","))
-    np.testing.assert_array_equal(warned(told, read_landmarks, path).points, expected)
-    table = WIDE.assign(who=["007", "1;2"], note="a, b", age="30,5")
-    for begin, decimal in (("", ","), ("", "."), ("\ufeff", ",")):
-        path.write_text(begin + table.to_csv(sep=";", decimal=decimal, index=False))
-        found = warned(told, read_table, path)
-        assert list(found["who"]) == ["007", "1;2"]
-        assert list(found["note"] + found["age"]) == ["a, b30.5"] * 2
-        np.testing.assert_array_equal(found[POINTS], WIDE)
-    for name, sign in (("a.csv", "\t"), ("a.csv", "|"), ("a.tsv", ",")):
+    found = warned("numbers have decimal commas", read_landmarks, path).points
+    np.testing.assert_array_equal(found, expected)
+    names = [f"{name[0]}, {name[1:]}" for name in WIDE]
+    WIDE.set_axis(names, axis=1).to_csv(path, sep=";", decimal=",", index=False)
+    assert list(read_table(path)) == names
+    for name, sign in (("a.csv", "\t"), ("a.csv", "|"), ("a.csv", ";"), ("a.tsv", ",")):
         WIDE.to_csv(tmp_path / name, sep=sign, index=False)
         told = re.escape(f"{name} end with {sign!r}")
         found = warned(told, read_landmarks, tmp_path / name)

@@ -9,6 +9,16 @@ from typing import Any
 FRAME = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number))?"
 IMAGE = r"(?:image|img|photo|frame)(?:[ _.]?(?:id|name|path|file))?"
 IMAGE_NAME = rf"{IMAGE}|file[ _.]?(?:name|path)?"
+# Times in names of images: dates, also with times of day; times of day alone; seconds
+# with decimals, and since 1970.
+_TIME = re.compile(
+    r"(?<!\d)(?:19|20)\d\d[-_.]?[01]\d[-_.]?[0-3]\d(?:(?=\.\D)|[-_. T]*[0-2]\d"
+    r"(?:[-_.:h]?[0-5]\d[-_.:m]?[0-5]\d(?:\.\d+)?|[-.:h][0-5]\d))(?!\d)"
+    r"|(?<![^/\\])[0-2]\d[-_.:h][0-5]\d[-_.:m][0-5]\d(?=s?\.\D)"
+    r"|(?:(?<![a-z\d])|(?<=frame)|(?<=image)|(?<=img)|(?<=time))\d+\.\d{1,3}(?=s?\.\D)"
+    r"|(?<!\d)[1-9]\d{9,}(?!\d)",
+    re.IGNORECASE,
+)
 
 
 def first_items(items: Iterable[Any], most: int = 4) -> str:
@@ -39,6 +49,18 @@ def by_number(path: Path | str) -> tuple[list[str | int], str]:
     return [int(each) if i % 2 else each for i, each in enumerate(parts)], name
 
 
+def have_times(names: Sequence[str]) -> bool:
+    """
+    Return whether names of images tell them apart by times instead of numbers.
+
+    >>> from isa_nrsfm._compat.texts import have_times
+    >>> have_times(["2023-05-01_12-00-30.png", "2023-05-01_12-00-31.png"])
+    True
+    """
+    rest = {_TIME.sub("", name) for name in names}
+    return all(map(_TIME.search, names)) and len(rest) < len({*names})
+
+
 def frame_numbers(names: Sequence[str]) -> list[int] | None:
     """
     Return the numbers that names of images have; None if these are no numbers of them.
@@ -49,6 +71,8 @@ def frame_numbers(names: Sequence[str]) -> list[int] | None:
     >>> frame_numbers(["v1/img0_x2.png", "v1/img10_x2.png", "v1/img20_x2.png"])
     [0, 10, 20]
     """
+    if have_times(names):
+        return None
     parts = [re.split("([0-9]+)", name) for name in names]
     least, found = max(len(set(names)) // 2, 1), None
     for place in range(-2, -min(map(len, parts)), -2):

@@ -1,5 +1,8 @@
 """Coordinates that are no places in an image: codes of missing points, shares."""
 
+from collections.abc import Hashable
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,17 +20,21 @@ FEW = 0.05
 LEAST = 0.2
 # Largest median of centred coordinates.
 CENTRED = 0.03
+# Attribute of a DataFrame of points of which `read_landmarks` has warned.
+TOLD = "warned of coordinates"
 
 
 class CoordinateWarning(UserWarning):
     """Coordinates are probably codes of missing points, or shares of an image."""
 
 
-def warn_of_rows(rows: FrameBlocks, camera: str) -> None:
+def warn_of_rows(rows: FrameBlocks, camera: str, attrs: dict[Hashable, Any]) -> None:
     """Warn of some rows of a table, evenly spread; not of shares if cameras are affine.
 
-    These absorb the stretch of shares.
+    These absorb the stretch of shares. The attributes of a DataFrame may have `TOLD`.
     """
+    if attrs.get(TOLD):
+        return
     few = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
     tracks = rows.take(few).mT
     warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
@@ -35,20 +42,23 @@ def warn_of_rows(rows: FrameBlocks, camera: str) -> None:
         warn_of_shares(tracks)
 
 
-def warn_of_places(tracks: NDArray, confidence: ArrayLike | None = None) -> None:
+def warn_of_places(
+    tracks: NDArray, confidence: ArrayLike | None = None, format: str = "table"
+) -> bool:
     """Warn of codes in tracks (n_frames, n_points, 2), and of shares; of sure points.
 
-    Trackers place points that they do not see beyond the image.
+    Trackers place points that they do not see beyond the image. Return whether there
+    are any.
     """
-    warn_of_codes(tracks)
+    have_codes = warn_of_codes(tracks)
     if confidence is not None:
         unsure = np.asarray(confidence)[..., None] < UNSURE
         tracks = np.where(unsure, np.nan, tracks)
-    warn_of_shares(tracks)
+    return warn_of_shares(tracks, format) or have_codes
 
 
-def warn_of_codes(tracks: NDArray, rows: str = "rows") -> None:
-    """Warn if points of tracks (n_frames, n_points, 2) may be missing, such as (0, 0).
+def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
+    """Warn, and return True, if tracks may have missing points, such as (0, 0).
 
     Codes such as -1 may be shifted or scaled: they are the same pair of numbers. Other
     points are at the same place, exactly and in three frames, only by chance. Then the
@@ -59,7 +69,7 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> None:
     places.real, places.imag = np.moveaxis(tracks + 0.0, 2, 0)  # -0.0 + 0.0 is 0.0
     shown = places[~np.isnan(places)]
     shown = shown[:: -(-len(shown) // MOST_PLACES) or 1]
-    found = {0j}
+    found, warned = {0j}, False
     for some in (shown, shown[shown.real == shown.imag]):
         if len(some):
             values, counts = np.unique(some, return_counts=True)
@@ -94,24 +104,36 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> None:
             f"them NaN {way}",
             CoordinateWarning,
         )
+        warned = True
+    return warned
 
 
-def warn_of_shares(tracks: NDArray) -> None:
-    """Warn if tracks (n_frames, n_points, 2) look like shares of an image's size."""
+def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
+    """Warn, and return True, if tracks (n_frames, n_points, 2) look like shares."""
     if not are_shares(tracks):
-        return
+        return False
     known = tracks[~np.isnan(tracks)]
     inside = np.mean((known >= 0) & (known <= 1))
+    way = (
+        ": isa_nrsfm.io.read_landmarks with format='mediapipe' and "
+        "image_size=(WIDTH, HEIGHT) does it (command line: --format mediapipe "
+        "--image-size WIDTHxHEIGHT)"
+    )
+    if format not in ("table", "mediapipe"):
+        way = (
+            f". In Python: points = landmarks.points * ([WIDTH, HEIGHT] * "
+            f"{tracks.shape[1]}), and isa_nrsfm.io.write_table(points, 'new.csv')"
+        )
     warn_caller(
         f"{100 * inside:.3g} % of the coordinates are between 0 and 1 (all between "
         f"{known.min():.2g} and {known.max():.2g}), like shares of the width and "
         "height of an image. Such shares stretch the shapes, which changes their "
-        "proportions and rotations. If these are shares, multiply x by the width and "
-        "y by the height of the image: isa_nrsfm.io.read_landmarks with "
-        "format='mediapipe' and image_size=(WIDTH, HEIGHT) does it (command line: "
-        "--format mediapipe --image-size WIDTHxHEIGHT)",
+        "proportions and rotations. If they have another unit, such as metres, ignore "
+        "this. If these are shares, multiply x by the width and y by the height of the "
+        f"image{way}",
         CoordinateWarning,
     )
+    return True
 
 
 def are_shares(tracks: NDArray) -> bool:

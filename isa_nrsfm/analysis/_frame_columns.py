@@ -59,7 +59,8 @@ def kind_of(y: NDArray, kind: str) -> Kind:
     if n_values == len(y):
         raise ValueError(
             f"the {len(y)} labels are all different, so that no class has two frames; "
-            "for a measured quantity use kind='number'"
+            "for a measured quantity use kind='number' (command line: --label "
+            "COLUMN:number)"
         )
     return "classes"
 

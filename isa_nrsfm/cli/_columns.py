@@ -18,7 +18,7 @@ from isa_nrsfm.cli._options import DEFAULTS
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
-from isa_nrsfm.cli._times import read_times, video_times
+from isa_nrsfm.cli._times import as_numbers, read_times, video_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import EYES, point_numbers
 from isa_nrsfm.export._viewer import MOST_LABELS
@@ -91,9 +91,9 @@ def column_results(
             X, time=frames.times, groups=frames.groups, **frames.weighting
         )
         found, images = smooth.alpha, frames.images[X.index]
-        seen = f"frames {images.min():g} to {images.max():g} by {images.name or 'row'}"
         report["time"] = {
-            "column": args.time or seen,
+            "column": args.time or images.name,
+            "frames": None if args.time else [images.min(), images.max()],
             "unit": frames.time_unit,
             "time_scales": smooth.time_scales,
             "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),
@@ -160,7 +160,7 @@ def _label(table: "pd.DataFrame", text: str) -> "pd.Series":
     names = _names(cells_of(table, name, "--label").dropna())
     if names.empty:
         raise ValueError(f"--label: no frame has a {name!r}")
-    numbers = pd.to_numeric(names, errors="coerce")
+    numbers = names if kind == "classes" else as_numbers(names)
     if kind == "auto" and numbers.notna().all() and (numbers % 1 != 0).any():
         kind = "number"
     if kind == "number" and numbers.isna().any():

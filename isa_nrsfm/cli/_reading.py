@@ -1,6 +1,6 @@
 """Read the table of a command: landmarks, layout, other columns, unusable rows."""
 
-import contextlib
+import shlex
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,13 +30,16 @@ from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
     LandmarkColumns,
-    confidence_columns,
     find_landmark_columns,
     landmark_sets,
 )
 from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
-from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
+from isa_nrsfm.skeletons._column_names import (
+    individuals_with,
+    names_of_points,
+    parse_coordinate,
+)
 
 # Options of some formats.
 _OF_FORMATS = ("image_size", "columns", "individuals", "part")
@@ -115,7 +118,7 @@ def read_frames(
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
     else:
-        columns = chosen or find_landmark_columns(table.columns)
+        columns = chosen or find_landmark_columns(table.columns, table=table)
     table, sure, not_used = _with_confidences(args, table, columns, sure)
     kept, left_out = _rows_to_keep(args, table)
     if estimator is not None and chosen is not None:
@@ -134,23 +137,24 @@ def read_frames(
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
     tracks[kept] = tracks_in(table[kept], names, args.missing_value)
     _refuse_lost_points(args, table[kept], columns, tracks)
-    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
-    tracks = cleaned.mT
     confidence = np.full(tracks.shape[:2], np.nan)
-    if sure is not None:
-        confidence = sure[list(columns.x)].to_numpy(np.float64)[rows]
-    weighting = {}
+    if not sure.empty:
+        confidence = sure[list(columns.x)].to_numpy(np.float64)
+    if args.min_confidence is not None:
+        tracks[confidence < args.min_confidence] = np.nan
+    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
+    tracks, confidence, weighting = cleaned.mT, confidence[rows], {}
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
-    warn_of_places(tracks[report.usable], confidence[report.usable])
+    warn_of_places(tracks[report.usable], confidence[report.usable], args.format)
     unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
     if unsure.any() and args.min_confidence is None and args.weights is None:
         warn_caller(
-            f"{100 * unsure.mean():.2g} % of the points have a confidence below "
+            f"{100 * unsure.mean():.3g} % of the points have a confidence below "
             f"{UNSURE:g}, and count like all others. If they are wrong, leave them out "
             f"with --min-confidence {UNSURE:g}"
         )
@@ -168,7 +172,7 @@ def read_frames(
         not_used=not_used,
         left_out=[out for out in left_out if len(out[1])],
         skeleton=layout,
-        images=image_numbers(table),
+        images=image_numbers(table, vars(args).get("fps")),
         weighting={name: each[report.usable] for name, each in weighting.items()},
         principal_point=_principal_point(args, other),
     )
@@ -244,37 +248,27 @@ def _with_confidences(
     table: "pd.DataFrame",
     columns: LandmarkColumns,
     known: "pd.DataFrame | None",
-) -> tuple["pd.DataFrame", "pd.DataFrame | None", dict[str, int]]:
-    """Take confidences out of a table, and leave out the points that are not sure.
+) -> tuple["pd.DataFrame", "pd.DataFrame", dict[str, int]]:
+    """Take confidences out of a table; those of other formats are known.
 
-    Those of other formats are known, by the names of x. Returns the table, the
-    confidences if there are any, and those of a plain table that are not used.
+    Returns the table, the confidences by the names of x, if there are any, and those of
+    a plain table that are not used.
     """
-    option = "" if args.weights is None else "--weights"
+    option = "--weights" * (args.weights is not None)
     option = option if args.min_confidence is None else "--min-confidence"
     names = []
     if known is None:
-        names = confidence_columns(table.columns, columns.x, columns.y)
-        # Texts are no confidences, unless these are asked for.
-        with contextlib.suppress(*() if option else (ValueError,)):
-            known = confidences_in(table, columns.x, columns.y)
-    if known is None and option:
+        known = confidences_in(table, columns.x, columns.y, strict=bool(option))
+        names = [*known]
+        known = known.set_axis([*columns.x][: len(names)], axis=1)
+    if known.empty and option:
         raise ValueError(
             f"{option}: {args.table} ({args.format}) has no confidences of all points. "
             "Their columns need the names of the x columns, with one of the "
             f"words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
         )
-    rest = table.drop(columns=names)
-    if known is not None and names:
-        known = known.set_axis(list(columns.x), axis=1)
-    if known is not None and args.min_confidence is not None:
-        unsure = known[list(columns.x)].to_numpy() < args.min_confidence
-        points = table[columns.interleaved]
-        rest[columns.interleaved] = points.mask(np.repeat(unsure, 2, axis=1))
-    not_used = {}
-    if names and not option:
-        not_used[f"{names[0].strip()}, ... (confidences)"] = len(names)
-    return rest, known, not_used
+    not_used = {f"{names[0].strip()}, ... (confidences)": len(names)} if names else {}
+    return table.drop(columns=names), known, {} if option else not_used
 
 
 def _rows_to_keep(
@@ -340,7 +334,7 @@ def _columns_of_model(
     fitted = getattr(estimator, "feature_names_in_", None)
     n_points = len(estimator.mean_shape_)
     if fitted is None:
-        found = chosen or find_landmark_columns(table.columns)
+        found = chosen or find_landmark_columns(table.columns, table=table)
         if len(found.points) != n_points:
             raise ValueError(
                 f"the model has {n_points} points, the table has {len(found.points)} "
@@ -365,8 +359,12 @@ def _columns_of_model(
             for some, where in ((absent, "model"), (surplus, "table"))
             if some
         ]
+        own = individuals_with(table.columns, names[::2])
+        hint = f". Individuals in one row: --individuals {shlex.quote(','.join(own))}"
         raise ValueError(
-            "the table does not have the points of the model: " + "; ".join(differences)
+            "the table does not have the points of the model: "
+            + "; ".join(differences)
+            + hint * bool(own)
         )
     columns = [in_table[name] for name in names]
     x, y = tuple(columns[::2]), tuple(columns[1::2])

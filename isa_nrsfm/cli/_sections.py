@@ -517,9 +517,11 @@ def _groups(groups: dict[str, Any]) -> Section:
 
 def _time(time: dict[str, Any]) -> Section:
     """Return the result of smoothing in time."""
-    scales = np.asarray(time["time_scales"], dtype=float)
+    scales, name = np.asarray(time["time_scales"], dtype=float), time["column"]
+    if (frames := time.get("frames")) is not None:
+        name = f"frames {frames[0]:g} to {frames[1]:g} by {name or 'row'}"
     if not len(scales):
-        return [f"{time['column']}: no dynamics found, coefficients are not smoothed"]
+        return [f"{name}: no dynamics found, coefficients are not smoothed"]
     fading = scales[np.isfinite(scales)]
     found = []
     if len(fading):
@@ -528,7 +530,7 @@ def _time(time: dict[str, Any]) -> Section:
     if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")
     return [
-        f"{time['column']}: {'; '.join(found)}",
+        f"{name}: {'; '.join(found)}",
         f"smoothed coefficients differ by {time['changed_by']:.2f} (root mean square)",
     ]
 

@@ -1,6 +1,7 @@
 """Times of frames: numbers, dates and durations, each in one reading for all rows."""
 
 import re
+import warnings
 from itertools import product
 from typing import Any
 
@@ -8,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._compat.texts import FRAME, IMAGE, IMAGE_NAME, frame_numbers
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import FRAME, IMAGE, IMAGE_NAME, frame_numbers, have_times
+from isa_nrsfm.io._tables import with_points
 
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
 _DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
@@ -37,7 +40,7 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
         dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
         return np.asarray(dates), "seconds"
     known = column.dropna().astype(str)
-    numbers = pd.to_numeric(known, errors="coerce")
+    numbers = as_numbers(known)
     if format is None and numbers.notna().all():
         of_frames = re.fullmatch(FRAME, str(column.name).strip(), re.IGNORECASE)
         unit = "frames" if of_frames else f"in the unit of the column {column.name}"
@@ -77,11 +80,18 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
     return np.asarray(first.reindex(column.index)), "seconds"
 
 
-def image_numbers(table: "pd.DataFrame") -> "pd.Series":
+def as_numbers(cells: "pd.Series") -> "pd.Series":
+    """Return the numbers in cells, also with decimal commas; NaN in other cells."""
+    with warnings.catch_warnings(action="ignore"):  # of commas
+        written = with_points(cells.to_frame("cells"), ["cells"])["cells"]
+    return pd.to_numeric(written, errors="coerce")
+
+
+def image_numbers(table: "pd.DataFrame", fps: float | None = None) -> "pd.Series":
     """Return the number of the image of each row, under the name of its column.
 
     It is the number of the frame, that in the name of the image, or that of the image
-    among all. Otherwise rows count.
+    among all. Otherwise rows count. Warn if times by fps leave out those in names.
     """
     for expression in (FRAME, IMAGE_NAME, IMAGE):
         for name in table.columns:
@@ -91,7 +101,16 @@ def image_numbers(table: "pd.DataFrame") -> "pd.Series":
             if expression == IMAGE_NAME:  # not of videos with many rows each
                 several = name == "file" and table[name].duplicated().any()
                 is_name = numbers.isna().all() and not several
-                numbers = frame_numbers([*map(str, table[name])]) if is_name else None
+                texts = [*map(str, table[name])]
+                numbers = frame_numbers(texts) if is_name else None
+                if fps and is_name and have_times(texts):
+                    warn_caller(
+                        f"--fps: the names of images in the column {name} have times "
+                        f"(first: {texts[0]}) instead of numbers of frames. Images "
+                        "count as successive frames, in their order. For these times "
+                        f"use --time {name} with a --time-format, such as "
+                        "%Y-%m-%d_%H-%M-%S.png, or a column frame of numbers"
+                    )
             elif expression == IMAGE:
                 numbers = pd.factorize(table[name])[0]
             if numbers is not None and np.isfinite(numbers).all():

@@ -12,12 +12,17 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.coordinates import are_shares
 from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
-    confidence_columns,
     find_landmark_columns,
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
-from isa_nrsfm.io._tables import Missing, header_names, read_columns, tracks_in
+from isa_nrsfm.io._tables import (
+    Missing,
+    confidences_in,
+    header_names,
+    read_columns,
+    tracks_in,
+)
 
 # OpenFace names points in space, in millimetres, by capital letters.
 _NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
@@ -104,11 +109,12 @@ def read_mediapipe(
     """
     names = header_names(path)
     found = find_landmark_columns(names, columns)
-    scores = confidence_columns(names, found.x, found.y)
     sizes = [name for name in ("image_width", "image_height") if name in names]
-    numbers = [*found.interleaved, *sizes, *scores]
+    numbers = [*found.interleaved, *sizes]
     text = {*names}.difference(numbers, found.z)
     table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
+    sure = confidences_in(table, found.x, found.y)
+    table, scores = table.assign(**sure), [*sure]
     tracks = tracks_in(table, found.interleaved, missing)
     known = np.abs(tracks[~np.isnan(tracks)])
     # Pixels of a face reach beyond this, and shares of the image's size do not.

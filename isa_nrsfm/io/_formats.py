@@ -212,9 +212,9 @@ def read_landmarks(
         with errors_of(str(path)):
             landmarks = landmarks.without_unsure_points(min_confidence)
     tracks = landmarks.points.to_numpy().reshape(len(landmarks.points), -1, 2)
-    import_module("isa_nrsfm._prepare.coordinates").warn_of_places(
-        tracks, landmarks.confidence
-    )
+    coordinates = import_module("isa_nrsfm._prepare.coordinates")
+    warned = coordinates.warn_of_places(tracks, landmarks.confidence, name)
+    landmarks.points.attrs[coordinates.TOLD] = warned
     return landmarks
 
 

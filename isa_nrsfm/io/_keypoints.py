@@ -221,7 +221,7 @@ def _chosen_categories(
         if found != (points or found):
             raise ValueError(
                 f"the categories {', '.join(names)} have different keypoints: choose "
-                "one with category"
+                f"one in Python, such as read_landmarks(path, category={names[0]!r})"
             )
         points = found
     return _by_id(named, "categories"), points or None
@@ -542,27 +542,16 @@ def read_wflw(path: Path) -> Landmarks:
     x_max y_max``), six attributes 0 or 1 (pose, expression, illumination, make-up,
     occlusion, blur) and the name of the image. Box and attributes may be missing.
     """
-    rows: list[NDArray[np.float64]] = []
-    images: list[str] = []
-    n_fields = 0
-    with path.open(encoding="utf-8-sig") as file:
-        for number, line in enumerate(file, start=1):
-            fields = line.split()
-            if not fields:
-                continue
-            n_fields = n_fields or len(fields)
-            if len(fields) not in _WFLW_LENGTHS or len(fields) != n_fields:
-                raise ValueError(
-                    f"line {number} has {len(fields)} fields; all must have "
-                    f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
-                )
-            with errors_of(f"line {number}"):
-                rows.append(_floats(fields[:-1]))
-            images.append(fields[-1])
-    if not rows:
-        raise ValueError("there are no lines in it")
-    frames: dict[str, object] = {"image": images}
-    points, box, attributes = np.split(np.stack(rows), [196, 200], axis=1)
+    fields = np.loadtxt(path, dtype=str, comments=None, encoding="utf-8-sig", ndmin=2)
+    n_fields = fields.shape[1]
+    if n_fields not in _WFLW_LENGTHS:
+        raise ValueError(
+            f"the lines have {n_fields} fields; all must have "
+            f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
+        )
+    numbers = np.stack([_floats(row) for row in fields[:, :-1].tolist()])
+    frames: dict[str, object] = {"image": fields[:, -1]}
+    points, box, attributes = np.split(numbers, [196, 200], axis=1)
     if n_fields == _WFLW_LENGTHS[1]:
         if not np.isin(attributes, (0, 1)).all():
             raise ValueError("the six attributes before the image must be 0 or 1")

@@ -10,8 +10,18 @@ from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
+import numpy as np
+from sklearn.decomposition import PCA
+from sklearn.linear_model import LinearRegression
+from sklearn.metrics import make_scorer, r2_score
+from sklearn.model_selection import cross_val_score
+from sklearn.pipeline import make_pipeline
+
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.skeletons._column_names import (
+    columns_of_individuals,
+    has_single_parts,
     individuals_in,
     parse_coordinate,
     point_names,
@@ -25,7 +35,9 @@ CONFIDENCES = (
 )
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
-
+# Least part of the motion of points that others of their body predict, and the rows
+# that are needed to see it: docs/benchmarks/README.md, "Thresholds".
+TOGETHER, FEWEST_ROWS = 0.7, 20
 
 # Columns that name points, and frames or people, in tables with a row for each point.
 _POINT = "point|landmark|joint|marker|node|part(?!ic)"
@@ -58,7 +70,9 @@ class LandmarkColumns(NamedTuple):
 
 
 def find_landmark_columns(
-    names: Iterable[Hashable], columns: str | Sequence[str] | None = None
+    names: Iterable[Hashable],
+    columns: str | Sequence[str] | None = None,
+    table: "pd.DataFrame | None" = None,
 ) -> LandmarkColumns:
     """
     Find the landmark columns among the columns of a table.
@@ -66,7 +80,8 @@ def find_landmark_columns(
     `columns` are patterns of the x and the y columns in turn, such as ``"x_#,y_#"``.
     Several pairs are put one after the other. Without it, the table must have exactly
     one set of landmarks of at least `MIN_POINTS` points. Numbered points are in the
-    order of their numbers, others in that of their x columns.
+    order of their numbers, others in that of their x columns. The table, if it is
+    known, tells points of one body from those of individuals.
 
     >>> from isa_nrsfm.io._landmark_columns import find_landmark_columns
     >>> names = ["file"] + [f"{a}_{j}" for a in "xy" for j in range(8)]
@@ -87,11 +102,12 @@ def find_landmark_columns(
     names = without_boxes(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
-    _refuse_individuals(names, candidates or sets)
+    if one_body := _one_body(names, candidates or sets, table):
+        return _select(names, one_body.split(","))
     if not candidates:
         x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
         if x and y:
-            raise ValueError(_pivoted(names, [x[0], y[0]]))
+            raise ValueError(_pivoted(names, [x[0], y[0]], table))
         if any(isinstance(name, tuple) for name in names):
             raise ValueError(
                 "the names of the columns have several levels: join them to names such "
@@ -117,17 +133,30 @@ def find_landmark_columns(
     return _select(names, pattern.split(","))
 
 
-def _pivoted(names: Sequence[Hashable], values: list[Hashable]) -> str:
+def _pivoted(
+    names: Sequence[Hashable], values: list[Hashable], table: "pd.DataFrame | None"
+) -> str:
     """Return how a table with a row for each point gets one for each frame."""
+    told = (
+        "the table has one row for each point, with columns x and y; one row for each "
+        "frame is needed. Columns must tell frames and points apart"
+    )
     aside = {"x", "y", "z", "", *CONFIDENCES}
     keys = [name for name in names if str(name).strip().lower() not in aside]
     points = [name for name in keys if re.search(_POINT, str(name), re.IGNORECASE)]
     last = [name for name in keys if not re.search(_FRAME, str(name), re.IGNORECASE)]
-    points = points or last[-1:] or ["point"]
-    frames = [name for name in keys if name not in points] or ["frame"]
+    if not keys:
+        return f"{told}: add columns frame and point with their numbers"
+    several = table is not None and table.duplicated(keys).any()
+    points = points or ([] if several else last[-1:])
+    frames = [name for name in keys if name not in points]
+    absent = "individual" if frames and several else "" if frames else "frame"
+    absent, counted = absent if points else "point", ""
+    if absent:
+        counted = f"table[{absent!r}] = table.groupby({keys}).cumcount(), and "
+        frames, points = [*frames, *[absent] * bool(points)], points or [absent]
     return (
-        "the table has one row for each point, with columns x and y; one row for each "
-        "frame is needed. Columns must tell frames and points apart. In pandas: "
+        f"{told}. In pandas: {counted}"
         f"wide = table.pivot(index={frames}, columns={points[0]!r}, values={values}), "
         "and wide.columns = "
         "[f'{axis}_{j}' for axis, j in wide.columns], and wide = wide.reset_index()"
@@ -205,15 +234,22 @@ def confidence_columns(
     return []
 
 
-def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None:
-    """Raise if the points of sets of landmarks are those of several individuals."""
+def _one_body(
+    names: Sequence[Hashable], sets: dict[str, int], table: "pd.DataFrame | None"
+) -> str:
+    """Return the pattern of points that have names of individuals and move together.
+
+    It is empty if points have other names. Raise if individuals may move apart.
+    """
     patterns = [pattern.split(",")[0] for pattern in sets]
     lists = [_columns_matching(names, pattern).values() for pattern in patterns]
     x = list(dict.fromkeys(chain.from_iterable(lists)))
     if not (who := individuals_in(x, MIN_POINTS)):
-        return
+        return ""
+    own = columns_of_individuals(x, who)
     largest = max(sets, key=sets.__getitem__)
     whole = largest if sets[largest] == len(x) else ",".join(sets)
+    single = has_single_parts(own[who[0]].values())
     listed, n_points = ",".join(who), len(x) // len(who)
     way = (
         f"For a row for each individual, use individuals={listed!r} (command line: "
@@ -221,11 +257,33 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
         if n_points >= MIN_POINTS
         else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
     )
+    parts = [] if table is None or single else [table[[*p]] for p in own.values()]
+    if parts and _move_together(parts):
+        warn_caller(
+            f"the points of {', '.join(who)} move together, and are read as those of "
+            f"one body. {way}"
+        )
+        return whole
     raise ValueError(
         f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
         f"of several individuals in one row. {way}. If all are points of one body, use "
         f"columns={whole!r} (command line: --columns {shlex.quote(whole)})"
     )
+
+
+def _move_together(tables: "Sequence[pd.DataFrame]") -> bool:
+    """Return whether the x of some points predict those of others, in other rows."""
+    found = [table.apply(pd.to_numeric, errors="coerce") for table in tables]
+    parts = [(part - part.mean()).fillna(0.0).to_numpy() for part in found]
+    if len(parts[0]) < FEWEST_ROWS:
+        return False
+    shares = []
+    for i, part in enumerate(parts):
+        model = make_pipeline(PCA(min(4, part.shape[1])), LinearRegression())
+        score = make_scorer(r2_score, multioutput="variance_weighted")
+        others = np.hstack([*parts[:i], *parts[i + 1 :]])
+        shares.append(cross_val_score(model, others, part, cv=2, scoring=score))
+    return bool(np.mean(shares) > TOGETHER)
 
 
 def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:

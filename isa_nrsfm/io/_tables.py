@@ -4,6 +4,7 @@ import contextlib
 import csv
 import os
 import re
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -28,10 +29,12 @@ from isa_nrsfm.skeletons._column_names import (
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
-_DECIMAL_COMMA = r"^(\s*[+-]?\d*),(\d+(?:[eE][+-]?\d+)?\s*)$"
+# Numbers with a decimal comma, and with commas between thousands.
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
+_THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = (
-    *("", "na", "nan", "n/a", "null", "none"),
+    *("", "na", "nan", "-nan", "n/a", "null", "none"),
     # Of spreadsheets, pandas, and C programs on Windows.
     *("#n/a", "<na>", "nan(ind)", "-nan(ind)"),
 )
@@ -214,7 +217,7 @@ def landmark_table(
             "(polars tables have a method to_pandas)"
         )
     frame = individuals_as_rows(frame, individuals)
-    names = find_landmark_columns(frame.columns, columns).interleaved
+    names = find_landmark_columns(frame.columns, columns, frame).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, missing).reshape(len(frame), len(names))
     return LandmarkTable(
@@ -274,6 +277,7 @@ def tracks_in(
 
     Those with one of the numbers in `missing` as x and y become NaN.
     """
+    frame = with_points(frame, names)
     values = np.stack([_as_numbers(frame[name]) for name in names], axis=1)
     tracks = values.reshape(len(frame), len(names) // 2, 2)
     for number in _codes(missing):
@@ -296,25 +300,43 @@ def read_named_columns(
     points, other = landmark_table(
         parse_table(path), columns=columns, missing=missing, individuals=individuals
     )
-    confidence, names = None, points.columns
-    with contextlib.suppress(ValueError):  # texts are no confidences
-        confidence = confidences_in(other, names[::2], names[1::2])
+    names = points.columns
+    confidence = confidences_in(other, names[::2], names[1::2])
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
         point_names(names[::2]),
-        other if confidence is None else other.drop(columns=confidence.columns),
+        other.drop(columns=confidence.columns),
         format="table",
         columns=list(names),
-        confidence=confidence,
+        confidence=None if confidence.empty else confidence,
     )
 
 
 def confidences_in(
-    frame: "pd.DataFrame", x: Iterable[str], y: Iterable[str]
-) -> "pd.DataFrame | None":
-    """Return the confidences (n_frames, n_points) of points of x and y columns."""
-    found = {name: _as_numbers(frame[name]) for name in confidence_columns(frame, x, y)}
-    return pd.DataFrame(found, index=frame.index) if found else None
+    frame: "pd.DataFrame", x: Sequence[str], y: Sequence[str], strict: bool = False
+) -> "pd.DataFrame":
+    """Return the confidences (n_frames, n_points) of points of x and y columns, if any.
+
+    No columns if there are none, or, unless strict, if they are no confidences.
+    """
+    names = confidence_columns(frame, x, y)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of commas, as in coordinates
+            frame = with_points(frame, names)
+        found = {name: _as_numbers(frame[name]) for name in names}
+        values = pd.DataFrame(found, frame.index)
+        # p may be a pressure, and v a velocity; in COCO it is 0, 1 or 2.
+        is_letter = bool(names) and len(names[0].strip()) == len(x[0].strip())
+        known = values.to_numpy()[values.notna()]
+        if is_letter and not ((known == known.clip(0, 1)) | (known == 2)).all():
+            raise ValueError(
+                f"{names[0]}, ... are no confidences: they are not all from 0 to 1"
+            )
+        return values
+    except ValueError:
+        if strict:
+            raise
+        return frame[[]]
 
 
 def table_suffix(path: str | os.PathLike[str]) -> str:
@@ -344,10 +366,21 @@ def first_lines(path: Path, n_lines: int) -> list[str]:
 
 
 def separator_of(path: Path) -> str:
-    """Return what separates the cells of a text: the usual sign, or one it has."""
-    line = "".join(first_lines(path, 1))
-    signs = (SEPARATORS.get(path.suffix.lower(), ","), *";\t,|")
-    return next((sign for sign in signs if sign in line), signs[0])
+    """Return what separates the cells of a text: the usual sign, or a better one.
+
+    The header and the first row have as many cells, and the most; numbers and names may
+    have a comma each.
+    """
+    usual, lines = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 2)
+
+    def fit(sign: str) -> tuple[bool, float]:
+        lengths = [len(row) for row in csv.reader(lines, delimiter=sign) if row]
+        return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / (1 + (sign == ","))
+
+    try:
+        return max((usual, *";\t,|"), key=fit)
+    except (csv.Error, ValueError):
+        return usual
 
 
 def header_rows(path: Path, n_rows: int) -> list[list[str]]:
@@ -380,11 +413,13 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     """
     n_rows, n_columns = 0, 0
     if separator != SEPARATORS.get(path.suffix.lower()):
-        commas = ", and its decimal commas are read as points" * (separator == ";")
-        warn_caller(f"the cells of {path.name} end with {separator!r}{commas}")
+        warn_caller(f"the cells of {path.name} end with {separator!r}")
     with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.reader(_without_nulls(file), delimiter=separator)
+        rows = csv.reader(file, delimiter=separator)
         for row in rows:
+            if "\0" in "".join(row):
+                line = f"line {rows.line_num} has a null character"
+                raise ValueError(f"its text is not in UTF-8: {line}")
             if not row or (len(row) == 1 < n_columns and not row[0].strip()):
                 continue
             n_columns = n_columns or len(row)
@@ -444,60 +479,96 @@ def read_columns(
     if path.suffix.lower() == ".parquet":
         frame = read_parquet(path).rename(columns=lambda name: str(name).strip())
         frame = frame.drop(columns=[name for name in frame if name in leave_out])
-        frame = pd.DataFrame(
-            {n: frame[n] if n in text else _numbers_if_all(frame[n]) for n in frame}
-        )
     else:
         separator = separator_of(path)
         if sum(1 for _ in checked_rows(path, separator)) <= n_header:
             raise ValueError("it has a header but no rows")
-        given: dict[str, Any] = {
-            "sep": separator,
-            "decimal": "," if separator == ";" else ".",
-            "header": None,
-            "names": names,
-            "skiprows": n_header,
-            "index_col": False,
-            "skipinitialspace": True,
-            "encoding": "utf-8-sig",
-            # As C and C++ programs on Windows write a number that is none.
-            "na_values": ["nan(ind)", "-nan(ind)"],
-            "low_memory": False,
-        }
-        used = [name for name in names if name not in leave_out]
-        frame = pd.read_csv(path, dtype=dict.fromkeys(text, str), usecols=used, **given)
-        whole = frame.select_dtypes("integer").columns.difference(numbers)
-        for name, cells in pd.read_csv(path, dtype=str, usecols=whole, **given).items():
-            if _of_codes(cells):
-                frame[name] = cells
-    kinds = dict(frame.dtypes)
+        frame = pd.read_csv(
+            path,
+            sep=separator,
+            header=None,
+            names=names,
+            skiprows=n_header,
+            usecols=[name for name in names if name not in leave_out],
+            dtype={name: str for name in names if name not in numbers},
+            index_col=False,
+            skipinitialspace=True,
+            encoding="utf-8-sig",
+            low_memory=False,
+        )
+    others = [name for name in frame if name not in {*numbers, *text}]
+    frame = with_points(frame, numbers, others)
+    found: dict[str, Any] = {name: _numbers_if_all(frame[name]) for name in others}
     for name in numbers:
-        if kinds[name].kind not in "iuf":
-            frame[name] = _as_numbers(frame[name])
-    return frame
+        is_number = frame[name].dtype.kind in "iuf"
+        found[name] = frame[name] if is_number else _as_numbers(frame[name])
+    return frame.assign(**found)
 
 
 def _numbers_if_all(column: "pd.Series") -> "pd.Series":
     """Return a column of texts as numbers, if all are and none is a code."""
-    if not pd.api.types.is_string_dtype(column):
+    if pd.api.types.infer_dtype(column) not in ("string", "empty"):
         return column
     column = column.replace("", None)
     numbers = pd.to_numeric(column, errors="coerce")
-    is_number = numbers.notna().equals(column.notna()) and not _of_codes(column)
+    is_number = numbers.notna().equals(column.notna())
+    whole = is_number and (numbers.dropna() % 1 == 0).all()
+    # Codes are whole numbers with zeros before them.
+    if whole and column.str.match(r"\s*[+-]?0\d+\s*$").any():
+        return column
     return numbers if is_number else column
 
 
-def _of_codes(cells: "pd.Series") -> bool:
-    """Return whether texts of whole numbers begin with zeros, as codes do."""
-    return bool(cells.str.match(r"\s*[+-]?0\d+\s*$").any())
+def with_points(
+    frame: "pd.DataFrame", names: Collection[str], others: Iterable[str] = ()
+) -> "pd.DataFrame":
+    """Return a table with the numbers in some columns written without commas.
 
+    Either all commas are decimal, or all are between thousands; raise if both can be.
+    Other columns are written so where all their cells are such numbers.
+    """
+    texts = frame[[*names]].select_dtypes(["object", "string"]).astype(str)
+    if not any(texts[name].str.contains(",", regex=False).any() for name in texts):
+        return frame
+    cells = {*texts.to_numpy(object).ravel()}
+    decimal, thousands = (
+        {cell for cell in cells if expression.fullmatch(cell)}
+        for expression in (_DECIMAL_COMMA, _THOUSANDS)
+    )
+    if not (decimal or thousands):
+        return frame
+    fractions = frame[[*names]].select_dtypes("float") % 1
+    has_points = fractions.any(axis=None) or any("." in c for c in cells - thousands)
+    is_decimal, is_thousands = decimal >= thousands, thousands >= decimal
+    is_decimal &= not has_points
+    first = max(decimal | thousands).strip()
+    if is_decimal and is_thousands:
+        raise ValueError(
+            f"{first!r} can be {first.replace(',', '.')} or {first.replace(',', '')}, "
+            "and no other number decides it: write numbers like 1234.5. In pandas, "
+            "read the file with pd.read_csv(..., decimal=',') if the commas are "
+            "decimal, otherwise with pd.read_csv(..., thousands=','), and save it with "
+            "to_csv"
+        )
+    if not (is_decimal or is_thousands):
+        return frame
+    expression, sign = (_DECIMAL_COMMA, ".") if is_decimal else (_THOUSANDS, "")
+    warn_caller(
+        f"numbers have {'decimal commas' if sign else 'commas between thousands'}: "
+        f"{first} is read as {first.replace(',', sign)}"
+    )
 
-def _without_nulls(lines: Iterator[str]) -> Iterator[str]:
-    """Yield lines, and raise at a null character."""
-    for i, line in enumerate(lines, start=1):
-        if "\0" in line:
-            raise ValueError(f"its text is not in UTF-8: line {i} has a null character")
-        yield line
+    def written(cell: Any) -> Any:
+        """Return a cell without its comma."""
+        is_number = isinstance(cell, str) and expression.fullmatch(cell)
+        return cell.replace(",", sign) if is_number else cell
+
+    found = {name: frame[name].map(written) for name in texts}
+    for name in others:
+        column = frame[name].map(written)
+        if pd.to_numeric(column, errors="coerce").notna().equals(column.notna()):
+            found[name] = column
+    return frame.assign(**found)
 
 
 def _read_text(path: Path, separator: str) -> "pd.DataFrame":
@@ -508,7 +579,7 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         raise ValueError("it is empty; a first line with column names is needed")
     if len(header) == 1:
         _refuse_one_column(path, separator, header[0])
-    if _parsed(pd.Series(header)) is not None:
+    if pd.to_numeric(pd.Series(header).replace("", 0), errors="coerce").notna().all():
         raise ValueError(
             "its first line has numbers; a first line with column names is needed, "
             "such as x0, y0, x1, y1"
@@ -516,7 +587,8 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     second = [cell.strip().lower() for cell in next(rows)]
     if second.count("x") == second.count("y") > 1:
         index = "" if second[0] in ("x", "y") else ", index_col=0"
-        decimal = ", decimal=','" if separator == ";" else ""
+        commas = any("," in cell for cell in next(rows, []))
+        decimal = ", decimal=','" * commas
         way = (
             f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}, "
             f"sep={separator!r}{decimal}), "
@@ -537,15 +609,12 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         index_col=False,
         keep_default_na=False,
         encoding="utf-8-sig",
-    )
-    if separator == ";":
-        frame = frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
-    frame.columns = pd.Index(header)
-    for name in header:
-        if parse_coordinate(name) is not None:
-            values = _parsed(frame[name])
-            if values is not None:
-                frame[name] = values
+    ).set_axis(header, axis=1)
+    coordinates = [name for name in header if parse_coordinate(name) is not None]
+    frame = with_points(frame, coordinates)
+    for name in coordinates:
+        with contextlib.suppress(ValueError):
+            frame[name] = _as_numbers(frame[name])
     return frame
 
 
@@ -561,20 +630,6 @@ def _refuse_one_column(path: Path, separator: str, line: str) -> None:
         )
 
 
-def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
-    """Return the numbers written in a column of text, or None."""
-    # A call of pandas takes longer than the cells of a column of a few frames.
-    cells = column.tolist()
-    # Python reads 1_000 as a number; in a table it is a mistake.
-    if "_" in "".join(cells):
-        return None
-    cells = ["nan" if cell.strip().lower() in _MISSING else cell for cell in cells]
-    try:
-        return np.array(cells, dtype=object).astype(np.float64)
-    except ValueError:
-        return None
-
-
 def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     """Return a landmark column as finite numbers and NaN."""
     types = pd.api.types
@@ -582,20 +637,20 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
         raise ValueError(
             f"column {column.name!r} should hold numbers; got {column.dtype}"
         )
-    if types.is_numeric_dtype(column):
-        values = column.to_numpy(dtype=np.float64, na_value=np.nan)
-    else:
+    numbers = column
+    if not types.is_numeric_dtype(column):
         text = column.astype(object).where(column.notna(), "").astype(str)
-        found = _parsed(text)
-        if found is None:
-            bad = next(i for i in range(len(text)) if _parsed(text.iloc[[i]]) is None)
+        numbers = pd.to_numeric(text, errors="coerce")
+        bad = text[numbers.isna()]
+        bad = bad[~bad.str.strip().str.lower().isin(_MISSING)]
+        if len(bad):
             raise ValueError(
                 f"column {column.name!r} should hold numbers, but in row "
-                f"{text.index[bad]} (counted from 0) it has {text.iloc[bad]!r}. Write "
+                f"{bad.index[0]} (counted from 0) it has {bad.iloc[0]!r}. Write "
                 "numbers like 1234.5, leave the cells of missing points empty, and "
                 "delete rows of units, means or repeated names"
             )
-        values = found
+    values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
     if np.isinf(values).any():
         row = int(np.flatnonzero(np.isinf(values))[0])
         raise ValueError(

@@ -29,12 +29,27 @@ _AXIS_LABEL = re.compile(rf"([xyzXYZ])({_SEPARATORS})([^ _.\-].*)", re.DOTALL)
 _TRAILING_NUMBER = re.compile(r"(.*?)(\d+)", re.DOTALL)
 # The sizes of boxes, named like the x of their corner.
 _HEIGHTS = {"w": "h", "W": "H", "width": "height", "Width": "Height"}
-_WIDTH = re.compile("[wW](?:idth)?")
+# Not of points that are called w and h.
+_WIDTH = re.compile(r"(?<!\b[xyzXYZ])[wW](?:idth)?(?![xyzXYZ]\b)")
 # Parts of names, with the separator after them: words, or numbers in words.
 _PARTS = (r"[^ _.\-]+[ _.\-]*", r"\d+|\D+")
-# Words that tell parts of one body apart, and letters of axes.
-_SIDES = frozenset(
-    "x left right l r upper lower front hind fore rear top bottom inner outer".split()
+# Words and letters that tell parts of one body apart, and the letter of an axis.
+_SIDE = re.compile(
+    "left|right|links|rechts|linke|rechte|gauche|droite?|izq(?:uierd[ao])?|derech[ao]|"
+    "esquerd[ao]|direit[ao]|sinistr[ao]|destr[ao]|v[äe]nst(?:er|re)|h[öøo][gjy]e?re?|"
+    "lew[aey]|praw[aey]|upper|lower|front|hind|fore|rear|back|top|bottom|inner|outer|"
+    "middle|^(?:l[it]|r[et]|der)$|^[lrx]|[lr]$"
+)
+# Parts that a body has several times, and parts that it has once.
+_SERIES = re.compile(
+    "(?<![a-z])(finger|thumb|index|middle|ring|pinky|pinkie|little|toe|leg|arm|limb|"
+    "wing|fin|coxa|trochanter|femur|tibia|tarsus|claw|antenna|tentacle|rib|vertebra|"
+    "daumen|zeige|mittel|kleiner|bein|row|col|column)(?:finger|tip|s)?(?![a-z])"
+)
+_ANIMAL = re.compile("mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|person")
+_ONCE = re.compile(
+    "(?<![a-z])(?:nose|snout|beak|mouth|chin|head|neck|spine|back|body|cent(?:er|re)|"
+    "chest|thorax|abdomen|pelvis|tail|nase|mund|kinn|kopf|hals|schwanz)"
 )
 
 
@@ -137,7 +152,8 @@ def checked_names(parameter: str, names: Any, default: Any) -> list[str]:
 def without_boxes(names: Sequence[Hashable]) -> list[Hashable]:
     """Leave out columns with the corner of a box: x beside w and h, x_min and x_max."""
     texts = {str(name).strip() for name in names}
-    found = ((name, size) for name in texts for size in _WIDTH.finditer(name))
+    others = [name for name in texts if parse_coordinate(name) is None]
+    found = ((name, size) for name in others for size in _WIDTH.finditer(name))
     corners = {
         f"{name[: size.start()]}{axis}{name[size.end() :]}"
         for name, size in found
@@ -169,14 +185,16 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
     Return what tells individuals apart in the names of x columns, if anything does.
 
     They have points of the same names, at least so many, and together nearly all; of
-    two or three with numbers, four. Points of one body differ by its sides.
+    two or three with numbers, four. Points of one body differ by its sides, fingers or
+    legs.
 
     >>> from isa_nrsfm.skeletons._column_names import individuals_in
     >>> names = [f"p{point}_{mouse}_x" for point in range(8) for mouse in "ab"]
     >>> individuals_in(names, least=7)
     ['a', 'b']
     """
-    found: list[list[str]] = []
+    found: list[tuple[frozenset, list[str]]] = []
+    of_one_body = set()
     for division in _divisions(names):
         keys = [key for key, each in division.items() if len(each) > 1]
         rests = [frozenset(division[key]) for key in keys] or [frozenset()]
@@ -185,9 +203,43 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
         whole &= max(map(len, rests)) <= 1.1 * len(common) + 1  # others are sets
         few = len(rests) < 4 and all(key[-1:].isdigit() for key in keys)
         enough = len(rests) > 1 and len(common) >= (4 if few else least)
-        if whole and enough and not _SIDES.issuperset(map(str.lower, keys)):
-            found.append(keys)
-    return min(found, key=len, default=[])
+        if whole and enough:
+            groups = frozenset(frozenset(division[key].values()) for key in keys)
+            found.append((groups, keys))
+            if _are_parts(keys, common):
+                of_one_body.add(groups)
+    apart = [keys for groups, keys in found if groups not in of_one_body]
+    return min(apart, key=len, default=[])
+
+
+def _are_parts(keys: Iterable[str], points: Iterable[str]) -> bool:
+    """Return whether names are of sides, or of parts that a body has several times."""
+    keys, points = [key.lower() for key in keys], [point.lower() for point in points]
+    without_sides = {_SIDE.sub("", point).strip(" _.-") for point in points}
+    found = [_SERIES.search(p) or _SERIES.search(_SIDE.sub("", p)) for p in points]
+    words = {part[0] if part else "" for part in found}
+    several = len(words) == 1 and all(key.isdigit() for key in keys)
+    of_points = "" not in words and (several or len(words) == len(without_sides))
+    of_keys = all(map(_SERIES.search, keys))
+    are_sides = len({_SIDE.sub("", key) for key in keys}) < 2
+    return (
+        of_points
+        or of_keys
+        or (are_sides and not any(map(_ANIMAL.search, [*keys, *points])))
+    )
+
+
+def has_single_parts(points: Iterable[str]) -> bool:
+    """Return whether one of some points is of a part that a body has once."""
+    return any(_ONCE.search(point.lower()) for point in points)
+
+
+def individuals_with(names: Sequence[Hashable], own: Iterable[str]) -> list[str]:
+    """Return individuals in one row that have columns of such names each, if any."""
+    for division in _divisions(names):
+        if who := [key for key, each in division.items() if each.keys() >= {*own}]:
+            return who
+    return []
 
 
 def columns_of_individuals(
