@@ -222,7 +222,7 @@ def test_python_calls_for_questions_run():
 
 @pytest.mark.usefixtures("video")
 def test_commands_for_questions_run():
-    fit = "fit --n-components 4 --camera weak_perspective --no-figures"
+    fit = "fit --n-components 1 --no-figures"
     codes = codes_of_calls(2)
     options = [code for code in codes if code.startswith("--")]
     commands = [code for code in codes if code.startswith("isa-nrsfm ")]
