@@ -172,8 +172,8 @@ class FastISA(BaseSubspaceAnalysis):
         starts = orthogonalise(
             random_state.standard_normal((self.n_init, n_signals, n_signals))
         )
-        # Few starts at first, as they often agree. Then batches that reduce the overhead
-        # of NumPy, with arrays that fit into the cache.
+        # Few starts at first, as they often agree. Then batches that reduce overhead of
+        # NumPy, with arrays that fit into the cache.
         ends = [AGREEING, 2 * AGREEING, *range(2 * AGREEING + 16, self.n_init, 16)]
         batches = [batch for batch in np.split(starts, ends) if len(batch)]
         results: list[Any] = []
