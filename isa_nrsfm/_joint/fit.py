@@ -338,8 +338,8 @@ def reweighted(
     the refinement and the noise variance of a coordinate, from the median of the
     residuals, corrected for the degrees of freedom.
 
-    If weights change by 1 % at random, the shapes change by about 1 % of their standard
-    errors. About 2,000 frames determine the noise, and nearly the shapes.
+    If weights change by 0.5 % at random, the shapes change by about 0.5 % of their
+    standard errors. About 2,000 frames determine the noise, and nearly the shapes.
     """
     loss, thorough = problem.settings.loss, problem.thorough
     rows, left_out = table.scaled.rows, table.outliers
@@ -347,6 +347,7 @@ def reweighted(
     few = representative_frames(rows, 2000)
     points = rows.take(few)
     weights, sizes = without(points, left_out[few])[1], robust_sizes(points)
+    alpha = problem.likelihood(*fit.state).alpha[few]
     fit = fit._replace(state=fit.state._replace(motion=fit.state.motion[few]))
 
     def refined(weighted: FrameBlocks, fit: JointFit) -> tuple[JointFit, NDArray]:
@@ -360,28 +361,30 @@ def reweighted(
         return fit, part.likelihood(*fit.state).alpha
 
     for _ in range(20):
+        shapes, motion, _ = fit.state
+        position = _positions((points, weights), motion, alpha, shapes)
+        distance = distances(points, shapes, motion, position, alpha)
+        # Enough frames for the median of the residuals
+        some = slice(None, None, max(distance.size // 150_000, 1))
+        state = fit.state._replace(motion=motion[some])
+        typical = distance[some] / residual_deviations(
+            state, alpha[some], weights[some], problem.cameras
+        )
+        noise = median_noise(typical[np.isfinite(typical)])
+        deviation = max(noise, OF_DISTANCES)
+        before, weights = weights, frame_weights(loss, distance, deviation, sizes)
+        if np.mean((weights - before) ** 2) < 2.5e-5:
+            break
         block = points, weights
         fit, alpha = refined(FrameBlocks.of_blocks([block], [len(few)]), fit)
-        shapes, motion, _ = fit.state
-        position = _positions(block, motion, alpha, shapes)
-        distance = distances(points, shapes, motion, position, alpha)
-        deviations = residual_deviations(fit.state, alpha, weights, problem.cameras)
-        typical = (distance / deviations)[np.isfinite(distance)]
-        deviation = max(median_noise(typical), OF_DISTANCES)
-        weights = frame_weights(loss, distance, deviation, sizes)
-        if np.mean((weights - block[1]) ** 2) < 1e-4:
-            break
     if len(few) < rows.n_frames:
         state = problem.aligned(fit.state, problem.cameras)
-        alpha, weighted = (
-            problem.likelihood(*state).alpha,
-            rows.derive(without, left_out),
-        )
+        alpha = problem.likelihood(*state).alpha
+        weighted = rows.derive(without, left_out)
         for _ in range(2):
             shapes, motion, _ = state
-            position = weighted.joined(
-                partial(_positions, shapes=shapes), motion, alpha
-            )
+            places = partial(_positions, shapes=shapes)
+            position = weighted.joined(places, motion, alpha)
             new = partial(_weighted, shapes=shapes, loss=loss, deviation=deviation)
             weighted = rows.derive(new, motion, position, alpha)
             fit, alpha = refined(weighted, fit._replace(state=state))

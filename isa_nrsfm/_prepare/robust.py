@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import (
@@ -107,7 +108,7 @@ def spatial_median(rows: NDArray) -> NDArray:
     # If half of the points coincide, their place is the median.
     least = np.where(median > 0, OF_DISTANCES * median, 1.0)
     counted = np.where(median > 0, seen, distance <= median)
-    for _ in range(40):
+    for _ in range(20):
         middle, distance = _weighted_middle(points, weights)
         weights = counted / np.maximum(distance, least)
     return (origin[..., 0] + middle).T
@@ -160,7 +161,8 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     for _ in range(100):
         # Rigid factorisation, rank 3, of the filled rows
         W = centred(filled).reshape(-1, rows.shape[2])
-        axes = np.linalg.eigh(W.T @ W)[1][:, -3:]
+        last = [rows.shape[2] - 3, rows.shape[2] - 1]
+        axes = eigh(W.T @ W, subset_by_index=last)[1]
         rigid, distance = _rigid_part(rows, hidden, axes)
         # Typical distances, of the table and of each point
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
