@@ -330,7 +330,7 @@ class TableModel(NamedTuple):
                 others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
             else:
                 own = None if weights is None else weights[usable]
-                if self.pinhole is None:
+                if self.pinhole is None and frames.loss == "linear":
                     fit = frames.fit(visible[usable], sizes[usable], False, own)
                 else:
                     fit = self.decompose(visible[usable], own, False)

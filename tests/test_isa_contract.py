@@ -212,6 +212,12 @@ class TestOptimality:
         assert isa.log_likelihood_ == isa.log_likelihoods_[best]
         assert isa.n_iter_ == isa.n_iters_[best]
 
+    def test_starts_that_agree_are_enough(self):
+        signals, _ = mixed(0, n_subspaces=3)
+        isa, least = (FastISA(n_init=n, random_state=0).fit(signals) for n in (30, 3))
+        assert len(isa.log_likelihoods_) == len(isa.n_iters_) == 3
+        assert_array_equal(isa.components_, least.components_)
+
 
 class TestInvariances:
     @pytest.mark.slow
@@ -271,7 +277,7 @@ class TestEdges:
     def test_verbose_prints_a_line_for_each_batch(self, capsys):
         isa = FastISA(n_init=20, random_state=0, verbose=1).fit(few_samples())
         lines = capsys.readouterr().out.splitlines()
-        assert len(lines) == 2
+        assert len(lines) == 3
         assert lines[-1] == f"[FastISA] 20/20 starts, best {isa.log_likelihood_:.6g}"
 
     @pytest.mark.parametrize("density", [3, "sqrt", object()])

@@ -9,9 +9,16 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._linalg.small_matrices import (
+    centred,
+    frames_first,
+    invert_positive,
+    pair_indices,
+    unpacked,
+)
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import seen_points
 
@@ -57,18 +64,22 @@ def median_noise(distance: NDArray) -> float:
 
 
 def distant_points(rows: NDArray) -> NDArray:
-    """Return a mask (I, J) of points of rows (I, 2, J) far from their frame."""
-    distance, sizes = _spread(rows)
-    return distance > DISTANT * sizes[:, None]
+    """Return a mask (I, J) of points far from their frame, `robustly_centred`."""
+    return np.linalg.norm(rows, axis=1) > DISTANT * robust_sizes(rows)[:, None]
 
 
 def robust_sizes(rows: NDArray) -> NDArray:
-    """Return sizes (I,) of rows (I, 2, J), robust against outliers.
+    """Return sizes (I,) of `robustly_centred` rows, robust against outliers.
 
-    The root of half the median squared distance of the visible points from their
-    `spatial_median`. If half of them coincide, the RMS.
+    The root of half the median squared distance of the visible points from zero. If
+    half of them coincide, the RMS.
     """
-    return _spread(rows)[1]
+    square = np.sort(np.sum(rows**2, axis=1), axis=1)  # missing points are last
+    last, frames = seen_points(rows).sum(axis=1) - 1, np.arange(len(rows))
+    median = (square[frames, last // 2] + square[frames, (last + 1) // 2]) / 2
+    # If half of the points coincide the median is rounding error: take the mean.
+    exact = median > OF_DISTANCES * square[frames, 3 * last // 4]
+    return np.sqrt(np.where(exact, median, np.nanmean(square, axis=1)) / 2)
 
 
 def robustly_centred(rows: NDArray) -> tuple[NDArray, NDArray]:
@@ -78,16 +89,6 @@ def robustly_centred(rows: NDArray) -> tuple[NDArray, NDArray]:
     return rows - middle[..., None], middle
 
 
-def _spread(rows: NDArray) -> tuple[NDArray, NDArray]:
-    """Return distances (I, J) of points from their spatial median, and sizes (I,)."""
-    square = np.sum((rows - spatial_median(rows)[..., None]) ** 2, axis=1)
-    median, upper = (np.nanquantile(square, q, axis=1) for q in (0.5, 0.75))
-    # If half of the points coincide the median is rounding error: take the mean.
-    mean = np.nanmean(square, axis=1)
-    size = np.sqrt(np.where(median > OF_DISTANCES * upper, median, mean) / 2)
-    return np.sqrt(square), size
-
-
 def spatial_median(rows: NDArray) -> NDArray:
     """Return spatial medians (I, 2) of rows (I, 2, J), of least sum of distances.
 
@@ -95,29 +96,28 @@ def spatial_median(rows: NDArray) -> NDArray:
     Unlike the medians of x and y it does not depend on the axes of the image.
     """
     seen = seen_points(rows)
-    # Points (I, J, 2) in memory: x and y are summed in the order of the points.
-    points = np.nan_to_num(np.ascontiguousarray(rows.transpose(0, 2, 1)))
+    points = np.nan_to_num(rows.swapaxes(0, 1))
     half: NDArray = seen * 1.0
     for _ in range(5):
         half, distance, _ = _nearest_half(points, half, seen)
     # Subtract the innermost point: equal points then differ by exactly zero.
-    innermost = distance.argmin(axis=1)[:, None, None]
-    origin = np.take_along_axis(points, innermost, axis=1)
-    points = np.where(seen[..., None], points - origin, 0.0)
+    innermost = distance.argmin(axis=1)[None, :, None]
+    origin = np.take_along_axis(points, innermost, axis=2)
+    points = np.where(seen, points - origin, 0.0)
     weights, distance, median = _nearest_half(points, half, seen)
     # If half of the points coincide, their place is the median.
     least = np.where(median > 0, OF_DISTANCES * median, 1.0)
     counted = np.where(median > 0, seen, distance <= median)
-    for _ in range(40):
+    for _ in range(20):
         middle, distance = _weighted_middle(points, weights)
         weights = counted / np.maximum(distance, least)
-    return origin[:, 0] + middle
+    return (origin[..., 0] + middle).T
 
 
 def _nearest_half(
     points: NDArray, weights: NDArray, seen: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Return weights (I, J) of the half of points (I, J, 2) nearest to their mean.
+    """Return weights (I, J) of the half of points (2, I, J) nearest to their mean.
 
     Also returns distances (I, J) from that mean, and the largest of the half (I, 1).
     """
@@ -129,18 +129,18 @@ def _nearest_half(
 
 
 def _weighted_middle(points: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
-    """Return weighted means (I, 2) of points (I, J, 2), and distances (I, J)."""
-    share = weights / weights.sum(axis=1, keepdims=True)
-    middle = np.einsum("ij,ijc->ic", share, points)
-    return middle, np.linalg.norm(points - middle[:, None], axis=2)
+    """Return weighted means (2, I) of points (2, I, J), and distances (I, J)."""
+    middle = np.vecdot(points, weights) / weights.sum(axis=1)
+    off = points - middle[..., None]
+    return middle, np.sqrt(off[0] ** 2 + off[1] ** 2)
 
 
 def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
-    """Return a mask (I, J) of the points of rows (I, 2, J) far from any rigid object.
+    """Return a mask (I, J) of points far from any rigid object.
 
-    Their residual of a rigid factorisation of the other points is many times the
-    typical one of the table and of the point. Frames with many such points have no
-    outliers.
+    Their residual of a rigid factorisation of the other points of rows (I, 2, J),
+    `robustly_centred`, is many times the typical one of the table and of the point.
+    Frames with many such points have no outliers.
     """
     some = representative_frames(rows, model_frames)
     hidden, axes, limit = _rigid_object(rows.take(some))
@@ -155,24 +155,23 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     Returns a mask of hidden points (I, J), orthonormal axes (J, 3), and the threshold
     of the distance of each point (J,). Factorisation and hiding alternate.
     """
-    target, hidden = _start_of_hiding(rows)
-    seen = seen_points(target)
+    seen, hidden = seen_points(rows), _hidden_first(rows)
     shown = np.asarray(seen.any(axis=0))
-    filled = np.where(hidden[:, None], 0.0, target)
+    filled = np.where(hidden[:, None], 0.0, rows)
     for _ in range(100):
         # Rigid factorisation, rank 3, of the filled rows
         W = centred(filled).reshape(-1, rows.shape[2])
-        axes = np.linalg.eigh(W.T @ W)[1][:, -3:]
-        rigid = _rigid_part(target, ~hidden, axes)
+        last = [rows.shape[2] - 3, rows.shape[2] - 1]
+        axes = eigh(W.T @ W, subset_by_index=last)[1]
+        rigid, distance = _rigid_part(rows, hidden, axes)
         # Typical distances, of the table and of each point
-        distance = np.linalg.norm(target - rigid, axis=1)
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
         of_point = np.zeros(rows.shape[2])  # of points in no frame, too
         of_point[shown] = np.nanmedian(distance[:, shown], axis=0) / MEDIAN_DISTANCE
         limit = 4.5 * np.maximum(typical, of_point)
         # Hide points that are too far, and fill them in
         previous, hidden = hidden, ~(distance <= limit)
-        before, filled = filled, np.where(hidden[:, None], rigid, target)
+        before, filled = filled, np.where(hidden[:, None], rigid, rows)
         moved = np.abs(filled - before).max()
         if (hidden == previous).all() and moved <= 0.01 * typical:
             break
@@ -181,14 +180,17 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 def _far_points(rows: NDArray, axes: NDArray, limit: NDArray) -> NDArray:
     """Return a mask of hidden points (n, J) of frames (n, 2, J), for a rigid object."""
-    target, hidden = _start_of_hiding(rows)
+    hidden, moving = _hidden_first(rows), np.arange(len(rows))
     for _ in range(100):  # a frame that is settled stays as it is
-        rigid = _rigid_part(target, ~hidden, axes)
-        previous = hidden
-        hidden = ~(np.linalg.norm(target - rigid, axis=1) <= limit)
-        if (hidden == previous).all():
-            break
+        previous = hidden[moving]
+        hidden[moving] = ~(_rigid_part(rows[moving], previous, axes)[1] <= limit)
+        moving = moving[(hidden[moving] != previous).any(axis=1)]
     return hidden
+
+
+def _hidden_first(rows: NDArray) -> NDArray:
+    """Return a mask of points (n, J) of rows (n, 2, J) that are hidden at first."""
+    return ~seen_points(rows) | distant_points(rows)
 
 
 def _unless_many(rows: NDArray, hidden: NDArray) -> NDArray:
@@ -199,16 +201,17 @@ def _unless_many(rows: NDArray, hidden: NDArray) -> NDArray:
     return gross & few[:, None]
 
 
-def _start_of_hiding(rows: NDArray) -> tuple[NDArray, NDArray]:
-    """Return rows (I, 2, J) from their medians, and points (I, J) hidden first."""
-    hidden = ~seen_points(rows) | distant_points(rows)
-    return rows - spatial_median(rows)[..., None], hidden
+def _rigid_part(
+    rows: NDArray, hidden: NDArray, axes: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return the rigid parts of rows (n, 2, J), and the distances (n, J) from them.
 
-
-def _rigid_part(target: NDArray, kept: NDArray, axes: NDArray) -> NDArray:
-    """Return the rigid parts of rows (n, 2, J): axes (J, 3) fitted to kept points."""
+    Axes (J, 3) are fitted to the points that are not hidden.
+    """
     design = np.column_stack([axes, np.full(len(axes), len(axes) ** -0.5)])
-    pairs = (design[:, :, None] * design[:, None]).reshape(len(axes), -1)
-    moments = (kept.astype(float) @ pairs).reshape(-1, 4, 4)
-    inner = np.where(kept[:, None], target, 0.0) @ design
-    return np.asarray(inner @ np.linalg.pinv(moments, OF_DISTANCES, True) @ design.T)
+    first, second = pair_indices(4)
+    moments = (design[:, first] * design[:, second]).T @ ~hidden.T
+    inverse = frames_first(unpacked(invert_positive(moments)[0]))
+    inner = np.where(hidden[:, None], 0.0, rows) @ design
+    rigid = inner @ inverse @ design.T
+    return rigid, np.linalg.norm(rows - rigid, axis=1)

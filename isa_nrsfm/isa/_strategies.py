@@ -27,6 +27,10 @@ from isa_nrsfm.isa._base import (
     swap_until_best,
 )
 
+# Starts that agree in the largest likelihood are enough:
+# docs/benchmarks/README.md, "Thresholds".
+AGREEING = 3
+
 
 class FastISA(BaseSubspaceAnalysis):
     """
@@ -45,7 +49,8 @@ class FastISA(BaseSubspaceAnalysis):
     subspace_size : int, default=3
         Dimension of each subspace; the number of signals must be a multiple of it.
     n_init : int, default=30
-        Number of starts.
+        Maximum number of starts. Three starts, or six, are enough if three of them
+        agree in the largest likelihood, up to a difference of `tol`.
     density : object, default=None
         Logarithm of the density of a subspace's energy, with the methods
         ``log_density(energy)`` and ``derivatives(energy)``; None is
@@ -72,11 +77,11 @@ class FastISA(BaseSubspaceAnalysis):
         Mean of the signals.
     log_likelihood_ : float
         Mean log-likelihood per sample of the best start, up to a constant.
-    log_likelihoods_ : ndarray of shape (n_init,)
-        The same for every start.
+    log_likelihoods_ : ndarray of shape (n_starts,)
+        The same for every start that was needed.
     n_iter_ : int
         Number of steps of the best start, in both iterations together.
-    n_iters_ : ndarray of int, shape (n_init,)
+    n_iters_ : ndarray of int, shape (n_starts,)
         The same for every start.
     n_features_in_ : int
         Number of signals.
@@ -163,24 +168,31 @@ class FastISA(BaseSubspaceAnalysis):
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
         density = SqrtDensity() if self.density is None else self.density
         random_state = check_random_state(self.random_state)
-        starts = random_state.standard_normal((self.n_init, len(Z), len(Z)))
-        starts = orthogonalise(starts)
-        # Batches that reduce the overhead of NumPy, with arrays that fit into the
-        # cache.
-        batches = [starts[first : first + 16] for first in range(0, self.n_init, 16)]
-        n_jobs = min(effective_n_jobs(self.n_jobs), len(batches))
-        runs = Parallel(n_jobs=n_jobs, return_as="generator")(
-            delayed(self._run)(batch, Z, density) for batch in batches
+        n_signals = len(Z)
+        starts = orthogonalise(
+            random_state.standard_normal((self.n_init, n_signals, n_signals))
         )
-        results = []
-        for run in runs:
-            results.append(run)
-            if self.verbose:
-                done = sum(len(W) for W, *_ in results)
-                best = max(values.max() for _, values, *_ in results)
-                print(f"[FastISA] {done}/{self.n_init} starts, best {best:.6g}")
-        of_starts = map(np.concatenate, zip(*results, strict=True))
-        W, log_likelihoods, n_iters, converged = of_starts
+        # Few starts at first, as they often agree. Then batches that reduce overhead of
+        # NumPy, with arrays that fit into the cache.
+        ends = [AGREEING, 2 * AGREEING, *range(2 * AGREEING + 16, self.n_init, 16)]
+        batches = [batch for batch in np.split(starts, ends) if len(batch)]
+        results: list[Any] = []
+        for group in filter(None, (batches[:1], batches[1:2], batches[2:])):
+            n_jobs = min(effective_n_jobs(self.n_jobs), len(group))
+            runs = Parallel(n_jobs=n_jobs, return_as="generator")(
+                delayed(self._run)(batch, Z, density) for batch in group
+            )
+            for run in runs:
+                results.append(run)
+                W, log_likelihoods, n_iters, converged = map(
+                    np.concatenate, zip(*results, strict=True)
+                )
+                highest = log_likelihoods.max()
+                if self.verbose:
+                    done = f"{len(W)}/{self.n_init} starts"
+                    print(f"[FastISA] {done}, best {highest:.6g}")
+            if np.sum(log_likelihoods > highest - self.tol) >= AGREEING:
+                break
         best = int(np.argmax(log_likelihoods))
         if not converged[best]:
             warn_caller(
