@@ -404,7 +404,8 @@ class TestCommandLine:
 
     def test_fit_and_transform(self, results, tmp_path, succeeds):
         options = ["--weights", "confidence"]
-        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
+        affine = ["--camera", "affine", *self.QUICK]
+        succeeds("fit", results, *options, "-o", tmp_path / "out", *affine)
         found = read_landmarks(results)
         model = estimator().fit(found.points, point_weight=found.confidence)
         alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
@@ -418,7 +419,7 @@ class TestCommandLine:
         assert_allclose(self.coefficients(new), model.alpha_, atol=1e-6)
 
     def test_all_results_of_some_points_are_weighted(self, results, tmp_path, succeeds):
-        options = ["--weights", "confidence", "--camera", "weak_perspective"]
+        options = ["--weights", "confidence"]
         options += ["--points", "without:3,7", "--fps", 25, "--std"]
         succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
         left, found = np.delete(np.arange(N_POINTS), [3, 7]), read_landmarks(results)

@@ -603,7 +603,12 @@ NO_EDGES, DAYS = "--edges no_edges.csv", "--time-format %d.%m.%Y"
         ),
         (PLAIN, "--points neck,eye", "or (without:).*", "--points {}neck"),
         (PLAIN, NO_EDGES, "use (.*) to draw", "{}"),
-        (PLAIN, "--image-size 640x480", "needs (.*?);", "--image-size 640x480 {}"),
+        (
+            PLAIN,
+            "--image-size 640x480 --camera affine",
+            "needs (.*?);",
+            "--image-size 640x480 {}",
+        ),
     ],
 )
 def test_options_that_messages_name_are_right(

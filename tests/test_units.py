@@ -150,6 +150,7 @@ def results(model, X):
         "decompose": decomposition._asdict(),
         "smooth": smoothed.decomposition._asdict() | {"times": smoothed.time_scales},
         "reconstruct": {"shapes": model.reconstruct(X)},
+        "shapes": {"shapes": model.shapes(decomposition.alpha)},
         "reproject": images[0],
         "inverse_transform": images[1],
         "score": {"score": model.score(X)},
