@@ -144,7 +144,7 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
         f"predicted from the other points of their frame.{weighted} Wrong points and "
         "too many basis shapes make it much larger.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
-        "square, in the units of the table)",
+        "square, in pixels or the unit of the table)",
     ]
 
 
