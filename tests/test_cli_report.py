@@ -205,7 +205,7 @@ def test_figures_show_twelve_basis_shapes(tmp_path):
     argv = ["fit", str(tmp_path / "table.csv"), "-o", str(tmp_path), *options.split()]
     with drawn() as figures:
         assert main(argv) == 0
-    shapes, _, _, label, _, time = figures
+    label, _, time, shapes, _, _ = figures
     text = " ".join(axes.get_title("left") for axes in shapes.axes)
     assert "12" in text
     assert "13" not in text
