@@ -675,7 +675,7 @@ FIT = "fit t.csv -o d"
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ("", "required: COMMAND"),
+        ("", "required: command"),
         ("fit", "required: TABLE, -o/--output"),
         (f"transform {MODEL} t.csv", "required: -o/--output"),
         *(

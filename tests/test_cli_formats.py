@@ -312,7 +312,7 @@ def test_points_outside_of_the_image_are_counted(fits, fails, tmp_path):
     assert find_format(path) == "table"
     err = fits(path, *options).err
     expected = "warning: 2 of 840 points are outside the image, by at most 0.25 of its "
-    expected += "width or height (point 5 in row 3)\n"
+    expected += "width or height (point 5 in row 3). Trackers guess "
     assert expected in err
     assert SHARES not in err
     path = write_shares(tmp_path, lambda shares: shares - shares[:, :1])

@@ -196,6 +196,16 @@ def test_means_of_twelve_classes_are_listed(answers, n_classes):
     assert line.endswith("(all in report.json).") == (n_classes == 13)
 
 
+def test_numbers_that_say_nothing_are_left_out(answers):
+    model = answers[0].report["model"]
+    rows = [row | {"pose_share": None} for row in model["alpha"]]
+    model = model | {"rank_floor": 1e-30, "alpha": rows}
+    sections = fit_sections(answers[0].report | {"model": model})
+    text = text_of("", {name: sections[name] for name in ("Alpha", "Fit")})
+    assert "pose" not in text
+    assert "no model with" not in text
+
+
 @pytest.mark.slow
 def test_figures_show_twelve_basis_shapes(tmp_path):
     scene = make_nonrigid_tracks(60, 45, 13, noise=0.01, random_state=0)
@@ -205,7 +215,7 @@ def test_figures_show_twelve_basis_shapes(tmp_path):
     argv = ["fit", str(tmp_path / "table.csv"), "-o", str(tmp_path), *options.split()]
     with drawn() as figures:
         assert main(argv) == 0
-    shapes, _, _, label, _, time = figures
+    label, _, time, shapes, _, _ = figures
     text = " ".join(axes.get_title("left") for axes in shapes.axes)
     assert "12" in text
     assert "13" not in text

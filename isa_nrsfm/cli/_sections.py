@@ -144,7 +144,7 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
         f"predicted from the other points of their frame.{weighted} Wrong points and "
         "too many basis shapes make it much larger.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
-        "square, in the units of the table)",
+        "square, in pixels or the unit of the table)",
     ]
 
 
@@ -270,7 +270,7 @@ def _fit(report: dict[str, Any]) -> Section:
     remark = ""
     if model["parameters"]["loss"] != "linear":
         remark = " (outliers count fully)"
-    elif model["rank_floor"] is not None and "prior" not in report:
+    elif (model["rank_floor"] or 0) > np.finfo(float).eps and "prior" not in report:
         floor = _percent(model["rank_floor"])
         remark = f" (no model with {_shapes(model)} is below {floor})"
     parts = quality_section(model, remark)
@@ -390,11 +390,14 @@ def _alpha(coefficients: list[dict[str, Any]]) -> Section:
         ]
         for row, share in zip(coefficients, shares, strict=True)
     ]
+    head = ["", "energy", "mean", "std", "min", "row", "max", "row", "pose"]
+    is_posed = any(row[-1] for row in rows)
+    head, *rows = [line[: len(head) - (not is_posed)] for line in (head, *rows)]
     parts: list[str | Cells] = [
-        Cells(["", "energy", "mean", "std", "min", "row", "max", "row", "pose"], rows),
+        Cells(head, rows),
         "energy: share of the deformation in the images (sum of squares)",
     ]
-    if any(row[-1] for row in rows):
+    if is_posed:
         parts.append("pose: variance that yaw, pitch and roll predict, cross-validated")
     return parts
 

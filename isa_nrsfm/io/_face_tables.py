@@ -163,7 +163,7 @@ def _check_inside(shares: NDArray[np.float64]) -> None:
             f"{found}: the coordinates are no shares of the width and height of an "
             "image. Read them without image_size, in the format table"
         )
-    warn_caller(found)
+    warn_caller(f"{found}. Trackers guess the places of points that the image cuts off")
 
 
 def _assembled(
