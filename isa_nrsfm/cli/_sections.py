@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._compat.texts import as_utf8, first_items
+from isa_nrsfm._compat.texts import as_utf8, first_items, percent
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
@@ -124,7 +124,7 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
     if n_missing:
         share = n_missing / (table["n_frames"] * table["n_points"])
         parts.append(
-            f"{n_missing} points ({_percent(share)}) are missing in "
+            f"{n_missing} points ({percent(share)}) are missing in "
             f"{table['n_frames_with_missing_points']} of these rows"
         )
     return parts
@@ -138,9 +138,9 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
             " Points count by their weights here, and equally in the inverse SNR."
         )
     return [
-        f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
+        f"inverse SNR {percent(quality['inverse_snr'])}{remark}: energy (sum of "
         "squares) of the residuals, relative to that of the centred points.",
-        f"held-out error {_percent(quality['held_out_error'])}: the same for points "
+        f"held-out error {percent(quality['held_out_error'])}: the same for points "
         f"predicted from the other points of their frame.{weighted} Wrong points and "
         "too many basis shapes make it much larger.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
@@ -271,14 +271,14 @@ def _fit(report: dict[str, Any]) -> Section:
     if model["parameters"]["loss"] != "linear":
         remark = " (outliers count fully)"
     elif model["rank_floor"] is not None and "prior" not in report:
-        floor = _percent(model["rank_floor"])
+        floor = percent(model["rank_floor"])
         remark = f" (no model with {_shapes(model)} is below {floor})"
     parts = quality_section(model, remark)
     worst = model["largest_error"]
     parts.append(f"largest error of a row: {worst['rms']:.3g}, of row {worst['row']}")
     if model["noise_variance"] is not None:
         noise = math.sqrt(model["noise_variance"])
-        size = f"{_percent(noise)} of the frame's size"
+        size = f"{percent(noise)} of the frame's size"
         if not model["frames_scaled"]:
             size = f"{noise:.3g} in the units of the table"
         parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
@@ -551,8 +551,3 @@ def _sentence(text: str) -> str:
 def _digits(number: float, n_digits: int) -> str:
     """Write a number with so many digits, zeros at the end included."""
     return f"{number:#.{n_digits}g}".removesuffix(".")
-
-
-def _percent(fraction: float) -> str:
-    """Write a fraction in percent."""
-    return f"{100 * fraction:.3g} %"
