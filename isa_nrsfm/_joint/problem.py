@@ -273,8 +273,8 @@ def refine_joint(
     slope = iterate.gradient @ iterate.precondition(iterate.gradient)
     norm = float(np.sqrt(max(slope, 0.0) / n_seen))
     converged = small_steps >= 2 and bool(np.isfinite(iterate.value))
-    values = np.array(history), norm, converged, iterate.misfit
-    return JointFit(iterate.state, *values, prior=likelihood.prior)
+    fit = JointFit(iterate.state, np.array(history), norm, converged, iterate.misfit)
+    return fit._replace(prior=likelihood.prior)
 
 
 class _Iterate:

@@ -158,12 +158,11 @@ def frame_certainty(
     noise = frames.noise_variance
     if frames.loss == "linear":
         noise = max(noise, residual / max(left - unknowns, 0.1 * numbers))
-    ratio = noise / frames.noise_variance
+    ratio, square = noise / frames.noise_variance, residual / weight.sum()
     images = ratio, ratio * unknowns / left / mean
-    certainty = certainty._replace(residual=residual / weight.sum(), images=images)
-    if certainty.leverage is None:
-        return certainty
-    return certainty._replace(leverage=mean)  # of coefficients from the images
+    # Of coefficients from the images
+    leverage = None if certainty.leverage is None else mean
+    return certainty._replace(residual=square, leverage=leverage, images=images)
 
 
 def shown_frames(

@@ -19,6 +19,7 @@ import numpy as np
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import as_utf8, first_items, percent
 from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm.analysis._frame_columns import STATISTICS
 from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
@@ -318,7 +319,7 @@ def _prior(prior: dict[str, Any], adapt: str) -> str:
     )
 
 
-def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Section:
+def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
     """Return the camera model, the certainty of the depth, and what the noise means."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
     if model["camera"] != "affine" and not model["depth_determined"]:
@@ -438,27 +439,21 @@ def _label(label: dict[str, Any]) -> Section:
     if label["n_without_label"]:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
-    statistic, meaning = "Spearman", "rank correlation, from -1 to 1"
-    if label["statistic"] == "eta_squared":
-        statistic, meaning = "eta squared", "share of the variance between classes"
+    statistic, meaning = STATISTICS[label["kind"]]
+    found = zip(names, label["values"], label["p_values"], strict=True)
     rows = [
         [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
-        for name, value, p in zip(
-            names, label["values"], label["p_values"], strict=True
-        )
+        for name, value, p in found
     ]
-    tested = "class_means" in label and not label["untested"]
-    means = _class_means(label, names) if tested else []
-    if means:
-        means.insert(0, "mean of each class if p < 0.05, in standard deviations:")
-    test = f"p-values: permutations of {label['permuted']}"
     answer = f"{label['column']} was not tested: {label['untested']}."
-    if label["untested"]:
-        test = "no p-values"
-    else:
+    test, means = "no p-values", list[str]()
+    if not label["untested"]:
         related = np.asarray(names)[np.less(label["p_values"], 0.05)]
         coefficients = ", ".join(related) or "no coefficient"
         answer = f"{label['column']} goes with {coefficients} (p < 0.05)."
+        test = f"p-values: permutations of {label['permuted']}"
+        if "class_means" in label and len(related):
+            means = _class_means(label, names)
     return [
         answer,
         Cells(["", statistic, "p"], rows, title),
@@ -493,7 +488,7 @@ def _score(label: dict[str, Any]) -> str:
 
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
-    lines = []
+    lines = ["mean of each class if p < 0.05, in standard deviations:"]
     means = pd.DataFrame(label["class_means"], names)
     for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")

@@ -530,19 +530,16 @@ def with_points(
     Other columns are written so where all their cells are such numbers.
     """
     texts = frame[[*names]].select_dtypes(["object", "string"]).astype(str)
-    if not any(texts[name].str.contains(",", regex=False).any() for name in texts):
-        return frame
     cells = {*texts.to_numpy(object).ravel()}
-    decimal, thousands = (
-        {cell for cell in cells if expression.fullmatch(cell)}
-        for expression in (_DECIMAL_COMMA, _THOUSANDS)
-    )
+    commas = [cell for cell in cells if "," in cell]
+    decimal = {*filter(_DECIMAL_COMMA.fullmatch, commas)}
+    thousands = {*filter(_THOUSANDS.fullmatch, commas)}
     if not (decimal or thousands):
         return frame
     fractions = frame[[*names]].select_dtypes("float") % 1
     has_points = fractions.any(axis=None) or any("." in c for c in cells - thousands)
-    is_decimal, is_thousands = decimal >= thousands, thousands >= decimal
-    is_decimal &= not has_points
+    is_decimal = decimal >= thousands and not has_points
+    is_thousands = thousands >= decimal
     first = max(decimal | thousands).strip()
     if is_decimal and is_thousands:
         raise ValueError(
