@@ -210,8 +210,7 @@ class JointProblem:
             parts = []
             for frames, piece in block.pieces(BLOCK_FRAMES):
                 sums = frame_sums(piece, search.shared)
-                other = search.reversed_cameras(sums, state.noise, motion[frames])
-                parts.append(other)
+                parts.append(search.reversed_cameras(sums, state.noise, motion[frames]))
             return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
         parts = self.frames.blocks.map(reversed_cameras, state.motion)

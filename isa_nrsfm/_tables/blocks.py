@@ -131,8 +131,7 @@ class FrameBlocks:
 
     def take(self, frames: NDArray) -> NDArray:
         """Return different frames (n_chosen,) in any order. Blocks are arrays."""
-        chosen = np.zeros(self.n_frames, dtype=bool)
-        chosen[frames] = True
+        chosen = np.isin(np.arange(self.n_frames), frames)
         block: NDArray = self.joined(getitem, chosen)
         in_order = (np.diff(frames) > 0).all()
         return block if in_order else block[np.argsort(np.argsort(frames))]
@@ -305,8 +304,7 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     if rows.n_frames <= most:
         return np.arange(rows.n_frames)
     order = order_by_halves(rows)
-    chosen = np.zeros(len(order), dtype=bool)
-    chosen[spread(order, most)] = True
+    chosen = np.isin(np.arange(rows.n_frames), spread(order, most))
     fewest = min(200, most // 5)
     shown = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))
     for point in np.flatnonzero(shown < fewest).tolist():
