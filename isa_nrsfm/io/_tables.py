@@ -529,8 +529,8 @@ def with_points(
     Either all commas are decimal, or all are between thousands; raise if both can be.
     Other columns are written so where all their cells are such numbers.
     """
-    texts = frame[[*names]].select_dtypes(["object", "string"]).astype(str)
-    cells = {*texts.to_numpy(object).ravel()}
+    texts = frame[[*names]].select_dtypes(["object", "string"])
+    cells = {*map(str, texts.to_numpy(object).ravel())}
     commas = [cell for cell in cells if "," in cell]
     decimal = {*filter(_DECIMAL_COMMA.fullmatch, commas)}
     thousands = {*filter(_THOUSANDS.fullmatch, commas)}
