@@ -20,7 +20,7 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 K = 2
-NEEDED = r"needs the cameras .* keep_frames=False"
+NEEDED = r"needs the cameras .* keep_frames=True"
 # A row that shows three of 20 points.
 FEW_POINTS = np.repeat([1.0, 2.0, 4.0, np.nan], [2, 2, 2, 34])
 CHUNKS = (35, 75, 0, 40)
