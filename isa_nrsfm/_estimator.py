@@ -554,9 +554,10 @@ default="affine"
         n_components = n_components if prior is None else len(prior.basis)
         auto, most = n_components == "auto", None
         if self.camera == "perspective":
-            point, number = self.principal_point, None if auto else n_components
+            point, f = self.principal_point, self.focal_length
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
-            fit = fit_perspective(images, number, self.focal_length, start, errors)
+            number = None if auto else n_components
+            fit = fit_perspective(images, number, f, start, errors)
         else:
             if auto:
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
@@ -672,9 +673,10 @@ default="affine"
 
         def __getattr__(self, name: str) -> Any:
             """Raise an error; it states why an attribute is lacking, or its name."""
-            reason, affine = _OTHER_NAMES.get(name), vars(self).get("camera_")
-            if name in ("rotations_", "scales_", "depth_uncertainty_"):
-                reason = _NEEDS_CALIBRATED if affine == "affine" else None
+            reason = _OTHER_NAMES.get(name)
+            affine = vars(self).get("camera_") == "affine"
+            if affine and name in ("rotations_", "scales_", "depth_uncertainty_"):
+                reason = _NEEDS_CALIBRATED
             if reason is not None:
                 raise AttributeError(f"{name} {reason}", name=name, obj=self)
             return super().__getattribute__(name)
@@ -794,8 +796,10 @@ default="affine"
         table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("smooth")
         alone = table.joined(self._model.linearised, *weights)
-        how = frames.gauge, CAMERAS[frames.camera], time, groups
-        result = smooth(alone, *how, max_gap, max_iter, tol, table.empty.dtype)
+        camera, dtype = CAMERAS[frames.camera], table.empty.dtype
+        result = smooth(
+            alone, frames.gauge, camera, time, groups, max_gap, max_iter, tol, dtype
+        )
         if self._model.pinhole is None:
             return result
         in_table = table.joined(self._model.in_table_cameras, *result.decomposition)

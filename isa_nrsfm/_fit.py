@@ -344,9 +344,8 @@ def _joint_frames(
     certainty = certainty._replace(weighted=table.weights is not None)
     model = replace(model, gauge=gauge, certainty=certainty)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
-    parts, *chance = zip(
-        *posteriors.map(last_pass, table.sizes, table.n_seen, weight), strict=True
-    )
+    passes = posteriors.map(last_pass, table.sizes, table.n_seen, weight)
+    parts, moments, noises = zip(*passes, strict=True)
     frames = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
     mean_shape, basis = mean_shape.astype(table.dtype), basis.astype(table.dtype)
     cameras = frames.motion / table.sizes[:, None, None]
@@ -355,11 +354,11 @@ def _joint_frames(
         errors = prior.depth_errors(information, noise, sight, frames.alpha)
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
-    square, chances = (table.unit or 1.0) ** 2, (sum(part) for part in chance)
+    square = (table.unit or 1.0) ** 2
     attributes = {
         "mode_covariance_": square * mode_covariance(cameras, frames.alpha),
         "noise_variance_": square * noise,
-        "reliability_": reliabilities(alpha, covariance, *chances),
+        "reliability_": reliabilities(alpha, covariance, sum(moments), sum(noises)),
     }
     frames = frames._replace(translation=frames.translation + table.translation)
     fitted = TableModel(model, mean_shape, basis, s.layout, table.unit)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import mean_view
+from isa_nrsfm._frames.camera_models import mean_view, stacked_motion
 from isa_nrsfm._frames.models import Decomposition, FrameMap
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
 from isa_nrsfm._linalg.small_matrices import orientations, polar
@@ -154,8 +154,7 @@ def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
     total = np.zeros((3 * alpha.shape[1],) * 2)
     for start in range(0, len(alpha), 4096):  # blocks limit memory
         part = slice(start, start + 4096)
-        blocks = np.einsum("ik,irc->irkc", alpha[part], motion[part])
-        blocks = blocks.reshape(-1, len(total))
+        blocks = stacked_motion(motion[part], alpha[part])[:, 3:]
         total += blocks.T @ blocks
     return total / (2 * len(alpha))
 

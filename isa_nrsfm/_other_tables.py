@@ -65,7 +65,7 @@ def far_points(distance: NDArray, frames: Any) -> float:
     else:  # without outliers
         square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2
     others = square > OTHER_POINTS**2 + 2.0 * frames.noise_variance
-    return float(others and np.sqrt(square))
+    return float(np.sqrt(square)) if others else 0.0
 
 
 def fitted_prior(prior: Any) -> Any:
@@ -75,9 +75,9 @@ def fitted_prior(prior: Any) -> Any:
 
 def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
     """Return the settings of the prior of a table's fit, or raise."""
-    prior, n_components = fitted_prior(estimator.prior), estimator.n_components
     if estimator.prior is None:
         return {}
+    prior, n_components = fitted_prior(estimator.prior), estimator.n_components
     if estimator.refinement != "joint" or estimator.camera == "affine":
         raise ValueError(
             "prior needs calibrated cameras and refinement='joint'; got camera="

@@ -125,12 +125,12 @@ class PerspectiveFit(NamedTuple):
         square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
         return float(np.copysign(np.sqrt(square), common))
 
-    def ends(self, settled: float, best: float) -> bool:
+    def ends(self, tol: float, best: float) -> bool:
         """Return whether further repeats would not help: for the best E of others."""
         n_repeats, change = len(self.changes), self.changes[-1]
         most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
         most = 2 if self.energy > WORSE * best else most
-        return change < settled or n_repeats >= most
+        return change < tol or n_repeats >= most
 
     def mirrored(self) -> "PerspectiveFit":
         """Return the mirror image in depth."""
@@ -208,13 +208,13 @@ class PerspectiveTable(NamedTuple):
         pinhole: Pinhole,
         n_components: int,
         *fits: PerspectiveFit,
-        settled: float = SETTLED,
+        tol: float = SETTLED,
     ) -> list[PerspectiveFit]:
         """Repeat fits until depths and fits agree; return them, the best first.
 
         A fit also ends if it is clearly worse than the best one.
         """
-        settled *= self.settings.tol / JOINT_TOL
+        tol *= self.settings.tol / JOINT_TOL
         running = [fit._replace(changes=(), earlier=()) for fit in fits]
         ended: list[PerspectiveFit] = []
         while running:
@@ -223,8 +223,8 @@ class PerspectiveTable(NamedTuple):
                 self.fit(pinhole, n_components, fit, start=fit.model) for fit in running
             ]
             best = min(fit.energy for fit in [*running, *ended])
-            ended += [fit for fit in running if fit.ends(settled, best)]
-            running = [fit for fit in running if not fit.ends(settled, best)]
+            ended += [fit for fit in running if fit.ends(tol, best)]
+            running = [fit for fit in running if not fit.ends(tol, best)]
         return sorted(ended, key=lambda fit: fit.energy)
 
     def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
@@ -259,8 +259,8 @@ class PerspectiveTable(NamedTuple):
     def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
         """Return the fit for g, from that with the nearest one."""
         fit = fits[min((g for g in fits if g > 0), key=lambda g: abs(g - place))]
-        pinhole, settled = self.pinhole(1.0 / place), COMPARED * SETTLED
-        return self.settled(pinhole, fit.n_components, fit, settled=settled)[0]
+        rough, pinhole = COMPARED * SETTLED, self.pinhole(1.0 / place)
+        return self.settled(pinhole, fit.n_components, fit, tol=rough)[0]
 
     def searched(self, n_components: int | None) -> dict[float, PerspectiveFit]:
         """Return fits around the minimum of E; 0 is the weak-perspective fit."""
@@ -357,7 +357,7 @@ def fit_perspective(
     # The last fit, with warnings and errors of depths
     before = None if why else best
     options = {"start": best.model, "errors": errors}
-    fit = table.fit(best.pinhole, best.n_components, before, True, **options)
+    fit = table.fit(best.pinhole, best.n_components, before, last=True, **options)
     model, _, converged, attributes, *_ = fit
     f = best.pinhole.focal_length
     if why:

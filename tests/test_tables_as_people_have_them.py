@@ -579,6 +579,7 @@ VIDEOS = PLAIN.assign(image=[f"v{i // 2}.png" for i in range(N)])
 ZERO = PLAIN.assign(neck_x=0.0, neck_y=0.0)
 SETS = PLAIN.join(table_of("{axis}_{part}", POINTS[:, :7] / 2, range(7)))
 NO_EDGES, DAYS = "--edges no_edges.csv", "--time-format %d.%m.%Y"
+SIZE = "--camera affine --image-size 640x480"
 
 
 @pytest.mark.parametrize(
@@ -603,12 +604,7 @@ NO_EDGES, DAYS = "--edges no_edges.csv", "--time-format %d.%m.%Y"
         ),
         (PLAIN, "--points neck,eye", "or (without:).*", "--points {}neck"),
         (PLAIN, NO_EDGES, "use (.*) to draw", "{}"),
-        (
-            PLAIN,
-            "--image-size 640x480 --camera affine",
-            "needs (.*?);",
-            "--image-size 640x480 {}",
-        ),
+        (PLAIN, SIZE, "needs (.*?);", f"{SIZE} {{}}"),
     ],
 )
 def test_options_that_messages_name_are_right(

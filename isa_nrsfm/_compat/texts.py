@@ -27,6 +27,11 @@ def first_items(items: Iterable[Any], most: int = 4) -> str:
     return ", ".join(texts[:most]) + ", ..." * (len(texts) > most)
 
 
+def percent(share: float) -> str:
+    """Return a share in percent, with three digits."""
+    return f"{100 * share:.3g} %"
+
+
 def aligned(rows: Iterable[Sequence[str]]) -> str:
     """Return the rows of a table as lines, with columns of one width."""
     columns = list(zip(*rows, strict=True))

@@ -201,10 +201,8 @@ def rotated(M: NDArray, turns: NDArray) -> NDArray:
     # sin(t) / t and (1 - cos(t)) / t^2 = 2 (sin(t/2) / t)^2, also for t = 0.
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    moved = np.cos(angle) * M + first * np.einsum(
-        "cra...,c...->ra...", turning(M), turns
-    )
-    return moved + second * along * turns
+    across = np.einsum("cra...,c...->ra...", turning(M), turns)
+    return np.cos(angle) * M + first * across + second * along * turns
 
 
 def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:

@@ -260,16 +260,17 @@ class FrameSearch:
                 problem, position, converged, 0 if rough else max_steps
             )
             motion = frames_first(M)
-            spreads = fits.covariance[block], fits.turn_covariance[block]
+            covariance, turns = fits.covariance[block], fits.turn_covariance[block]
             if covariances:
                 spreads = self.covariances(problem, M, alpha)
                 covariance, turns = map(frames_first, spreads)
-                spreads = covariance, self.space.T @ turns @ self.space
+                turns = self.space.T @ turns @ self.space
             minima = FramePosterior(
                 motion @ self.space,
                 products.positions(motion, alpha.T),
                 alpha.T,
-                *spreads,
+                covariance,
+                turns,
                 np.maximum(objective, 0.0),  # less is rounding errors
                 converged,
             )

@@ -15,6 +15,7 @@ The mean squared difference of the depths of a point in its groups from the resu
 step 4 estimates its squared error: docs/benchmarks/consensus.md.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -149,8 +150,8 @@ def consensus(
         most, left = min(possible, MOST_COMPONENTS), LEFT * noise
     shapes, alpha, rest = principal_shapes(S, most, left)
     starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
-    merged = shapes, noise + rest, starts, model.loss, gauge, model.camera, certainty
-    return PosteriorFrames(*merged)
+    model = replace(model, shapes=shapes, noise_variance=noise + rest)
+    return replace(model, starts=starts, gauge=gauge, certainty=certainty)
 
 
 def together(

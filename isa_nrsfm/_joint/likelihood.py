@@ -160,8 +160,7 @@ class JointFrames:
 
     def take(self, frames: NDArray) -> Self:
         """Return some of the frames, in the order of the table."""
-        chosen = np.zeros(self.n_frames, dtype=bool)
-        chosen[frames] = True
+        chosen = np.isin(np.arange(self.n_frames), frames)
         parts = self.blocks.map(
             lambda block, kept: of_frames(block, np.flatnonzero(kept)), chosen
         )

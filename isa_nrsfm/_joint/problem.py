@@ -210,8 +210,7 @@ class JointProblem:
             parts = []
             for frames, piece in block.pieces(BLOCK_FRAMES):
                 sums = frame_sums(piece, search.shared)
-                other = search.reversed_cameras(sums, state.noise, motion[frames])
-                parts.append(other)
+                parts.append(search.reversed_cameras(sums, state.noise, motion[frames]))
             return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
         parts = self.frames.blocks.map(reversed_cameras, state.motion)
@@ -273,8 +272,8 @@ def refine_joint(
     slope = iterate.gradient @ iterate.precondition(iterate.gradient)
     norm = float(np.sqrt(max(slope, 0.0) / n_seen))
     converged = small_steps >= 2 and bool(np.isfinite(iterate.value))
-    values = np.array(history), norm, converged, iterate.misfit
-    return JointFit(iterate.state, *values, prior=likelihood.prior)
+    fit = JointFit(iterate.state, np.array(history), norm, converged, iterate.misfit)
+    return fit._replace(prior=likelihood.prior)
 
 
 class _Iterate:

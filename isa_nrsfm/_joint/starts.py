@@ -97,8 +97,7 @@ def extended_shapes(
     deviation of their coefficients. Zeros if there are fewer.
     """
     rest = rows - motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
-    lifted = np.linalg.pinv(motion) @ np.nan_to_num(rest)
-    lifted = lifted.reshape(len(rows), -1)
+    lifted = (np.linalg.pinv(motion) @ np.nan_to_num(rest)).reshape(len(rows), -1)
     # Principal components, from the smaller Gram matrix
     tall = len(lifted) > lifted.shape[1]
     square, axes = np.linalg.eigh(lifted.T @ lifted if tall else lifted @ lifted.T)

@@ -150,16 +150,18 @@ def frame_certainty(
     """
     *_, alpha, covariance, residual = fits
     certainty, mean = frames.certainty, float(leverages(alpha).mean())
-    unknowns = prior.n_determined if prior else float(frames.shapes.size)
-    numbers = 2.0 * n_seen.sum()
+    unknowns, numbers = float(frames.shapes.size), 2.0 * n_seen.sum()
+    if prior is not None:
+        unknowns = prior.n_determined
     n_own = 2 + CAMERAS[frames.camera].n_parameters + np.trace(1 - covariance)
     left = max(numbers - len(alpha) * n_own, 0.1 * numbers)
     noise = frames.noise_variance
     if frames.loss == "linear":
         noise = max(noise, residual / max(left - unknowns, 0.1 * numbers))
     ratio, square = noise / frames.noise_variance, residual / weight.sum()
-    images, leverage = (ratio, ratio * unknowns / left / mean), certainty.leverage
-    leverage = leverage and mean  # of coefficients from the images
+    images = ratio, ratio * unknowns / left / mean
+    # Of coefficients from the images
+    leverage = None if certainty.leverage is None else mean
     return certainty._replace(residual=square, leverage=leverage, images=images)
 
 
@@ -266,8 +268,10 @@ def depth_certainty(
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], fit.motion[known]
-    prior = settings.shape_prior and settings.shape_prior.of_points(points)
     tracks, camera = part[known], CAMERAS[frames.camera]
+    prior, extents = settings.shape_prior, EXTENT_WEIGHT
+    if prior is not None:  # which does not let depths grow
+        prior, extents = prior.of_points(points), 0.0
 
     def refit(
         kept: NDArray, start: JointState | None = None, extents: float = 0.0
@@ -282,12 +286,14 @@ def depth_certainty(
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
-        own = prior and prior.of_points(kept)
-        penalty = 0.0 if own else part.basis_penalty(limits.basis_std)
-        likelihood = MarginalLikelihood(part, penalty, extents, own)
+        penalty = part.basis_penalty(limits.basis_std)
+        likelihood = MarginalLikelihood(part, penalty, extents)
+        if prior is not None:
+            likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         least = min(noise * n_numbers / energy, limits.least_noise)
-        start = start or JointState(centred(shapes[:, :, kept]), motion, noise)
+        if start is None:
+            start = JointState(centred(shapes[:, :, kept]), motion, noise)
         start = start._replace(noise=noise)
         ends: Any = {"least_noise": least, "max_iter": limits.error_steps, "tol": TOL}
         state = refine_joint(likelihood, start, camera, **ends).state
@@ -298,10 +304,9 @@ def depth_certainty(
         return state, rotations, centred(z), terms.value / len(rows)
 
     every = np.ones(len(points), dtype=bool)
-    extents = 0.0 if prior else EXTENT_WEIGHT
     whole, rotations, depths, value = refit(every, extents=extents)
     deformation = 0.0
-    if prior is None:  # which does not let depths grow
+    if prior is None:
         *_, far_value = refit(every, far_state(whole, camera))
         deformation = float(np.exp(-max(far_value - value, 0.0)))
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))

@@ -9,6 +9,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from operator import getitem
 from typing import Any, Self
 
 import numpy as np
@@ -101,9 +102,9 @@ class FrameBlocks:
         """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
         length = max(self.lengths[:-1] or self.lengths)
         if self.cached:
-            array = self.joined(chosen_rows, frames)
+            array = self.joined(getitem, frames)
             return self.of_array(array, length, self.n_threads)
-        chosen = self.derive(chosen_rows, frames)
+        chosen = self.derive(getitem, frames)
         counts = [np.count_nonzero(frames[part]) for part in self.slices]
         before = np.cumsum([0, *counts])
 
@@ -130,9 +131,8 @@ class FrameBlocks:
 
     def take(self, frames: NDArray) -> NDArray:
         """Return different frames (n_chosen,) in any order. Blocks are arrays."""
-        chosen = np.zeros(self.n_frames, dtype=bool)
-        chosen[frames] = True
-        block: NDArray = self.joined(chosen_rows, chosen)
+        chosen = np.isin(np.arange(self.n_frames), frames)
+        block: NDArray = self.joined(getitem, chosen)
         in_order = (np.diff(frames) > 0).all()
         return block if in_order else block[np.argsort(np.argsort(frames))]
 
@@ -193,7 +193,7 @@ class DaskBlocks(FrameBlocks):
     def subset(self, frames: NDArray) -> Self:
         """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
         lengths = [int(frames[rows].sum()) for rows in self.slices]
-        return type(self)(self.derive(chosen_rows, frames).blocks, lengths)
+        return type(self)(self.derive(getitem, frames).blocks, lengths)
 
     def collect(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
         """Return dask arrays, or a named tuple of them, that are not computed yet."""
@@ -259,11 +259,6 @@ def block_slices(n_frames: int, block_frames: int) -> list[slice]:
     return list(map(slice, starts, [*starts[1:], n_frames]))
 
 
-def chosen_rows(block: NDArray, kept: NDArray) -> NDArray:
-    """Return the frames of a block selected by a mask."""
-    return block[kept]
-
-
 def read_rows(table: Any, rows: slice) -> NDArray:
     """Return rows of a table; the pages of a memory map do not stay in memory."""
     block = np.array(table[rows])
@@ -309,8 +304,7 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     if rows.n_frames <= most:
         return np.arange(rows.n_frames)
     order = order_by_halves(rows)
-    chosen = np.zeros(len(order), dtype=bool)
-    chosen[spread(order, most)] = True
+    chosen = np.isin(np.arange(rows.n_frames), spread(order, most))
     fewest = min(200, most // 5)
     shown = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))
     for point in np.flatnonzero(shown < fewest).tolist():

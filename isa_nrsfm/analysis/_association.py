@@ -24,6 +24,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import aligned
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm.analysis._frame_columns import (
+    STATISTICS,
     checked_column,
     checked_times,
     group_numbers,
@@ -74,9 +75,7 @@ class Association(NamedTuple):
 
     def __repr__(self) -> str:
         """Return the results as a table and what they are."""
-        name, meaning = "Spearman", "rank correlation, from -1 to 1"
-        if self.kind == "classes":
-            name, meaning = "eta squared", "share of the variance between classes"
+        name, meaning = STATISTICS[self.kind]
         rows = [["", name, "p"]]
         for value, p in zip(self.statistic, self.p_value, strict=True):
             known = "" if self.untested else f"{p:.3f}"
@@ -84,8 +83,7 @@ class Association(NamedTuple):
         test = f"p-values: permutations of {self.permuted}"
         if self.untested:
             test = f"no p-values: {self.untested}"
-        meaning = f"{name}: {meaning}; {test}; {self.n_frames} frames"
-        return f"{aligned(rows)}\n{meaning}"
+        return f"{aligned(rows)}\n{name}: {meaning}; {test}; {self.n_frames} frames"
 
     def to_frame(self) -> "pd.DataFrame":
         """
@@ -182,23 +180,19 @@ def association(
     """
     check_scalar(n_permutations, "n_permutations", Integral, min_val=1)
     alpha, labels, _, order = _known_frames(alpha, y, groups, time)
-    found = kind_of(labels, kind)
-    columns = _label_columns(labels, found)
-    values = alpha
-    if found == "number":
-        alpha = rankdata(alpha, axis=0)
-    alpha = _unit_columns(alpha)
-    covariances = columns.T @ alpha
-    classes = found == "classes"
+    kind = kind_of(labels, kind)
+    columns, classes = _label_columns(labels, kind), kind == "classes"
+    standard = _unit_columns(alpha if classes else rankdata(alpha, axis=0))
+    covariances = columns.T @ standard
     statistic = np.sum(covariances**2, axis=0) if classes else covariances[0]
     rng = check_random_state(random_state)
     energies, permuted, untested = permuted_energies(
-        values, alpha, columns, order, n_permutations, rng
+        alpha, standard, columns, order, n_permutations, rng
     )
     p_value = _step_down_p_values(energies)
     if untested:
         p_value[:] = np.nan
-    return Association(found, statistic, p_value, len(alpha), permuted, untested)
+    return Association(kind, statistic, p_value, len(alpha), permuted, untested)
 
 
 def predictability(
@@ -245,12 +239,15 @@ def predictability(
     """
     check_scalar(n_folds, "n_folds", Integral, min_val=2)
     features, labels, numbers, order = _known_frames(features, y, groups, time)
-    found = kind_of(labels, kind)
+    kind = kind_of(labels, kind)
     if groups is None:
-        numbers = _dependent_frames(features, labels, found, order, n_folds)
-    most = len(labels)
-    if found == "classes":
+        numbers = _dependent_frames(features, labels, kind, order, n_folds)
+    most, model = len(labels), RidgeCV(np.logspace(-3, 3, 13))
+    splitter = KFold if numbers is None else GroupKFold
+    if kind == "classes":
         most = int(np.unique(labels, return_counts=True)[1].min())
+        model = LinearDiscriminantAnalysis()
+        splitter = StratifiedKFold if numbers is None else StratifiedGroupKFold
     if numbers is not None:
         most = min(most, len(np.unique(numbers)))
     if most < 2:
@@ -258,14 +255,7 @@ def predictability(
             "two folds need two frames of each class, and two groups where there are "
             f"groups; got {most}"
         )
-    n_folds = min(n_folds, most)
-    alone, grouped = KFold, GroupKFold
-    if found == "classes":
-        alone, grouped = StratifiedKFold, StratifiedGroupKFold
-    splitter = alone if numbers is None else grouped
-    folds = splitter(n_folds, shuffle=True, random_state=random_state)
-    ridge = RidgeCV(np.logspace(-3, 3, 13))
-    model = LinearDiscriminantAnalysis() if found == "classes" else ridge
+    folds = splitter(min(n_folds, most), shuffle=True, random_state=random_state)
     model = make_pipeline(StandardScaler(), model)
     return np.asarray(
         cross_val_score(model, features, labels, groups=numbers, cv=folds)

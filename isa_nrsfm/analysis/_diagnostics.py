@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.texts import aligned, first_items
+from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm.analysis._advice import (
@@ -95,17 +95,17 @@ class Diagnostics(NamedTuple):
         """Return the messages, the figures of the table and those of coefficients."""
         certainty = "not estimated"
         if math.isfinite(self.depth_uncertainty):
-            certainty = f"{_percent(self.depth_uncertainty)} of the depth"
+            certainty = f"{percent(self.depth_uncertainty)} of the depth"
         shares = first_items((f"{share:.2f}" for share in self.reliability), 12)
         rows = [["", "effective frames", "pose share"]]
         for frames, share in zip(self.effective_frames, self.pose_share, strict=True):
-            known = "" if math.isnan(share) else _percent(max(share, 0.0))
+            known = "" if math.isnan(share) else percent(max(share, 0.0))
             rows.append([f"alpha_{len(rows)}", f"{frames:.1f}", known])
         lines = [
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
             f"depth error: {certainty}",
-            f"deformation: {_percent(self.deformation_amplitude)} of the mean shape",
+            f"deformation: {percent(self.deformation_amplitude)} of the mean shape",
             f"reliability, along uncorrelated directions: {shares}",
             aligned(rows),
         ]
@@ -290,22 +290,17 @@ def _lines(model: Any) -> dict[str, str]:
     ratio = getattr(model, "camera_noise_ratio_", None)
     meaning = "" if ratio is None else f"; {camera_meaning(ratio)}"
     lines["Cameras"] = f"{camera}{meaning}"
-    floor = _percent(model.rank_floor_)
-    lines["Inverse SNR"] = f"{_percent(model.inverse_snr_)}, rank floor {floor}"
+    floor = percent(model.rank_floor_)
+    lines["Inverse SNR"] = f"{percent(model.inverse_snr_)}, rank floor {floor}"
     if hasattr(model, "noise_variance_"):
         noise = math.sqrt(model.noise_variance_)
         lines["Noise"] = (
-            f"{_percent(noise)} of a frame's size"
+            f"{percent(noise)} of a frame's size"
             if model.frames_scaled_
             else f"{noise:.3g} in the units of the table"
         )
-    lines["Energy of each"] = first_items(map(_percent, model.energy_share_), 12)
+    lines["Energy of each"] = first_items(map(percent, model.energy_share_), 12)
     if "Noise" in lines and "Frames" in lines:
         messages = model.diagnostics().messages
         lines["Diagnostics"] = "; ".join(messages) or "no warning"
     return lines
-
-
-def _percent(share: float) -> str:
-    """Return a share in percent."""
-    return f"{100 * share:.3g} %"

@@ -10,6 +10,11 @@ from sklearn.utils import check_array, column_or_1d
 from sklearn.utils.multiclass import type_of_target
 
 Kind = Literal["classes", "number"]
+# Names and meanings of the statistics of labels, by their kind.
+STATISTICS = {
+    "classes": ("eta squared", "share of the variance between classes"),
+    "number": ("Spearman", "rank correlation, from -1 to 1"),
+}
 
 
 def checked_column(name: str, values: Any, n_frames: int) -> NDArray:

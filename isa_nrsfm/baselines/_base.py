@@ -119,9 +119,11 @@ class ShapeSequenceNRSfM(
             column names that contradict `layout`.
         """
         X = self._checked(X, reset=True)
-        names, scaled = getattr(self, "feature_names_in_", None), self.scale_frames
         settings = FitSettings(
-            refinement=None, layout=self.layout, names=names, scale_frames=scaled
+            refinement=None,
+            layout=self.layout,
+            names=getattr(self, "feature_names_in_", None),
+            scale_frames=self.scale_frames,
         )
         rows = open_table(X, self.layout)
         table = scaled_table(rows, None, self.n_components, settings)

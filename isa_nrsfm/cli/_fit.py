@@ -161,17 +161,18 @@ def fit_table(
 
 def _load_prior(args: Namespace) -> None:
     """Load the prior, and set the options that it determines unless they are given."""
-    n_components, asked = 3, args.n_components
+    n_components = 3
     if args.prior is not None:
         face = args.prior == FACE_PRIOR
         args.prior = load_face_prior() if face else load_model(args.prior)
         n_components = len(args.prior.basis_)
-        asked = None if asked == (AUTO,) else asked
+        if args.n_components == (AUTO,):
+            args.n_components = None
         if args.camera is None and args.prior.camera_ != "affine":  # which is refused
             args.camera = args.prior.camera_
     elif args.adapt == "shapes":
         raise ValueError("--adapt shapes needs --prior")
-    args.n_components = asked or (n_components,)
+    args.n_components = args.n_components or (n_components,)
 
 
 def _check_options(args: Namespace) -> None:

@@ -77,7 +77,7 @@ def quality_report(
 
 
 def model_report(
-    estimator: AffineNRSfM, frames: Frames, edges: Any = "auto", perspective: str = ""
+    estimator: AffineNRSfM, frames: Frames, edges: Any, perspective: str
 ) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table.
 
@@ -92,6 +92,7 @@ def model_report(
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
+    n_edges = 0 if lines is None else len(lines.edges)
     is_joint = estimator.refinement in JOINT_REFINEMENTS
     found = estimator.diagnostics(X, **frames.weighting) if is_joint else None
     messages = () if found is None else found.messages
@@ -138,7 +139,7 @@ def model_report(
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
-        "n_edges": None if edges is None else 0 if lines is None else len(lines.edges),
+        "n_edges": None if edges is None else n_edges,
         "spanning_tree": lines is not None and lines.name == SPANNING_TREE,
         "outliers": None if found is None else _outliers(found, estimator, X),
         "n_iter": estimator.n_iter_,

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._compat.texts import as_utf8, first_items
+from isa_nrsfm._compat.texts import as_utf8, first_items, percent
 from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm.analysis._frame_columns import STATISTICS
 from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
@@ -124,7 +125,7 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
     if n_missing:
         share = n_missing / (table["n_frames"] * table["n_points"])
         parts.append(
-            f"{n_missing} points ({_percent(share)}) are missing in "
+            f"{n_missing} points ({percent(share)}) are missing in "
             f"{table['n_frames_with_missing_points']} of these rows"
         )
     return parts
@@ -138,9 +139,9 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
             " Points count by their weights here, and equally in the inverse SNR."
         )
     return [
-        f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
+        f"inverse SNR {percent(quality['inverse_snr'])}{remark}: energy (sum of "
         "squares) of the residuals, relative to that of the centred points.",
-        f"held-out error {_percent(quality['held_out_error'])}: the same for points "
+        f"held-out error {percent(quality['held_out_error'])}: the same for points "
         f"predicted from the other points of their frame.{weighted} Wrong points and "
         "too many basis shapes make it much larger.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
@@ -271,14 +272,14 @@ def _fit(report: dict[str, Any]) -> Section:
     if model["parameters"]["loss"] != "linear":
         remark = " (outliers count fully)"
     elif (model["rank_floor"] or 0) > np.finfo(float).eps and "prior" not in report:
-        floor = _percent(model["rank_floor"])
+        floor = percent(model["rank_floor"])
         remark = f" (no model with {_shapes(model)} is below {floor})"
     parts = quality_section(model, remark)
     worst = model["largest_error"]
     parts.append(f"largest error of a row: {worst['rms']:.3g}, of row {worst['row']}")
     if model["noise_variance"] is not None:
         noise = math.sqrt(model["noise_variance"])
-        size = f"{_percent(noise)} of the frame's size"
+        size = f"{percent(noise)} of the frame's size"
         if not model["frames_scaled"]:
             size = f"{noise:.3g} in the units of the table"
         parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
@@ -318,7 +319,7 @@ def _prior(prior: dict[str, Any], adapt: str) -> str:
     )
 
 
-def _cameras(model: dict[str, Any], unit: dict[str, Any] | None = None) -> Section:
+def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
     """Return the camera model, the certainty of the depth, and what the noise means."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
     if model["camera"] != "affine" and not model["depth_determined"]:
@@ -441,27 +442,23 @@ def _label(label: dict[str, Any]) -> Section:
     if label["n_without_label"]:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
-    statistic, meaning = "Spearman", "rank correlation, from -1 to 1"
-    if label["statistic"] == "eta_squared":
-        statistic, meaning = "eta squared", "share of the variance between classes"
+    statistic, meaning = STATISTICS[label["kind"]]
+    found = zip(names, label["values"], label["p_values"], strict=True)
     rows = [
         [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
-        for name, value, p in zip(
-            names, label["values"], label["p_values"], strict=True
-        )
+        for name, value, p in found
     ]
-    tested = "class_means" in label and not label["untested"]
-    means = _class_means(label, names) if tested else []
-    if means:
-        means.insert(0, "mean of each class if p < 0.05, in standard deviations:")
-    test = f"p-values: permutations of {label['permuted']}"
     answer = f"{label['column']} was not tested: {label['untested']}."
-    if label["untested"]:
-        test = "no p-values"
-    else:
+    test, means = "no p-values", list[str]()
+    if not label["untested"]:
         related = np.asarray(names)[np.less(label["p_values"], 0.05)]
         coefficients = ", ".join(related) or "no coefficient"
         answer = f"{label['column']} goes with {coefficients} (p < 0.05)."
+        test = (
+            f"corrected p-values: permutations of {label['permuted']}"
+        )
+        if "class_means" in label and len(related):
+            means = _class_means(label, names)
     return [
         answer,
         Cells(["", statistic, "p"], rows, title),
@@ -496,7 +493,7 @@ def _score(label: dict[str, Any]) -> str:
 
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
-    lines = []
+    lines = ["mean of each class if p < 0.05, in standard deviations:"]
     means = pd.DataFrame(label["class_means"], names)
     for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
@@ -554,8 +551,3 @@ def _sentence(text: str) -> str:
 def _digits(number: float, n_digits: int) -> str:
     """Write a number with so many digits, zeros at the end included."""
     return f"{number:#.{n_digits}g}".removesuffix(".")
-
-
-def _percent(fraction: float) -> str:
-    """Write a fraction in percent."""
-    return f"{100 * fraction:.3g} %"

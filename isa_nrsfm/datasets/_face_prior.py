@@ -66,11 +66,15 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     C, others = stored["moments"], stored["basis"][K:]
     left = np.einsum("ab,kja,kjb->", C, others, others) / (2 * len(mean_shape))
     total, residual, constant, slope = certain
-    noise, residual, camera = noise + left, residual + 2.0 * left, "weak_perspective"
-    turns, points = stored["turns"], stored["points"]
     certainty = DepthCertainty(
-        total, 0.0, turns, points, residual=residual, images=(constant, slope)
+        total,
+        0.0,
+        stored["turns"],
+        stored["points"],
+        residual=residual + 2.0 * left,
+        images=(constant, slope),
     )
+    noise, camera = noise + left, "weak_perspective"
     shapes = np.ascontiguousarray(np.concatenate([mean_shape[None], basis]).mT)
     gauge, starts = FrameMap.identity(K), np.zeros((0, K))
     frames = PosteriorFrames(shapes, noise, starts, "linear", gauge, camera, certainty)

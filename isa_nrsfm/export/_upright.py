@@ -120,9 +120,7 @@ def upright_frames(
     return EuclideanFrames(shapes @ space.transform.T, rotations, scales)
 
 
-def viewed_shapes(
-    space: UprightSpace, model: Any, block_numbers: int = 2**23
-) -> NDArray[np.float64]:
+def viewed_shapes(space: UprightSpace, model: Any) -> NDArray[np.float64]:
     """Return the centred mean shape and the basis shapes (K + 1, J, 3) for a viewer.
 
     They are upright, but y points up and z to the viewer. Euclidean shapes of affine
@@ -135,7 +133,7 @@ def viewed_shapes(
     else:
         n_shapes, size = len(shapes), shapes[0].size
         gram, product = (np.zeros((n_shapes, n)) for n in (n_shapes, size))
-        for block in gen_batches(len(model.alpha_), max(1, block_numbers // size)):
+        for block in gen_batches(len(model.alpha_), max(1, 2**23 // size)):
             motion, alpha = model.motion_[block], model.alpha_[block]
             frames = upright_frames(space, model, motion, alpha).shapes
             known = np.isfinite(frames).all(axis=(1, 2))

@@ -11,11 +11,6 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.decomposition import PCA
-from sklearn.linear_model import LinearRegression
-from sklearn.metrics import make_scorer, r2_score
-from sklearn.model_selection import cross_val_score
-from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
@@ -150,11 +145,15 @@ def _pivoted(
     several = table is not None and table.duplicated(keys).any()
     points = points or ([] if several else last[-1:])
     frames = [name for name in keys if name not in points]
-    absent = "individual" if frames and several else "" if frames else "frame"
-    absent, counted = absent if points else "point", ""
-    if absent:
-        counted = f"table[{absent!r}] = table.groupby({keys}).cumcount(), and "
-        frames, points = [*frames, *[absent] * bool(points)], points or [absent]
+    counted = "table[{!r}] = table.groupby({}).cumcount(), and "
+    if not points:
+        points = ["point"]
+        counted = counted.format("point", keys)
+    elif not frames or several:
+        frames.append("individual" if frames else "frame")
+        counted = counted.format(frames[-1], keys)
+    else:
+        counted = ""
     return (
         f"{told}. In pandas: {counted}"
         f"wide = table.pivot(index={frames}, columns={points[0]!r}, values={values}), "
@@ -273,14 +272,20 @@ def _one_body(
 
 def _move_together(tables: "Sequence[pd.DataFrame]") -> bool:
     """Return whether the x of some points predict those of others, in other rows."""
-    found = [table.apply(pd.to_numeric, errors="coerce") for table in tables]
-    parts = [(part - part.mean()).fillna(0.0).to_numpy() for part in found]
+    # These import all linear models, which other tables do not need.
+    from sklearn.decomposition import PCA
+    from sklearn.linear_model import LinearRegression
+    from sklearn.metrics import make_scorer, r2_score
+    from sklearn.model_selection import cross_val_score
+    from sklearn.pipeline import make_pipeline
+
+    numbers = [table.apply(pd.to_numeric, errors="coerce") for table in tables]
+    parts = [(part - part.mean()).fillna(0.0).to_numpy() for part in numbers]
     if len(parts[0]) < FEWEST_ROWS:
         return False
-    shares = []
+    shares, score = [], make_scorer(r2_score, multioutput="variance_weighted")
     for i, part in enumerate(parts):
         model = make_pipeline(PCA(min(4, part.shape[1])), LinearRegression())
-        score = make_scorer(r2_score, multioutput="variance_weighted")
         others = np.hstack([*parts[:i], *parts[i + 1 :]])
         shares.append(cross_val_score(model, others, part, cv=2, scoring=score))
     return bool(np.mean(shares) > TOGETHER)

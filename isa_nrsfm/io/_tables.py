@@ -260,14 +260,15 @@ def individuals_as_rows(
 
 def _codes(missing: Missing) -> list[float]:
     """Return the numbers of missing points, or raise."""
-    given = [] if missing is None else [0.0] if isinstance(missing, str) else missing
-    codes = np.atleast_1d(np.asarray(given))
-    wrong = isinstance(missing, str) and missing != "zeros"
-    if wrong or codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
+    if missing is None:
+        return []
+    zeros = isinstance(missing, str) and missing == "zeros"
+    codes = np.atleast_1d(0.0 if zeros else missing)
+    if codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
         raise ValueError(
             f'missing must be None, "zeros" or finite numbers; got {missing!r}'
         )
-    return [float(code) for code in codes]
+    return codes.astype(float).tolist()
 
 
 def tracks_in(
@@ -373,12 +374,13 @@ def separator_of(path: Path) -> str:
     """
     usual, lines = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 2)
 
-    def fit(sign: str) -> tuple[bool, float]:
+    def better(sign: str) -> tuple[bool, float]:
+        """Return whether rows have as many cells, and separators; half for commas."""
         lengths = [len(row) for row in csv.reader(lines, delimiter=sign) if row]
         return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / (1 + (sign == ","))
 
     try:
-        return max((usual, *";\t,|"), key=fit)
+        return max((usual, *";\t,|"), key=better)
     except (csv.Error, ValueError):
         return usual
 
@@ -527,20 +529,17 @@ def with_points(
     Either all commas are decimal, or all are between thousands; raise if both can be.
     Other columns are written so where all their cells are such numbers.
     """
-    texts = frame[[*names]].select_dtypes(["object", "string"]).astype(str)
-    if not any(texts[name].str.contains(",", regex=False).any() for name in texts):
-        return frame
-    cells = {*texts.to_numpy(object).ravel()}
-    decimal, thousands = (
-        {cell for cell in cells if expression.fullmatch(cell)}
-        for expression in (_DECIMAL_COMMA, _THOUSANDS)
-    )
+    texts = frame[[*names]].select_dtypes(["object", "string"])
+    cells = {*map(str, texts.to_numpy(object).ravel())}
+    commas = [cell for cell in cells if "," in cell]
+    decimal = {*filter(_DECIMAL_COMMA.fullmatch, commas)}
+    thousands = {*filter(_THOUSANDS.fullmatch, commas)}
     if not (decimal or thousands):
         return frame
     fractions = frame[[*names]].select_dtypes("float") % 1
     has_points = fractions.any(axis=None) or any("." in c for c in cells - thousands)
-    is_decimal, is_thousands = decimal >= thousands, thousands >= decimal
-    is_decimal &= not has_points
+    is_decimal = decimal >= thousands and not has_points
+    is_thousands = thousands >= decimal
     first = max(decimal | thousands).strip()
     if is_decimal and is_thousands:
         raise ValueError(

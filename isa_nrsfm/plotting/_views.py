@@ -130,17 +130,20 @@ def choose_lines(
     tree of the points `seen`, by default the shape. Without lines only the points are
     drawn.
     """
-    named, pairs, name = isinstance(edges, str | Skeleton), None, "edges"
+    named = isinstance(edges, str | Skeleton)
     if named and edges != "auto":
         layout: Skeleton | None = checked_skeleton(edges, len(shape))
     else:
         layout = find_skeleton(len(shape), names, shape=shape)
-    lines = None if edges is None else layout
-    if edges is not None and not named:
+    lines, pairs = layout, None
+    if edges is None:
+        lines = None
+    elif not named:
         pairs = edges_of(checked_links("edges", edges, len(shape), triangles=True))
-    elif edges is not None and layout is None and not is_dense(shape):
-        pairs, name = spanning_tree(shape if seen is None else seen), SPANNING_TREE
+    elif layout is None and not is_dense(shape):
+        pairs = spanning_tree(shape if seen is None else seen)
     if pairs is not None:
+        name = SPANNING_TREE if named else "edges"
         bare = layout or Skeleton(name, "other", len(shape), (), "the points")
         lines = replace(bare, curves=tuple(map(tuple, pairs.tolist())))
     return layout, lines, choose_origin(origin, shape, layout)

@@ -220,13 +220,10 @@ def _are_parts(keys: Iterable[str], points: Iterable[str]) -> bool:
     words = {part[0] if part else "" for part in found}
     several = len(words) == 1 and all(key.isdigit() for key in keys)
     of_points = "" not in words and (several or len(words) == len(without_sides))
-    of_keys = all(map(_SERIES.search, keys))
+    if of_points or all(map(_SERIES.search, keys)):
+        return True
     are_sides = len({_SIDE.sub("", key) for key in keys}) < 2
-    return (
-        of_points
-        or of_keys
-        or (are_sides and not any(map(_ANIMAL.search, [*keys, *points])))
-    )
+    return are_sides and not any(map(_ANIMAL.search, [*keys, *points]))
 
 
 def has_single_parts(points: Iterable[str]) -> bool:

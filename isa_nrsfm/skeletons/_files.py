@@ -109,5 +109,6 @@ def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> S
             )
         # A curve may be written as more than two bodyparts in turn.
         pairs = [pair for edge in edges for pair in pairwise(edge)]
-        name, source = Path(path).name, f"DeepLabCut, {Path(path).name}"
+        name = Path(path).name
+        source = f"DeepLabCut, {name}"
         return skeleton_of_names(pairs, point_names, name=name, source=source)
