@@ -292,7 +292,7 @@ def _fit(report: dict[str, Any]) -> Section:
     if model["skeleton"] is not None:
         parts.append(f"points recognised as {model['skeleton']}")
     elif model["n_edges"] == 0 or model["spanning_tree"]:
-        drawn = "join them by a minimal spanning tree of the mean shape; give lines"
+        drawn = "join them by a minimal spanning tree; give lines"
         if not model["spanning_tree"]:
             drawn = "have no lines between them; give these"
         n_points = report["table"]["n_points"]
@@ -309,13 +309,14 @@ def _fit(report: dict[str, Any]) -> Section:
 def _prior(prior: dict[str, Any], adapt: str) -> str:
     """Return how far the shapes are from those of the prior, and what that means."""
     mean_shape, basis = (f"{100 * width:.2g} %" for width in prior["std"])
-    whose = "the prior, so that studies with the same prior can be compared"
+    others, whose = "", "the prior, so that studies with the same prior can be compared"
     if adapt != "mean":
+        others = f", the basis shapes by {basis}"
         whose = "adapted basis shapes: compare studies with --adapt mean"
     return (
         f"prior {prior['name']}: the mean shape differs by {mean_shape} of the size of "
-        f"the object from that of the prior, the basis shapes by {basis} (standard "
-        f"deviations of a coordinate). Coefficients are those of {whose}."
+        f"the object from that of the prior{others} (standard deviation of a "
+        f"coordinate). Coefficients are those of {whose}."
     )
 
 
@@ -454,9 +455,7 @@ def _label(label: dict[str, Any]) -> Section:
         related = np.asarray(names)[np.less(label["p_values"], 0.05)]
         coefficients = ", ".join(related) or "no coefficient"
         answer = f"{label['column']} goes with {coefficients} (p < 0.05)."
-        test = (
-            f"corrected p-values: permutations of {label['permuted']}"
-        )
+        test = f"corrected p-values: permutations of {label['permuted']}"
         if "class_means" in label and len(related):
             means = _class_means(label, names)
     return [
