@@ -404,8 +404,7 @@ class TestCommandLine:
 
     def test_fit_and_transform(self, results, tmp_path, succeeds):
         options = ["--weights", "confidence"]
-        affine = ["--camera", "affine", *self.QUICK]
-        succeeds("fit", results, *options, "-o", tmp_path / "out", *affine)
+        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
         found = read_landmarks(results)
         camera = "weak_perspective"
         model = estimator(camera=camera)

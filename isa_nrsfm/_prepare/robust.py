@@ -108,7 +108,7 @@ def spatial_median(rows: NDArray) -> NDArray:
     # If half of the points coincide, their place is the median.
     least = np.where(median > 0, OF_DISTANCES * median, 1.0)
     counted = np.where(median > 0, seen, distance <= median)
-    for _ in range(20):
+    for _ in range(40):
         middle, distance = _weighted_middle(points, weights)
         weights = counted / np.maximum(distance, least)
     return (origin[..., 0] + middle).T
