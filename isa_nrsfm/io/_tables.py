@@ -530,6 +530,9 @@ def with_points(
     Other columns are written so where all their cells are such numbers.
     """
     texts = frame[[*names]].select_dtypes(["object", "string"])
+    columns = (texts[name].astype(str) for name in texts)
+    if not any(column.str.contains(",", regex=False).any() for column in columns):
+        return frame
     cells = {*map(str, texts.to_numpy(object).ravel())}
     commas = [cell for cell in cells if "," in cell]
     decimal = {*filter(_DECIMAL_COMMA.fullmatch, commas)}
@@ -638,9 +641,11 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
         )
     numbers = column
     if not types.is_numeric_dtype(column):
-        text = column.astype(object).where(column.notna(), "").astype(str)
+        text = column
+        if not types.is_string_dtype(column):
+            text = column.astype(object).where(column.notna(), "").astype(str)
         numbers = pd.to_numeric(text, errors="coerce")
-        bad = text[numbers.isna()]
+        bad = text[numbers.isna()].dropna()
         bad = bad[~bad.str.strip().str.lower().isin(_MISSING)]
         if len(bad):
             raise ValueError(
