@@ -339,6 +339,12 @@ def test_perspective_is_found_or_advised(fits, webcam, camera):
     assert found.err.endswith(". Use --camera perspective\n")
 
 
+def test_perspective_is_compared_with_joint_fits_only(fits, webcam):
+    options = "--camera weak_perspective --refinement alternating --image-size 1280x720"
+    found = fits(webcam[0], "--no-figures", "-k", 1, *options.split())
+    assert found.report["model"]["perspective"] == ""
+
+
 def test_outliers_are_reported(fits, tmp_path):
     scene = make_nonrigid_tracks(60, 20, 1, noise=0.01, random_state=0)
     table = pd.DataFrame(scene.data, columns=scene.feature_names)

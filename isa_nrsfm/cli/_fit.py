@@ -23,6 +23,7 @@ from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._prepare.coordinates import CoordinateWarning
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._advice import facts_of
+from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
@@ -109,7 +110,7 @@ def fit_table(
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
         clock["read"] = time.perf_counter()
-        estimator, search, perspective = _fitted(args, frames, clock)
+        estimator, search, diagnostics, perspective = _fitted(args, frames, clock)
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
@@ -133,7 +134,9 @@ def fit_table(
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args, frames) | {"other_columns": unused},
                 **({} if search is None else {"choice": choice_report(search, X)}),
-                "model": model_report(estimator, frames, drawn["edges"], perspective),
+                "model": model_report(
+                    estimator, frames, drawn["edges"], diagnostics, perspective
+                ),
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
@@ -215,8 +218,8 @@ def _seconds(clock: dict[str, float]) -> dict[str, float]:
 
 def _fitted(
     args: Namespace, frames: Frames, clock: dict[str, float]
-) -> tuple[AffineNRSfM, AffineNRSfMCV | None, str]:
-    """Return the model that the options ask for, the search for its K, and a message.
+) -> tuple[AffineNRSfM, AffineNRSfMCV | None, Diagnostics | None, str]:
+    """Return model, search for its K, diagnostics of a joint fit, and a message.
 
     That is of perspective cameras if they explain the table better than those of the
     model, which the options then ask for.
@@ -264,14 +267,18 @@ def _fitted(
     else:
         # For `shown_progress`; the model that is written does not have it.
         estimator.set_params(verbose=2).fit(X, **frames.weighting)
-    perspective = perspective_advice(estimator, frames)
+    diagnostics, perspective = None, ""
+    if args.refinement in JOINT_REFINEMENTS:
+        diagnostics = estimator.diagnostics(X, **frames.weighting)
+        perspective = perspective_advice(estimator, frames, diagnostics)
     if perspective and args.camera is None and args.refinement == "joint":
         show_stage("fit with perspective cameras")
         estimator.set_params(verbose=2, n_components=len(estimator.basis_), **near)
         estimator.fit(X, **frames.weighting)
+        diagnostics = estimator.diagnostics(X, **frames.weighting)
     estimator.set_params(verbose=0)
     clock["fit"] = time.perf_counter()
-    return estimator, search, perspective
+    return estimator, search, diagnostics, perspective
 
 
 def _old_figures(folder: Path, new: list[str]) -> list[str]:

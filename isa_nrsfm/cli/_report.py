@@ -14,7 +14,6 @@ from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of, sees_perspective
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.analysis._advice import advice, camera_meaning, facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics, outlier_text
 from isa_nrsfm.cli._outputs import fitted_table
@@ -77,11 +76,16 @@ def quality_report(
 
 
 def model_report(
-    estimator: AffineNRSfM, frames: Frames, edges: Any, perspective: str
+    estimator: AffineNRSfM,
+    frames: Frames,
+    edges: Any,
+    found: Diagnostics | None,
+    perspective: str,
 ) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table.
 
-    `perspective` is the advice to use perspective cameras.
+    `found` are the diagnostics of a joint fit, `perspective` is what speaks for
+    perspective cameras.
     """
     # Not needed by transform
     from isa_nrsfm.plotting._axes import SPANNING_TREE
@@ -93,8 +97,6 @@ def model_report(
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     n_edges = 0 if lines is None else len(lines.edges)
-    is_joint = estimator.refinement in JOINT_REFINEMENTS
-    found = estimator.diagnostics(X, **frames.weighting) if is_joint else None
     messages = () if found is None else found.messages
     if perspective and estimator.camera_ == "weak_perspective":
         joint = ', refinement="joint"' * (estimator.refinement == "consensus")
@@ -148,7 +150,9 @@ def model_report(
     }
 
 
-def perspective_advice(estimator: AffineNRSfM, frames: Frames) -> str:
+def perspective_advice(
+    estimator: AffineNRSfM, frames: Frames, found: Diagnostics
+) -> str:
     """Compare fits of some rows with perspective and without; say what is better.
 
     Nothing is said if the fit had other cameras, or outliers that bend it, and if the
@@ -161,8 +165,7 @@ def perspective_advice(estimator: AffineNRSfM, frames: Frames) -> str:
     point = frames.principal_point
     if point is None or estimator.camera_ != "weak_perspective":
         return ""
-    share = estimator.diagnostics(frames.X, **frames.weighting).outlier_share
-    if facts_of(estimator, outlier_share=share).bent:
+    if facts_of(estimator, outlier_share=found.outlier_share).bent:
         return ""
     show_stage("comparison with perspective")
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
