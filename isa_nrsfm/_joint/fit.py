@@ -310,8 +310,9 @@ def _freedom_correction(
     """
     n_shapes, _, n_points = shape
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
-    free = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
-    unknowns = prior.n_determined if prior else free
+    unknowns: float = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
+    if prior is not None:
+        unknowns = prior.n_determined
     freedom = n_numbers - n_pose * n_frames - unknowns
     return float(n_numbers / max(freedom, 0.1 * n_numbers))
 
@@ -337,7 +338,8 @@ def reweighted(
     residuals, corrected for the degrees of freedom.
 
     If weights change by 0.5 % at random, the shapes change by about 0.5 % of their
-    standard errors. About 2,000 frames determine the noise, and nearly the shapes.
+    standard errors (docs/benchmarks/README.md, "Thresholds"). About 2,000 frames
+    determine the noise, and nearly the shapes.
     """
     loss, thorough = problem.settings.loss, problem.thorough
     rows, left_out = table.scaled.rows, table.outliers

@@ -309,7 +309,8 @@ def _fit(report: dict[str, Any]) -> Section:
 def _prior(prior: dict[str, Any], adapt: str) -> str:
     """Return how far the shapes are from those of the prior, and what that means."""
     mean_shape, basis = (f"{100 * width:.2g} %" for width in prior["std"])
-    others, whose = "", "the prior, so that studies with the same prior can be compared"
+    others = ""
+    whose = "the prior, so that studies with the same prior can be compared"
     if adapt != "mean":
         others = f", the basis shapes by {basis}"
         whose = "adapted basis shapes: compare studies with --adapt mean"
@@ -450,7 +451,8 @@ def _label(label: dict[str, Any]) -> Section:
         for name, value, p in found
     ]
     answer = f"{label['column']} was not tested: {label['untested']}."
-    test, means = "no p-values", list[str]()
+    test = "no p-values"
+    means: list[str] = []
     if not label["untested"]:
         related = np.asarray(names)[np.less(label["p_values"], 0.05)]
         coefficients = ", ".join(related) or "no coefficient"
@@ -516,7 +518,8 @@ def _groups(groups: dict[str, Any]) -> Section:
 
 def _time(time: dict[str, Any]) -> Section:
     """Return the result of smoothing in time."""
-    scales, name = np.asarray(time["time_scales"], dtype=float), time["column"]
+    scales = np.asarray(time["time_scales"], dtype=float)
+    name = time["column"]
     if (frames := time.get("frames")) is not None:
         name = f"frames {frames[0]:g} to {frames[1]:g} by {name or 'row'}"
     if not len(scales):
