@@ -6,6 +6,7 @@ fits the camera to the mean shape alone, then the coefficients by least squares.
 coefficients together.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -22,7 +23,7 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.search import FramePosterior, FrameSearch
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch, largest_objective
 from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, padded
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
@@ -450,23 +451,34 @@ class PosteriorFrames:
         Weights (n, J) are by default 1. With a robust loss they follow from the
         residuals, as long as the points with positive weights determine a camera.
         """
-        fitted = partial(
-            self._search.fit_rows, noise=self.noise_variance, covariances=covariances
-        )
+        noise = self.noise_variance
+        fitted = partial(self._search.fit_rows, noise=noise, covariances=covariances)
         if self.loss == "linear":
             if len(rows) == 1 and weights is None:
-                alone = self.single_search.fit(rows[0], self.noise_variance)
+                alone = self.single_search.fit(rows[0], noise)
                 if alone is not None:
                     return alone
             return fitted(rows, weights=weights, starts=self.starts)
-        # Robust loss: first without gross outliers
+        # Robust loss: outliers alone are no reason for further starts.
+        fit, weights = self._reweighted(rows, fitted)
+        poor = np.flatnonzero(fit.objective > largest_objective(weights.sum(1), noise))
+        if len(poor):
+            fitted = partial(fitted, starts=self.starts)
+            fit.put(poor, self._reweighted(rows[poor], fitted)[0])
+        return fit
+
+    def _reweighted(
+        self, rows: NDArray, fitted: Callable[..., FramePosterior]
+    ) -> tuple[FramePosterior, NDArray]:
+        """Return the fit of rows (n, 2, J) with a robust loss, and its weights."""
+        # First without gross outliers
         weights = np.where(distant_points(rows), 0.0, 1.0)
-        fit = fitted(rows, weights=weights, starts=self.starts)
+        fit = fitted(rows, weights=weights)
         # If too few points remain, use the distant ones.
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
         if len(lost):
             weights[lost] = 1.0
-            fit.put(lost, fitted(rows[lost], starts=self.starts))
+            fit.put(lost, fitted(rows[lost]))
         sizes = robust_sizes(rows)
         deviation = np.sqrt(self.noise_variance)
         changing = padded(np.flatnonzero(np.isfinite(fit.objective)))
@@ -488,7 +500,7 @@ class PosteriorFrames:
             kept = np.isfinite(refit.objective)
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
-        return fit
+        return fit, weights
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
