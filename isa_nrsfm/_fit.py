@@ -167,7 +167,9 @@ def fit_table(
                 model = consensus(model, table.rows, settings, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
-        fitted, frames, measures = _joint_frames(table, model, tracks, settings)
+        fits = fitted_frames(model, tracks, table.rows)
+        del tracks  # as much memory as the table
+        fitted, frames, measures = _joint_frames(table, model, fits, settings)
         if fit.prior is not None:
             attributes["prior_std_"] = np.array(fit.prior.widths)
         if errors and camera != "affine":
@@ -318,10 +320,9 @@ def _paper_frames(
 
 
 def _joint_frames(
-    table: ScaledTable, model: PosteriorFrames, tracks: JointFrames, s: FitSettings
+    table: ScaledTable, model: PosteriorFrames, fits: Any, s: FitSettings
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return model, frames and attributes of a joint fit in the independent gauge."""
-    fits = fitted_frames(model, tracks, table.rows)
+    """Return model, frames and attributes of fits in the independent gauge."""
     posteriors, motion, alpha, covariance, _ = fits
     unknown = np.isnan(motion).any(axis=(1, 2))
     if unknown.any():
