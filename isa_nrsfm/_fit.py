@@ -247,7 +247,9 @@ def _factorised(
         outliers = gross_outliers(table.rows, limits.model_frames)
         completed = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
-    if not complete:
+    if complete:  # kept, because the factorisation reads it up to ten times
+        completed = completed.derive(np.asarray)
+    else:
         most = limits.model_frames
         completed = complete_rows(completed, n_points, n_components, most)
     report("table")
