@@ -167,7 +167,9 @@ def fit_table(
                 model = consensus(model, table.rows, settings, wanted, free)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
-        fitted, frames, measures = _joint_frames(table, model, tracks, settings)
+        fits = fitted_frames(model, tracks, table.rows)
+        del tracks  # as much memory as the table
+        fitted, frames, measures = _joint_frames(table, model, fits, settings)
         if fit.prior is not None:
             attributes["prior_std_"] = np.array(fit.prior.widths)
         if errors and camera != "affine":
@@ -234,6 +236,9 @@ def _factorised(
 ) -> FactorisedTable:
     """Return a table with outliers (robust loss), completed frames and factors."""
     limits, n_points = settings.limits, table.n_points
+    # Frames with many points are fitted by directions.
+    many = settings.joint and settings.prior is None
+    many = many and n_points > max(24 * (n_components + 1), limits.many_points)
     # Calibrated cameras can have more basis shapes than the factorisation.
     n_triplets = min(3 * n_components + 3, n_points - 1)
     n_components = min(n_components, largest_n_components(n_points))
@@ -242,7 +247,9 @@ def _factorised(
         outliers = gross_outliers(table.rows, limits.model_frames)
         completed = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
-    if not complete:
+    if complete:  # kept, because the factorisation reads it up to ten times
+        completed = completed.derive(np.asarray)
+    else:
         most = limits.model_frames
         completed = complete_rows(completed, n_points, n_components, most)
     report("table")
@@ -257,8 +264,13 @@ def _factorised(
     else:
         W, parts = completed.whole().reshape(shape), []
     factors = factorise(W, n_components, table.precision, triplets)
+    compressed = None
+    if many:
+        directions = np.concatenate([factors.rigid_shape, factors.signals])
+        directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
+        compressed = JointFrames.from_directions(completed, directions)
     report("factorisation")
-    return FactorisedTable(table, completed, outliers, values, rest, W, parts, factors)
+    return FactorisedTable(table, compressed, outliers, values, rest, W, parts, factors)
 
 
 def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointState:
@@ -310,10 +322,9 @@ def _paper_frames(
 
 
 def _joint_frames(
-    table: ScaledTable, model: PosteriorFrames, tracks: JointFrames, s: FitSettings
+    table: ScaledTable, model: PosteriorFrames, fits: Any, s: FitSettings
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return model, frames and attributes of a joint fit in the independent gauge."""
-    fits = fitted_frames(model, tracks, table.rows)
+    """Return model, frames and attributes of fits in the independent gauge."""
     posteriors, motion, alpha, covariance, _ = fits
     unknown = np.isnan(motion).any(axis=(1, 2))
     if unknown.any():

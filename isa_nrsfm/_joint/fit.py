@@ -22,6 +22,7 @@ g_k is the share of the 3J numbers of B_k that the table determines rather than 
 prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -67,8 +68,8 @@ def fit_jointly(
     are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
     of freedom.
     """
-    problems, seen = _problems(table, paper_shapes, settings)
-    first, sampled = problems[0], len(problems) > 1
+    problems = _problems(table, paper_shapes, settings)
+    first = next(problems)
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is None:
         fit, start = _first_fit(first, table, paper_shapes)
@@ -85,21 +86,21 @@ def fit_jointly(
         least_noise, sufficient = settings.limits.least_noise, False
         if table.outliers is None:  # with them the widths follow the weights
             fit = widened(first, fit)
-            problems = [problem.with_prior(fit.prior) for problem in problems]
-    if sufficient:
-        problems = [replace(problem, penalty=0.0) for problem in problems]
-        if not sampled:  # for a sufficient model a smaller tolerance is safe
-            tol = 0.1**2 * settings.tol
-            fit = problems[0].refined(fit.state, least_noise=least_noise, tol=tol)
+    penalty = 0.0 if sufficient else first.penalty
+    problem = replace(first.with_prior(fit.prior), penalty=penalty)
+    if sufficient and not table.parts:  # a smaller tolerance is safe
+        tol = 0.1**2 * settings.tol
+        fit = problem.refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames
-    for problem in problems[1:]:
+    for larger in problems:
+        problem = replace(larger.with_prior(fit.prior), penalty=penalty)
         state = problem.aligned(fit.state, problem.cameras)
         fit = problem.refined(state, least_noise=least_noise)
     # After completed frames, the points that are seen, and robust weights
-    problem = problems[-1]
-    if seen is not None:
+    every_point = table.scaled.complete and table.scaled.weights is None
+    if table.compressed and not (every_point and table.outliers is None):
         shapes = problem.frames.points(fit.state.shapes)
-        problem = replace(problem, frames=seen)
+        problem = replace(problem, frames=_visible_frames(table))
         state = fit.state._replace(shapes=shapes)
         fit = problem.refined(state, least_noise=least_noise)
     noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
@@ -110,7 +111,7 @@ def fit_jointly(
     shapes = problem.frames.points(fit.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
-    if sampled:
+    if table.parts:
         state = state._replace(motion=state.motion[table.parts[0]])
     noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose, fit.prior)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
@@ -125,7 +126,7 @@ def count_components(
 
     Arguments as in `fit_jointly`, with more basis shapes than are expected.
     """
-    problem = _problems(table, paper_shapes, settings)[0][0]
+    problem = next(_problems(table, paper_shapes, settings))
     fit, _ = _first_fit(problem, table, paper_shapes)
     return max(relevant_components(problem, fit.state), 1)
 
@@ -171,35 +172,19 @@ def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
 
 def _problems(
     table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings
-) -> tuple[list[JointProblem], JointFrames | None]:
-    """Return the problems of growing samples and of all frames.
-
-    With many points, frames are completed and represented by directions. If points are
-    missing, left out or weighted, the second result has the frames by their visible
-    points.
-    """
-    n_shapes, _, n_points = paper_shapes.shape
-    limits, prior, seen = settings.limits, settings.shape_prior, None
-    if prior is None and n_points > max(24 * n_shapes, limits.many_points):
-        directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
-        directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
-        frames = JointFrames.from_directions(table.completed, directions)
-        every_point = table.scaled.complete and table.scaled.weights is None
-        if not every_point or table.outliers is not None:
-            seen = _visible_frames(table)
-    else:
-        frames = _visible_frames(table)
+) -> Iterator[JointProblem]:
+    """Yield the problems of growing samples, one at a time, and of all frames."""
+    limits, frames = settings.limits, table.compressed or _visible_frames(table)
     thorough = frames.n_frames <= limits.few_frames
+    prior = settings.shape_prior
     penalty = 0.0 if prior else frames.basis_penalty(limits.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
     # Each parameter that fits noise only lowers -2 log L by about one. Steps on a
     # sample end when they gain less than 3 % of the number of shape parameters.
     chance = 0.03 * frames.coordinates(paper_shapes).size
-    problems = [
-        problem.part(part, tol=max(settings.tol, chance / len(part)))
-        for part in table.parts
-    ]
-    return [*problems, problem], seen
+    for part in table.parts:
+        yield problem.part(part, tol=max(settings.tol, chance / len(part)))
+    yield problem
 
 
 def _visible_frames(table: FactorisedTable) -> JointFrames:

@@ -165,7 +165,8 @@ class JointFrames:
             lambda block, kept: of_frames(block, np.flatnonzero(kept)), chosen
         )
         taken = [part for part in parts if len(part.weight)]
-        blocks = FrameBlocks.of_blocks(taken, [len(part.weight) for part in taken])
+        lengths = [len(part.weight) for part in taken]
+        blocks = FrameBlocks.of_blocks(taken, lengths, self.blocks.n_threads)
         return replace(self, blocks=blocks.regrouped(joined_frames, BLOCK_FRAMES))
 
 

@@ -28,7 +28,7 @@ from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 from isa_nrsfm._linalg.small_matrices import centred, frames_first, frames_last
 from isa_nrsfm._paper.pipeline import Factorisation
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 # Lower bound of the noise variance, as a share of the mean square of the tracks. It
 # keeps the objective finite for tables without noise.
@@ -41,7 +41,8 @@ Memory = deque[tuple[NDArray, NDArray, float]]
 class FactorisedTable(NamedTuple):
     """A table that is ready for a fit.
 
-    completed: its frames (I, 2, J) with missing points and outliers filled in.
+    compressed: its frames with missing points and outliers filled in, by directions, if
+    there are many points.
     outliers (I, J): points that a robust loss leaves out at first; None for other
     losses.
     singular_values (3 K + 3,): the largest ones of the completed table, decreasing.
@@ -51,7 +52,7 @@ class FactorisedTable(NamedTuple):
     """
 
     scaled: ScaledTable
-    completed: FrameBlocks
+    compressed: JointFrames | None
     outliers: NDArray | None
     singular_values: NDArray
     rest: float

@@ -211,9 +211,13 @@ def check_points(
             f"determine {equations} numbers of the shapes, which have {unknowns}. Take "
             "fewer basis shapes, or leave out points that are rarely visible"
         )
-    shown = seen.astype(np.float32)
-    n_groups, group = connected_components(shown.T @ shown)  # points seen together
-    if n_groups > 1:
+    # Points of the first one's group, from frame to frame; all groups if others are left
+    before, group = np.array(False), np.arange(n_points) == 0
+    while (group != before).any():
+        before, group = group, group | seen[seen[:, group].any(axis=1)].any(axis=0)
+    if not group.all():
+        shown = seen.astype(np.float32)
+        n_groups, group = connected_components(shown.T @ shown)
         raise ValueError(
             f"the points fall into {n_groups} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "

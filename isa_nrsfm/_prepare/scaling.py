@@ -36,7 +36,8 @@ class ScaledTable(NamedTuple):
 
     shown (n_rows,): mask of the rows that show any point, the frames.
     source: their rows before centring and scaling.
-    rows: blocks (I, 2, J) of centred frames of size one, NaN where not seen.
+    rows: blocks (I, 2, J) of centred frames of size one, NaN where not seen, computed
+    at each reading.
     sizes, n_seen (I,): divisors of the frames, and their numbers of visible points.
     translation (I, 2): centroids of visible points, or medians with a robust loss.
     unit: the common size of all frames, None if each has its own.
@@ -130,7 +131,7 @@ def scaled_table(
     return ScaledTable(
         shown,
         blocks,
-        blocks.derive(unit_rows, translation, size),
+        blocks.derive(unit_rows, translation, size, kept=False),
         size,
         translation,
         n_seen,
@@ -230,7 +231,9 @@ def weighted_rows(
             f"point {point}. Give points without information the weight 0"
         )
     nan = rows.empty.dtype.type(np.nan)
-    visible = rows.derive(lambda r, w: np.where(w[:, None] == 0, nan, r), weights)
+    visible = rows.derive(
+        lambda r, w: np.where(w[:, None] == 0, nan, r), weights, kept=False
+    )
     seen = visible.joined(seen_points)
     weights = np.where(seen, weights, 0.0)
     least = LEAST_WEIGHT * weights.max(axis=1, keepdims=True, initial=0.0)

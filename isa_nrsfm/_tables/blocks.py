@@ -29,8 +29,8 @@ class FrameBlocks:
     A block is an array with a row for each of some consecutive frames, or the result of
     a function given to `derive`. `read` returns the block of a given number, and
     `lengths` are the numbers of frames, `n_frames` their sum. Derived blocks are
-    computed once if `cached`, and otherwise at each reading. `n_threads` threads work
-    on blocks at the same time.
+    computed once if `cached` and to be kept, otherwise at each reading. `n_threads`
+    threads work on blocks at the same time.
     `empty` is a block without frames of the table, known for blocks of `open_table` and
     those derived from them.
     """
@@ -78,10 +78,12 @@ class FrameBlocks:
             return map(result, numbers)
         return in_threads(result, numbers, self.n_threads)
 
-    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
+    def derive(
+        self, function: Callable[..., Any], *by_frame: NDArray, kept: bool = True
+    ) -> Self:
         """Return blocks of the results of a function of each block (see `map`)."""
         read = self._results(function, by_frame)
-        if self.cached:
+        if self.cached and kept:
             read = list(self.map(function, *by_frame)).__getitem__
         derived = type(self)(read, self.lengths, self.cached, self.n_threads)
         derived.empty = self.empty
@@ -183,7 +185,9 @@ class DaskBlocks(FrameBlocks):
         """Return the results of a function of each block, in order."""
         return iter(self._run("compute", self._tasks(function, *by_frame)))
 
-    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
+    def derive(
+        self, function: Callable[..., Any], *by_frame: NDArray, kept: bool = True
+    ) -> Self:
         """Return new blocks, the results of a function of each of these."""
         tasks = self._tasks(function, *by_frame)
         derived = type(self)(self._run("persist", tasks), self.lengths)

@@ -19,6 +19,7 @@ from isa_nrsfm._tables.tracks import (
     clean_rows,
     refuse_odd,
     table_to_rows,
+    table_to_tracks,
     without_half_points,
 )
 
@@ -62,8 +63,11 @@ def open_table(
     dtype = np.float32 if X.dtype == np.float32 else np.float64
     empty = np.empty((0, 2, X.shape[1] // 2), dtype)
     if not is_read_later(X):
-        rows = clean_rows(table_to_rows(X, layout), layout, names)
+        # Views of the table: each block is copied when it is read.
+        views = table_to_tracks(X, layout).transpose(0, 2, 1)
+        rows = clean_rows(views, layout, names)
         blocks = FrameBlocks.of_array(rows, min(length, 2048), n_threads)
+        blocks = blocks.derive(np.ascontiguousarray, kept=False)
         blocks.empty = empty
         return blocks
     if is_on_dask(X):
