@@ -77,12 +77,10 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     for place in sorted(found, key=lambda place: (place.real, place.imag)):
         there = places == place
         counts, n_rows = there.sum(axis=0), there.any(axis=1).sum()
-        if n_rows < (3 if place else 1):  # before the slow steps
+        if n_rows < (3 if place else 1) or np.isnan(tracks[~there]).all():
             continue
         point = counts.argmax()
         other, others = places[~there[:, point], point], tracks[~there]
-        if np.isnan(others).all():
-            continue
         often = np.unique(other, return_counts=True, equal_nan=False)[1].max(initial=0)
         xy = np.array([place.real, place.imag])
         beyond = (xy < np.nanmin(others, axis=0)) | (xy > np.nanmax(others, axis=0))
@@ -156,8 +154,7 @@ def are_shares(tracks: NDArray) -> bool:
     if beyond.sum() - beyond.max() > 2 * FEW:
         return False
     # Half of the points of a centred body are on either side.
-    if (np.abs(np.median(known, axis=1)) < CENTRED).any():
-        return False
+    centred = (np.abs(np.median(known, axis=1)) < CENTRED).any()
     inside = ((tracks >= 0) & (tracks <= 1)).all(axis=2) & seen
     zero, one = (((tracks == end).any(axis=2) & seen) for end in (0, 1))
     ends, few = (zero.sum(), one.sum()), 4 + seen.sum() / 1000
@@ -165,6 +162,6 @@ def are_shares(tracks: NDArray) -> bool:
     aligned = (
         zero.all(axis=0).any() or any(scaled) or (0 < min(ends) and sum(ends) < few)
     )
-    if inside.sum() < LEAST * seen.sum() or aligned:
+    if centred or aligned or inside.sum() < LEAST * seen.sum():
         return False
     return bool(np.ptp(tracks[inside], axis=0).min() > 0.1)
