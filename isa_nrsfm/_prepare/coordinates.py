@@ -65,10 +65,10 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     point has other places as often, or others are further out. The origin of the
     coordinates is one point in all frames, and others are around it.
     """
-    # -0.0 + 0.0 is 0.0
-    places = np.add(tracks, 0.0, order="C", dtype=float).view(complex)[..., 0]
-    shown = places[~np.isnan(places)]
-    shown = shown[:: -(-len(shown) // MOST_PLACES) or 1]
+    places = np.ascontiguousarray(tracks, dtype=float).view(complex)[..., 0]
+    known = np.flatnonzero(~np.isnan(places))
+    some = known[:: -(-len(known) // MOST_PLACES) or 1]
+    shown = places.ravel()[some] + 0  # -0.0 + 0.0 is 0.0
     found, warned = {0j}, False
     for some in (shown, shown[shown.real == shown.imag]):
         if len(some):
