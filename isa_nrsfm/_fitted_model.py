@@ -305,13 +305,14 @@ class TableModel(NamedTuple):
         folds = np.random.RandomState(0).permutation(rows.shape[2]) % 5
         seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
-        counts = counts * sizes[:, None] ** -2.0
+        counts = (counts * sizes[:, None] ** -2.0)[..., None]
         # Complete frames are fitted without these points, others with NaN instead.
         frames = self.frames
-        complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
-        complete = complete and weights is None and bool(seen.all())
-        complete = complete and self.pinhole is None
-        noise = signal = 0.0
+        linear = self.pinhole is None and frames.loss == "linear"
+        complete = linear and weights is None and bool(seen.all())
+        tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
+        energies = counts * (tracks - np.nanmean(tracks, 1, keepdims=True)) ** 2
+        total = np.zeros(2)
         for fold in range(5):
             held = folds == fold
             # Fit without the held-out points
@@ -321,33 +322,32 @@ class TableModel(NamedTuple):
             if not len(usable):
                 continue
             mean, others = self.mean_shape[held], self.basis[:, held]
-            if complete:
-                assert isinstance(frames, PosteriorFrames)
+            if complete and isinstance(frames, PosteriorFrames):
                 kept = frames.of_points(~held)  # their centroid is the origin
-                visible = np.ascontiguousarray(rows[usable][..., ~held])
+                visible = np.compress(~held, rows[usable], axis=2)
                 fit = kept.fit(visible, sizes[usable], False, None)
                 mean = mean - self.mean_shape[~held].mean(axis=0)
                 others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
             else:
                 own = None if weights is None else weights[usable]
-                if self.pinhole is None and frames.loss == "linear":
+                if linear:
                     fit = frames.fit(visible[usable], sizes[usable], False, own)
                 else:
                     fit = self.decompose(visible[usable], own, False)
             # Prediction of the held-out points, and its error
             shapes = compose(mean, others, fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
-            part = np.ascontiguousarray(rows[usable].transpose(0, 2, 1))
-            centre = np.nanmean(part, axis=1, keepdims=True)
-            weight = counts[np.ix_(usable, held)][..., None]
-            counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
+            chosen = np.ix_(usable, held)
+            error = counts[chosen] * (tracks[chosen] - predicted) ** 2
+            counted = seen[chosen] & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)
             # Effect of the threshold 2: docs/benchmarks/README.md, "Thresholds"
             leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
             counted[some] &= leverage[:, held] <= 2.0
-            noise += np.sum((weight * (part[:, held] - predicted) ** 2)[counted])
-            signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
-        return np.array([[noise, signal]])
+            # `compress` is quicker than a mask.
+            parts = (part.reshape(-1, 2) for part in (error, energies[chosen]))
+            total += [np.compress(counted.ravel(), part, 0).sum() for part in parts]
+        return total[None]
 
     def _ready(
         self, rows: NDArray, weights: NDArray | None = None

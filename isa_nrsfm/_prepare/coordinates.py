@@ -65,10 +65,10 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     point has other places as often, or others are further out. The origin of the
     coordinates is one point in all frames, and others are around it.
     """
-    places = np.empty(tracks.shape[:2], dtype=complex)
-    places.real, places.imag = np.moveaxis(tracks + 0.0, 2, 0)  # -0.0 + 0.0 is 0.0
-    shown = places[~np.isnan(places)]
-    shown = shown[:: -(-len(shown) // MOST_PLACES) or 1]
+    places = np.ascontiguousarray(tracks, dtype=float).view(complex)[..., 0]
+    known = np.flatnonzero(~np.isnan(places))
+    some = known[:: -(-len(known) // MOST_PLACES) or 1]
+    shown = places.ravel()[some] + 0  # -0.0 + 0.0 is 0.0
     found, warned = {0j}, False
     for some in (shown, shown[shown.real == shown.imag]):
         if len(some):
@@ -77,16 +77,16 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     for place in sorted(found, key=lambda place: (place.real, place.imag)):
         there = places == place
         counts, n_rows = there.sum(axis=0), there.any(axis=1).sum()
+        if n_rows < (3 if place else 1) or np.isnan(tracks[~there]).all():
+            continue
         point = counts.argmax()
         other, others = places[~there[:, point], point], tracks[~there]
-        if not n_rows or np.isnan(others).all():
-            continue
         often = np.unique(other, return_counts=True, equal_nan=False)[1].max(initial=0)
         xy = np.array([place.real, place.imag])
         beyond = (xy < np.nanmin(others, axis=0)) | (xy > np.nanmax(others, axis=0))
         is_outside = beyond.all()
         is_origin = len(there) > 2 and not is_outside and np.isnan(other).all()
-        enough = n_rows > 2 and (is_outside or counts[point] > 3 * often)
+        enough = is_outside or counts[point] > 3 * often
         equal = xy[0] == xy[1]
         alone = not equal and np.count_nonzero(counts) < 2
         if is_origin or alone or (place and not enough):
@@ -145,22 +145,23 @@ def are_shares(tracks: NDArray) -> bool:
     [0, 1], a few coordinates are exactly 0 and 1; in aligned ones, a point is at 0.
     Points at (0, 0) are missing.
     """
-    seen = ~np.isnan(tracks).any(axis=2) & (tracks != 0).any(axis=2)
-    known = tracks[seen]
-    if not len(known):
+    x, y = np.moveaxis(tracks, 2, 0)
+    seen = ~(np.isnan(x) | np.isnan(y)) & ((x != 0) | (y != 0))
+    if not seen.any():
         return False
-    beyond = np.mean([known < 0, known > 1], axis=1)  # of two borders, in x and y
+    known = np.stack([x[seen], y[seen]])
+    beyond = np.mean([known < 0, known > 1], axis=2)  # of two borders, in x and y
+    if beyond.sum() - beyond.max() > 2 * FEW:
+        return False
     # Half of the points of a centred body are on either side.
-    centred = (np.abs(np.median(known, axis=0)) < CENTRED).any()
-    if centred or beyond.sum() - beyond.max() > 2 * FEW:
-        return False
+    centred = (np.abs(np.median(known, axis=1)) < CENTRED).any()
     inside = ((tracks >= 0) & (tracks <= 1)).all(axis=2) & seen
     zero, one = (((tracks == end).any(axis=2) & seen) for end in (0, 1))
-    ends, few = (zero.sum(), one.sum()), 4 + len(known) / 1000
+    ends, few = (zero.sum(), one.sum()), 4 + seen.sum() / 1000
     scaled = [np.mean(zero.any(axis) & one.any(axis)) > 0.5 for axis in (0, 1)]
     aligned = (
         zero.all(axis=0).any() or any(scaled) or (0 < min(ends) and sum(ends) < few)
     )
-    if inside.sum() < LEAST * len(known) or aligned:
+    if centred or aligned or inside.sum() < LEAST * seen.sum():
         return False
     return bool(np.ptp(tracks[inside], axis=0).min() > 0.1)

@@ -160,7 +160,10 @@ def centred_frames(rows: NDArray) -> tuple[NDArray, FrameReport]:
     in_one_place = (n_seen > 0) & (square <= n_seen * (eps * place) ** 2)
     on_line = np.zeros(len(rows), dtype=bool)
     if not complete:
-        some = ~seen.all(axis=1)
+        # Twice the square of the distances from the principal axis, roughly
+        off = square - np.abs(np.einsum("ij,ij->i", points, points))
+        near = off <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
+        some = near & ~seen.all(axis=1)
         on_line[some] = _collinear(centred[some], place[some], n_seen[some], eps)
         np.copyto(centred, np.nan, where=~seen[:, None])
     size = np.sqrt(square / (2 * np.maximum(n_seen, 1)))

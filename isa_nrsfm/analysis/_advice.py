@@ -218,12 +218,15 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
     median = float(np.median(distance[shown]))
     if not median > 0:
         return 0.0, none
-    filled = np.ma.masked_invalid(distance)
-    of_rows = np.maximum(1.0, np.ma.median(filled, axis=1).filled(0) / median)
-    of_points = np.maximum(1.0, np.ma.median(filled, axis=0).filled(0) / median)
-    relative = np.where(shown, distance, 0.0) / of_rows[:, None] / of_points
-    found = np.argwhere(relative > GROSS * median / MEDIAN_DISTANCE)
-    order = np.argsort(-relative[tuple(found.T)], kind="stable")
+    limit = GROSS * median / MEDIAN_DISTANCE
+    found = np.argwhere(shown & (distance > limit))
+    relative = distance[tuple(found.T)]
+    for axis, numbers in enumerate(found.T):  # medians of few rows and points
+        some, places = np.unique(numbers, return_inverse=True)
+        own = np.nanmedian(distance.take(some, axis), axis=1 - axis)
+        relative = relative / np.maximum(1.0, own / median)[places]
+    found, relative = found[relative > limit], relative[relative > limit]
+    order = np.argsort(-relative, kind="stable")
     return len(found) / np.count_nonzero(shown), found[order]
 
 

@@ -5,37 +5,26 @@ from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
+from isa_nrsfm import plotting
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._columns import class_means, has_classes
-from isa_nrsfm.cli._outputs import fitted_table
+from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.cli._report import MOST_CLASSES
 from isa_nrsfm.export._names import names_of_components
-from isa_nrsfm.metrics._reprojection import frame_energies
 from isa_nrsfm.plotting import _axes
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
 # `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.
 MOST_DRAWN = 12
-
-
-class Fit(NamedTuple):
-    """A fit to draw: model, frames, search, smoothed coefficients, lines to draw."""
-
-    estimator: AffineNRSfM
-    frames: Frames
-    search: AffineNRSfMCV | None
-    smooth: Any
-    drawn: dict[str, Any]
 
 
 # By name: the caption, and the function that draws the figure.
@@ -109,14 +98,12 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
 
 def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
     """Draw up to three frames about the median residual, and as many of the largest."""
-    model = fit.estimator
-    energy, error, _ = frame_energies(fit.frames.X, fitted_table(model), model.layout)
-    order = np.argsort(error / energy)
+    order = np.argsort(fit.inverse_snr)
     n_drawn = max(min(3, len(order) // 3), 1)
     start = (len(order) - n_drawn) // 2
     rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
     display = plotting.ReprojectionDisplay.from_estimator(
-        model, fit.frames.X, frames=rows, **fit.drawn
+        fit.estimator, fit.frames.X, frames=rows, **fit.drawn
     )
     for number, axes in enumerate(display.axes_):
         which = "median" if number < n_drawn else "largest"

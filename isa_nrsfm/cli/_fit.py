@@ -26,8 +26,9 @@ from isa_nrsfm.analysis._advice import facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
-from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
+from isa_nrsfm.cli._figures import ALWAYS, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, NONE, flag_of
+from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import (
@@ -40,6 +41,7 @@ from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
+from isa_nrsfm.metrics._reprojection import frame_energies
 
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
@@ -125,7 +127,11 @@ def fit_table(
                     X, return_std=True, **frames.weighting
                 )[1]
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
-            _outputs.write_results(new, estimator, frames, smooth, drawn, unit, **shown)
+            explained = _outputs.fitted_table(estimator)
+            energy, error, _ = frame_energies(X, explained, estimator.layout)
+            snr = error / energy
+            fit = Fit(estimator, frames, search, smooth, drawn, explained, snr)
+            _outputs.write_results(new, fit, unit, **shown)
             if prior is not None:
                 answers["prior"] = {"name": prior, "std": estimator.prior_std_}
             report = {
@@ -134,9 +140,7 @@ def fit_table(
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args, frames) | {"other_columns": unused},
                 **({} if search is None else {"choice": choice_report(search, X)}),
-                "model": model_report(
-                    estimator, frames, drawn["edges"], diagnostics, perspective
-                ),
+                "model": model_report(fit, diagnostics, perspective),
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
@@ -154,7 +158,6 @@ def fit_table(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
                 )
-            fit = Fit(estimator, frames, search, smooth, drawn)
             captions = write_figures(new, figures, fit)
             clock["figures"] = time.perf_counter()
             report |= {"seconds": _seconds(clock), "files": results | captions}

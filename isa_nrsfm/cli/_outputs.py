@@ -9,19 +9,18 @@ import warnings
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, SmoothedCoefficients, export
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
-from isa_nrsfm.metrics._reprojection import frame_energies
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 PAGE = "report.html"
@@ -50,6 +49,21 @@ RESULTS = {
     "a frame is mean_shape + sum_k alpha_k basis[k]",
     "viewer.html": "the shapes and the frames in 3D, for any browser",
 }
+
+
+class Fit(NamedTuple):
+    """A fit to write and draw: model, frames, search, smoothed coefficients, lines.
+
+    ``explained`` is the `fitted_table`, and ``inverse_snr`` (n_frames,) that of frames.
+    """
+
+    estimator: AffineNRSfM
+    frames: Frames
+    search: AffineNRSfMCV | None
+    smooth: Any
+    drawn: dict[str, Any]
+    explained: NDArray
+    inverse_snr: NDArray
 
 
 def refuse_overwriting(sources: Iterable[str], targets: Iterable[Path]) -> None:
@@ -105,28 +119,20 @@ def write_alpha(
     write_table(pd.concat(parts, axis=1), path)
 
 
-def write_results(
-    folder: Path,
-    estimator: AffineNRSfM,
-    frames: Frames,
-    smooth: SmoothedCoefficients | None,
-    drawn: dict[str, Any],
-    unit: float = 1.0,
-    **shown: Any,
-) -> None:
+def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> None:
     """Write cameras, shapes, the viewer with the `shown` data, and the model.
 
     The cameras have a row for each frame, empty if it could not be fitted. `unit` is
     the length of a unit of the shapes, for positions.
     """
+    estimator, frames, _, smooth, drawn, *_ = fit
     X, motion = frames.X, estimator.motion_
     cameras = pd.DataFrame(
         np.hstack([motion.reshape(-1, 6), estimator.translation_]),
         index=X.index,
         columns=[*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"],
     )
-    energy, error, _ = frame_energies(X, fitted_table(estimator), estimator.layout)
-    cameras["inverse_snr"] = error / energy
+    cameras["inverse_snr"] = fit.inverse_snr
     if hasattr(estimator, "positions_"):
         names = [f"position_{axis}" for axis in "xyz"]
         cameras[names] = unit * estimator.positions_

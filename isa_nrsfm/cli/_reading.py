@@ -83,7 +83,7 @@ class Frames(NamedTuple):
     @property
     def X(self) -> "pd.DataFrame":
         """The landmarks of the usable rows."""
-        return self.points[self.usable]
+        return self.points if self.usable.all() else self.points[self.usable]
 
 
 def read_frames(

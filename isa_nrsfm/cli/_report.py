@@ -16,11 +16,10 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm.analysis._advice import advice, camera_meaning, facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics, outlier_text
-from isa_nrsfm.cli._outputs import fitted_table
+from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
-from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Rows and points that are listed, and classes whose means are shown, at most.
@@ -63,24 +62,21 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
 
 
 def quality_report(
-    estimator: AffineNRSfM, X: Any, explained: NDArray, weighting: dict[str, Any]
+    estimator: AffineNRSfM, X: Any, square: NDArray, weighting: dict[str, Any]
 ) -> dict[str, Any]:
-    """Describe how well a model explains a table, whose points may have weights."""
-    layout, scaled = estimator.layout, estimator.frames_scaled_
+    """Describe how well a model explains a table, whose points may have weights.
+
+    `square` has the squared errors of its coordinates.
+    """
     return {
-        "inverse_snr": inverse_snr(X, explained, layout=layout, scale_frames=scaled),
         "held_out_error": -estimator.score(X, **weighting),
         "held_out_error_weighted": bool(weighting),
-        "rms_point_error": np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2)),
+        "rms_point_error": np.sqrt(2 * np.nanmean(square)),
     }
 
 
 def model_report(
-    estimator: AffineNRSfM,
-    frames: Frames,
-    edges: Any,
-    found: Diagnostics | None,
-    perspective: str,
+    fit: Fit, found: Diagnostics | None, perspective: str
 ) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table.
 
@@ -91,8 +87,10 @@ def model_report(
     from isa_nrsfm.plotting._axes import SPANNING_TREE
     from isa_nrsfm.plotting._views import view_and_layout
 
-    X, alpha, explained = frames.X, estimator.alpha_, fitted_table(estimator)
-    errors = np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2, axis=1))
+    estimator, frames, edges = fit.estimator, fit.frames, fit.drawn["edges"]
+    X, alpha = frames.X, estimator.alpha_
+    square = (fit.explained - X.to_numpy()) ** 2
+    errors = np.sqrt(2 * np.nanmean(square, axis=1))
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
@@ -121,9 +119,9 @@ def model_report(
     )
     return {
         "n_components": alpha.shape[1],
-        **quality_report(estimator, X, explained, frames.weighting),
-        "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "inverse_snr": estimator.inverse_snr_,
+        **quality_report(estimator, X, square, frames.weighting),
+        "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         # Known only if the fit has seen the table as it is.
         "rank_floor": estimator.rank_floor_ if complete else None,
         "noise_variance": getattr(estimator, "noise_variance_", None),

@@ -189,7 +189,8 @@ def _poses(
 ) -> FramePoses:
     """Return the poses of frames in an upright space."""
     motion, alpha = frames_of_table(model, X, point_weight)
-    _, rotations, scales = upright_frames(space, model, motion, alpha)
+    shaped = alpha[:0] if space.metric is None else alpha  # no shapes are needed
+    _, rotations, scales = upright_frames(space, model, motion, shaped)
     # The fitted table must determine the depth.
     determined = frames_of(model).certainty.determined
     if space.metric is not None:

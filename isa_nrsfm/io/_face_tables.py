@@ -116,9 +116,9 @@ def read_mediapipe(
     sure = confidences_in(table, found.x, found.y)
     table, scores = table.assign(**sure), [*sure]
     tracks = tracks_in(table, found.interleaved, missing)
-    known = np.abs(tracks[~np.isnan(tracks)])
+    n_known = np.count_nonzero(~np.isnan(tracks))
     # Pixels of a face reach beyond this, and shares of the image's size do not.
-    if known.size and np.median(known) <= 2.0:
+    if 2 * np.count_nonzero((tracks >= -2) & (tracks <= 2)) > n_known:
         if image_size is None and len(sizes) < 2:
             raise ValueError(
                 "its coordinates are shares of the image's width and height: give "
@@ -135,9 +135,9 @@ def read_mediapipe(
     elif image_size is not None:
         raise ValueError(
             "image_size is for coordinates that are shares of the image's width and "
-            f"height; these are in pixels (median {np.median(known):.3g}), for the "
-            "format table"
-            if known.size
+            "height; these are in pixels (median "
+            f"{np.nanmedian(np.abs(tracks)):.3g}), for the format table"
+            if n_known
             else "image_size is given, but there are no points"
         )
     return _assembled(table, found, "mediapipe", tracks=tracks, scores=scores)

@@ -131,7 +131,7 @@ def assemble(
     if skeleton is None and (format in LAYOUTS_OF_READERS or not numbered(point_names)):
         skeleton = find_skeleton(n_points, point_names, format)
     return Landmarks(
-        points=pd.DataFrame(tracks.reshape(n_frames, -1), columns=list(columns)),
+        points=pd.DataFrame(tracks.reshape(n_frames, -1), None, columns, copy=False),
         # The copy is in one piece, so that further columns can be added quickly.
         frames=frames.set_axis(pd.RangeIndex(n_frames), axis=0).copy(),
         confidence=None

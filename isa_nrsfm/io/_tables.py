@@ -6,6 +6,7 @@ import os
 import re
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -501,10 +502,8 @@ def read_columns(
     others = [name for name in frame if name not in {*numbers, *text}]
     frame = with_points(frame, numbers, others)
     found: dict[str, Any] = {name: _numbers_if_all(frame[name]) for name in others}
-    for name in numbers:
-        is_number = frame[name].dtype.kind in "iuf"
-        found[name] = frame[name] if is_number else _as_numbers(frame[name])
-    return frame.assign(**found)
+    texts = [name for name in numbers if frame[name].dtype.kind not in "iuf"]
+    return frame.assign(**found, **{name: _as_numbers(frame[name]) for name in texts})
 
 
 def _numbers_if_all(column: "pd.Series") -> "pd.Series":
@@ -604,15 +603,16 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         pass
     refuse_same_names(header)
     header[0] = header[0].removeprefix("# ")  # of numpy.savetxt
-    frame = pd.read_csv(
-        path,
-        sep=separator,
-        dtype=str,
-        index_col=False,
-        keep_default_na=False,
-        encoding="utf-8-sig",
-    ).set_axis(header, axis=1)
     coordinates = [name for name in header if parse_coordinate(name) is not None]
+    options = {"index_col": False, "encoding": "utf-8-sig", "low_memory": False}
+    read = partial(pd.read_csv, path, sep=separator, keep_default_na=False, **options)
+    with contextlib.suppress(ValueError):  # without texts, if all cells are numbers
+        missing = {name: [*_MISSING, "NaN", "NA"] for name in coordinates}
+        types = {name: float if name in missing else str for name in header}
+        frame = read(names=header, header=0, dtype=types, na_values=missing)
+        if not np.isinf(frame[coordinates]).any(axis=None):
+            return frame
+    frame = read(dtype=str).set_axis(header, axis=1)
     frame = with_points(frame, coordinates)
     for name in coordinates:
         with contextlib.suppress(ValueError):
