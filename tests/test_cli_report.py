@@ -184,6 +184,28 @@ def test_means_of_classes_are_of_significant_coefficients(answers):
     )
 
 
+def test_many_coefficients_for_few_frames_are_named(answers):
+    labels = answers[0].report["labels"][:2]
+    for n_frames, many in ((4, ["mood"]), (6, [])):
+        cases = [label | {"n_frames": n_frames} for label in labels]
+        found = fit_sections(answers[0].report | {"labels": cases})["Labels"]
+        lines = [text for text in found if "coefficients are many for" in str(text)]
+        assert len(lines) == len(many)
+        assert all("with -k 1 or less" in line for line in lines)
+
+
+def test_the_largest_correlation_is_named(answers):
+    report = answers[0].report
+    model = report["model"]
+    r = np.corrcoef(answers[0].model.alpha_.T)[0, 1]
+    for independence in ("shapes", "coefficients"):
+        parameters = model["parameters"] | {"independence": independence}
+        text = fit_sections(report | {"model": model | {"parameters": parameters}})
+        assert f"alpha_1 and alpha_2 correlate most: {r:.2f}." in text["Alpha"][-1]
+        advised = "--independence coefficients" in text["Alpha"][-1]
+        assert advised == (independence == "shapes")
+
+
 @pytest.mark.parametrize("n_classes", [12, 13])
 def test_means_of_twelve_classes_are_listed(answers, n_classes):
     report = answers[0].report

@@ -416,7 +416,10 @@ class TestAdvice:
                 {"certainty": UNKNOWN["parts"], "n_points": 68, "prior": True},
                 "Fit more frames, best of objects that turn further",
             ),
-            ({"certainty": UNKNOWN["parts"]}, 'Use n_components="auto"'),
+            (
+                {"certainty": UNKNOWN["parts"]},
+                'Use refinement="consensus", n_components="auto". If',
+            ),
             (
                 {"certainty": UNKNOWN["parts"], "noise_ratio": 20.0},
                 "Make sure that x",
