@@ -20,6 +20,7 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm.analysis._advice import SAME_UNIT
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model
@@ -739,14 +740,16 @@ def test_warnings_are_shown_once_with_options(fits, table, monkeypatch):
 
     def warn_and_fit(self, X, y=None):
         given = "got camera='affine';\n  n_components=2 of a/camera=1.csv, layout='x'"
+        given += f". Make sure that {SAME_UNIT}, then use refinement=None"
         for _ in range(2):
             warnings.warn(given, UserWarning, stacklevel=1)
         warnings.warn("for developers", DeprecationWarning, stacklevel=1)
         return fit(self, X, y)
 
     monkeypatch.setattr(AffineNRSfM, "fit", warn_and_fit)
-    found = fits(table, *UNREFINED)
+    found = fits(table, *UNREFINED, "--image-size", "9x9")
     text = "got --camera affine; --n-components 2 of a/camera=1.csv, layout='x'"
+    text += ". Use --refinement none"
     assert found.err == f"isa-nrsfm: warning: {text}\n"
     assert found.report["warnings"] == [text]
 
