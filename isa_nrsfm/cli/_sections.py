@@ -518,7 +518,7 @@ def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     means = pd.DataFrame(label["class_means"], names)
     for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
-        listed = [f"{each} {mean:+.1f}" for each, mean in largest.items()]
+        listed = [f"{each} {mean:+z.1f}" for each, mean in largest.items()]
         rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
         lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{rest}.")
     return lines
