@@ -688,7 +688,7 @@ FIT = "fit t.csv -o d"
         ("fit", "required: TABLE, -o/--output"),
         (f"transform {MODEL} t.csv", "required: -o/--output"),
         *(
-            (f"{FIT} -k {numbers}", f"got {numbers.split(',')[-1]!r}\n")
+            (f"{FIT} -k {numbers}", f"got {numbers.split(',')[-1]!r} (see")
             for numbers in ("0", "two", "3-1", "1-1000", "-1", "1-", "2,-3", "1.5")
         ),
         ("fit  -o d", "expected a path; got an empty text"),

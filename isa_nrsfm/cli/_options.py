@@ -327,12 +327,9 @@ _COMMANDS: dict[str, tuple[str, str, str, dict[str, tuple]]] = {
         """\
 examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
-  isa-nrsfm fit faces.csv --n-components 1-12 --output results
   isa-nrsfm fit body.csv -k auto --output results
   isa-nrsfm fit photos.csv --prior face-68 --output results
   isa-nrsfm fit webcam.csv --image-size 1280x720 --output results
-  isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results
-  isa-nrsfm fit 300W/01_Indoor --points inner --n-components 5 --output results
 
 Cells of missing points are empty. Rows with too few points are counted and have empty
 coefficients. The results replace those of an earlier run in the output folder.""",

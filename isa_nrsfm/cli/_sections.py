@@ -406,7 +406,9 @@ def _alpha(model: dict[str, Any]) -> Section:
     if correlations.any():
         place = np.unravel_index(abs(correlations).argmax(), correlations.shape)
         first, second = (coefficients[k]["name"] for k in place)
-        found = f"largest correlation: {correlations[place]:.2f}, of {first} and {second}"
+        found = (
+            f"largest correlation: {correlations[place]:.2f}, of {first} and {second}"
+        )
         others = "; --independence coefficients lowers it"
         given, is_joint = model["parameters"], model["noise_variance"] is not None
         is_open = given["independence"] == "shapes" and given["prior"] is None
