@@ -14,6 +14,7 @@ from refusals import warned
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
+from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 
 import isa_nrsfm
@@ -26,7 +27,11 @@ from isa_nrsfm.analysis._diagnostics import (
     pose_share,
     weak_information,
 )
-from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.datasets import (
+    make_body_tracks,
+    make_face_tracks,
+    make_nonrigid_tracks,
+)
 from isa_nrsfm.skeletons import get_skeleton
 
 pytestmark = one_start
@@ -217,10 +222,10 @@ class TestPoseShare:
         alpha[:, 0] += 1 + 5 * R[:, 0, 2]
         predictors = np.hstack([np.ones((40, 1)), R.reshape(40, 9)])
         error = np.empty_like(alpha)
-        for i in range(40):
-            others = np.arange(40) != i
+        for part in np.arange(40).reshape(5, 8):
+            others = np.delete(np.arange(40), part)
             fit = np.linalg.lstsq(predictors[others], alpha[others])[0]
-            error[i] = alpha[i] - predictors[i] @ fit
+            error[part] = alpha[part] - predictors[part] @ fit
         energy = np.sum((alpha - alpha.mean(axis=0)) ** 2, axis=0)
         expected = 1 - np.sum(error**2, axis=0) / energy
         found = pose_share(scales * R[:, :2], alpha)
@@ -228,6 +233,12 @@ class TestPoseShare:
         assert found[0] > 0.5 > found[1]
         turned = R[:, :2] @ Rotation.from_rotvec([1.0, 2.0, 3.0]).as_matrix()
         assert_allclose(pose_share(turned, alpha), expected, rtol=1e-9)
+
+    def test_of_slow_movements_without_relation_to_slow_turns_is_small(self):
+        bodies = make_body_tracks(n_frames=300, random_state=0)
+        changes = (bodies.shapes - bodies.mean_shape).reshape(300, -1)
+        alpha = PCA(8).fit_transform(changes)
+        assert pose_share(bodies.motion, alpha).max() < 0.3
 
     @pytest.mark.parametrize("n_frames", [2, 19])
     def test_of_few_frames_is_not_known(self, n_frames, rng):
@@ -405,7 +416,10 @@ class TestAdvice:
                 {"certainty": UNKNOWN["parts"], "n_points": 68, "prior": True},
                 "Fit more frames, best of objects that turn further",
             ),
-            ({"certainty": UNKNOWN["parts"]}, 'Use n_components="auto"'),
+            (
+                {"certainty": UNKNOWN["parts"]},
+                'Use refinement="consensus", n_components="auto". If',
+            ),
             (
                 {"certainty": UNKNOWN["parts"], "noise_ratio": 20.0},
                 "Make sure that x",

@@ -168,7 +168,7 @@ def test_frames_play_and_stop(browser, page):
     assert_allclose(state["weights"], model.alpha_[row], atol=1e-5)
     browser.run(DRAWN)
     seen = browser.run("document.getElementById('seen').textContent")
-    assert seen == f"frame {row}: {LABELS[row]}"
+    assert seen == f"row {row}: {LABELS[row]}"
 
 
 def test_a_frame_is_seen_as_by_its_camera(browser, page):

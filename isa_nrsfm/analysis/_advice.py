@@ -192,10 +192,10 @@ def depth_advice(facts: Facts) -> str:
         remedy = f"fit a table in which the objects turn, then use prior=model{given}"
     elif most < len(facts.reliability):
         remedy = f"use at most n_components={most}"
+    elif grouped and not facts.consensus:
+        remedy = f'use refinement="consensus"{given}'
     elif not facts.auto:
         remedy = 'use n_components="auto"'
-    elif grouped and not facts.consensus:
-        remedy = 'use refinement="consensus"'
     if facts.noise_ratio >= SAME_NOISE:
         remedy = f"make sure that {SAME_UNIT}, then {remedy}"
     return (

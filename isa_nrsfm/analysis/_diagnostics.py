@@ -26,6 +26,9 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
 # to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
 MOST_POSE = 0.3
+# Parts of the rows of a table, each predicted from the others. Videos change slowly:
+# neighbours of a single frame predict it without any relation to the pose.
+N_PARTS = 5
 
 
 class Diagnostics(NamedTuple):
@@ -64,9 +67,10 @@ class Diagnostics(NamedTuple):
     camera_meaning : str
         Meaning of that ratio, in a sentence.
     pose_share : ndarray of shape (n_components,)
-        Share of the variance of each coefficient that the pose predicts: leave-one-out
-        R^2 of a linear regression on the rotation. Zero or negative if there is no
-        relation. NaN with fewer than 20 frames, or if the rotations are not determined.
+        Share of the variance of each coefficient that the pose predicts: R^2 of a
+        linear regression on the rotation, for each fifth of the rows fitted to the
+        others. Zero or negative if there is no relation. NaN with fewer than 20 frames,
+        or if the rotations are not determined.
     outlier_share : float
         Share of the points of a table with gross residuals, more than 8 robust standard
         deviations. NaN without a table.
@@ -169,22 +173,20 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     """Return the share of the variance of coefficients that the pose predicts.
 
-    Leave-one-out R^2 (n_components,) of a regression on the nine entries of the nearest
-    rotations, second order in yaw, pitch and roll. NaN for zero coefficients, or with
-    fewer than 20 frames.
+    R^2 (n_components,) in fifths of the rows that are left out of a regression on the
+    nine entries of the nearest rotations, second order in yaw, pitch and roll. NaN for
+    zero coefficients, or with fewer than 20 frames.
     """
     if len(alpha) < 20:
         return np.full(alpha.shape[1], np.nan)
     rows = polar(motion)[0]
     third = np.cross(rows[:, 0], rows[:, 1])
-    predictors = np.hstack([rows.reshape(-1, 6), third])
-    axes, sizes, _ = np.linalg.svd(predictors - predictors.mean(0), full_matrices=False)
-    axes = axes[:, sizes > OF_RANKS * np.sqrt(len(alpha))]
-    centred = alpha - alpha.mean(axis=0)
-    # With hat matrix H, the residual of a frame that was left out is r_i / (1 - H_ii).
-    kept = np.maximum(1 - 1 / len(alpha) - np.sum(axes**2, axis=1), OF_RANKS)
-    left_out = (centred - axes @ (axes.T @ centred)) / kept[:, None]
-    energy = np.sum(centred**2, axis=0)
+    predictors = np.hstack([np.ones((len(alpha), 1)), rows.reshape(-1, 6), third])
+    left_out = alpha.copy()
+    for part in np.array_split(np.arange(len(alpha)), N_PARTS):
+        known, others = (np.delete(x, part, axis=0) for x in (predictors, alpha))
+        left_out[part] -= predictors[part] @ np.linalg.lstsq(known, others, OF_RANKS)[0]
+    energy = np.sum((alpha - alpha.mean(axis=0)) ** 2, axis=0)
     energy[energy == 0] = np.nan
     return np.asarray(1 - np.sum(left_out**2, axis=0) / energy)
 

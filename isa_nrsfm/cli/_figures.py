@@ -42,8 +42,7 @@ ALWAYS: Figures = {
     ),
     "mode_covariance.png": (
         "whether basis shapes occur together; covariance of the deformations in the "
-        "images, 3x3 blocks: only the diagonal blocks differ from zero if the "
-        "coefficients are uncorrelated",
+        "images, 3x3 blocks: zero off the diagonal if coefficients are uncorrelated",
         lambda fit: plotting.ModeCovarianceDisplay.from_estimator(fit.estimator),
     ),
     "reprojection.png": (
@@ -107,7 +106,7 @@ def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
     )
     for number, axes in enumerate(display.axes_):
         which = "median" if number < n_drawn else "largest"
-        title = f"{which} residual: {axes.get_title()}"
+        title = f"{which} residual: {axes.get_title().replace('frame', 'row', 1)}"
         axes.set_title(title, fontsize="small", parse_math=False)
     return display
 

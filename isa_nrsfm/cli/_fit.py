@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
@@ -33,7 +32,7 @@ from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import (
     model_report,
-    perspective_advice,
+    perspective_report,
     table_report,
     versions,
 )
@@ -221,11 +220,11 @@ def _seconds(clock: dict[str, float]) -> dict[str, float]:
 
 def _fitted(
     args: Namespace, frames: Frames, clock: dict[str, float]
-) -> tuple[AffineNRSfM, AffineNRSfMCV | None, Diagnostics | None, str]:
-    """Return model, search for its K, diagnostics of a joint fit, and a message.
+) -> tuple[AffineNRSfM, AffineNRSfMCV | None, Diagnostics | None, dict[str, Any]]:
+    """Return model, search for its K, diagnostics of a joint fit, and a comparison.
 
-    That is of perspective cameras if they explain the table better than those of the
-    model, which the options then ask for.
+    The model has perspective cameras if the options leave it open, and these explain
+    the table better.
     """
     isa = None
     if args.isa == "fast" or args.n_init is not None:
@@ -270,11 +269,11 @@ def _fitted(
     else:
         # For `shown_progress`; the model that is written does not have it.
         estimator.set_params(verbose=2).fit(X, **frames.weighting)
-    diagnostics, perspective = None, ""
+    diagnostics = None
     if args.refinement in JOINT_REFINEMENTS:
         diagnostics = estimator.diagnostics(X, **frames.weighting)
-        perspective = perspective_advice(estimator, frames, diagnostics)
-    if perspective and args.camera is None and args.refinement == "joint":
+    perspective = perspective_report(estimator, frames, diagnostics)
+    if perspective["better"] and args.camera is None and args.refinement == "joint":
         show_stage("fit with perspective cameras")
         estimator.set_params(verbose=2, n_components=len(estimator.basis_), **near)
         estimator.fit(X, **frames.weighting)
@@ -296,47 +295,25 @@ def _old_figures(folder: Path, new: list[str]) -> list[str]:
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
-    """Return the numbers tried, their held-out errors, seconds, and the one chosen.
+    """Return the numbers tried, their held-out errors, and the one chosen.
 
-    If that is the largest, and the table supports it, also the next numbers that it
-    allows with their expected seconds.
+    Also whether a larger one may be better: it is the largest, and the table supports
+    it and allows others.
     """
     results, n_parts = search.cv_results_, search.n_splits_
-    seconds = results["path_fit_time"] + n_parts * (
-        results["mean_fit_time"] + results["mean_score_time"]
-    )
-    tried = results["param_n_components"]
+    tried, chosen = results["param_n_components"], search.n_components_
     scores = [results[f"split{part}_test_score"] for part in range(n_parts)]
     of_parts = -np.transpose(scores)
-    report = {
-        "n_components": tried.tolist(),
-        "held_out_error": -results["mean_test_score"],
-        "held_out_error_standard_error": standard_errors(of_parts),
-        "held_out_error_of_parts": of_parts,
-        "seconds": seconds,
-        "chosen": search.n_components_,
-    }
     fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
     best = search.best_estimator_
     joint = best.refinement in JOINT_REFINEMENTS
     most = most_components(fitted, X.shape[1] // 2, best.camera_ if joint else None)
-    following = np.arange(tried[-1] + 1, min(tried[-1] + 3, most) + 1)
-    supported = not joint or facts_of(best).n_supported == tried[-1]
-    if search.n_components_ == tried[-1] and supported:
-        report["next"] = {
-            "n_components": following.tolist(),
-            "seconds": float(extrapolated(tried, seconds, following).sum()),
-        }
-    return report
-
-
-def extrapolated(tried: NDArray, seconds: NDArray, following: NDArray) -> NDArray:
-    """Return the expected seconds of further numbers of basis shapes.
-
-    The least squares line, and at least the seconds of the largest number. The first of
-    three or more numbers is left out: it includes the search for starts.
-    """
-    if len(tried) > 2:
-        tried, seconds = tried[1:], seconds[1:]
-    line = np.polyfit(tried, seconds, min(len(tried) - 1, 1))
-    return np.maximum(np.polyval(line, following), seconds[-1])
+    supported = not joint or facts_of(best).n_supported == chosen
+    return {
+        "n_components": tried.tolist(),
+        "held_out_error": -results["mean_test_score"],
+        "held_out_error_standard_error": standard_errors(of_parts),
+        "held_out_error_of_parts": of_parts,
+        "chosen": chosen,
+        "larger_may_be_better": bool(supported and chosen == tried[-1] < most),
+    }

@@ -8,7 +8,7 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from isa_nrsfm import __version__
 from isa_nrsfm._parameters import choices
@@ -233,9 +233,7 @@ HELP = {
     "webcam), or affine (no assumption, for stretched images), which leaves depth and "
     "proportions open (default: that of the prior; perspective if the size of the "
     "images is known and held-out points say so; otherwise weak_perspective)",
-    "focal_length NUMBER": "of perspective cameras, in pixels (default: estimated). "
-    "For images of width w and height h OpenFace assumes 500 w / 640, and MediaPipe "
-    "0.816 h (63 degrees vertically)",
+    "focal_length NUMBER": "of perspective cameras, in pixels (default: estimated)",
     "principal_point X Y": "of perspective cameras: the point of the image on the axis "
     "of the camera, in pixels (default: the middle of the images)",
     "prior MODEL": "a fitted model of a table in which the objects turn, such as "
@@ -329,14 +327,9 @@ _COMMANDS: dict[str, tuple[str, str, str, dict[str, tuple]]] = {
         """\
 examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
-  isa-nrsfm fit faces.csv --n-components 1-12 --output results
   isa-nrsfm fit body.csv -k auto --output results
   isa-nrsfm fit photos.csv --prior face-68 --output results
   isa-nrsfm fit webcam.csv --image-size 1280x720 --output results
-  isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
-      --n-components 9 --output muct
-  isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results
-  isa-nrsfm fit 300W/01_Indoor --points inner --n-components 5 --output results
 
 Cells of missing points are empty. Rows with too few points are counted and have empty
 coefficients. The results replace those of an earlier run in the output folder.""",
@@ -412,9 +405,17 @@ The folder has the files of 'isa-nrsfm fit', and the table as tracks.csv.""",
 }
 
 
-def build_parser() -> argparse.ArgumentParser:
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with the message of an error."""
+        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def build_parser() -> Parser:
     """Return the parser of the command line."""
-    top = argparse.ArgumentParser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
+    top = Parser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
     top.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     commands = top.add_subparsers(dest="command", required=True)
     for command, (line, description, examples, groups) in _COMMANDS.items():

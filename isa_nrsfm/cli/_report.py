@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import frames_of, sees_perspective
 from isa_nrsfm.analysis._advice import advice, camera_meaning, facts_of
-from isa_nrsfm.analysis._diagnostics import Diagnostics, outlier_text
+from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames
@@ -76,11 +77,11 @@ def quality_report(
 
 
 def model_report(
-    fit: Fit, found: Diagnostics | None, perspective: str
+    fit: Fit, found: Diagnostics | None, perspective: dict[str, Any]
 ) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table.
 
-    `found` are the diagnostics of a joint fit, `perspective` is what speaks for
+    `found` are the diagnostics of a joint fit, `perspective` is the comparison with
     perspective cameras.
     """
     # Not needed by transform
@@ -96,9 +97,9 @@ def model_report(
     _, layout, lines, _ = view_and_layout(estimator, edges)
     n_edges = 0 if lines is None else len(lines.edges)
     messages = () if found is None else found.messages
-    if perspective and estimator.camera_ == "weak_perspective":
+    if perspective["better"] and estimator.camera_ == "weak_perspective":
         joint = ', refinement="joint"' * (estimator.refinement == "consensus")
-        use = f'{perspective}. Use camera="perspective"{joint}'
+        use = f'{perspective["text"]}. Use camera="perspective"{joint}'
         messages = advice(facts_of(estimator, perspective=use))
     for message in messages:
         warn_caller(message)
@@ -135,7 +136,7 @@ def model_report(
         "focal_length": getattr(estimator, "focal_length_", None),
         "focal_length_std": getattr(estimator, "focal_length_std_", None),
         "principal_point": estimator.principal_point,
-        "perspective": perspective,
+        "perspective": perspective["text"],
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
@@ -145,26 +146,27 @@ def model_report(
         "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),
         "alpha": coefficients.to_dict("records"),
+        "correlations": pd.DataFrame(alpha).corr().to_numpy(),
     }
 
 
-def perspective_advice(
-    estimator: AffineNRSfM, frames: Frames, found: Diagnostics
-) -> str:
+def perspective_report(
+    estimator: AffineNRSfM, frames: Frames, found: Diagnostics | None
+) -> dict[str, Any]:
     """Compare fits of some rows with perspective and without; say what is better.
 
-    Nothing is said if the fit had other cameras, or outliers that bend it, and if the
-    point of the image on the axis of the camera is not known. The first focal length is
-    too long for most cameras, which does no harm. It takes two or three times as long
-    as the fit without perspective, and the estimate ten.
+    Nothing is compared if the fit had other cameras, or outliers that bend it, and if
+    the point of the image on the axis of the camera is not known. The first focal
+    length is too long for most cameras, which does no harm. It takes two or three times
+    as long as the fit without perspective, and the estimate ten.
     """
     from isa_nrsfm._selection import StartedNRSfM  # not needed by transform
 
-    point = frames.principal_point
-    if point is None or estimator.camera_ != "weak_perspective":
-        return ""
+    point, none = frames.principal_point, {"better": False, "text": ""}
+    if found is None or point is None or estimator.camera_ != "weak_perspective":
+        return none
     if facts_of(estimator, outlier_share=found.outlier_share).bent:
-        return ""
+        return none
     show_stage("comparison with perspective")
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
     X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
@@ -178,16 +180,16 @@ def perspective_advice(
             model = StartedNRSfM(**params | camera)
             errors.append(-model.fit(X, **weights).score(X, **weights))
             if errors[-1] > errors[0]:
-                return ""
+                break
     except ValueError:  # too few of the rows show a point
-        return ""
+        return none
     weak, *_, error = errors
-    if not error < MUCH_LOWER * weak or np.isinf(model.focal_length_):
-        return ""
-    return (
-        "perspective explains the table better: error of held-out points "
-        f"{100 * error:.2g} % instead of {100 * weak:.2g} %"
-    )
+    better = error < MUCH_LOWER * weak and np.isfinite(model.focal_length_)
+    what = "explains the table better" if better else "hardly explains the table better"
+    if np.isinf(model.focal_length_):
+        what = "is too weak to estimate the focal length"
+    text = f"error of held-out points {percent(error)} instead of {percent(weak)}"
+    return {"better": better, "text": f"perspective {what}: {text}"}
 
 
 def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
@@ -199,7 +201,6 @@ def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
         "n_points": len(found.outliers),
         "n_frames": len(np.unique(found.outliers[:, 0])),
         "largest": [{"row": X.index[i], "point": names[j]} for i, j in largest],
-        "message": outlier_text(found, X.index, names),
     }
 
 

@@ -38,6 +38,7 @@ _CAMERAS = {
     "perspective": "perspective: shapes are known up to size",
 }
 
+_DATA = {REPORT: "the numbers of this report, for programs"}
 # Rows of a table in the terminal, at most.
 MOST_SHOWN = 16
 
@@ -84,7 +85,7 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
         sections["Groups"] = _groups(report["groups"])
     if "time" in report:
         sections["Time"] = _time(report["time"])
-    sections["Alpha"] = _alpha(model["alpha"])
+    sections["Alpha"] = _alpha(model)
     if "choice" in report:
         sections["Choice"] = _choice(report["choice"])
     elif model["parameters"]["n_components"] == AUTO:
@@ -164,7 +165,7 @@ def fit_text(report: dict[str, Any], folder: Path, more: Sections) -> str:
     """Return the report of a fit as text, with more sections after it."""
     described = [
         [name, content.partition(";")[0].partition(": the image")[0]]
-        for name, content in report["files"].items()
+        for name, content in (report["files"] | _DATA).items()
     ]
     listed: Section = [f"in {folder}", Cells([], described)]
     sections = fit_sections(report) | {"Files": listed, **more}
@@ -218,7 +219,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
     found = report["versions"].items()
     sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
-    sections["Files"] = [Cells([], [*report["files"].items()])]
+    sections["Files"] = [Cells([], [*(report["files"] | _DATA).items()])]
     for name, section in sections.items():
         parts += _markup(name, section)
     page = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
@@ -276,7 +277,7 @@ def _fit(report: dict[str, Any]) -> Section:
         remark = f" (no model with {_shapes(model)} is below {floor})"
     parts = quality_section(model, remark)
     worst = model["largest_error"]
-    parts.append(f"largest error of a row: {worst['rms']:.3g}, of row {worst['row']}")
+    parts.append(f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}")
     if model["noise_variance"] is not None:
         noise = math.sqrt(model["noise_variance"])
         size = f"{percent(noise)} of the frame's size"
@@ -285,8 +286,6 @@ def _fit(report: dict[str, Any]) -> Section:
         parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
     if "prior" in report:
         parts.append(_prior(report["prior"], model["parameters"]["adapt"]))
-    if model["outliers"] is not None and model["outliers"]["message"]:
-        parts.append(_sentence(model["outliers"]["message"]))
     fit = seconds["fit"] + seconds.get("choose", 0.0)
     parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
     if model["skeleton"] is not None:
@@ -333,8 +332,6 @@ def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
     if model["camera"] == "perspective" and not model["mirror_decided_by_perspective"]:
         title += " and a mirror image in depth"
     parts = [title, *_perspective(model, unit)]
-    if model["camera"] == "perspective" and model["perspective"]:
-        parts.append(_sentence(model["perspective"]))
     if uncertainty and math.isfinite(uncertainty):
         parts.append(
             f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
@@ -358,10 +355,11 @@ def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
 
 
 def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str]:
-    """Return the focal length of perspective cameras, and the unit of positions."""
+    """Return comparison, focal length and unit of positions of perspective cameras."""
     focal, deviation = model["focal_length"], model["focal_length_std"]
+    compared = [_sentence(text) for text in [model["perspective"]] if text]
     if focal is None:
-        return []
+        return compared
     if not math.isfinite(focal):
         return ["no perspective: the focal length is too long to estimate it"]
     shown = "given"
@@ -375,11 +373,13 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
     return [
         f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})",
         f"positions in cameras.csv: {length}",
+        *compared,
     ]
 
 
-def _alpha(coefficients: list[dict[str, Any]]) -> Section:
+def _alpha(model: dict[str, Any]) -> Section:
     """Return the distribution of the coefficients, and what the pose predicts."""
+    coefficients = model["alpha"]
     shares = [row["pose_share"] for row in coefficients]
     rows = [
         [
@@ -402,6 +402,17 @@ def _alpha(coefficients: list[dict[str, Any]]) -> Section:
     ]
     if is_posed:
         parts.append("pose: variance that yaw, pitch and roll predict, cross-validated")
+    correlations = np.triu(np.nan_to_num(np.array(model["correlations"], float)), 1)
+    if correlations.any():
+        place = np.unravel_index(abs(correlations).argmax(), correlations.shape)
+        first, second = (coefficients[k]["name"] for k in place)
+        found = (
+            f"largest correlation: {correlations[place]:.2f}, of {first} and {second}"
+        )
+        others = "; --independence coefficients lowers it"
+        given, is_joint = model["parameters"], model["noise_variance"] is not None
+        is_open = given["independence"] == "shapes" and given["prior"] is None
+        parts.append(found + others * (is_joint and is_open))
     return parts
 
 
@@ -425,12 +436,8 @@ def _choice(choice: dict[str, Any]) -> Section:
 
         return [cells, NO_SHAPE]
     parts: list[str | Cells] = [cells, "as under Fit, in frames left out of the fit"]
-    if "next" in choice:
+    if choice["larger_may_be_better"]:
         parts.append("larger K may be better: this is the largest that was tried")
-        if following := choice["next"]["n_components"]:
-            numbers = "-".join(map(str, sorted({following[0], following[-1]})))
-            seconds = choice["next"]["seconds"]
-            parts.append(f"K = {numbers} would take about {seconds:.0f} s more")
     return parts
 
 
@@ -466,6 +473,7 @@ def _label(label: dict[str, Any]) -> Section:
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),
+        *_many(label),
     ]
 
 
@@ -492,13 +500,27 @@ def _score(label: dict[str, Any]) -> str:
     return f"cross-validated {parts[0]} {', '.join(parts[1:])}"
 
 
+def _many(label: dict[str, Any]) -> list[str]:
+    """Return that classes have too many coefficients for their frames, if they have.
+
+    From half of the frames of a fit: docs/benchmarks/README.md, "Thresholds".
+    """
+    n_frames, n_components = label["n_frames"], len(label["values"])
+    if label["score"] != "accuracy" or n_components < 0.4 * n_frames:
+        return []
+    return [
+        f"{n_components} coefficients are many for {n_frames} frames: fewer predict "
+        f"classes better. Fit without --prior, with -k {max(n_frames // 6, 1)} or less."
+    ]
+
+
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
     lines = ["mean of each class if p < 0.05, in standard deviations:"]
     means = pd.DataFrame(label["class_means"], names)
     for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
-        listed = [f"{each} {mean:+.1f}" for each, mean in largest.items()]
+        listed = [f"{each} {mean:+z.1f}" for each, mean in largest.items()]
         rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
         lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{rest}.")
     return lines

@@ -206,7 +206,7 @@
     if (deviations.length && state.frame >= 0 && byId("bars").checked)
       drawBars(pen, endsOfBars(shape));
     drawShape(pen, latest, inks, 1);
-    const row = state.frame < 0 ? "" : `frame ${model.rows[state.frame]}`;
+    const row = state.frame < 0 ? "" : `row ${model.rows[state.frame]}`;
     byId("seen").textContent = code < 0 ? row : `${row}: ${model.categories[code]}`;
   }
 
