@@ -23,7 +23,6 @@ from isa_nrsfm.cli._sections import fit_sections, text_of
 from isa_nrsfm.cli._times import read_times
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses
-from isa_nrsfm.plotting import ComponentChoiceDisplay
 
 pytestmark = one_start
 
@@ -327,11 +326,6 @@ def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
     best = 1 + of_parts.mean(axis=1).argmin()
     assert report["chosen"] == search.n_components_ == best
     assert min(report["seconds"]) > 0
-    # As in the figure.
-    (bars,) = ComponentChoiceDisplay.from_estimator(search).errorbar_.lines[2]
-    ends = np.array([bar[:, 1] for bar in bars.get_segments()])
-    error = np.multiply(200, report["held_out_error_standard_error"])
-    np.testing.assert_allclose(np.diff(ends)[:, 0], error, rtol=1e-6)
     message = fails("fit", path, "-o", tmp_path, *options, "--group", "same")
     assert "needs two groups; got 1" in message
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
+from isa_nrsfm import AffineNRSfM, plotting
 from isa_nrsfm.calibration import canonical_pose
 from isa_nrsfm.datasets import (
     make_body_tracks,
@@ -29,7 +29,6 @@ from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import (
     BasisShapeDisplay,
     CoefficientsDisplay,
-    ComponentChoiceDisplay,
     ModeCovarianceDisplay,
     ReprojectionDisplay,
 )
@@ -39,7 +38,6 @@ from isa_nrsfm.skeletons import get_skeleton
 pytestmark = [may_not_converge, one_start]
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
-SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
 # Of each display: arguments, and the number of its axes.
 DISPLAYS = {
     BasisShapeDisplay: (
@@ -53,10 +51,6 @@ DISPLAYS = {
         8,
     ),
     CoefficientsDisplay: ({"alpha": RNG.standard_normal((30, 2))}, 2),
-    ComponentChoiceDisplay: (
-        {"n_components": [2, 4], "scores": SCORES, "chosen": 4},
-        1,
-    ),
     ModeCovarianceDisplay: ({"mode_covariance": np.eye(6)}, 1),
     ReprojectionDisplay: (
         {"observed": POINTS, "reprojected": 1.1 * POINTS, "edges": [[0, 1]]},
@@ -114,10 +108,9 @@ def test_displays_draw_on_a_new_figure_or_given_axes(kind):
 @EACH
 def test_displays_take_keywords_and_fitted_estimators(kind):
     refused(None, kind, *list(DISPLAYS[kind][0].values())[:2], error=TypeError)
-    choice = kind is ComponentChoiceDisplay
     table = [np.zeros((3, 4))] if kind is ReprojectionDisplay else []
     with pytest.raises(NotFittedError):
-        kind.from_estimator(AffineNRSfMCV() if choice else AffineNRSfM(), *table)
+        kind.from_estimator(AffineNRSfM(), *table)
     assert plt.get_fignums() == []
 
 
@@ -144,9 +137,6 @@ def test_points_can_have_another_style():
         (CoefficientsDisplay, {"alpha_std": np.eye(3)}, r"of alpha; got \(3, 3\)"),
         (CoefficientsDisplay, {"y": ["a"]}, "y must have one entry for each of the 30"),
         (CoefficientsDisplay, {"component_names": ["a"]}, "must hold 2 names"),
-        (ComponentChoiceDisplay, {"scores": SCORES[0]}, "one row for each"),
-        (ComponentChoiceDisplay, {"n_components": [1, 2, 3]}, "one row for each"),
-        (ComponentChoiceDisplay, {"chosen": 3}, "chosen must be one of n_components"),
         *(
             (ModeCovarianceDisplay, {"mode_covariance": np.zeros(shape)}, "a square")
             for shape in ((4, 4), (3, 6), (0, 0), (3,))
@@ -616,27 +606,6 @@ def test_coefficients_are_those_of_the_estimator(faces, estimator):
     assert display.axes_[-1].get_xlabel() == "frame"
     other = CoefficientsDisplay.from_estimator(estimator, faces.data[:5], kind="time")
     assert_allclose(other.alpha, estimator.alpha_[:5], atol=1e-9)
-
-
-def test_errors_of_the_choice_are_in_percent_with_standard_errors():
-    display = ComponentChoiceDisplay(n_components=[2, 4], scores=SCORES, chosen=4)
-    display.plot()
-    curve = display.errorbar_.lines[0]
-    assert_array_equal(curve.get_xdata(), [2, 4])
-    assert_allclose(curve.get_ydata(), [2.5, 0.3])
-    # Deviations of 0.5 and 0.1 %, of three parts each
-    mean, half = np.array([[2.5], [0.3]]), np.array([[0.5], [0.1]]) / np.sqrt(3)
-    bars = [each[:, 1] for each in display.errorbar_.lines[2][0].get_segments()]
-    assert_allclose(bars, mean + half * [-1, 1])
-    assert display.ax_.get_yscale() == "log"
-    assert_allclose(display.chosen_.get_xydata(), [[4, 0.3]])
-    # Other scores are drawn as they are; one part has no standard error.
-    given = {"scores": SCORES[:, :1], "held_out_error": False}
-    display = ComponentChoiceDisplay(n_components=[2, 4], **given).plot()
-    assert_allclose(display.errorbar_.lines[0].get_ydata(), SCORES[:, 0])
-    assert display.ax_.get_yscale() == "linear"
-    assert display.chosen_ is None
-    assert not display.errorbar_.has_yerr
 
 
 def covariance(n_components=2):
