@@ -10,7 +10,6 @@ from exported_files import Read, content_of
 from fit_runs import MODEL
 from layers import one_start
 from numpy.testing import assert_array_equal, assert_equal
-from scipy.io import loadmat
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli import main
@@ -82,12 +81,6 @@ def test_the_suffix_tells_what_is_written(export, tmp_path):
         assert_array_equal(arrays["basis"], face_model().basis_)
 
 
-def test_content_tells_a_point_distribution_model_from_shapes(export):
-    assert set(loadmat(export("a.mat")[0])) >= {"mean_shape", "alpha"}
-    assert set(loadmat(export("b.mat", "--content", "pdm")[0])) >= {"M", "V", "E"}
-    assert len(read_pdm(export("c.npz", "--content", "pdm")[0]).modes) == 2
-
-
 def test_options_reach_what_is_written(export):
     pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
     output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model=MODEL)
@@ -147,7 +140,6 @@ def test_the_viewer_shows_a_table_with_its_labels(export):
     ("name", "options", "message"),
     [
         ("a.foo", [], "expected a file with one of the suffixes .html, .htm, .glb"),
-        ("a.txt", ["--content", "glb"], "--content glb needs a file .glb; got"),
         ("a.mat", ["--n-modes", "2"], "--n-modes is an option of pdm; "),
         ("a.glb", ["table.csv"], "TABLE is an option of viewer; "),
         ("a.txt", ["--edges", "none"], "--edges is an option of viewer and glb; "),

@@ -25,7 +25,7 @@ _OPTIONS = {
 def run(args: Namespace, warned: list[str]) -> str:
     """Write a model for another program, and return the report."""
     output = Path(args.output)
-    content = _content(output, args.content)
+    content = _content(output)
     options = _given(args, content)
     estimator = read_model(args)
     sources = filter(None, (args.model, args.table, *_reading.drawing_files(args)))
@@ -59,25 +59,15 @@ def run(args: Namespace, warned: list[str]) -> str:
     return text_of("", sections | {"Output": lines})
 
 
-def _content(output: Path, content: str | None) -> str:
-    """Return the content to write, and check that the suffix fits."""
-    suffix = output.suffix.lower()
-    if content is None:
-        known = {each: name for name, own in SUFFIXES.items() for each in own}
-        if suffix not in known:
-            raise ValueError(
-                "--output: expected a file with one of the suffixes "
-                f"{', '.join(known)}; got {output}"
-            )
-        return known[suffix]
-    suffixes = SUFFIXES[content]
-    if content == "pdm":
-        suffixes += SUFFIXES["shapes"]
-    if suffix not in suffixes:
+def _content(output: Path) -> str:
+    """Return the content to write, by the suffix."""
+    known = {each: name for name, own in SUFFIXES.items() for each in own}
+    if output.suffix.lower() not in known:
         raise ValueError(
-            f"--content {content} needs a file {', '.join(suffixes)}; got {output}"
+            "--output: expected a file with one of the suffixes "
+            f"{', '.join(known)}; got {output}"
         )
-    return content
+    return known[output.suffix.lower()]
 
 
 def _given(args: Namespace, content: str) -> dict[str, Any]:

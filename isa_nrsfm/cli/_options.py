@@ -261,8 +261,6 @@ HELP = {
     "random_state SEED": "seed of the random starts (default: 0)",
     "n_jobs N": "processes for the random starts, -1 for all processors (default: 1)",
     # Export.
-    "content": "contents of the file, if the suffix leaves it open: pdm for a point "
-    "distribution model as .mat (M, V and E) or .npz",
     "n_modes MODES": "for a point distribution model, the number of modes, or the "
     "share of the variance that they explain, such as 0.98 (default: number of basis "
     "shapes)",
@@ -284,7 +282,6 @@ CHOICES: dict[str, Sequence[str]] = {
     "refinement": (*choices.REFINEMENTS, NONE),
     "independence": (*choices.INDEPENDENCE, NONE),
     "loss": choices.LOSSES,
-    "content": tuple(SUFFIXES),
 }
 # Options whose first choice is their value by default, which the help states.
 FIRST = ("adapt", "isa", "block_recovery", "refinement", "independence", "loss")
@@ -383,7 +380,6 @@ Write a fitted model for other programs. The suffix of the output determines the
 examples:
   isa-nrsfm export results/model.npz --output faces.glb
   isa-nrsfm export results/model.npz --output pdm.txt --n-modes 0.98
-  isa-nrsfm export results/model.npz --output pdm.mat --content pdm
   isa-nrsfm export results/model.npz faces.csv --label expression --output faces.html
 
 Shapes are upright and frontal, with the proportions that weak-perspective cameras
@@ -393,7 +389,7 @@ proportions.""",
         {
             "model": ("model",),
             "output": (
-                *("output", "force", "content", "n_modes", *DRAWING, "names"),
+                *("output", "force", "n_modes", *DRAWING, "names"),
                 *("label", "n_frames", "camera", "mirrored"),
             ),
             "table": ("table", *TABLE_OPTIONS),

@@ -80,7 +80,7 @@ def wrap_title(title: str, axes: NDArray) -> str:
 
     first, last = axes[0].get_position(), axes[-1].get_position()
     width = (last.x1 - first.x0) * axes[0].figure.get_figwidth()
-    letters = max(int(width / 0.07), 8)  # inches of a letter of the default font
+    letters = max(int(width / 0.06), 8)  # inches of a letter of the default font
     if len(title) <= letters:
         return title
     lines = title.replace(" (", "\n(").splitlines()
