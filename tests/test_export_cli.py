@@ -84,8 +84,9 @@ def test_the_suffix_tells_what_is_written(export, tmp_path):
 def test_options_reach_what_is_written(export):
     pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
     output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model=MODEL)
-    options = {"camera": None, "origin": "lower", "mirrored": True}
-    expected = point_distribution_model(face_model(), n_modes=1, **options)
+    options = {"camera": None, "origin": "lower"}
+    mirrored = face_model().mirrored()
+    expected = point_distribution_model(mirrored, n_modes=1, **options)
     assert_equal(read_pdm(output), expected)
     assert len(read_pdm(export("b.txt", "--n-modes", "0.1")[0]).modes) == 1
 

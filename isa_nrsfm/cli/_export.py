@@ -45,6 +45,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     if "edges" in _OPTIONS[content]:
         names = names_of_points(estimator)
         options |= _reading.drawing(args, names, stored)
+    if args.mirrored:
+        estimator = estimator.mirrored()
     if options.get("camera") == NONE:
         options["camera"] = None
 
@@ -82,7 +84,7 @@ def _given(args: Namespace, content: str) -> dict[str, Any]:
                 f"{flag_of(name)} is an option of {' and '.join(having)}; "
                 f"{args.output} is {content}"
             )
-        if name not in ("table", "label", "skeleton"):
+        if name not in ("table", "label", "skeleton", "mirrored"):
             given[name] = getattr(args, name)
     if args.table is None:
         for name in (*TABLE_OPTIONS, "label"):

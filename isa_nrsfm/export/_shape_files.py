@@ -201,7 +201,6 @@ def point_distribution_model(
     n_modes: float | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> PointDistributionModel:
     """
     Return the point distribution model of the frames that a model was fitted to.
@@ -222,9 +221,6 @@ def point_distribution_model(
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" if 68 points of a face would otherwise
         be upside down.
-    mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table equally well. By
-        default, faces of 68 points in the order of iBUG have the right depth.
 
     Returns
     -------
@@ -270,7 +266,7 @@ def point_distribution_model(
     >>> pdm.mean.shape, pdm.modes.shape, pdm.eigenvalues.shape
     ((68, 3), (1, 68, 3), (1,))
     """
-    space = upright_space(model, camera, origin, mirrored)
+    space = upright_space(model, camera, origin)
     shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
     if space.camera is not None:

@@ -76,7 +76,6 @@ def write_viewer(
     names: Sequence[str] | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> None:
     """
     Write a page that shows a shape model in any browser.
@@ -129,9 +128,6 @@ def write_viewer(
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" if a face or a body would otherwise be
         upside down.
-    mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table equally well.
-        The page has a switch for it.
 
     Raises
     ------
@@ -162,7 +158,7 @@ def write_viewer(
         raise ValueError(
             f"n_frames must be a whole number of at least 0; got {n_frames!r}"
         )
-    space = upright_space(model, camera, origin, mirrored, edges)
+    space = upright_space(model, camera, origin, edges)
     components = names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
@@ -301,7 +297,6 @@ def write_glb(
     names: Sequence[str] | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> None:
     """
     Write the mean shape with the basis shapes as morph targets to a glTF 2.0 file.
@@ -334,9 +329,6 @@ def write_glb(
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" if a face or a body would otherwise be
         upside down.
-    mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table equally well. By
-        default, faces and bodies of known layouts have the right depth.
 
     Raises
     ------
@@ -365,7 +357,7 @@ def write_glb(
     frames; those of calibrated cameras are the model's.
     """
     suffix_of(path, [".glb"])
-    space = upright_space(model, camera, origin, mirrored, edges)
+    space = upright_space(model, camera, origin, edges)
     targets = names_of_components(names, len(model.basis_))
     shapes = viewed_shapes(space, model)
     factor = 1 / np.ptp(shapes[0], axis=0).max()
