@@ -390,20 +390,16 @@ def test_sleap_axes_are_those_that_the_file_tells(order, named, tmp_path):
     assert_array_equal(np.isnan(tracks_of(sure)[..., 0]), lost)
 
 
-def test_sleap_tables_have_a_row_for_each_instance(tmp_path):
+def test_sleap_tables_are_tables_with_names(tmp_path):
     pair = np.stack([TRACKS, TRACKS + 100], axis=1)
-    pair[4] = np.nan
-    pair[5, 1, 3] = np.nan
     scores = np.random.default_rng(0).uniform(0, 1, pair.shape[:3])
     path = files.write_sleap_csv(tmp_path / "a.csv", pair, scores)
-    assert find_format(path) == "sleap"
+    assert find_format(path) == "table"
     landmarks = read_landmarks(path, min_confidence=0.2)
-    shown = np.delete(np.arange(12), 4)
-    expected = np.where(scores[..., None] < 0.2, np.nan, pair)[shown]
-    assert_array_equal(tracks_of(landmarks), expected.reshape(22, 8, 2))
-    assert individuals_of(landmarks) == ["a", "b"] * 11
-    assert list(landmarks.frames["frame"]) == list(np.repeat(shown, 2))
-    assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
+    expected = np.where(scores[..., None] < 0.2, np.nan, pair)
+    assert_array_equal(tracks_of(landmarks), expected.reshape(24, 8, 2))
+    assert list(landmarks.frames) == ["track", "frame_idx", "instance.score"]
+    assert landmarks.point_names[:2] == ("snout", "ear_L")
 
 
 def test_points_without_a_confidence_are_kept(tmp_path):

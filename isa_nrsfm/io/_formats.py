@@ -340,9 +340,8 @@ _ALL = (
     LandmarkFormat(
         "sleap",
         "SLEAP analysis",
-        "the datasets tracks, node_names and track_names, or the columns track, "
-        "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
-        (".h5", ".hdf5", *_TABLES),
+        "the datasets tracks, node_names and track_names",
+        (".h5", ".hdf5"),
         "_animals.sleap",
     ),
     LandmarkFormat(
