@@ -201,13 +201,10 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     for camera in ("affine", "weak_perspective"):
         text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points.values)
         assert (told in text) == (camera != "affine")
-    n_outside = (shares > 1).any(axis=2).sum()
     for columns in ({}, {"columns": "LM#_x,LM#_y"}):
         size = {"format": "mediapipe", "image_size": (1280, 720)}
         text, found = warnings_of(read_landmarks, path, **size, **columns)
-        assert (f"{n_outside} of {17 * N} points are outside" in text) == (
-            n_outside > 0
-        )
+        assert not text
         points = found.points.to_numpy().reshape(shares.shape)
         assert_allclose(points, shares * [1280, 720])
 

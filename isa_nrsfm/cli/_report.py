@@ -48,7 +48,6 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
         "columns": frames.columns.pattern,
         "first_columns": names[:4],
         "last_columns": names[-2:],
-        "absent_numbers": frames.columns.gaps,
         "coordinates_not_used": frames.not_used,
         "rows_left_out": [
             {

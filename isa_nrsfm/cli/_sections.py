@@ -102,9 +102,6 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
     ]
-    if table["absent_numbers"]:
-        absent = first_items(table["absent_numbers"], MOST_LISTED)
-        parts.append(f"the table has no points with the numbers {absent}")
     if table["coordinates_not_used"]:
         not_used = table["coordinates_not_used"].items()
         listed = "; ".join(f"{pattern} ({n_points})" for pattern, n_points in not_used)

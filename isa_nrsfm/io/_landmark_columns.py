@@ -41,7 +41,6 @@ class LandmarkColumns(NamedTuple):
     pattern: the set, such as ``"x_#,y_#"``.
     points: names of the points, without the axis letter if that is unambiguous.
     z: columns with a third coordinate of these points. They are not used.
-    gaps: numbers that are absent between the first and the last numbered point.
     """
 
     pattern: str
@@ -49,7 +48,6 @@ class LandmarkColumns(NamedTuple):
     x: tuple[str, ...]
     y: tuple[str, ...]
     z: tuple[str, ...] = ()
-    gaps: tuple[int, ...] = ()
 
     @property
     def interleaved(self) -> list[str]:
@@ -251,7 +249,6 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
     """Return the columns that match pairs of patterns of x and y columns."""
     x: list[str] = []
     y: list[str] = []
-    gaps: list[int] = []
     for x_pattern, y_pattern in zip(patterns[::2], patterns[1::2], strict=True):
         x_by_key = _columns_matching(names, x_pattern)
         y_by_key = _columns_matching(names, y_pattern)
@@ -268,9 +265,6 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
         keys = list(x_by_key) if "*" in x_pattern else sorted(x_by_key)
         x += [x_by_key[key] for key in keys]
         y += [y_by_key[key] for key in keys]
-        if x_pattern.count("#") == 1 and "*" not in x_pattern:
-            numbers = {number for key in keys for number in key}
-            gaps += sorted(set(range(min(numbers), max(numbers))) - numbers)
     chosen, joined = x + y, ",".join(patterns)
     if len(set(chosen)) < len(chosen):
         twice = next(name for name in chosen if chosen.count(name) > 1)
@@ -278,7 +272,7 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
     if not {"#", "*"}.isdisjoint(joined):
         _warn_of_left_out(names, chosen, joined)
     points, z = point_names(x), _z_of(names, x)
-    return LandmarkColumns(joined, points, tuple(x), tuple(y), z, tuple(gaps))
+    return LandmarkColumns(joined, points, tuple(x), tuple(y), z)
 
 
 def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:
