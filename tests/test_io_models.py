@@ -188,7 +188,7 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
         assert str(getattr(found, "dtype", "")) == str(getattr(expected, "dtype", ""))
     names = model.get_feature_names_out().tolist()
     assert loaded.get_feature_names_out().tolist() == names
-    assert loaded._repr_html_().count("basis shapes of") == 1
+    assert loaded._html_repr().count("basis shapes of") == 1
     if hasattr(model, "alpha_std_"):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)

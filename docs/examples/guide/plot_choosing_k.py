@@ -46,7 +46,7 @@ print("held-out errors, %:", 100 * held_out.round(6))
 
 # %%
 # ``best_estimator_`` is `AffineNRSfM` with the selected number, fitted to all frames.
-# `transform`, `reconstruct` and other methods use it. ``select="one_standard_error"``
+# `transform`, `inverse_transform` and `score` use it. ``select="one_standard_error"``
 # selects the fewest basis shapes whose error is within one standard error of the
 # lowest.
 #
