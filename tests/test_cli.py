@@ -644,13 +644,6 @@ def test_a_figure_that_fails_costs_no_results(
     assert warning in (folder / "report.html").read_text()
 
 
-def test_old_figures_cause_a_warning(fits, table, tmp_path):
-    (tmp_path / "basis_shapes.png").write_bytes(PNG)
-    err = fits(table, *UNREFINED).err
-    assert "figures of an earlier run: basis_shapes.png" in err
-    assert (tmp_path / "basis_shapes.png").read_bytes() == PNG
-
-
 def test_figures_are_not_written_to_another_run(
     fails, fitted, table, tmp_path, monkeypatch
 ):

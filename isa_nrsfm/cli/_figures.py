@@ -16,12 +16,10 @@ from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli._columns import class_means, has_classes
-from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.cli._report import MOST_CLASSES
 from isa_nrsfm.export._names import names_of_components
-from isa_nrsfm.metrics._reprojection import frame_energies
 from isa_nrsfm.plotting import _axes
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
@@ -59,9 +57,10 @@ ALWAYS: Figures = {
         lambda fit: plotting.ModeCovarianceDisplay.from_estimator(fit.estimator),
     ),
     "reprojection.png": (
-        "frames of median and of largest residual: observed points and points of the "
-        "model",
-        lambda fit: _reprojections(fit),
+        "observed points and points of the model, in some of the frames",
+        lambda fit: plotting.ReprojectionDisplay.from_estimator(
+            fit.estimator, fit.frames.X, random_state=0, **fit.drawn
+        ),
     ),
 }
 
@@ -107,24 +106,6 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
         except Exception as error:  # results do not depend on it
             warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
     return drawn
-
-
-def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
-    """Draw up to three frames about the median residual, and as many of the largest."""
-    model = fit.estimator
-    energy, error, _ = frame_energies(fit.frames.X, fitted_table(model), model.layout)
-    order = np.argsort(error / energy)
-    n_drawn = max(min(3, len(order) // 3), 1)
-    start = (len(order) - n_drawn) // 2
-    rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
-    display = plotting.ReprojectionDisplay.from_estimator(
-        model, fit.frames.X, frames=rows, **fit.drawn
-    )
-    for number, axes in enumerate(display.axes_):
-        which = "median" if number < n_drawn else "largest"
-        title = f"{which} residual: {axes.get_title()}"
-        axes.set_title(title, fontsize="small", parse_math=False)
-    return display
 
 
 def _choice(fit: Fit) -> Any:

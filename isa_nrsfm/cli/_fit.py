@@ -8,15 +8,21 @@ from argparse import Namespace
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from platform import python_version
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
+from isa_nrsfm import (
+    AffineNRSfM,
+    AffineNRSfMCV,
+    FastISA,
+    PooledFastICA,
+    __version__,
+)
 from isa_nrsfm._compat import pandas as pd, whole_files
-from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
@@ -26,7 +32,7 @@ from isa_nrsfm.analysis._advice import facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
-from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
+from isa_nrsfm.cli._figures import Fit, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, NONE, flag_of
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
@@ -34,7 +40,6 @@ from isa_nrsfm.cli._report import (
     model_report,
     perspective_advice,
     table_report,
-    versions,
 )
 from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.datasets import load_face_prior
@@ -105,7 +110,7 @@ def fit_table(
             earlier = _outputs.entry_of_report(folder, "sha256")
             own = {*earlier, _outputs.REPORT} if earlier else ()
             _outputs.refuse_replacing([folder / name for name in files], own)
-        removed = {*_old_figures(folder, files), *figures}
+        removed = {*_old_figures(folder), *figures}
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
@@ -140,7 +145,7 @@ def fit_table(
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
-                "versions": versions(),
+                "versions": {"isa_nrsfm": __version__, "python": python_version()},
             }
             clock["write"] = time.perf_counter()
             report |= {"seconds": _seconds(clock), "files": results}
@@ -281,15 +286,10 @@ def _fitted(
     return estimator, search, diagnostics, perspective
 
 
-def _old_figures(folder: Path, new: list[str]) -> list[str]:
-    """Return the figures that the report of an earlier run lists; warn of others."""
+def _old_figures(folder: Path) -> list[str]:
+    """Return the figures that the report of an earlier run lists."""
     files = _outputs.entry_of_report(folder, "files")
-    old = [name for name in files if name.endswith(".png")]
-    others = sorted({*ALWAYS}.difference(old, new))
-    others = [name for name in others if (folder / name).exists()]
-    if others:
-        warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
-    return old
+    return [name for name in files if name.endswith(".png")]
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
