@@ -749,13 +749,10 @@ def test_demo_writes_a_table_and_finds_its_faces(succeeds, tmp_path, monkeypatch
     demo = Results(tmp_path / "isa-nrsfm-demo")
     assert {path.name for path in demo.folder.iterdir()} == FIT_FILES | {"tracks.csv"}
     report, before = demo.report, (demo.folder / "alpha.csv").read_bytes()
-    truth = report["truth"]
-    assert [row["name"] for row in truth["basis"]][:2] == ["jaw open", "smile"]
-    assert truth["shape_error"] < 0.3 * truth["mean_shape_error"]
-    assert all(row["similarity"] > 0.9 for row in truth["basis"])
-    assert all(row["correlation"] > 0.9 for row in truth["basis"])
+    error, of_mean = re.search(r"off by (\S+) % .* alone: (\S+) %", out).groups()
+    assert float(error) < 0.3 * float(of_mean)
     assert report["choice"]["n_components"] == [1, 2, 3, 4, 5]
-    assert report["choice"]["chosen"] == len(truth["basis"]) == 3
+    assert report["choice"]["chosen"] == 3
     assert list(pd.read_csv(demo.folder / "tracks.csv"))[:3] == ["frame", "x_0", "y_0"]
     command = out[out.index("isa-nrsfm fit") :].splitlines()[0].split()[1:]
     assert out.endswith("\n\nOpen       isa-nrsfm-demo/report.html\n")

@@ -5,7 +5,6 @@ import sys
 import time
 import warnings
 from argparse import Namespace
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from platform import python_version
@@ -62,17 +61,12 @@ def run(args: Namespace, warned: list[str]) -> str:
 
 
 def fit_table(
-    args: Namespace,
-    warned: list[str],
-    *,
-    table: "pd.DataFrame | None" = None,
-    **extra: "Callable[[AffineNRSfM, pd.DataFrame], Any]",
+    args: Namespace, warned: list[str], table: "pd.DataFrame | None" = None
 ) -> dict[str, Any]:
     """Fit a table, write everything, and return the report.
 
     A given table is written to the path in the options. `warned` has the warnings so
-    far, and grows. Functions of the model and its table make `extra` entries of the
-    report.
+    far, and grows.
     """
     prior = args.prior
     _load_prior(args)
@@ -143,7 +137,6 @@ def fit_table(
                     estimator, frames, drawn["edges"], diagnostics, perspective
                 ),
                 **answers,
-                **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
                 "versions": {"isa_nrsfm": __version__, "python": python_version()},
             }
