@@ -51,7 +51,7 @@ N_PARTS = 3
 # Options that are parameters of the same name; none stands for None.
 _PARAMETERS = (
     *("block_recovery", "refinement", "camera", "focal_length", "independence"),
-    *("prior", "adapt", "loss", "random_state", "n_jobs"),
+    *("prior", "loss", "random_state", "n_jobs"),
 )
 
 
@@ -171,8 +171,6 @@ def _load_prior(args: Namespace) -> None:
             args.n_components = None
         if args.camera is None and args.prior.camera_ != "affine":  # which is refused
             args.camera = args.prior.camera_
-    elif args.adapt == "shapes":
-        raise ValueError("--adapt shapes needs --prior")
     args.n_components = args.n_components or (n_components,)
 
 

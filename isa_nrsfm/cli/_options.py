@@ -241,8 +241,6 @@ HELP = {
     "prior MODEL": "a fitted model of a table in which the objects turn, such as "
     f"model.npz, or {FACE_PRIOR} for faces with 68 points: with it frontal photos and "
     "few frames have true depths",
-    "adapt": "what differs from the prior: the mean shape, so that coefficients of "
-    "several studies can be compared, or all shapes",
     "export.camera": "camera model for a model with affine cameras; none exports "
     "affine shapes, whose angles and depth are not true (default: weak_perspective)",
     "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
@@ -275,7 +273,6 @@ CHOICES: dict[str, Sequence[str]] = {
     "part": tuple(dict.fromkeys((*choices.OPENPOSE_PARTS, *choices.WHOLE_PARTS))),
     "origin": ("auto", "upper", "lower"),
     "camera": choices.CAMERA_NAMES,
-    "adapt": choices.ADAPTED,
     "export.camera": ("weak_perspective", NONE),
     "isa": ("pooled", "fast"),
     "block_recovery": choices.BLOCK_RECOVERIES,
@@ -284,7 +281,7 @@ CHOICES: dict[str, Sequence[str]] = {
     "loss": choices.LOSSES,
 }
 # Options whose first choice is their value by default, which the help states.
-FIRST = ("adapt", "isa", "block_recovery", "refinement", "independence", "loss")
+FIRST = ("isa", "block_recovery", "refinement", "independence", "loss")
 DEFAULTS = {
     **{name: CHOICES[name][0] for name in ("format", *FIRST)},
     **{"length": 1.0, "random_state": 0},
@@ -346,8 +343,7 @@ coefficients. The results replace those of an earlier run in the output folder."
             ),
             "method": (
                 *("n_components", "camera", "focal_length", "principal_point"),
-                *("prior", "adapt"),
-                *("isa", "n_init", "block_recovery"),
+                *("prior", "isa", "n_init", "block_recovery"),
                 *("refinement", "independence", "loss", "no_scale_frames"),
                 *("no_hidden_points", "random_state", "n_jobs"),
             ),

@@ -281,7 +281,7 @@ def _fit(report: dict[str, Any]) -> Section:
             size = f"{noise:.3g} in the units of the table"
         parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
     if "prior" in report:
-        parts.append(_prior(report["prior"], model["parameters"]["adapt"]))
+        parts.append(_prior(report["prior"]))
     if model["outliers"] is not None and model["outliers"]["message"]:
         parts.append(_sentence(model["outliers"]["message"]))
     fit = seconds["fit"] + seconds.get("choose", 0.0)
@@ -303,18 +303,13 @@ def _fit(report: dict[str, Any]) -> Section:
     return parts
 
 
-def _prior(prior: dict[str, Any], adapt: str) -> str:
+def _prior(prior: dict[str, Any]) -> str:
     """Return how far the shapes are from those of the prior, and what that means."""
-    mean_shape, basis = (f"{100 * width:.2g} %" for width in prior["std"])
-    others = ""
-    whose = "the prior, so that studies with the same prior can be compared"
-    if adapt != "mean":
-        others = f", the basis shapes by {basis}"
-        whose = "adapted basis shapes: compare studies with --adapt mean"
     return (
-        f"prior {prior['name']}: the mean shape differs by {mean_shape} of the size of "
-        f"the object from that of the prior{others} (standard deviation of a "
-        f"coordinate). Coefficients are those of {whose}."
+        f"prior {prior['name']}: the mean shape differs by {100 * prior['std'][0]:.2g} "
+        "% of the size of the object from that of the prior (standard deviation of a "
+        "coordinate). Coefficients are those of the prior, so that studies with the "
+        "same prior can be compared."
     )
 
 

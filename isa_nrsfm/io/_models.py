@@ -473,7 +473,7 @@ def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     stored = parts["parameters"].items()
     parameters = {name: unpacked(value, arrays) for name, value in stored}
     # Of older files. Parameters that are newer than the file have their defaults.
-    parameters.pop("density", None)
+    parameters = {n: v for n, v in parameters.items() if n not in ("density", "fun")}
     defaults = kind().get_params(deep=False)
     check_names({**defaults, **parameters}, defaults, "parameters")
     created = kind(**parameters)

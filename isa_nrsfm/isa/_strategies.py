@@ -13,7 +13,7 @@ from sklearn.utils import check_array, check_random_state
 from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import StrOptions, fit_context
+from isa_nrsfm._compat.scikit_learn import fit_context
 from isa_nrsfm.isa._base import (
     BaseSubspaceAnalysis,
     Values,
@@ -230,8 +230,6 @@ class PooledFastICA(BaseSubspaceAnalysis):
     n_init : int, default=16
         Number of runs of FastICA from different starts. With few samples the runs end
         in different local optima. The best run by the criterion of `fit` is kept.
-    fun : {"exp", "logcosh", "cube"}, default="exp"
-        Contrast function of FastICA.
     max_iter : int, default=200
         Maximum number of steps of a run of FastICA.
     tol : float, default=1e-4
@@ -277,24 +275,17 @@ class PooledFastICA(BaseSubspaceAnalysis):
     (6, 6)
     """
 
-    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        **BaseSubspaceAnalysis._parameter_constraints,
-        "fun": [StrOptions({"exp", "logcosh", "cube"})],
-    }
-
     def __init__(
         self,
         subspace_size: int = 3,
         *,
         n_init: int = 16,
-        fun: str = "exp",
         max_iter: int = 200,
         tol: float = 1e-4,
         random_state: Any = None,
     ):
         self.subspace_size = subspace_size
         self.n_init = n_init
-        self.fun = fun
         self.max_iter = max_iter
         self.tol = tol
         self.random_state = random_state
@@ -389,11 +380,10 @@ class PooledFastICA(BaseSubspaceAnalysis):
             )
             W = W[rows]
         if not converged:
-            other = "another fun or " if "fun" in self.get_params() else ""
             warn_caller(
                 f"{type(self).__name__} did not converge in max_iter={self.max_iter} "
                 "steps in the run that is kept: its sources may be ill determined; try "
-                f"{other}larger n_init or max_iter",
+                "larger n_init or max_iter",
                 ConvergenceWarning,
             )
         return W
@@ -407,7 +397,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         from sklearn.decomposition import FastICA
 
         ica = FastICA(
-            whiten=False, fun=self.fun, max_iter=self.max_iter, tol=self.tol, w_init=W
+            whiten=False, fun="exp", max_iter=self.max_iter, tol=self.tol, w_init=W
         )
         with warnings.catch_warnings(record=True, action="always") as caught:
             ica.fit(Z.T)
