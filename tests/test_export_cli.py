@@ -31,16 +31,12 @@ NAMES = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a folder with a model and a table with labels and a row too few."""
+    """Return a folder with a model, and one with names of points."""
     folder = tmp_path_factory.mktemp("export")
     save_model(face_model(), folder / MODEL)
     named = AffineNRSfM(2, random_state=0)
     named.fit(pd.DataFrame(faces().data[:50], columns=NAMES))
     save_model(named, folder / NAMED)
-    table = pd.DataFrame(faces().data[:9], columns=NAMES).round(3)
-    table.insert(0, " mood", ["calm", "glad", "sad"] * 3)
-    table.loc[4, NAMES[6:]] = np.nan
-    table.to_csv(folder / "table.csv", index=False)
     return folder
 
 
@@ -50,7 +46,7 @@ def export(folder, tmp_path, capsys):
 
     def run(name, *options, model=NAMED):
         output = tmp_path / name
-        options = [str(folder / o) if o == "table.csv" else str(o) for o in options]
+        options = map(str, options)
         argv = ["export", str(folder / model), *options, "--output", str(output)]
         code = main(argv)
         captured = capsys.readouterr()
@@ -125,28 +121,12 @@ def test_other_edges_are_refused(export, tmp_path, text, message):
     assert re.search(message, export("a.glb", "--edges", path)[2])
 
 
-def test_the_viewer_shows_a_table_with_its_labels(export):
-    output, report, _ = export("a.html", "table.csv", "--label", "mood")
-    content = content_of(output)
-    assert content["categories"] == ["calm", "glad", "sad"]
-    assert content["rows"] == ["0", "1", "2", "3", "5", "6", "7", "8"]
-    assert content["labels"] == [0, 1, 2, 0, 2, 0, 1, 2]
-    assert "1  not shown: fewer than 4 points" in report
-    output, _, _ = export("b.html", "table.csv", "--skip-rows", "mood=^g")
-    assert content_of(output)["rows"] == ["0", "2", "3", "5", "6", "8"]
-    assert len(content_of(export("c.html", "--n-frames", "5")[0])["rows"]) == 5
-
-
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
         ("a.foo", [], "expected a file with one of the suffixes .html, .htm, .glb"),
         ("a.mat", ["--n-modes", "2"], "--n-modes is an option of pdm; "),
-        ("a.glb", ["table.csv"], "TABLE is an option of viewer; "),
         ("a.txt", ["--edges", "none"], "--edges is an option of viewer and glb; "),
-        ("a.html", ["--label", "mood"], "--label needs a TABLE"),
-        ("a.glb", ["--zeros-missing"], "--zeros-missing needs a TABLE"),
-        ("a.html", ["table.csv", "--label", "age"], "has no column 'age'; its"),
         ("a.glb", ["--names", "jaw"], "names must hold 2 names"),
         ("a.txt", ["--n-modes", "999"], "n_modes must be at most"),
     ],

@@ -161,7 +161,6 @@ HELP = {
     # The table.
     "table TABLE": "a .csv, .tsv or .parquet file, or a file or folder of another "
     "format",
-    "export.table TABLE": "for .html, the table whose frames are shown",
     "format FORMAT": "the program that wrote the table: "
     f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for any table "
     "with named columns (default: auto, recognised by the beginning of the file)",
@@ -209,8 +208,6 @@ HELP = {
     "label COLUMN": "a class or a number for each frame, such as an expression or an "
     "age: reports the dependence of the coefficients on it. Whole numbers are classes "
     "unless given as COLUMN:number",
-    "export.label COLUMN": "for .html, the column of TABLE that determines the colours "
-    "of frames",
     "group COLUMN": "people, videos or files: reports the variance between and within "
     "groups. Held-out frames come from other groups; smoothing stops at their borders",
     "distance POINT,POINT": "add the distance of two points of the 3D shapes to "
@@ -263,7 +260,6 @@ HELP = {
     "share of the variance that they explain, such as 0.98 (default: number of basis "
     "shapes)",
     "names NAMES": "for .html and .glb, names of the basis shapes with commas",
-    "n_frames N": "for .html, the largest number of frames (default: 1000)",
     "mirrored": "take the mirror image in depth, which has the same images",
 }
 # The values of options that have few.
@@ -376,7 +372,7 @@ Write a fitted model for other programs. The suffix of the output determines the
 examples:
   isa-nrsfm export results/model.npz --output faces.glb
   isa-nrsfm export results/model.npz --output pdm.txt --n-modes 0.98
-  isa-nrsfm export results/model.npz faces.csv --label expression --output faces.html
+  isa-nrsfm export results/model.npz --output faces.html
 
 Shapes are upright and frontal, with the proportions that weak-perspective cameras
 determine; .npz and .mat have the arrays of the model unchanged. Models that were
@@ -386,9 +382,8 @@ proportions.""",
             "model": ("model",),
             "output": (
                 *("output", "force", "n_modes", *DRAWING, "names"),
-                *("label", "n_frames", "camera", "mirrored"),
+                *("camera", "mirrored"),
             ),
-            "table": ("table", *TABLE_OPTIONS),
         },
     ),
     "demo": (
@@ -412,7 +407,9 @@ def build_parser() -> argparse.ArgumentParser:
     for command, (line, description, examples, groups) in _COMMANDS.items():
         own = commands.add_parser(command, help=line, **_manners(description, examples))
         # For commands without these
-        own.set_defaults(weights=None, points=None, principal_point=None)
+        own.set_defaults(
+            weights=None, points=None, principal_point=None, missing_value=()
+        )
         for title, entries in groups.items():
             group = own.add_argument_group(title)
             for entry in entries:
@@ -439,8 +436,6 @@ def _settings(command: str, name: str) -> dict[str, Any]:
         settings |= {"metavar": metavar, "type": TYPES.get(metavar)}
     if metavar == "X Y":
         settings |= {"metavar": ("X", "Y"), "nargs": 2}
-    if key == "export.table":
-        settings["nargs"] = "?"
     if name == "output":
         settings["required"] = default is None
     if key in FIRST:
