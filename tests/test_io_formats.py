@@ -518,7 +518,7 @@ def test_tables_keep_options_of_their_own(tmp_path):
     table.iloc[2, [3, 11]] = 0
     table.insert(0, "id", [f"{i:03d}" for i in range(12)])
     table.to_csv(path, sep="\t", index=False)
-    landmarks = read_landmarks(path, columns="a#,b#", missing="zeros")
+    landmarks = read_landmarks(path, columns="a#,b#", missing=0)
     expected = TRACKS.copy()
     expected[2, 3] = np.nan
     assert_array_equal(tracks_of(landmarks), expected)
