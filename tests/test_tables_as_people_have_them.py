@@ -528,7 +528,6 @@ PLAIN = table_of("{part}_{axis}", POINTS).assign(
     team=["a", "b", "", "a"] * (N // 4),
 )
 VIDEOS = PLAIN.assign(image=[f"v{i // 2}.png" for i in range(N)])
-ZERO = PLAIN.assign(neck_x=0.0, neck_y=0.0)
 SETS = PLAIN.join(table_of("{axis}_{part}", POINTS[:, :7] / 2, range(7)))
 NO_EDGES, DAYS = "--edges no_edges.csv", "--time-format %d.%m.%Y"
 SIZE = "--camera affine --image-size 640x480"
@@ -537,8 +536,6 @@ SIZE = "--camera affine --image-size 640x480"
 @pytest.mark.parametrize(
     ("table", "options", "told", "advised"),
     [
-        (ZERO, "--zeros-missing", r"the point: (.*)", "--zeros-missing {}"),
-        (ZERO, "--zeros-missing", r"of the coordinates, leave out (--zeros.*?)\.", ""),
         (SETS, "", r"command line: (.*?)\), such as (.*)", "{} {}"),
         (VIDEOS, "--fps 25", "apart with (.*?),", "--fps 25 {} who"),
         (VIDEOS, "--fps 25", "others out with (.*)", "--fps 25 {} who=bob"),
