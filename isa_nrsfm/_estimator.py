@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import TransformerMixin
+from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -20,7 +20,6 @@ from isa_nrsfm._compat.scikit_learn import (
     CoefficientsMixin,
     HasMethods,
     Interval,
-    ShownEstimator,
     StrOptions,
     fit_context,
 )
@@ -75,7 +74,7 @@ _OTHER_NAMES = {
 
 
 class AffineNRSfM(
-    CallbackSupportMixin, CoefficientsMixin, TransformerMixin, ShownEstimator
+    CallbackSupportMixin, CoefficientsMixin, TransformerMixin, BaseEstimator
 ):
     """
     Affine non-rigid structure from motion by independent subspace analysis.

@@ -35,9 +35,8 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._joint.settings import JOINT_TOL
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS, CalibratedCamera
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 
@@ -329,56 +328,6 @@ class AffineNRSfMCV(
             The table.
         """
         return self._fitted().inverse_transform(alpha, motion, translation)
-
-    def decompose(self, X: Any) -> Decomposition:
-        """
-        Return camera and coefficients of each frame of a table.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-
-        Returns
-        -------
-        Decomposition
-            As in `AffineNRSfM.decompose`.
-        """
-        return self._fitted().decompose(X)
-
-    def reconstruct(self, X: Any, camera: CalibratedCamera | None = None) -> NDArray:
-        """
-        Return the 3D shape of each frame of a table.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-        camera : {"orthographic", "weak_perspective"} or None, default=None
-            As in `AffineNRSfM.reconstruct`.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_points, 3)
-            As in `AffineNRSfM.reconstruct`.
-        """
-        return self._fitted().reconstruct(X, camera)
-
-    def reproject(self, X: Any) -> NDArray:
-        """
-        Return the images of the fitted shapes, including missing points.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, 2 * n_points)
-            As in `AffineNRSfM.reproject`.
-        """
-        return self._fitted().reproject(X)
 
     def score(self, X: Any, y: Any = None, **params: Any) -> float:
         """

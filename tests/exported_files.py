@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 
-TYPES = {5126: "<f4", 5123: "<u2", 5125: "<u4"}
+TYPES = {5126: "<f4", 5125: "<u4"}
 
 
 class Read:

@@ -333,10 +333,6 @@ WRITERS = {
     "deeplabcut-pandas": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=False),
     "deeplabcut-index": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=True),
     "sleap": lambda d: write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),
-    "sleap-csv": lambda d: write_sleap_csv(
-        d / "a.csv", TRACKS[:, None], np.ones((12, 1, 8)), names=["a"]
-    ),
-    "sleap-parquet": lambda d: saved_again(WRITERS["sleap-csv"](d), ".parquet"),
     "coco": lambda d: write_json(d / "a.json", coco_annotations(TRACKS)),
     "coco-unnamed": lambda d: write_json(
         d / "a.json", coco_annotations(TRACKS) | {"categories": [{"id": 1}]}

@@ -413,13 +413,12 @@ class TestBetweenShare:
 
 
 class TestAlignedFrames:
-    @pytest.mark.parametrize("turn", [True, False])
-    def test_position_size_and_turn_are_taken_away(self, turn, rng):
+    def test_position_size_and_turn_are_taken_away(self, rng):
         shape = rng.normal(size=20) + 1j * rng.normal(size=20)
-        angles = 1j * (rng.normal(size=(9, 1)) if turn else np.zeros((9, 1)))
-        frames = np.exp(angles) * rng.uniform(1, 5, (9, 1)) * shape
+        turns = np.exp(1j * rng.normal(size=(9, 1)))
+        frames = turns * rng.uniform(1, 5, (9, 1)) * shape
         frames = np.ascontiguousarray(frames + rng.normal(size=(9, 1)))
-        got = AlignedFrames(turn).fit_transform(frames.view(float))
+        got = AlignedFrames().fit_transform(frames.view(float))
         assert_allclose(got, got[:1].repeat(9, axis=0), atol=1e-9)
         points = got.view(complex)
         assert_allclose(points.mean(axis=1), 0, atol=1e-12)

@@ -104,7 +104,6 @@ class TestContract:
         [
             *((method, "ordered", "yes") for method in METHODS),
             *(("block matrix", name, -1) for name in ("max_iter", "tol")),
-            ("block matrix", "accelerated", 2),
             *(("compressible", k, 0) for k in ("n_atoms", "sparsity", "max_iter")),
             *(("compressible", k, -0.1) for k in ("penalty", "tol", "ridge")),
             ("compressible", "ridge", 0.3),
@@ -298,11 +297,9 @@ class TestLowRank:
         nearest = (U[:, :3] * S[:3]) @ Vt[:3]
         assert_allclose(model.shapes_.reshape(60, -1), nearest, atol=1e-9)
 
-    @pytest.mark.parametrize("accelerated", [True, False])
-    def test_exact_shapes_are_found(self, accelerated):
+    def test_exact_shapes_are_found(self):
         truth = table(0, 0.0, n_frames=150)
-        tol = 1e-6 if accelerated else 1e-7
-        model = BlockMatrixNRSfM(2, accelerated=accelerated, tol=tol).fit(truth.data)
+        model = BlockMatrixNRSfM(2, tol=1e-6).fit(truth.data)
         assert model.inverse_snr_ < 1e-6
         assert error_in_cameras(truth.shapes, truth.motion, model) < 2e-3
         # The shapes are right without any coordinate system of the cameras, too.
@@ -316,9 +313,6 @@ class TestLowRank:
             for shapes in (model.shapes_, truth.shapes)
         )
         assert next(norms) == pytest.approx(next(norms), rel=0.02)
-        other = BlockMatrixNRSfM(2, accelerated=False).fit(truth.data)
-        assert_allclose(other.shapes_, model.shapes_, atol=0.05)
-        assert model.n_iter_ < other.n_iter_ / 4
 
     def test_new_frames(self):
         truth = table(n_frames=200)
@@ -332,9 +326,8 @@ class TestLowRank:
         rest = np.linalg.lstsq(np.column_stack([alpha, np.ones(50)]), expected)[1]
         assert (rest / np.sum(expected**2, axis=0) < 0.02).all()
 
-    @pytest.mark.parametrize("accelerated", [True, False])
-    def test_too_few_steps(self, accelerated):
-        model = BlockMatrixNRSfM(2, accelerated=accelerated, max_iter=2)
+    def test_too_few_steps(self):
+        model = BlockMatrixNRSfM(2, max_iter=2)
         options = {"category": ConvergenceWarning}
         warned("converge in max_iter=2 steps", model.fit, table().data, **options)
         assert 18 <= model.n_iter_ <= 36

@@ -362,8 +362,6 @@ class TestEuclideanFrames:
         [
             (1, np.ones((4, 2)), r"motion .* \(n_frames, 2, 3\); got \(4, 2\)"),
             (2, np.ones((40, 3)), r"alpha .* \(40, 2\).*got \(40, 3\)"),
-            (3, np.ones((9, 2)), r"mean_shape .* got \(9, 2\)"),
-            (4, np.ones((2, 8, 3)), r"basis .* \(2, 9, 3\).*got \(2, 8, 3\)"),
         ],
     )
     def test_refuses(self, fitted, index, value, message):

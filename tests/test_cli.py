@@ -182,24 +182,23 @@ def test_options_reach_the_estimator(fits, table, options, expected):
     assert (" % (outliers count fully): energy " in fit.out) == ("huber" in options)
 
 
-@pytest.mark.parametrize("adapt", ["mean", "shapes"])
-def test_a_prior_of_another_table(fits, fails, transforms, tmp_path, adapt):
+def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     options = {"n_components": 2, "camera": "weak_perspective", "random_state": 0}
     prior = AffineNRSfM(**options).fit(make_face_tracks(100, **options).data)
     path = tmp_path / "prior.npz"
     save_model(prior, path)
     X = make_face_tracks(30, **options | {"random_state": 1}).data
     table = saved(pd.DataFrame(X, columns=LANDMARKS), tmp_path)
-    given = ["--prior", path, "--adapt", adapt, "--no-figures"]
+    given = ["--prior", path, "--no-figures"]
     found = fits(table, *given)
-    model, alone = found.model, AffineNRSfM(**options, prior=prior, adapt=adapt)
+    model, alone = found.model, AffineNRSfM(**options, prior=prior)
     assert_array_equal(model.alpha_, alone.fit(X).alpha_)
     assert_array_equal(model.prior.basis_, prior.basis_)
     assert found.report["prior"] == {"name": str(path), "std": [*model.prior_std_]}
     text = " ".join(found.out.split())
     width = f"{100 * model.prior_std_[0]:.2g} % of the size"
     assert f"prior {path}: the mean shape differs by {width}" in text
-    assert ("studies with the same prior can be compared" in text) == (adapt == "mean")
+    assert "studies with the same prior can be compared" in text
     assert "Choice" not in text
     alpha, *_ = transforms(found.path, table)
     assert_allclose(alpha[ALPHA], model.alpha_, atol=1e-9)
@@ -212,7 +211,6 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path, adapt):
     again[5] = path
     assert "n-components must be that of the prior, 2" in fails(*again, "-k", 3)
     assert "--prior needs one number of basis shapes" in fails(*again, "-k", "1-2")
-    assert "--adapt shapes needs --prior" in fails(*again[:4], "--adapt", "shapes")
 
 
 def test_the_face_prior_that_a_warning_names(fits, tmp_path):
@@ -443,7 +441,7 @@ def test_standard_deviations_are_written(
     assert "was fitted with refinement=None" in message
 
 
-def test_origin_is_not_a_missing_point(fits, fails, faces, tmp_path):
+def test_origin_is_not_a_missing_point(fits, faces, tmp_path):
     away = faces.copy()
     away[LANDMARKS] += 1000.0
     away[["x_30", "y_30"]] = 0.0
@@ -455,12 +453,6 @@ def test_origin_is_not_a_missing_point(fits, fails, faces, tmp_path):
     err = fits(path, *UNREFINED).err
     assert "(0, 0)" not in err
     assert "(-0" not in err
-    message = fails("fit", path, "-o", tmp_path, *UNREFINED, "--zeros-missing")
-    expected = "--zeros-missing: 1 of 68 points are missing in all rows (first: 30)"
-    assert expected in message
-    assert "leave out --zeros-missing" in message
-    left = message.partition("--points ")[2]
-    fits(path, *UNREFINED, "--zeros-missing", "--points", left)
 
 
 def test_transform_gives_each_row_its_coefficients(transforms, fitted, faces, tmp_path):
@@ -469,8 +461,7 @@ def test_transform_gives_each_row_its_coefficients(transforms, fitted, faces, tm
     new["alpha_1"] = "mine"
     path = tmp_path / "new.parquet"
     new[[*LANDMARKS[1::2], "alpha_1", "name", *LANDMARKS[0::2]]].to_parquet(path)
-    alpha, out, err = transforms(fitted.path, path, "--skip-rows", "name=^ir")
-    assert "renamed to alpha_1_ (not alpha_1)\n" in err
+    alpha, out, _ = transforms(fitted.path, path, "--skip-rows", "name=^ir")
     assert out.startswith("2 coefficients of 54 frames\n")
     assert " 1 points (0.0272 %) are missing in 1 of these rows\n" in out
     assert out.endswith("54 rows\n")
@@ -633,25 +624,18 @@ def test_a_figure_that_fails_costs_no_results(
         raise np.linalg.LinAlgError("no axes")
 
     monkeypatch.setattr(ModeCovarianceDisplay, "from_estimator", fail)
-    options = ["--force", *QUICK, "--refinement", "none"]
+    options = ["--force", *QUICK, "--refinement", "none", "-k", "1,2"]
     found = fits(table, *options, folder=folder)
     warning, report = "mode_covariance.png was not drawn: no axes", found.report
-    assert found.err == f"isa-nrsfm: warning: {warning}\n"
+    assert found.err.endswith(f"\nisa-nrsfm: warning: {warning}\n")
     # All results were there, and only they, when figures began.
     assert set(seen) == FIT_FILES
-    left = FIT_FILES | FIGURES - {"mode_covariance.png"}
+    left = FIT_FILES | FIGURES - {"mode_covariance.png"} | {"choice.png"}
     assert {path.name for path in folder.iterdir()} == left
     assert "mode_covariance" not in found.out
     assert set(report["files"]) == set(report["sha256"]) == left - {"report.json"}
     assert report["warnings"] == [warning]
     assert warning in (folder / "report.html").read_text()
-
-
-def test_old_figures_cause_a_warning(fits, table, tmp_path):
-    (tmp_path / "basis_shapes.png").write_bytes(PNG)
-    err = fits(table, *UNREFINED).err
-    assert "figures of an earlier run: basis_shapes.png" in err
-    assert (tmp_path / "basis_shapes.png").read_bytes() == PNG
 
 
 def test_figures_are_not_written_to_another_run(
@@ -762,13 +746,10 @@ def test_demo_writes_a_table_and_finds_its_faces(succeeds, tmp_path, monkeypatch
     demo = Results(tmp_path / "isa-nrsfm-demo")
     assert {path.name for path in demo.folder.iterdir()} == FIT_FILES | {"tracks.csv"}
     report, before = demo.report, (demo.folder / "alpha.csv").read_bytes()
-    truth = report["truth"]
-    assert [row["name"] for row in truth["basis"]][:2] == ["jaw open", "smile"]
-    assert truth["shape_error"] < 0.3 * truth["mean_shape_error"]
-    assert all(row["similarity"] > 0.9 for row in truth["basis"])
-    assert all(row["correlation"] > 0.9 for row in truth["basis"])
+    error, of_mean = re.search(r"off by (\S+) % .* alone: (\S+) %", out).groups()
+    assert float(error) < 0.3 * float(of_mean)
     assert report["choice"]["n_components"] == [1, 2, 3, 4, 5]
-    assert report["choice"]["chosen"] == len(truth["basis"]) == 3
+    assert report["choice"]["chosen"] == 3
     assert list(pd.read_csv(demo.folder / "tracks.csv"))[:3] == ["frame", "x_0", "y_0"]
     command = out[out.index("isa-nrsfm fit") :].splitlines()[0].split()[1:]
     assert out.endswith("\n\nOpen       isa-nrsfm-demo/report.html\n")

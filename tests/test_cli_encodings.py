@@ -47,7 +47,7 @@ def test_paths_that_are_not_utf8(fits, succeeds, faces, tmp_path):
     alpha, page = (folder / f"{NOT_UTF8}.{suffix}" for suffix in ("tsv", "html"))
     succeeds("transform", found.path, table, "-o", alpha)
     assert list(pd.read_csv(alpha, sep="\t")["ομάδα"]) == CELLS
-    succeeds("export", found.path, table, "-o", page)
+    succeeds("export", found.path, "-o", page)
     assert page.stat().st_size > 0
 
 

@@ -113,8 +113,7 @@ def test_edges_of_a_file(fits, succeeds, table, bodies_fit, tmp_path):
     assert drawn("--skeleton", config) == {(5, 7), (6, 8)}
     export = ["export", bodies_fit.path, "-o", tmp_path / "a.glb"]
     succeeds(*export, "--skeleton", "coco-17")
-    materials = Read(tmp_path / "a.glb").document["materials"]
-    assert [m["name"] for m in materials] == ["points and edges", "left", "right"]
+    assert Read(tmp_path / "a.glb").mesh["extras"]["lines"] == "coco-17"
 
 
 def test_transform_writes_a_page(fails, transforms, table, bodies_fit, tmp_path):
@@ -139,7 +138,7 @@ def test_where_y_is_zero_is_said(fits, transforms, succeeds, tmp_path):
     fit = fits(path, *options, *lower[:2])
     exported = {name: tmp_path / f"{name}.html" for name in ("upper", "lower")}
     for name, page in exported.items():
-        succeeds("export", fit.path, path, "-o", page, "--origin", name)
+        succeeds("export", fit.path, "-o", page, "--origin", name)
     transforms(fit.path, path, *lower, "--std")
     pages = [tmp_path / "viewer.html", exported["lower"], lower[-1]]
     fitted, shapes, new = map(content_of, pages)

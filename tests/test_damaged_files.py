@@ -217,7 +217,6 @@ FORMATS = {
     "tsv": (lambda d: write_points(d / "a.tsv"), read_text_table),
     "parquet": (lambda d: write_points(d / "a.parquet"), read_parquet),
     "model": (lambda d: write_model(d / "a.npz"), read_model),
-    "pdm npz": (lambda d: write_shape_model(d / "a.npz"), read_shape_model),
     "pdm txt": (lambda d: write_shape_model(d / "a.txt"), read_shape_model),
     "npy folder": (lambda d: write_parts(d / "a", ".npy"), read_stored),
     "parquet folder": (lambda d: write_parts(d / "a", ".parquet"), read_stored),

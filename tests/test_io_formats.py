@@ -390,20 +390,16 @@ def test_sleap_axes_are_those_that_the_file_tells(order, named, tmp_path):
     assert_array_equal(np.isnan(tracks_of(sure)[..., 0]), lost)
 
 
-def test_sleap_tables_have_a_row_for_each_instance(tmp_path):
+def test_sleap_tables_are_tables_with_names(tmp_path):
     pair = np.stack([TRACKS, TRACKS + 100], axis=1)
-    pair[4] = np.nan
-    pair[5, 1, 3] = np.nan
     scores = np.random.default_rng(0).uniform(0, 1, pair.shape[:3])
     path = files.write_sleap_csv(tmp_path / "a.csv", pair, scores)
-    assert find_format(path) == "sleap"
+    assert find_format(path) == "table"
     landmarks = read_landmarks(path, min_confidence=0.2)
-    shown = np.delete(np.arange(12), 4)
-    expected = np.where(scores[..., None] < 0.2, np.nan, pair)[shown]
-    assert_array_equal(tracks_of(landmarks), expected.reshape(22, 8, 2))
-    assert individuals_of(landmarks) == ["a", "b"] * 11
-    assert list(landmarks.frames["frame"]) == list(np.repeat(shown, 2))
-    assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
+    expected = np.where(scores[..., None] < 0.2, np.nan, pair)
+    assert_array_equal(tracks_of(landmarks), expected.reshape(24, 8, 2))
+    assert list(landmarks.frames) == ["track", "frame_idx", "instance.score"]
+    assert landmarks.point_names[:2] == ("snout", "ear_L")
 
 
 def test_points_without_a_confidence_are_kept(tmp_path):
@@ -458,13 +454,10 @@ def test_coco_categories_are_not_mixed(tmp_path):
     content["annotations"].append(seen | {"keypoints": [1, 2, 2, 3, 4, 1]})
     path = files.write_json(tmp_path / "a.json", content)
     refused("person, hand have different keypoints", read_landmarks, path)
-    people = read_landmarks(path, category="person")
+    del content["categories"][1]
+    message = "1 annotations are of the category 2.* They are left out"
+    people = warned(message, read_landmarks, files.write_json(path, content))
     assert_array_equal(tracks_of(people), TRACKS)
-    hands = read_landmarks(path, category="hand")
-    assert hands.failed.sum() == 11
-    assert_array_equal(tracks_of(hands)[1], [[1, 2], [3, 4]])
-    message = "no category 'cat'.* there are person, hand"
-    refused(message, read_landmarks, path, category="cat")
 
 
 def test_coco_results_have_confidences(tmp_path):
@@ -525,7 +518,7 @@ def test_tables_keep_options_of_their_own(tmp_path):
     table.iloc[2, [3, 11]] = 0
     table.insert(0, "id", [f"{i:03d}" for i in range(12)])
     table.to_csv(path, sep="\t", index=False)
-    landmarks = read_landmarks(path, columns="a#,b#", missing="zeros")
+    landmarks = read_landmarks(path, columns="a#,b#", missing=0)
     expected = TRACKS.copy()
     expected[2, 3] = np.nan
     assert_array_equal(tracks_of(landmarks), expected)
@@ -664,15 +657,10 @@ def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
     swapped["position"].coords["space"].values = np.array(["y", "x"])
     found = tracks_of(from_movement(swapped))
     assert_array_equal(found[..., ::-1], tracks_of(landmarks))
-    one = from_movement(movement_dataset(plural, order), individual="id_1")
-    assert_allclose(tracks_of(one)[4:], TRACKS[4:] + 100)
-    assert list(np.flatnonzero(one.failed)) == [3]
 
 
 def test_other_datasets_are_refused():
     dataset = movement_dataset(plural=False)
-    message = "no individual 'x'; there are id_0, id_1"
-    refused(message, from_movement, dataset, individual="x")
     refused("should have position; got dict", from_movement, {})
     flat = Variable(np.zeros((2, 3)), ["time", "space"], {})
     refused("have the axes .* got time, space", from_movement, {"position": flat})

@@ -116,13 +116,13 @@ def test_zeros_are_missing_only_on_request_and_only_in_pairs(frame):
     frame.loc[0, ["x1", "y1"]] = 0.0
     frame.loc[1, "x1"] = 0.0
     assert not landmark_table(frame).points.isna().any(axis=None)
-    points = landmark_table(frame, missing="zeros").points
+    points = landmark_table(frame, missing=0.0).points
     missing = np.zeros(points.shape, dtype=bool)
     missing[0, 2:4] = True
     assert_array_equal(points.isna(), missing)
     pd.testing.assert_frame_equal(landmark_table(frame, missing=0).points, points)
     for wrong in (True, np.inf, "nan"):
-        message = '"zeros" or finite numbers; got'
+        message = "None or finite numbers; got"
         refused(message, landmark_table, frame, missing=wrong)
 
 

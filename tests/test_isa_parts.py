@@ -10,7 +10,7 @@ from scipy.linalg import polar
 from scipy.optimize import linear_sum_assignment
 
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.isa import SqrtDensity, _shared_mixing
+from isa_nrsfm.isa import _shared_mixing
 from isa_nrsfm.isa._base import (
     fixed_point_step,
     iterate,
@@ -24,8 +24,6 @@ from isa_nrsfm.isa._shared_mixing import (
     independent_coefficients,
     shared_mixing,
 )
-
-DENSITY = SqrtDensity()
 
 
 def white_signals(seed, n_samples=400, n_subspaces=2, size=3):
@@ -73,17 +71,17 @@ class TestStep:
     @pytest.mark.parametrize("size", [1, 2, 3])
     def test_by_plain_loops(self, size):
         Z, W = white_signals(0), starts(0, 4, 6)
-        new = fixed_point_step(W, Z, size, DENSITY)
+        new = fixed_point_step(W, Z, size)
         for w, step in zip(W, new, strict=True):
             assert_allclose(step, published_step(w, Z, size), atol=1e-11)
 
     def test_shorter_steps_have_the_same_fixed_points(self):
         Z = white_signals(0)
         first, ends = starts(0, 1, 6), {"max_iter": 2000, "tol": 1e-14}
-        W, _, converged = iterate(first, Z, 3, DENSITY, **ends)
+        W, _, converged = iterate(first, Z, 3, **ends)
         assert converged.all()
         for length in (1.0, 0.5, 1 / 16):
-            new = fixed_point_step(W, Z, 3, DENSITY, length)
+            new = fixed_point_step(W, Z, 3, length)
             assert subspace_change(W, new, 3).max() < 1e-13
 
 

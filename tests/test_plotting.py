@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
+from isa_nrsfm import AffineNRSfM, plotting
 from isa_nrsfm.calibration import canonical_pose
 from isa_nrsfm.datasets import (
     make_body_tracks,
@@ -29,7 +29,6 @@ from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import (
     BasisShapeDisplay,
     CoefficientsDisplay,
-    ComponentChoiceDisplay,
     ModeCovarianceDisplay,
     ReprojectionDisplay,
 )
@@ -39,7 +38,6 @@ from isa_nrsfm.skeletons import get_skeleton
 pytestmark = [may_not_converge, one_start]
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
-SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
 # Of each display: arguments, and the number of its axes.
 DISPLAYS = {
     BasisShapeDisplay: (
@@ -53,10 +51,6 @@ DISPLAYS = {
         8,
     ),
     CoefficientsDisplay: ({"alpha": RNG.standard_normal((30, 2))}, 2),
-    ComponentChoiceDisplay: (
-        {"n_components": [2, 4], "scores": SCORES, "chosen": 4},
-        1,
-    ),
     ModeCovarianceDisplay: ({"mode_covariance": np.eye(6)}, 1),
     ReprojectionDisplay: (
         {"observed": POINTS, "reprojected": 1.1 * POINTS, "edges": [[0, 1]]},
@@ -114,10 +108,9 @@ def test_displays_draw_on_a_new_figure_or_given_axes(kind):
 @EACH
 def test_displays_take_keywords_and_fitted_estimators(kind):
     refused(None, kind, *list(DISPLAYS[kind][0].values())[:2], error=TypeError)
-    choice = kind is ComponentChoiceDisplay
     table = [np.zeros((3, 4))] if kind is ReprojectionDisplay else []
     with pytest.raises(NotFittedError):
-        kind.from_estimator(AffineNRSfMCV() if choice else AffineNRSfM(), *table)
+        kind.from_estimator(AffineNRSfM(), *table)
     assert plt.get_fignums() == []
 
 
@@ -144,9 +137,6 @@ def test_points_can_have_another_style():
         (CoefficientsDisplay, {"alpha_std": np.eye(3)}, r"of alpha; got \(3, 3\)"),
         (CoefficientsDisplay, {"y": ["a"]}, "y must have one entry for each of the 30"),
         (CoefficientsDisplay, {"component_names": ["a"]}, "must hold 2 names"),
-        (ComponentChoiceDisplay, {"scores": SCORES[0]}, "one row for each"),
-        (ComponentChoiceDisplay, {"n_components": [1, 2, 3]}, "one row for each"),
-        (ComponentChoiceDisplay, {"chosen": 3}, "chosen must be one of n_components"),
         *(
             (ModeCovarianceDisplay, {"mode_covariance": np.zeros(shape)}, "a square")
             for shape in ((4, 4), (3, 6), (0, 0), (3,))
@@ -168,13 +158,11 @@ def test_bad_arguments_are_refused(kind, changed, message):
 @pytest.mark.parametrize(
     ("kind", "arguments", "message"),
     [
-        (BasisShapeDisplay, {"n_std": [1, 2]}, "one for each basis shape.*got shape"),
         *(
             (BasisShapeDisplay, {"components": each}, "basis shapes, from 0 to 2")
             for each in ([3], [-1], [], 0, [0.0])
         ),
         (CoefficientsDisplay, {"kind": "classes"}, "kind='classes' needs y"),
-        (ModeCovarianceDisplay, {"scale": "log"}, "got 'log'"),
     ],
 )
 def test_bad_arguments_of_plot_are_refused(kind, arguments, message):
@@ -219,7 +207,7 @@ def test_shapes_are_inside_limits_of_one_scale(rng):
     title = display.axes_[4, 0].get_title(loc="left")
     assert title == f"Basis shape 4 (drawn 1:{ratio[0, 0]:.2g})"
     # Large drifts alone are no reason for another scale.
-    display.plot(n_std=50 / sizes)
+    display = drawn_shapes(mean, 50 * basis / sizes[:, None, None]).plot()
     assert len({ax.get_xlim() for ax in display.axes_[1:, 0]}) == 1
     display = drawn_shapes(np.ones((5, 3))).plot()
     assert all(np.ptp(ax.get_xlim()) > 0 for ax in display.axes_.ravel())
@@ -499,15 +487,6 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert texts(display)[1:] == ["Basis shape 3", "Basis shape 1"]
     drift = display.plus_[0].get_offsets() - display.mean_[0].get_offsets()
     assert_allclose(drift, 2 * display.basis[2][:, :2], atol=1e-12)
-    # A drift for each basis shape; the last one is out of all proportion.
-    display = random_shapes().plot(n_std=[1, 2, 30])
-    assert texts(display)[1:3] == ["Basis shape 1 (±1 s.d.)", "Basis shape 2 (±2 s.d.)"]
-    assert texts(display)[3].startswith("Basis shape 3 (±30 s.d., drawn 1:")
-    for k, n_std in enumerate([1, 2, 30]):
-        drift = display.plus_[2 * k].get_offsets() - display.mean_[0].get_offsets()
-        assert_allclose(drift, n_std * display.basis[k][:, :2], atol=1e-12)
-    widths = [np.ptp(ax.get_xlim()) for ax in display.axes_[:, 0]]
-    assert widths[0] == widths[1] == widths[2] < widths[3] / 2
 
 
 def test_notes_of_narrow_side_views_end_within_the_figure(rng):
@@ -619,36 +598,14 @@ def test_coefficients_are_those_of_the_estimator(faces, estimator):
     assert_allclose(other.alpha, estimator.alpha_[:5], atol=1e-9)
 
 
-def test_errors_of_the_choice_are_in_percent_with_standard_errors():
-    display = ComponentChoiceDisplay(n_components=[2, 4], scores=SCORES, chosen=4)
-    display.plot()
-    curve = display.errorbar_.lines[0]
-    assert_array_equal(curve.get_xdata(), [2, 4])
-    assert_allclose(curve.get_ydata(), [2.5, 0.3])
-    # Deviations of 0.5 and 0.1 %, of three parts each
-    mean, half = np.array([[2.5], [0.3]]), np.array([[0.5], [0.1]]) / np.sqrt(3)
-    bars = [each[:, 1] for each in display.errorbar_.lines[2][0].get_segments()]
-    assert_allclose(bars, mean + half * [-1, 1])
-    assert display.ax_.get_yscale() == "log"
-    assert_allclose(display.chosen_.get_xydata(), [[4, 0.3]])
-    # Other scores are drawn as they are; one part has no standard error.
-    given = {"scores": SCORES[:, :1], "held_out_error": False}
-    display = ComponentChoiceDisplay(n_components=[2, 4], **given).plot()
-    assert_allclose(display.errorbar_.lines[0].get_ydata(), SCORES[:, 0])
-    assert display.ax_.get_yscale() == "linear"
-    assert display.chosen_ is None
-    assert not display.errorbar_.has_yerr
-
-
 def covariance(n_components=2):
     rows = np.random.default_rng(0).standard_normal((50, 3 * n_components))
     return rows.T @ rows * np.outer(*2 * [np.repeat(np.arange(n_components) + 1, 3)])
 
 
-@pytest.mark.parametrize("scale", ["asinh", "linear"])
-def test_colours_of_the_matrix_are_symmetric(scale):
+def test_colours_of_the_matrix_are_symmetric():
     matrix = covariance()
-    display = ModeCovarianceDisplay(mode_covariance=matrix).plot(scale=scale)
+    display = ModeCovarianceDisplay(mode_covariance=matrix).plot()
     assert_array_equal(display.im_.get_array(), matrix)
     low, high = display.im_.get_clim()
     assert low == -high
@@ -657,7 +614,7 @@ def test_colours_of_the_matrix_are_symmetric(scale):
     assert_allclose(middle, middle[0], atol=0.01)  # a grey
     assert middle[0] > 0.95
     small = ModeCovarianceDisplay(mode_covariance=np.diag([1.0, 1, 1, 0.05, 1, 1]))
-    assert (small.plot(scale=scale).im_.norm(0.05) > 0.6) == (scale == "asinh")
+    assert small.plot().im_.norm(0.05) > 0.6  # not linear
 
 
 def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
@@ -678,10 +635,6 @@ def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     assert display.boundaries_.get_segments() == []
     assert display.colorbar_.mappable is display.im_
     assert display.colorbar_.ax.get_ylabel() == "covariance"
-    display.plot(normalize=True)
-    assert display.colorbar_.ax.get_ylabel() == "correlation"
-    assert display.plot(colorbar=False).colorbar_ is None
-    assert len(display.figure_.axes) == 1
 
 
 @pytest.mark.parametrize("n_components", [12, 13, 99])
@@ -696,29 +649,6 @@ def test_labels_of_the_matrix_do_not_touch(n_components):
         assert not any(a.overlaps(b) for a, b in pairwise(boxes))
         place = int(labels[-1].get_text()) * 3 - 2
         assert axis.get_ticklocs()[-1] == place
-
-
-@pytest.mark.parametrize("largest", [3e-7, 0.017, 1.0, 99.0])
-def test_ticks_of_the_asinh_scale(largest):
-    display = ModeCovarianceDisplay(mode_covariance=largest * np.eye(6)).plot()
-    display.figure_.canvas.draw()
-    axis = display.colorbar_.ax
-    ticks = axis.get_yticks()
-    assert_array_equal(ticks, -ticks[::-1])
-    assert 0 in ticks
-    assert largest / 10 < ticks.max() <= largest
-    boxes = [tick.get_window_extent() for tick in axis.get_yticklabels()]
-    assert len(boxes) == len(ticks)
-    assert not any(a.overlaps(b) for a, b in pairwise(boxes))
-
-
-def test_correlations():
-    matrix = covariance()
-    expected = matrix / np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
-    expected[2] = expected[:, 2] = matrix[2] = matrix[:, 2] = 0
-    display = ModeCovarianceDisplay(mode_covariance=matrix).plot(normalize=True)
-    assert_allclose(display.im_.get_array(), expected)
-    assert display.im_.get_clim() == pytest.approx((-1, 1))
 
 
 @pytest.mark.parametrize(
@@ -751,7 +681,7 @@ def test_points_of_frames_are_the_numbers(faces, estimator):
         assert display.observed_[i].axes is display.axes_[i]
         error = inverse_snr(faces.data[[row]], table[row].reshape(1, -1))
         assert display.inverse_snr[i] == pytest.approx(error)
-        title = f"frame {row}\ninverse SNR {percent(error)}"
+        title = f"row {row}\ninverse SNR {percent(error)}"
         assert display.axes_[i].get_title() == title
     # Planar tables show the same.
     planar = faces.tracks.transpose(0, 2, 1).reshape(len(table), -1)
@@ -792,7 +722,7 @@ def test_rows_of_dataframes_may_have_names(faces):
     estimator = AffineNRSfM(2, refinement=None, random_state=0).fit(X)
     display = ReprojectionDisplay.from_estimator(estimator, X, frames=[5, 2])
     assert display.frame_names == [names[5], names[2]]
-    assert display.axes_[1].get_title().startswith(f"frame {names[2]}\n")
+    assert display.axes_[1].get_title().startswith(f"row {names[2]}\n")
     assert_array_equal(display.observed, faces.tracks[[5, 2]])
 
 

@@ -115,9 +115,6 @@ def test_methods_are_those_of_the_best_estimator(fitted):
     alpha = best.transform(rows)
     assert_array_equal(fitted.transform(rows), alpha)
     assert_array_equal(fitted.inverse_transform(alpha), best.inverse_transform(alpha))
-    assert_array_equal(fitted.reconstruct(rows), best.reconstruct(rows))
-    assert_array_equal(fitted.reproject(rows), best.reproject(rows))
-    assert_array_equal(fitted.decompose(rows).motion, best.decompose(rows).motion)
     assert fitted.score(rows) == best.score(rows)
     assert fitted.n_features_in_ == X.shape[1]
     assert_array_equal(fitted.get_feature_names_out(), ["alpha_1", "alpha_2"])

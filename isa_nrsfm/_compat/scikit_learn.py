@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, _fit_context
+from sklearn.base import ClassNamePrefixFeaturesOutMixin, _fit_context
 from sklearn.utils import _param_validation, _safe_indexing as taken_rows
 from sklearn.utils._param_validation import (
     HasMethods as HasMethods,
@@ -25,19 +25,6 @@ class Interval(_param_validation.Interval):
     def is_satisfied_by(self, value: Any) -> bool:
         """Return whether a value is in the interval."""
         return not isinstance(value, bool) and bool(super().is_satisfied_by(value))
-
-
-class ShownEstimator(BaseEstimator):
-    """Estimators that notebooks show by `_html_repr`, also with scikit-learn 1.6."""
-
-    def _repr_html_inner(self) -> str:
-        """Return the text of `_repr_html_`."""
-        return self._html_repr()
-
-    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
-        """Return the texts of which a notebook shows one."""
-        texts: dict[str, str] = super()._repr_mimebundle_(**kwargs)
-        return texts | {kind: self._html_repr() for kind in texts if "html" in kind}
 
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:

@@ -211,7 +211,7 @@ def check_points(
             f"determine {equations} numbers of the shapes, which have {unknowns}. Take "
             "fewer basis shapes, or leave out points that are rarely visible"
         )
-    # Points of the first one's group, from frame to frame; all groups if others are left
+    # Points of the first one's group, frame by frame; all groups if others are left
     before, group = np.array(False), np.arange(n_points) == 0
     while (group != before).any():
         before, group = group, group | seen[seen[:, group].any(axis=1)].any(axis=0)

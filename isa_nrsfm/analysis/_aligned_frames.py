@@ -16,11 +16,6 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
     analysis", 1975). PCA of aligned frames is a baseline for coefficients. It uses the
     same table, but mixes the view with the deformation.
 
-    Parameters
-    ----------
-    turn : bool, default=True
-        Whether to rotate frames. If False, they are only centred and scaled.
-
     Attributes
     ----------
     mean_ : ndarray of shape (n_points,)
@@ -29,9 +24,6 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
     n_features_in_ : int
         Number of columns.
     """
-
-    def __init__(self, turn: bool = True):
-        self.turn = turn
 
     def fit(self, X: Any, y: Any = None) -> Self:
         """
@@ -51,7 +43,7 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         """
         points = _unit_points(validate_data(self, X, dtype=np.float64))
         mean = points[0]
-        for _ in range(100 if self.turn else 0):
+        for _ in range(100):
             turned = _nearest_turns(points, mean).mean(axis=0)
             turned /= np.sqrt(np.mean(np.abs(turned) ** 2))
             change = np.abs(turned - mean).max()
@@ -77,9 +69,8 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         """
         check_is_fitted(self)
         points = _unit_points(validate_data(self, X, dtype=np.float64, reset=False))
-        if self.turn:
-            points = _nearest_turns(points, self.mean_)
-        return np.ascontiguousarray(points).view(float)
+        turned = _nearest_turns(points, self.mean_)
+        return np.ascontiguousarray(turned).view(float)
 
 
 def _unit_points(X: NDArray) -> NDArray:

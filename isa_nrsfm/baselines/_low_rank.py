@@ -194,17 +194,12 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         determine the sign of a frame's camera and shape. If True, the sign minimises
         the rotation of the camera from the frame before; if False, signs are chosen to
         make the shapes similar.
-    accelerated : bool, default=True
-        Whether to use steps of length one with Nesterov's momentum instead of the
-        published steps of length 0.2 without momentum. The minimum is the same, with
-        far fewer steps.
     max_iter : int, default=10000
         The most steps for each price of the nuclear norm.
-    tol : float or None, default=None
+    tol : float, default=1e-4
         Relative change of the shapes in a step that ends the steps, for each price.
-        None means 1e-4 with acceleration and 1e-6, as published, without; the results
-        are nearly the same. Smaller values need more steps and reduce the reprojection
-        error, but do not improve the 3D shapes.
+        Smaller values need more steps and reduce the reprojection error, but do not
+        improve the 3D shapes.
 
     Attributes
     ----------
@@ -252,9 +247,10 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
     -----
     ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2`` is minimised by proximal gradient
     steps for prices mu from 1 to 6e-11, each a quarter of the last and started from its
-    shapes, where W has unit mean square (fixed-point continuation; with acceleration,
-    Beck and Teboulle 2009, O'Donoghue and Candes 2015). The shapes that are returned
-    are the nearest mixtures of ``n_components + 1`` shapes.
+    shapes, where W has unit mean square (fixed-point continuation). Steps have length
+    one and Nesterov's momentum (Beck and Teboulle 2009, O'Donoghue and Candes 2015);
+    the published ones, of length 0.2 without momentum, need far more. The shapes that
+    are returned are the nearest mixtures of ``n_components + 1`` shapes.
 
     The method factorises the given table only. See `PseudoInverseNRSfM` for
     `transform`, the related methods, and the signs of frames.
@@ -288,9 +284,8 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **ShapeSequenceNRSfM._parameter_constraints,
-        "accelerated": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
-        "tol": [None, Interval(Real, 0, None, closed="left")],
+        "tol": [Interval(Real, 0, None, closed="left")],
     }
 
     def __init__(
@@ -300,14 +295,12 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         layout: Layout = "interleaved",
         scale_frames: bool = False,
         ordered: bool = False,
-        accelerated: bool = True,
         max_iter: int = 10_000,
-        tol: float | None = None,
+        tol: float = 1e-4,
     ):
         super().__init__(
             n_components, layout=layout, scale_frames=scale_frames, ordered=ordered
         )
-        self.accelerated = accelerated
         self.max_iter = max_iter
         self.tol = tol
 
@@ -336,30 +329,24 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
 
         S has one row for each frame, mu is the price. Proximal gradient steps of length
         one have Nesterov's momentum, reset when it leads up (Beck, Teboulle 2009;
-        O'Donoghue, Candes 2015); the published ones length 0.2 and no momentum. Returns
-        shapes (I, J, 3), the number of steps, and whether the last relative change was
-        at most `tol`.
+        O'Donoghue, Candes 2015). Returns shapes (I, J, 3), the number of steps, and
+        whether the last relative change was at most `tol`.
         """
         images = W.reshape(len(cameras), 2, -1).transpose(0, 2, 1)
         # The curvature of the images is one, as the cameras have orthonormal rows.
-        # Accelerated steps are some hundred times as long as the published ones.
-        step, tol = (1.0, 1e-4) if self.accelerated else (0.2, 1e-6)
-        tol = tol if self.tol is None else self.tol
         ahead, momentum = shapes, 1.0
         for n_iter in range(1, self.max_iter + 1):
             error = ahead @ cameras.transpose(0, 2, 1) - images
-            moved = shrink(ahead - step * (error @ cameras), step * price)
+            moved = shrink(ahead - error @ cameras, price)
             change = moved - shapes
             size = np.linalg.norm(shapes)
-            if not self.accelerated:
-                ahead = moved
-            elif np.vdot(ahead - moved, change) > 0:
+            if np.vdot(ahead - moved, change) > 0:
                 ahead, momentum = moved, 1.0
             else:
                 larger = 0.5 + np.sqrt(0.25 + momentum**2)
                 ahead = moved + (momentum - 1.0) / larger * change
                 momentum = larger
             shapes = moved
-            if np.linalg.norm(change) <= tol * size:
+            if np.linalg.norm(change) <= self.tol * size:
                 return shapes, n_iter, True
         return shapes, self.max_iter, False

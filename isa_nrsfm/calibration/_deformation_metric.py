@@ -204,13 +204,6 @@ def euclidean_frames(
             f"alpha must be of the shape ({len(cameras)}, {n_components}), for the "
             f"cameras and the metric; got {weights.shape}"
         )
-    if mean.ndim != 2 or mean.shape[1] != 3:
-        raise ValueError(f"mean_shape must have shape (n_points, 3); got {mean.shape}")
-    if directions.shape != (n_components, *mean.shape):
-        raise ValueError(
-            f"basis must have shape {(n_components, *mean.shape)}, for the metric and "
-            f"the mean shape; got {directions.shape}"
-        )
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
 

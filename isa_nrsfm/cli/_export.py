@@ -6,16 +6,15 @@ from typing import Any
 
 from isa_nrsfm import export
 from isa_nrsfm.cli import _reading
-from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
+from isa_nrsfm.cli._options import NONE, SUFFIXES, flag_of
 from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, refuse_replacing
-from isa_nrsfm.cli._report import table_report
-from isa_nrsfm.cli._sections import table_section, text_of
+from isa_nrsfm.cli._sections import text_of
 from isa_nrsfm.skeletons._column_names import names_of_points
 
-# The options of each content, besides those of the table.
+# The options of each content.
 _POSE = ("camera", "origin", "mirrored")
 _OPTIONS = {
-    "viewer": ("table", "edges", "skeleton", "names", "label", "n_frames", *_POSE),
+    "viewer": ("edges", "skeleton", "names", *_POSE),
     "glb": ("edges", "skeleton", "names", *_POSE),
     "pdm": ("n_modes", *_POSE),
     "shapes": (),
@@ -25,26 +24,16 @@ _OPTIONS = {
 def run(args: Namespace, warned: list[str]) -> str:
     """Write a model for another program, and return the report."""
     output = Path(args.output)
-    content = _content(output, args.content)
+    content = _content(output)
     options = _given(args, content)
     estimator = read_model(args)
-    sources = filter(None, (args.model, args.table, *_reading.drawing_files(args)))
-    refuse_overwriting(sources, [output])
+    refuse_overwriting([args.model, *_reading.drawing_files(args)], [output])
     if not args.force:
         refuse_replacing([output])
-    sections: dict[str, Any] = {"Model": [args.model]}
-    stored = None
-    if args.table is not None:
-        frames = _reading.read_frames(args, estimator)
-        stored = frames.skeleton
-        sections["Table"] = table_section(table_report(args, frames), "not shown")
-        options["X"] = _reading.as_fitted(estimator, frames.X)
-        if args.label is not None:
-            labels = _reading.cells_of(frames.other, args.label, "--label")
-            options["labels"] = labels[frames.usable]
     if "edges" in _OPTIONS[content]:
-        names = names_of_points(estimator)
-        options |= _reading.drawing(args, names, stored)
+        options |= _reading.drawing(args, names_of_points(estimator), None)
+    if args.mirrored:
+        estimator = estimator.mirrored()
     if options.get("camera") == NONE:
         options["camera"] = None
 
@@ -56,28 +45,18 @@ def run(args: Namespace, warned: list[str]) -> str:
     else:
         getattr(export, f"write_{content}")(estimator, output, **options)
     lines.append(f"{output.stat().st_size} bytes")
-    return text_of("", sections | {"Output": lines})
+    return text_of("", {"Model": [args.model], "Output": lines})
 
 
-def _content(output: Path, content: str | None) -> str:
-    """Return the content to write, and check that the suffix fits."""
-    suffix = output.suffix.lower()
-    if content is None:
-        known = {each: name for name, own in SUFFIXES.items() for each in own}
-        if suffix not in known:
-            raise ValueError(
-                "--output: expected a file with one of the suffixes "
-                f"{', '.join(known)}; got {output}"
-            )
-        return known[suffix]
-    suffixes = SUFFIXES[content]
-    if content == "pdm":
-        suffixes += SUFFIXES["shapes"]
-    if suffix not in suffixes:
+def _content(output: Path) -> str:
+    """Return the content to write, by the suffix."""
+    known = {each: name for name, own in SUFFIXES.items() for each in own}
+    if output.suffix.lower() not in known:
         raise ValueError(
-            f"--content {content} needs a file {', '.join(suffixes)}; got {output}"
+            "--output: expected a file with one of the suffixes "
+            f"{', '.join(known)}; got {output}"
         )
-    return content
+    return known[output.suffix.lower()]
 
 
 def _given(args: Namespace, content: str) -> dict[str, Any]:
@@ -92,10 +71,6 @@ def _given(args: Namespace, content: str) -> dict[str, Any]:
                 f"{flag_of(name)} is an option of {' and '.join(having)}; "
                 f"{args.output} is {content}"
             )
-        if name not in ("table", "label", "skeleton"):
+        if name not in ("skeleton", "mirrored"):
             given[name] = getattr(args, name)
-    if args.table is None:
-        for name in (*TABLE_OPTIONS, "label"):
-            if getattr(args, name) not in (None, False, [], "auto"):
-                raise ValueError(f"{flag_of(name)} needs a TABLE")
     return given

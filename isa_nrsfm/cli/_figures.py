@@ -14,6 +14,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
@@ -46,9 +47,10 @@ ALWAYS: Figures = {
         lambda fit: plotting.ModeCovarianceDisplay.from_estimator(fit.estimator),
     ),
     "reprojection.png": (
-        "frames of median and of largest residual: observed points and points of the "
-        "model",
-        lambda fit: _reprojections(fit),
+        "observed points and points of the model, in some of the frames",
+        lambda fit: plotting.ReprojectionDisplay.from_estimator(
+            fit.estimator, fit.frames.X, random_state=0, **fit.drawn
+        ),
     ),
 }
 
@@ -69,8 +71,8 @@ def figures_of(args: Namespace, frames: Frames) -> Figures:
     figures |= ALWAYS
     if len(args.n_components) > 1:
         figures["choice.png"] = (
-            "held-out error by the number of basis shapes",
-            lambda fit: plotting.ComponentChoiceDisplay.from_estimator(fit.search),
+            "held-out error by the number of basis shapes, with one standard error",
+            _choice,
         )
     return figures
 
@@ -83,7 +85,8 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     for name, (caption, draw) in figures.items():
         show_stage(name)
         try:
-            figure, image = draw(fit).figure_, io.BytesIO()
+            shown, image = draw(fit), io.BytesIO()
+            figure = getattr(shown, "figure_", None) or shown.figure
             figure.savefig(image, format="png", dpi=150)
             plt.close(figure)
             write_whole(folder / name, image.getvalue())
@@ -95,20 +98,18 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     return drawn
 
 
-def _reprojections(fit: Fit) -> plotting.ReprojectionDisplay:
-    """Draw up to three frames about the median residual, and as many of the largest."""
-    order = np.argsort(fit.inverse_snr)
-    n_drawn = max(min(3, len(order) // 3), 1)
-    start = (len(order) - n_drawn) // 2
-    rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
-    display = plotting.ReprojectionDisplay.from_estimator(
-        fit.estimator, fit.frames.X, frames=rows, **fit.drawn
+def _choice(fit: Fit) -> Any:
+    """Draw the held-out errors by the number of basis shapes."""
+    assert fit.search is not None
+    results, splits = fit.search.cv_results_, range(fit.search.n_splits_)
+    scores = np.transpose([results[f"split{i}_test_score"] for i in splits])
+    numbers, error = results["param_n_components"], -100 * scores.mean(axis=1)
+    (axes,) = _axes.grid(1, 1, figsize=(5.2, 3.2))
+    axes.errorbar(numbers, error, 100 * standard_errors(scores), fmt="o-", capsize=3)
+    axes.set(
+        xlabel="number of basis shapes", ylabel="held-out error, %", xticks=numbers
     )
-    for number, axes in enumerate(display.axes_):
-        which = "median" if number < n_drawn else "largest"
-        title = f"{which} residual: {axes.get_title().replace('frame', 'row', 1)}"
-        axes.set_title(title, fontsize="small", parse_math=False)
-    return display
+    return axes
 
 
 def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:

@@ -5,17 +5,22 @@ import sys
 import time
 import warnings
 from argparse import Namespace
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from platform import python_version
 from typing import Any
 
 import numpy as np
 from sklearn.model_selection import GroupKFold
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
+from isa_nrsfm import (
+    AffineNRSfM,
+    AffineNRSfMCV,
+    FastISA,
+    PooledFastICA,
+    __version__,
+)
 from isa_nrsfm._compat import pandas as pd, whole_files
-from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
@@ -25,7 +30,7 @@ from isa_nrsfm.analysis._advice import facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
-from isa_nrsfm.cli._figures import ALWAYS, figures_of, write_figures
+from isa_nrsfm.cli._figures import figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, NONE, flag_of
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
@@ -34,7 +39,6 @@ from isa_nrsfm.cli._report import (
     model_report,
     perspective_report,
     table_report,
-    versions,
 )
 from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.datasets import load_face_prior
@@ -48,7 +52,7 @@ N_PARTS = 3
 # Options that are parameters of the same name; none stands for None.
 _PARAMETERS = (
     *("block_recovery", "refinement", "camera", "focal_length", "independence"),
-    *("prior", "adapt", "loss", "random_state", "n_jobs"),
+    *("prior", "loss", "random_state", "n_jobs"),
 )
 
 
@@ -58,17 +62,12 @@ def run(args: Namespace, warned: list[str]) -> str:
 
 
 def fit_table(
-    args: Namespace,
-    warned: list[str],
-    *,
-    table: "pd.DataFrame | None" = None,
-    **extra: "Callable[[AffineNRSfM, pd.DataFrame], Any]",
+    args: Namespace, warned: list[str], table: "pd.DataFrame | None" = None
 ) -> dict[str, Any]:
     """Fit a table, write everything, and return the report.
 
     A given table is written to the path in the options. `warned` has the warnings so
-    far, and grows. Functions of the model and its table make `extra` entries of the
-    report.
+    far, and grows.
     """
     prior = args.prior
     _load_prior(args)
@@ -106,7 +105,7 @@ def fit_table(
             earlier = _outputs.entry_of_report(folder, "sha256")
             own = {*earlier, _outputs.REPORT} if earlier else ()
             _outputs.refuse_replacing([folder / name for name in files], own)
-        removed = {*_old_figures(folder, files), *figures}
+        removed = {*_old_figures(folder), *figures}
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
@@ -141,9 +140,8 @@ def fit_table(
                 **({} if search is None else {"choice": choice_report(search, X)}),
                 "model": model_report(fit, diagnostics, perspective),
                 **answers,
-                **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
-                "versions": versions(),
+                "versions": {"isa_nrsfm": __version__, "python": python_version()},
             }
             clock["write"] = time.perf_counter()
             report |= {"seconds": _seconds(clock), "files": results}
@@ -175,8 +173,6 @@ def _load_prior(args: Namespace) -> None:
             args.n_components = None
         if args.camera is None and args.prior.camera_ != "affine":  # which is refused
             args.camera = args.prior.camera_
-    elif args.adapt == "shapes":
-        raise ValueError("--adapt shapes needs --prior")
     args.n_components = args.n_components or (n_components,)
 
 
@@ -283,15 +279,10 @@ def _fitted(
     return estimator, search, diagnostics, perspective
 
 
-def _old_figures(folder: Path, new: list[str]) -> list[str]:
-    """Return the figures that the report of an earlier run lists; warn of others."""
+def _old_figures(folder: Path) -> list[str]:
+    """Return the figures that the report of an earlier run lists."""
     files = _outputs.entry_of_report(folder, "files")
-    old = [name for name in files if name.endswith(".png")]
-    others = sorted({*ALWAYS}.difference(old, new))
-    others = [name for name in others if (folder / name).exists()]
-    if others:
-        warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
-    return old
+    return [name for name in files if name.endswith(".png")]
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:

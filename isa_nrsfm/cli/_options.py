@@ -161,7 +161,6 @@ HELP = {
     # The table.
     "table TABLE": "a .csv, .tsv or .parquet file, or a file or folder of another "
     "format",
-    "export.table TABLE": "for .html, the table whose frames are shown",
     "format FORMAT": "the program that wrote the table: "
     f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for any table "
     "with named columns (default: auto, recognised by the beginning of the file)",
@@ -209,8 +208,6 @@ HELP = {
     "label COLUMN": "a class or a number for each frame, such as an expression or an "
     "age: reports the dependence of the coefficients on it. Whole numbers are classes "
     "unless given as COLUMN:number",
-    "export.label COLUMN": "for .html, the column of TABLE that determines the colours "
-    "of frames",
     "group COLUMN": "people, videos or files: reports the variance between and within "
     "groups. Held-out frames come from other groups; smoothing stops at their borders",
     "distance POINT,POINT": "add the distance of two points of the 3D shapes to "
@@ -239,8 +236,6 @@ HELP = {
     "prior MODEL": "a fitted model of a table in which the objects turn, such as "
     f"model.npz, or {FACE_PRIOR} for faces with 68 points: with it frontal photos and "
     "few frames have true depths",
-    "adapt": "what differs from the prior: the mean shape, so that coefficients of "
-    "several studies can be compared, or all shapes",
     "export.camera": "camera model for a model with affine cameras; none exports "
     "affine shapes, whose angles and depth are not true (default: weak_perspective)",
     "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
@@ -259,13 +254,10 @@ HELP = {
     "random_state SEED": "seed of the random starts (default: 0)",
     "n_jobs N": "processes for the random starts, -1 for all processors (default: 1)",
     # Export.
-    "content": "contents of the file, if the suffix leaves it open: pdm for a point "
-    "distribution model as .mat (M, V and E) or .npz",
     "n_modes MODES": "for a point distribution model, the number of modes, or the "
     "share of the variance that they explain, such as 0.98 (default: number of basis "
     "shapes)",
     "names NAMES": "for .html and .glb, names of the basis shapes with commas",
-    "n_frames N": "for .html, the largest number of frames (default: 1000)",
     "mirrored": "take the mirror image in depth, which has the same images",
 }
 # The values of options that have few.
@@ -275,17 +267,15 @@ CHOICES: dict[str, Sequence[str]] = {
     "part": tuple(dict.fromkeys((*choices.OPENPOSE_PARTS, *choices.WHOLE_PARTS))),
     "origin": ("auto", "upper", "lower"),
     "camera": choices.CAMERA_NAMES,
-    "adapt": choices.ADAPTED,
     "export.camera": ("weak_perspective", NONE),
     "isa": ("pooled", "fast"),
     "block_recovery": choices.BLOCK_RECOVERIES,
     "refinement": (*choices.REFINEMENTS, NONE),
     "independence": (*choices.INDEPENDENCE, NONE),
     "loss": choices.LOSSES,
-    "content": tuple(SUFFIXES),
 }
 # Options whose first choice is their value by default, which the help states.
-FIRST = ("adapt", "isa", "block_recovery", "refinement", "independence", "loss")
+FIRST = ("isa", "block_recovery", "refinement", "independence", "loss")
 DEFAULTS = {
     **{name: CHOICES[name][0] for name in ("format", *FIRST)},
     **{"length": 1.0, "random_state": 0},
@@ -342,8 +332,7 @@ coefficients. The results replace those of an earlier run in the output folder."
             ),
             "method": (
                 *("n_components", "camera", "focal_length", "principal_point"),
-                *("prior", "adapt"),
-                *("isa", "n_init", "block_recovery"),
+                *("prior", "isa", "n_init", "block_recovery"),
                 *("refinement", "independence", "loss", "no_scale_frames"),
                 *("no_hidden_points", "random_state", "n_jobs"),
             ),
@@ -376,8 +365,7 @@ Write a fitted model for other programs. The suffix of the output determines the
 examples:
   isa-nrsfm export results/model.npz --output faces.glb
   isa-nrsfm export results/model.npz --output pdm.txt --n-modes 0.98
-  isa-nrsfm export results/model.npz --output pdm.mat --content pdm
-  isa-nrsfm export results/model.npz faces.csv --label expression --output faces.html
+  isa-nrsfm export results/model.npz --output faces.html
 
 Shapes are upright and frontal, with the proportions that weak-perspective cameras
 determine; .npz and .mat have the arrays of the model unchanged. Models that were
@@ -386,10 +374,9 @@ proportions.""",
         {
             "model": ("model",),
             "output": (
-                *("output", "force", "content", "n_modes", *DRAWING, "names"),
-                *("label", "n_frames", "camera", "mirrored"),
+                *("output", "force", "n_modes", *DRAWING, "names"),
+                *("camera", "mirrored"),
             ),
-            "table": ("table", *TABLE_OPTIONS),
         },
     ),
     "demo": (
@@ -421,7 +408,9 @@ def build_parser() -> Parser:
     for command, (line, description, examples, groups) in _COMMANDS.items():
         own = commands.add_parser(command, help=line, **_manners(description, examples))
         # For commands without these
-        own.set_defaults(weights=None, points=None, principal_point=None)
+        own.set_defaults(
+            weights=None, points=None, principal_point=None, missing_value=()
+        )
         for title, entries in groups.items():
             group = own.add_argument_group(title)
             for entry in entries:
@@ -448,8 +437,6 @@ def _settings(command: str, name: str) -> dict[str, Any]:
         settings |= {"metavar": metavar, "type": TYPES.get(metavar)}
     if metavar == "X Y":
         settings |= {"metavar": ("X", "Y"), "nargs": 2}
-    if key == "export.table":
-        settings["nargs"] = "?"
     if name == "output":
         settings["required"] = default is None
     if key in FIRST:

@@ -103,18 +103,8 @@ def write_alpha(
     results = results.reindex(frames.points.index)
     results.insert(0, "row", results.index)
     taken = {str(name) for name in frames.other.columns}
-    renamed = {}
-    for name in filter(taken.__contains__, results):
-        renamed[name] = f"{name}_"
-        while renamed[name] in taken:
-            renamed[name] += "_"
-    if renamed:
-        listed = ", ".join(f"{new} (not {name})" for name, new in renamed.items())
-        warn_caller(
-            "the table has columns with the names of results, which were renamed to "
-            + listed
-        )
-    results = results.rename(columns=renamed)
+    while not taken.isdisjoint(results):
+        results = results.rename(columns=lambda name: f"{name}{'_' * (name in taken)}")
     parts = [results.iloc[:, :1], frames.other, results.iloc[:, 1:]]
     write_table(pd.concat(parts, axis=1), path)
 

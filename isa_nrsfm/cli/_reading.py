@@ -136,7 +136,6 @@ def read_frames(
     stripped = [name.strip() for name in names]
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
     tracks[kept] = tracks_in(table[kept], names, args.missing_value)
-    _refuse_lost_points(args, table[kept], columns, tracks)
     confidence = np.full(tracks.shape[:2], np.nan)
     if not sure.empty:
         confidence = sure[list(columns.x)].to_numpy(np.float64)
@@ -285,28 +284,6 @@ def _rows_to_keep(
         skipped.append((reason, np.flatnonzero(matches), True))
         kept &= ~matches
     return kept, skipped
-
-
-def _refuse_lost_points(
-    args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns, tracks: NDArray
-) -> None:
-    """Raise if a table to fit has a point that no row shows but for --zeros-missing.
-
-    tracks (n_frames, n_points, 2) are those of all rows, without missing points.
-    """
-    if args.command != "fit" or not args.missing_value:
-        return
-    absent = np.isnan(tracks).all(axis=(0, 2))
-    found = zip(columns.points, columns.x, absent, strict=True)
-    lost = [name for name, x, each in found if each and table[x].notna().any()]
-    if lost:
-        option = "--zeros-missing" if args.zeros_missing else "--missing-value"
-        raise ValueError(
-            f"{option}: {len(lost)} of {len(absent)} points are missing in all rows "
-            f"(first: {lost[0]}). If that point is the origin of the coordinates, "
-            f"leave out {option}. If no row shows it, leave out the point: --points "
-            f"without:{','.join(lost)}"
-        )
 
 
 def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:

@@ -1,16 +1,13 @@
 """The report of a run as data, rendered as text, JSON and HTML."""
 
-import contextlib
-import platform
 from argparse import Namespace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import percent
@@ -48,7 +45,6 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
         "columns": frames.columns.pattern,
         "first_columns": names[:4],
         "last_columns": names[-2:],
-        "absent_numbers": frames.columns.gaps,
         "coordinates_not_used": frames.not_used,
         "rows_left_out": [
             {
@@ -202,12 +198,3 @@ def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
         "n_frames": len(np.unique(found.outliers[:, 0])),
         "largest": [{"row": X.index[i], "point": names[j]} for i, j in largest],
     }
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of libraries that the results depend on."""
-    found = {"isa_nrsfm": __version__, "python": platform.python_version()}
-    for library in ("numpy", "scipy", "scikit-learn", "joblib", "pandas"):
-        with contextlib.suppress(PackageNotFoundError):
-            found[library] = version(library)
-    return found

@@ -103,9 +103,6 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
     ]
-    if table["absent_numbers"]:
-        absent = first_items(table["absent_numbers"], MOST_LISTED)
-        parts.append(f"the table has no points with the numbers {absent}")
     if table["coordinates_not_used"]:
         not_used = table["coordinates_not_used"].items()
         listed = "; ".join(f"{pattern} ({n_points})" for pattern, n_points in not_used)
@@ -285,7 +282,7 @@ def _fit(report: dict[str, Any]) -> Section:
             size = f"{noise:.3g} in the units of the table"
         parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
     if "prior" in report:
-        parts.append(_prior(report["prior"], model["parameters"]["adapt"]))
+        parts.append(_prior(report["prior"]))
     fit = seconds["fit"] + seconds.get("choose", 0.0)
     parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
     if model["skeleton"] is not None:
@@ -305,18 +302,13 @@ def _fit(report: dict[str, Any]) -> Section:
     return parts
 
 
-def _prior(prior: dict[str, Any], adapt: str) -> str:
+def _prior(prior: dict[str, Any]) -> str:
     """Return how far the shapes are from those of the prior, and what that means."""
-    mean_shape, basis = (f"{100 * width:.2g} %" for width in prior["std"])
-    others = ""
-    whose = "the prior, so that studies with the same prior can be compared"
-    if adapt != "mean":
-        others = f", the basis shapes by {basis}"
-        whose = "adapted basis shapes: compare studies with --adapt mean"
     return (
-        f"prior {prior['name']}: the mean shape differs by {mean_shape} of the size of "
-        f"the object from that of the prior{others} (standard deviation of a "
-        f"coordinate). Coefficients are those of {whose}."
+        f"prior {prior['name']}: the mean shape differs by {100 * prior['std'][0]:.2g} "
+        "% of the size of the object from that of the prior (standard deviation of a "
+        "coordinate). Coefficients are those of the prior, so that studies with the "
+        "same prior can be compared."
     )
 
 

@@ -11,20 +11,16 @@ file, whose name keeps the number, has 68.
 
 A photo is named like i000qa-fn: the subject, the lighting, the camera, the sex, and
 whether glasses are worn (g) or not (n). Three names have a number in the last place, so
-that the glasses are taken from the tag. Names of mirror images begin with ir; their
-points are renumbered such that those on the left of a face are on its left again.
+that the glasses are taken from the tag. The mirror images of the file are left out.
 
 S. Milborrow, J. Morkel, F. Nicolls: The MUCT Landmarked Face Database. Pattern
 Recognition Association of South Africa, 2010. http://www.milbo.org/muct
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
-from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables.tracks import table_to_tracks
 from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, fetch_file
@@ -39,17 +35,10 @@ SHA256 = "e5f393a52b6c8b1cdd945063d450476c0ca6be6ac07b3b2cd3cd5357f202c0eb"
 DESCR = f"{__doc__}\nSource: free for academic use, {URL}\n"
 
 
-@checked_parameters(
-    PARAMETERS | {name: ["boolean"] for name in ("mirrored", "return_X_y", "as_frame")}
-)
+@checked_parameters(PARAMETERS)
 def fetch_muct(
-    *,
-    data_home: DataHome = None,
-    download_if_missing: bool = True,
-    mirrored: bool = False,
-    return_X_y: bool = False,
-    as_frame: bool = False,
-) -> Any:
+    *, data_home: DataHome = None, download_if_missing: bool = True
+) -> Bunch:
     """
     Load the landmarks of the faces of MUCT; download them if necessary.
 
@@ -65,24 +54,16 @@ def fetch_muct(
     download_if_missing : bool, default=True
         Whether to download the file (4.2 MB) if it is not there. This needs pooch:
         ``pip install "isa-nrsfm[datasets]"``.
-    mirrored : bool, default=False
-        Whether to include the mirror images of the photos: 7510 frames instead of
-        3755. Their points are renumbered such that those on the left of a face are on
-        its left again.
-    return_X_y : bool, default=False
-        Whether to return ``(data, target)`` instead of a Bunch.
-    as_frame : bool, default=False
-        Whether `data` is a pandas DataFrame and `target` a Series.
 
     Returns
     -------
-    sklearn.utils.Bunch or tuple of (data, target)
+    sklearn.utils.Bunch
         Dictionary-like object with the attributes
 
-        data : ndarray or DataFrame of shape (n_frames, 136)
+        data : ndarray of shape (n_frames, 136)
             The table x00, y00, x01, ..., in pixels, x to the right and y down. Points
             that are not seen are NaN.
-        target : ndarray or Series of shape (n_frames,)
+        target : ndarray of shape (n_frames,)
             The same as `subjects`.
         tracks : ndarray of shape (n_frames, 68, 2)
             The same numbers as in `data`, one (x, y) pair per point.
@@ -98,17 +79,12 @@ def fetch_muct(
             The sex of the person, f or m.
         glasses : ndarray of shape (n_frames,), dtype=bool
             Whether glasses are worn.
-        mirrored : ndarray of shape (n_frames,), dtype=bool
-            Which rows are mirror images.
         names : ndarray of shape (n_frames,), dtype=str
             The names of the photos.
         tags : ndarray of shape (n_frames,), dtype=str
             Attributes of the photos as they are in the file: bits, hexadecimal.
         feature_names : list of str
             The names of the columns of `data`.
-        frame : DataFrame of shape (n_frames, 144)
-            Only with `as_frame`: the columns name, tag, subject, lighting, camera, sex,
-            glasses, mirrored, and those of `data`.
         filename : str
             The path of the file.
         DESCR : str
@@ -120,8 +96,7 @@ def fetch_muct(
         If the file is not there and cannot be downloaded, or not with
         `download_if_missing=False`; or if the file that is there is another one.
     ImportError
-        If the file has to be downloaded and pooch is not installed, or if pandas is not
-        installed with `as_frame`.
+        If the file has to be downloaded and pooch is not installed.
 
     See Also
     --------
@@ -141,33 +116,26 @@ def fetch_muct(
     (3755, 136)
     """
     path = fetch_file(URL, SHA256, data_home, download_if_missing)
-    cells = np.loadtxt(path, dtype=np.str_, delimiter=",")
-    faces = _labelled(cells[1:])
-    if not mirrored:
-        faces = {name: column[~faces["mirrored"]] for name, column in faces.items()}
-    bunch = Bunch(
+    header, *cells = np.loadtxt(path, dtype=np.str_, delimiter=",")
+    # Without the mirror images of all photos, which are called ir...
+    faces = _labelled(np.array([row for row in cells if not row[0].startswith("ir")]))
+    return Bunch(
         **faces,
         target=faces["subjects"],
         tracks=table_to_tracks(faces["data"]),
-        feature_names=cells[0, 2:].tolist(),
+        feature_names=header[2:].tolist(),
         filename=str(path),
         DESCR=DESCR,
     )
-    if as_frame:
-        _put_in_frames(bunch)
-    return (bunch.data, bunch.target) if return_X_y else bunch
 
 
 def _labelled(cells: NDArray) -> dict[str, NDArray]:
-    """Return all rows of the file, NaN where a point is at (0, 0), and their labels."""
+    """Return the rows of the file, NaN where a point is at (0, 0), and their labels."""
     names, tags, data = *cells[:, :2].T.copy(), cells[:, 2:].astype(float)
     visible = table_to_tracks(data).any(axis=2)
     table_to_tracks(data)[~visible] = np.nan
-
-    mirrored = np.strings.startswith(names, "ir")
     # One column a letter: i000qa-fn.
-    photos = np.where(mirrored, np.strings.replace(names, "ir", "i", 1), names)
-    letters = photos.astype("U9").view("U1").reshape(-1, 9)
+    letters = names.astype("U9").view("U1").reshape(-1, 9)
     return {
         "data": data,
         "visible": visible,
@@ -176,16 +144,6 @@ def _labelled(cells: NDArray) -> dict[str, NDArray]:
         "camera": letters[:, 5],
         "sex": letters[:, 7],
         "glasses": np.array([int(tag, 16) & 0x2 > 0 for tag in tags]),
-        "mirrored": mirrored,
         "names": names,
         "tags": tags,
     }
-
-
-def _put_in_frames(faces: Bunch) -> None:
-    """Make the table and the target of pandas, and add a frame of all columns."""
-    faces.data = pd.DataFrame(faces.data, columns=faces.feature_names)
-    faces.target = pd.Series(faces.subjects, name="subject")
-    names = "name tag subject lighting camera sex glasses mirrored".split()
-    labels = {name: faces[name if name in faces else f"{name}s"] for name in names}
-    faces.frame = pd.concat([pd.DataFrame(labels), faces.data], axis=1)

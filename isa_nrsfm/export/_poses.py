@@ -67,7 +67,6 @@ def frame_poses(
     camera: Camera = "weak_perspective",
     edges: Any = "auto",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> FramePoses:
     """
     Return yaw, pitch and roll of the object in each frame.
@@ -91,8 +90,6 @@ def frame_poses(
         The layout of the points or its name; otherwise it is recognised.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: above, as in images, or below.
-    mirrored : bool, default=False
-        Whether to take the mirror image in depth.
 
     Returns
     -------
@@ -121,9 +118,8 @@ def frame_poses(
     >>> frame_poses(model.fit(faces.data)).yaw.shape
     (40,)
     """
-    return pose_function(
-        model, camera=camera, edges=edges, origin=origin, mirrored=mirrored
-    )(X, point_weight)
+    pose = pose_function(model, camera=camera, edges=edges, origin=origin)
+    return pose(X, point_weight)
 
 
 def pose_function(
@@ -132,7 +128,6 @@ def pose_function(
     camera: Camera = "weak_perspective",
     edges: Any = "auto",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> Callable[..., FramePoses]:
     """
     Return a function that computes the poses of frames of a model.
@@ -148,8 +143,6 @@ def pose_function(
     edges : "auto", str, Skeleton or None, default="auto"
         As in `frame_poses`.
     origin : {"auto", "upper", "lower"}, default="auto"
-        As in `frame_poses`.
-    mirrored : bool, default=False
         As in `frame_poses`.
 
     Returns
@@ -180,7 +173,7 @@ def pose_function(
     """
     if camera is None:
         raise ValueError("angles need calibrated cameras; got camera=None")
-    space = upright_space(model, camera, origin, mirrored, edges)
+    space = upright_space(model, camera, origin, edges)
     return partial(_poses, space, model)
 
 
@@ -264,7 +257,7 @@ def point_distances(
         raise ValueError("distances need calibrated cameras; got camera=None")
     if not 0 < length < np.inf:
         raise ValueError(f"length must be a positive number; got {length}")
-    space = upright_space(model, camera, "auto", False)
+    space = upright_space(model, camera, "auto")
     names = names_of_points(model)
     first, second = np.array([point_numbers(pair, names) for pair in pairs]).T
     if unit is None:

@@ -1,19 +1,18 @@
 """The arrays of a fitted model, and point distribution models, with their files."""
 
 import os
-from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import loadmat, savemat
+from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
-from isa_nrsfm._compat.stored_arrays import read_arrays, write_arrays
+from isa_nrsfm._compat.stored_arrays import write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._linalg.small_matrices import procrustes
@@ -202,7 +201,6 @@ def point_distribution_model(
     n_modes: float | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> PointDistributionModel:
     """
     Return the point distribution model of the frames that a model was fitted to.
@@ -223,9 +221,6 @@ def point_distribution_model(
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" if 68 points of a face would otherwise
         be upside down.
-    mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table equally well. By
-        default, faces of 68 points in the order of iBUG have the right depth.
 
     Returns
     -------
@@ -271,7 +266,7 @@ def point_distribution_model(
     >>> pdm.mean.shape, pdm.modes.shape, pdm.eigenvalues.shape
     ((68, 3), (1, 68, 3), (1,))
     """
-    space = upright_space(model, camera, origin, mirrored)
+    space = upright_space(model, camera, origin)
     shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
     if space.camera is not None:
@@ -341,41 +336,29 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
     Parameters
     ----------
     path : str or path-like
-        A file that `write_pdm` has written, or one of OpenFace.
+        A text file (``.txt``) of `write_pdm` or OpenFace.
 
     Returns
     -------
     PointDistributionModel
-        Named tuple of mean, modes and eigenvalues. Further matrices in a text file,
-        such as modes of expressions alone, are ignored.
+        Named tuple of mean, modes and eigenvalues. Further matrices, such as modes of
+        expressions alone, are ignored.
 
     Raises
     ------
     ValueError
-        If the suffix is not ``.txt``, ``.mat`` or ``.npz``, or if the file does not
-        have three finite matrices of consistent shapes.
+        If the suffix is not ``.txt``, or if the file does not have three finite
+        matrices of consistent shapes.
     OSError
         If the file cannot be opened.
 
     See Also
     --------
     write_pdm : Write such a file.
-
-    Notes
-    -----
-    SciPy reads ``.mat`` files. Damaged ``.mat`` files can crash Python. Use text files
-    if you do not trust the source.
     """
-    suffix = suffix_of(path, SUFFIXES)
+    suffix_of(path, [".txt"])
     with reading(path, "a point distribution model"):
-        if suffix == ".npz":
-            names = PointDistributionModel._fields
-            pdm = PointDistributionModel(*_numbers(read_arrays(path), names))
-        elif suffix == ".mat":
-            pdm = _from_matrices(*_numbers(loadmat(path), "MVE"))
-        else:
-            pdm = _from_matrices(*_read_matrices(path))
-        _check_shapes(pdm)
+        pdm = _from_matrices(*_read_matrices(path))
         if not all(np.isfinite(part).all() for part in pdm):
             raise ValueError("its numbers should be finite; got NaN or infinity")
         return pdm
@@ -394,7 +377,6 @@ def _check_shapes(pdm: PointDistributionModel) -> None:
 
 def _from_matrices(M: NDArray, V: NDArray, E: NDArray) -> PointDistributionModel:
     """Return the model of mean (3n x 1), components (3n x m) and m variances."""
-    M, V, E = (np.asarray(matrix, dtype=np.float64) for matrix in (M, V, E))
     n_points, n_modes = M.size // 3, E.size
     if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
         raise ValueError(
@@ -403,18 +385,6 @@ def _from_matrices(M: NDArray, V: NDArray, E: NDArray) -> PointDistributionModel
         )
     modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
     return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
-
-
-def _numbers(found: Mapping[str, NDArray], names: Sequence[str]) -> list[NDArray]:
-    """Return the arrays with some names, which must hold real numbers."""
-    absent = [name for name in names if name not in found]
-    if absent:
-        raise ValueError(f"it has no {', '.join(absent)}")
-    for name in names:
-        dtype = found[name].dtype
-        if dtype.kind not in "fiu":
-            raise ValueError(f"{name} should have real numbers; got {dtype}")
-    return [found[name] for name in names]
 
 
 def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:

@@ -36,8 +36,6 @@ from isa_nrsfm.skeletons import Skeleton
 
 Camera = Literal["weak_perspective"] | None
 
-MIRROR = np.diag([1.0, 1.0, -1.0])
-
 
 class UprightSpace(NamedTuple):
     """The transform from the space of a model to the upright space.
@@ -56,7 +54,7 @@ class UprightSpace(NamedTuple):
 
 
 def upright_space(
-    model: Any, camera: Camera, origin: Origin, mirrored: bool, edges: Any = "auto"
+    model: Any, camera: Camera, origin: Origin, edges: Any = "auto"
 ) -> UprightSpace:
     """Find the upright space of a fitted model, or raise.
 
@@ -94,9 +92,6 @@ def upright_space(
         image_axes[1, 1] = -1
         transform, shape = UPSIDE_DOWN @ transform, shape @ UPSIDE_DOWN
     transform = upright_turn(shape, layout, "upper") @ transform
-    if mirrored:
-        model.mirrored()  # raises if perspective decides
-        transform = MIRROR @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
     return UprightSpace(known, metric, transform, image_axes, lines)

@@ -30,7 +30,6 @@ from isa_nrsfm.export._upright import (
 from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
 from isa_nrsfm.plotting._views import UPSIDE_DOWN, Edges, Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
-from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT
 
 # The colours of more labels than this look alike.
 MOST_LABELS = 30
@@ -45,12 +44,10 @@ ABOUT = {
 }
 MIRRORED = " The mirror image in depth fits the images as well."
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
-FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125
+FLOATS, INTEGERS = 5126, 5125
 VERTICES, INDICES = 34962, 34963
 POINTS, LINES, TRIANGLES = 0, 1, 4
-# Matt materials, seen from both sides: for points and edges in the middle, on the left
-# and on the right, and for surfaces.
-SURFACE = 3
+# Matt materials, seen from both sides.
 MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.8}
 MATERIALS = [
     {
@@ -60,8 +57,6 @@ MATERIALS = [
     }
     for name, colour in (
         ("points and edges", (0.05, 0.12, 0.25)),
-        ("left", (0.0, 0.342, 0.171)),
-        ("right", (0.604, 0.191, 0.386)),
         ("surface", (0.80, 0.66, 0.55)),
     )
 ]
@@ -81,7 +76,6 @@ def write_viewer(
     names: Sequence[str] | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> None:
     """
     Write a page that shows a shape model in any browser.
@@ -134,9 +128,6 @@ def write_viewer(
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" if a face or a body would otherwise be
         upside down.
-    mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table equally well.
-        The page has a switch for it.
 
     Raises
     ------
@@ -167,7 +158,7 @@ def write_viewer(
         raise ValueError(
             f"n_frames must be a whole number of at least 0; got {n_frames!r}"
         )
-    space = upright_space(model, camera, origin, mirrored, edges)
+    space = upright_space(model, camera, origin, edges)
     components = names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
@@ -306,7 +297,6 @@ def write_glb(
     names: Sequence[str] | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
-    mirrored: bool = False,
 ) -> None:
     """
     Write the mean shape with the basis shapes as morph targets to a glTF 2.0 file.
@@ -339,9 +329,6 @@ def write_glb(
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" if a face or a body would otherwise be
         upside down.
-    mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table equally well. By
-        default, faces and bodies of known layouts have the right depth.
 
     Raises
     ------
@@ -370,27 +357,21 @@ def write_glb(
     frames; those of calibrated cameras are the model's.
     """
     suffix_of(path, [".glb"])
-    space = upright_space(model, camera, origin, mirrored, edges)
+    space = upright_space(model, camera, origin, edges)
     targets = names_of_components(names, len(model.basis_))
     shapes = viewed_shapes(space, model)
     factor = 1 / np.ptp(shapes[0], axis=0).max()
     shapes = factor * shapes
-    lines, surface, drawn_edges = space.lines, None, []
+    lines, surface = space.lines, None
     if np.shape(cast(Any, edges))[1:] == (3,):
         lines, surface = None, np.asarray(edges)
     elif isinstance(edges, str) and edges == "auto":
         if lines is None or lines.kind in ("face", "other"):
             surface = frontal_triangles(shapes[0])
-    if lines is not None:
-        drawn_edges = [
-            lines.edges[lines.edge_sides == side] for side in (MIDDLE, LEFT, RIGHT)
-        ]
 
     file = Binary()
+    drawn_edges = None if lines is None else lines.edges
     primitives = _primitives(file, shapes, surface, drawn_edges)
-    used = sorted({part["material"] for part in primitives})
-    for part in primitives:
-        part["material"] = used.index(part["material"])
     extras = {
         "targetNames": targets,
         "pointNames": list(names_of_points(model)),
@@ -416,7 +397,7 @@ def write_glb(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "shape", "mesh": 0}],
         "meshes": [mesh],
-        "materials": [MATERIALS[material] for material in used],
+        "materials": MATERIALS,
         "animations": [animation],
     }
     write_whole(path, file.with_document(document))
@@ -437,15 +418,11 @@ class Binary:
 
         The use of the bytes is VERTICES or INDICES; bounds add minimum and maximum.
         """
-        kind, dtype = FLOATS, "<f4"
-        if array.dtype.kind in "iu":
-            # For short integers the index 65535 is reserved.
-            short = array.max(initial=0) < 65535
-            kind, dtype = (SHORTS, "<u2") if short else (INTEGERS, "<u4")
-        array = array.astype(dtype)
+        is_index = array.dtype.kind in "iu"
+        array = array.astype("<u4" if is_index else "<f4")
         accessor = {
             "bufferView": len(self.views),
-            "componentType": kind,
+            "componentType": INTEGERS if is_index else FLOATS,
             "count": len(array),
             "type": "SCALAR" if array.ndim == 1 else "VEC3",
         }
@@ -480,35 +457,24 @@ def _padded(content: bytes, filler: bytes) -> bytes:
 
 
 def _primitives(
-    file: Binary, shapes: NDArray, surface: NDArray | None, drawn_edges: list[NDArray]
+    file: Binary, shapes: NDArray, surface: NDArray | None, edges: NDArray | None
 ) -> list[dict[str, Any]]:
     """Return a surface, the points, unless there are many on it, and the edges."""
-    mean, *basis = shapes
     position, *drifts = (file.add(x, VERTICES, bounds=True) for x in shapes)
     bare: dict[str, Any] = {
         "attributes": {"POSITION": position},
         "targets": [{"POSITION": drift} for drift in drifts],
-        "material": MIDDLE,
+        "material": 0,
     }
     primitives = []
+    if surface is None or not is_dense(shapes[0]):
+        primitives.append(bare | {"mode": POINTS})
     if surface is not None:
         indices = file.add(surface.ravel(), INDICES)
-        normals = vertex_normals(mean, surface)
-        # Viewers add normals with the weights: store their change by one standard
-        # deviation.
-        turns = [vertex_normals(mean + drift, surface) - normals for drift in basis]
-        numbers = [file.add(normal, VERTICES) for normal in (normals, *turns)]
-        parts = zip([bare["attributes"], *bare["targets"]], numbers, strict=True)
-        first, *others = (part | {"NORMAL": number} for part, number in parts)
-        shaded = {"attributes": first, "targets": others, "material": SURFACE}
-        primitives.append(shaded | {"mode": TRIANGLES, "indices": indices})
-    if surface is None or not is_dense(mean):
-        primitives.append(bare | {"mode": POINTS})
-    for side, edges in enumerate(drawn_edges):
-        if len(edges):
-            indices = file.add(edges.ravel(), INDICES)
-            lines = {"mode": LINES, "indices": indices, "material": side}
-            primitives.append(bare | lines)
+        primitives.append(bare | {"mode": TRIANGLES, "indices": indices, "material": 1})
+    if edges is not None and len(edges):
+        indices = file.add(edges.ravel(), INDICES)
+        primitives.append(bare | {"mode": LINES, "indices": indices})
     return primitives
 
 
@@ -525,34 +491,11 @@ def _swings(n_components: int) -> tuple[NDArray, NDArray]:
 
 
 def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:
-    """Return the Delaunay triangles (n, 3) of the front view of a shape (n_points, 3).
-
-    Counter-clockwise for the viewer: x points right, y up and z to the viewer.
-    """
+    """Return the Delaunay triangles (n, 3) of the front view of a shape (J, 3)."""
     try:
-        corners = Delaunay(shape[:, :2]).simplices.astype(np.intp)
+        return Delaunay(shape[:, :2]).simplices.astype(np.intp)
     except QhullError as error:
         raise ValueError(
             "the points are on one line in the front view and have no triangles there; "
             "set edges, or edges=None to draw only points"
         ) from error
-    a, b, c = shape[corners, :2].transpose(1, 0, 2)
-    area = np.linalg.det(np.stack([b - a, c - a], axis=1))
-    corners[area < 0] = corners[area < 0][:, ::-1]
-    return corners
-
-
-def vertex_normals(shape: NDArray, triangles: NDArray[np.intp]) -> NDArray:
-    """Return unit normals (n_points, 3) of the points of a mesh, weighted with areas.
-
-    Points without triangles have normals towards the viewer, (0, 0, 1).
-    """
-    a, b, c = shape[triangles].transpose(1, 0, 2)
-    faces = np.cross(b - a, c - a)
-    normals = np.zeros_like(shape)
-    for corner in triangles.T:
-        np.add.at(normals, corner, faces)
-    sizes = np.linalg.norm(normals, axis=1)
-    alone = sizes <= np.finfo(float).tiny
-    normals[alone], sizes[alone] = [0.0, 0.0, 1.0], 1.0
-    return normals / sizes[:, None]

@@ -20,15 +20,8 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.io._landmark_columns import find_landmark_columns
-from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
-from isa_nrsfm.io._tables import (
-    SEPARATORS,
-    header_names,
-    header_rows,
-    read_columns,
-    tracks_in,
-)
+from isa_nrsfm.io._landmarks import Landmarks, assemble_individuals
+from isa_nrsfm.io._tables import SEPARATORS, header_rows, read_columns
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -50,7 +43,6 @@ _DIMS = ("frame", "track", "node", "xy")
 # Without the attribute: SLEAP's own order, and that of its older files
 # for Python. They differ where there are more than two points.
 _ORDERS = (("track", "xy", "node", "frame"), ("frame", "node", "xy", "track"))
-_CSV_COLUMNS = ["track", "frame_idx", "instance.score"]
 _NEEDED = frozenset({"tracks", "node_names", "track_names"})
 
 Columns = list[tuple[str, ...]]
@@ -331,52 +323,18 @@ def _plain(pickled: Any) -> Any:
 
 
 def is_sleap(path: Path) -> bool:
-    """Return whether a file has the datasets (h5) or the header of SLEAP."""
-    if is_hdf5(path):
-        return _NEEDED <= root_groups(path)
-    return header_names(path)[: len(_CSV_COLUMNS)] == _CSV_COLUMNS
+    """Return whether a file has the datasets of SLEAP."""
+    return is_hdf5(path) and _NEEDED <= root_groups(path)
 
 
 def read_sleap(path: Path) -> Landmarks:
-    """Read an analysis h5 file or table of SLEAP, or of sleap-io and movement.
+    """Read an analysis h5 file of SLEAP, or of sleap-io and movement.
 
-    In an h5 file, ``tracks`` has the points, in the order of axes of its attribute
-    ``dims``, by default (track, xy, node, frame). ``point_scores`` and
-    ``instance_scores`` have confidences, ``edge_names`` the pairs of nodes that the
-    skeleton joins. A table has a row for each instance, ``track, frame_idx,
-    instance.score`` and ``x``, ``y`` and ``score`` of each node. Frames are counted
-    from 0.
+    ``tracks`` has the points, in the order of axes of its attribute ``dims``, by
+    default (track, xy, node, frame). ``point_scores`` and ``instance_scores`` have
+    confidences, ``edge_names`` the pairs of nodes that the skeleton joins. Frames are
+    counted from 0.
     """
-    is_h5 = path.suffix.lower() in (".h5", ".hdf5")
-    return _read_analysis(path) if is_h5 else _read_table(path)
-
-
-def _read_table(path: Path) -> Landmarks:
-    """Read a table, which has no rows for frames without instances."""
-    if not is_sleap(path):
-        raise ValueError(f"its first columns are not {', '.join(_CSV_COLUMNS)}")
-    names = header_names(path)
-    found = find_landmark_columns(names, "*.x,*.y")
-    nodes = [name.removesuffix(".x") for name in found.x]
-    scores = [f"{node}.score" for node in nodes]
-    if not set(scores).issubset(names):
-        raise ValueError("not all of its points have a score")
-    table = read_columns(
-        path,
-        numbers=[*found.interleaved, *scores, "frame_idx", "instance.score"],
-        text=("track",),
-    )
-    return assemble(
-        tracks_in(table, found.interleaved),
-        nodes,
-        table[_CSV_COLUMNS].set_axis(["individual", "frame", "instance_score"], axis=1),
-        format="sleap",
-        confidence=table[scores].to_numpy(np.float64),
-    )
-
-
-def _read_analysis(path: Path) -> Landmarks:
-    """Read an h5 file."""
     h5py = import_optional("h5py", extra="h5")
     with h5py.File(path, "r") as file:
         absent = _NEEDED.difference(file)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.coordinates import are_shares
 from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
@@ -144,26 +143,15 @@ def read_mediapipe(
 
 
 def _check_inside(shares: NDArray[np.float64]) -> None:
-    """Warn of points (n_frames, n_points, 2) outside the image; refuse if most are.
-
-    Trackers place points that the image cuts off, such as the legs of a body, beyond
-    its border. Of faces and hands centred at the origin more than half are outside.
-    """
+    """Refuse points (n_frames, n_points, 2) if most are outside the image."""
     beyond = np.maximum(-shares, shares - 1).max(axis=2)
     n_outside, n_shown = np.sum(beyond > 0), np.sum(~np.isnan(beyond))
-    if not n_outside:
-        return
-    row, point = np.unravel_index(np.nanargmax(beyond), beyond.shape)
-    found = (
-        f"{n_outside} of {n_shown} points are outside the image, by at most "
-        f"{beyond[row, point]:.2g} of its width or height (point {point} in row {row})"
-    )
     if 2 * n_outside > n_shown and not are_shares(shares):
         raise ValueError(
-            f"{found}: the coordinates are no shares of the width and height of an "
-            "image. Read them without image_size, in the format table"
+            f"{n_outside} of {n_shown} points are outside the image: the coordinates "
+            "are no shares of the width and height of an image. Read them without "
+            "image_size, in the format table"
         )
-    warn_caller(f"{found}. Trackers guess the places of points that the image cuts off")
 
 
 def _assembled(

@@ -146,8 +146,8 @@ def read_landmarks(
         Points with a lower confidence become NaN, where the format has confidences.
     **options : dict
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
-        pixels, for coordinates in shares of the image's size; ``category`` of "coco",
-        the name of the category to read; ``part`` of "openpose", one of "pose", "face",
+        pixels, for coordinates in shares of the image's size; ``part``
+        of "openpose", one of "pose", "face",
         "hand_left" and "hand_right"; ``part`` of whole bodies of "coco" and "mmpose",
         one of "body", "feet", "face", "left_hand", "right_hand" and "all"; ``columns``
         and ``missing`` of "table" and "mediapipe", and ``individuals`` of "table", as
@@ -340,9 +340,8 @@ _ALL = (
     LandmarkFormat(
         "sleap",
         "SLEAP analysis",
-        "the datasets tracks, node_names and track_names, or the columns track, "
-        "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
-        (".h5", ".hdf5", *_TABLES),
+        "the datasets tracks, node_names and track_names",
+        (".h5", ".hdf5"),
         "_animals.sleap",
     ),
     LandmarkFormat(
@@ -352,7 +351,7 @@ _ALL = (
         "write json of other programs as a table",
         (".json",),
         "_keypoints.coco",
-        ("category", "part"),
+        ("part",),
     ),
     LandmarkFormat(
         "openpose",

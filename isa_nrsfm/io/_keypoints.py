@@ -71,9 +71,7 @@ def _beginning(path: Path) -> bytes:
         return file.read(256).removeprefix(b"\xef\xbb\xbf").lstrip()
 
 
-def read_coco(
-    path: Path, category: str | None = None, part: str | None = None
-) -> Landmarks:
+def read_coco(path: Path, part: str | None = None) -> Landmarks:
     """Read keypoints of COCO, annotations or results of a detector.
 
     Annotations are an object with ``images``, ``annotations`` and ``categories``; the
@@ -81,14 +79,13 @@ def read_coco(
     Results are a list of objects with ``image_id``, ``category_id``, ``keypoints`` and
     ``score``; the third number is a confidence. Each instance has a row, and each image
     without any has one without points, in the order of the numbers in their names.
-    ``category`` chooses one of several with different keypoints, ``part`` a part of
-    whole bodies.
+    ``part`` is a part of whole bodies.
     """
     content = _read_json(path)
     if isinstance(content, list):
-        entries = _results(content, category)
+        entries = _results(content)
         return _landmarks(entries, None, part, "coco", "result")
-    entries, names = _annotations(content, category)
+    entries, names = _annotations(content)
     found = _landmarks(entries, names, part, "coco", "annotation")
     return replace(found, confidence=None)
 
@@ -132,10 +129,8 @@ def _read_json(path: Path) -> Any:
         raise ValueError(f"it is not json: {error}") from error
 
 
-def _results(entries: list[Any], category: str | None) -> list[dict[str, Any]]:
+def _results(entries: list[Any]) -> list[dict[str, Any]]:
     """Return the entries of a list of results, which must be of one category."""
-    if category is not None:
-        raise ValueError("results of a detector do not name their categories")
     _refuse_non_objects(entries, "results")
     if not all(isinstance(entry.get("image_id", 0), int | str) for entry in entries):
         raise ValueError("the image_id of a result must be a number or a text")
@@ -148,9 +143,7 @@ def _results(entries: list[Any], category: str | None) -> list[dict[str, Any]]:
     return sorted(entries, key=lambda entry: by_number(str(entry.get("image_id"))))
 
 
-def _annotations(
-    content: Any, category: str | None
-) -> tuple[list[dict[str, Any]], list[str] | None]:
+def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
     """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
     content = {"categories": []} | content if isinstance(content, dict) else {}
@@ -161,7 +154,7 @@ def _annotations(
         )
     for part in lists:
         _refuse_non_objects(content[part], part)
-    chosen, names = _chosen_categories(content["categories"], category)
+    chosen, names = _chosen_categories(content["categories"])
     images = _by_id(content["images"], "images")
     of_images: dict[Any, list[dict[str, Any]]] = {image: [] for image in images}
     others = []
@@ -180,7 +173,7 @@ def _annotations(
             continue
         if entry.get("keypoints"):
             of_images[where].append(known | entry)
-    if others and category is None:
+    if others:
         listed = first_items(dict.fromkeys(others))
         text = (
             f"{len(others)} annotations are of the category {listed}, which names no "
@@ -199,7 +192,7 @@ def _annotations(
 
 
 def _chosen_categories(
-    categories: list[dict[str, Any]], name: str | None
+    categories: list[dict[str, Any]],
 ) -> tuple[dict[Any, dict[str, Any]], list[str] | None]:
     """Return the categories to read by their ids, and their common keypoints.
 
@@ -207,12 +200,6 @@ def _chosen_categories(
     """
     named = [entry for entry in categories if entry.get("keypoints")] or categories
     names = [str(entry.get("name")) for entry in named]
-    if name is not None:
-        named = [entry for entry in named if str(entry.get("name")) == name]
-        if not named:
-            raise ValueError(
-                f"no category {name!r} has keypoints; there are {', '.join(names)}"
-            )
     points: list[str] = []
     for entry in named:
         found = entry.get("keypoints") or []
@@ -220,8 +207,8 @@ def _chosen_categories(
             raise ValueError("the keypoints of a category must be a list of names")
         if found != (points or found):
             raise ValueError(
-                f"the categories {', '.join(names)} have different keypoints: choose "
-                f"one in Python, such as read_landmarks(path, category={names[0]!r})"
+                f"the categories {', '.join(names)} have different keypoints: remove "
+                "the others from the categories of the file"
             )
         points = found
     return _by_id(named, "categories"), points or None

@@ -10,13 +10,9 @@ from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.skeletons._column_names import (
-    columns_of_individuals,
-    has_single_parts,
     individuals_in,
     parse_coordinate,
     point_names,
@@ -30,9 +26,6 @@ CONFIDENCES = (
 )
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
-# Least part of the motion of points that others of their body predict, and the rows
-# that are needed to see it: docs/benchmarks/README.md, "Thresholds".
-TOGETHER, FEWEST_ROWS = 0.7, 20
 
 # Columns that name points, and frames or people, in tables with a row for each point.
 _POINT = "point|landmark|joint|marker|node|part(?!ic)"
@@ -48,7 +41,6 @@ class LandmarkColumns(NamedTuple):
     pattern: the set, such as ``"x_#,y_#"``.
     points: names of the points, without the axis letter if that is unambiguous.
     z: columns with a third coordinate of these points. They are not used.
-    gaps: numbers that are absent between the first and the last numbered point.
     """
 
     pattern: str
@@ -56,7 +48,6 @@ class LandmarkColumns(NamedTuple):
     x: tuple[str, ...]
     y: tuple[str, ...]
     z: tuple[str, ...] = ()
-    gaps: tuple[int, ...] = ()
 
     @property
     def interleaved(self) -> list[str]:
@@ -75,8 +66,7 @@ def find_landmark_columns(
     `columns` are patterns of the x and the y columns in turn, such as ``"x_#,y_#"``.
     Several pairs are put one after the other. Without it, the table must have exactly
     one set of landmarks of at least `MIN_POINTS` points. Numbered points are in the
-    order of their numbers, others in that of their x columns. The table, if it is
-    known, tells points of one body from those of individuals.
+    order of their numbers, others in that of their x columns.
 
     >>> from isa_nrsfm.io._landmark_columns import find_landmark_columns
     >>> names = ["file"] + [f"{a}_{j}" for a in "xy" for j in range(8)]
@@ -97,8 +87,7 @@ def find_landmark_columns(
     names = without_boxes(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
-    if one_body := _one_body(names, candidates or sets, table):
-        return _select(names, one_body.split(","))
+    _refuse_individuals(names, candidates or sets)
     if not candidates:
         x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
         if x and y:
@@ -233,22 +222,15 @@ def confidence_columns(
     return []
 
 
-def _one_body(
-    names: Sequence[Hashable], sets: dict[str, int], table: "pd.DataFrame | None"
-) -> str:
-    """Return the pattern of points that have names of individuals and move together.
-
-    It is empty if points have other names. Raise if individuals may move apart.
-    """
+def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None:
+    """Raise if points have the names of several individuals in one row."""
     patterns = [pattern.split(",")[0] for pattern in sets]
     lists = [_columns_matching(names, pattern).values() for pattern in patterns]
     x = list(dict.fromkeys(chain.from_iterable(lists)))
     if not (who := individuals_in(x, MIN_POINTS)):
-        return ""
-    own = columns_of_individuals(x, who)
+        return
     largest = max(sets, key=sets.__getitem__)
     whole = largest if sets[largest] == len(x) else ",".join(sets)
-    single = has_single_parts(own[who[0]].values())
     listed, n_points = ",".join(who), len(x) // len(who)
     way = (
         f"For a row for each individual, use individuals={listed!r} (command line: "
@@ -256,13 +238,6 @@ def _one_body(
         if n_points >= MIN_POINTS
         else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
     )
-    parts = [] if table is None or single else [table[[*p]] for p in own.values()]
-    if parts and _move_together(parts):
-        warn_caller(
-            f"the points of {', '.join(who)} move together, and are read as those of "
-            f"one body. {way}"
-        )
-        return whole
     raise ValueError(
         f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
         f"of several individuals in one row. {way}. If all are points of one body, use "
@@ -270,32 +245,10 @@ def _one_body(
     )
 
 
-def _move_together(tables: "Sequence[pd.DataFrame]") -> bool:
-    """Return whether the x of some points predict those of others, in other rows."""
-    # These import all linear models, which other tables do not need.
-    from sklearn.decomposition import PCA
-    from sklearn.linear_model import LinearRegression
-    from sklearn.metrics import make_scorer, r2_score
-    from sklearn.model_selection import cross_val_score
-    from sklearn.pipeline import make_pipeline
-
-    numbers = [table.apply(pd.to_numeric, errors="coerce") for table in tables]
-    parts = [(part - part.mean()).fillna(0.0).to_numpy() for part in numbers]
-    if len(parts[0]) < FEWEST_ROWS:
-        return False
-    shares, score = [], make_scorer(r2_score, multioutput="variance_weighted")
-    for i, part in enumerate(parts):
-        model = make_pipeline(PCA(min(4, part.shape[1])), LinearRegression())
-        others = np.hstack([*parts[:i], *parts[i + 1 :]])
-        shares.append(cross_val_score(model, others, part, cv=2, scoring=score))
-    return bool(np.mean(shares) > TOGETHER)
-
-
 def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:
     """Return the columns that match pairs of patterns of x and y columns."""
     x: list[str] = []
     y: list[str] = []
-    gaps: list[int] = []
     for x_pattern, y_pattern in zip(patterns[::2], patterns[1::2], strict=True):
         x_by_key = _columns_matching(names, x_pattern)
         y_by_key = _columns_matching(names, y_pattern)
@@ -312,9 +265,6 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
         keys = list(x_by_key) if "*" in x_pattern else sorted(x_by_key)
         x += [x_by_key[key] for key in keys]
         y += [y_by_key[key] for key in keys]
-        if x_pattern.count("#") == 1 and "*" not in x_pattern:
-            numbers = {number for key in keys for number in key}
-            gaps += sorted(set(range(min(numbers), max(numbers))) - numbers)
     chosen, joined = x + y, ",".join(patterns)
     if len(set(chosen)) < len(chosen):
         twice = next(name for name in chosen if chosen.count(name) > 1)
@@ -322,7 +272,7 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
     if not {"#", "*"}.isdisjoint(joined):
         _warn_of_left_out(names, chosen, joined)
     points, z = point_names(x), _z_of(names, x)
-    return LandmarkColumns(joined, points, tuple(x), tuple(y), z, tuple(gaps))
+    return LandmarkColumns(joined, points, tuple(x), tuple(y), z)
 
 
 def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:

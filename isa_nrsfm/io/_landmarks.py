@@ -325,7 +325,7 @@ def from_mediapipe(
     )
 
 
-def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
+def from_movement(dataset: Any) -> Landmarks:
     """
     Take the landmarks out of a dataset of poses of the package movement.
 
@@ -335,8 +335,6 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
         The poses: ``position`` (time, space, keypoint, individual) and, optionally,
         ``confidence`` without space. The axes may have any order, and keypoint and
         individual may be named in the plural, as earlier versions do.
-    individual : str, optional
-        The individual to take. By default all.
 
     Returns
     -------
@@ -348,8 +346,7 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
     Raises
     ------
     ValueError
-        If the dataset has not these axes, is of points in space, or has no such
-        individual.
+        If the dataset has not these axes, or is of points in space.
 
     Examples
     --------
@@ -373,18 +370,9 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
         confidence = np.asarray(found.values, dtype=np.float64)
     tracks = np.asarray(position.values, dtype=np.float64)
     tracks = tracks[..., [space.index("x"), space.index("y")]]
-    names = _names(position, 1)
-    if individual is not None:
-        if individual not in names:
-            raise ValueError(
-                f"there is no individual {individual!r}; there are {', '.join(names)}"
-            )
-        chosen = [names.index(individual)]
-        tracks, names = tracks[:, chosen], [individual]
-        confidence = None if confidence is None else confidence[:, chosen]
     return assemble_individuals(
         tracks,
-        names,
+        _names(position, 1),
         _names(position, 2),
         {"frame": range(len(tracks)), "time": position.coords["time"].values},
         format="movement",

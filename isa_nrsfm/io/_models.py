@@ -64,7 +64,7 @@ IMPLIED = ("n_components_", "camera_", "frames_scaled_")
 
 
 class NamedStrategy(BaseEstimator):
-    """Placeholder for an ISA strategy or density that a model file only names."""
+    """Placeholder for an ISA strategy that a model file only names."""
 
     def __init__(self, name: str = ""):
         self.name = name
@@ -76,7 +76,7 @@ class NamedStrategy(BaseEstimator):
             "and its fitted arrays: set the parameter to such an object for a new fit"
         )
 
-    transform = log_density = derivatives = fit
+    transform = fit
 
 
 # Strategies and densities of which parameters and fitted attributes are stored.
@@ -167,7 +167,8 @@ def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
     -------
     AffineNRSfM
         The fitted estimator. In place of a strategy that the file only names it has an
-        object with the fitted arrays, which cannot be fitted again.
+        object with the fitted arrays, which cannot be fitted again. A `random_state`
+        that is no number is None.
 
     Raises
     ------
@@ -397,9 +398,7 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
         if array.ndim == 1 and all(isinstance(item, str) for item in array.tolist()):
             return {"names": array.tolist()}
     elif isinstance(value, np.random.RandomState):
-        if value.get_state(legacy=False)["bit_generator"] == "MT19937":
-            _, key, *rest = value.get_state()
-            return {"random_state": [packed(key, name, arrays), *rest]}
+        return None  # a new fit draws other numbers
     elif isinstance(value, Path):
         return {"path": str(value)}
     elif type(value) in (tuple, list):
@@ -411,7 +410,7 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
         return {"object": {"class": type(value).__name__, **parts}}
     elif type(model := fitted_prior(value)) is AffineNRSfM:
         return {"model": packed_model(model, f"{name}.", arrays)}
-    elif name.rpartition(".")[2] in ("isa", "isa_", "density"):
+    elif name.rpartition(".")[2] in ("isa", "isa_"):
         named = NamedStrategy(full_name(type(value)))
         for key, item in fitted_attributes(value).items():
             if np.asarray(item).dtype.kind in "biuf" and not isinstance(item, list):
@@ -460,13 +459,8 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
             return tuple(numbers)
         case {"list": [*numbers]} if all(type(n) in (int, float) for n in numbers):
             return numbers
-        case {"random_state": [key, int(position), int(has_gauss), float(gauss)]}:
-            key = unpacked(key, arrays)
-            # NumPy does not check the position, and reads there.
-            if np.shape(key) == (624,) and 0 <= position <= 624:
-                random = np.random.RandomState()
-                random.set_state(("MT19937", key, position, has_gauss, gauss))
-                return random
+        case {"random_state": _}:  # of older files
+            return None
         case {"object": {"class": str(name), **parts}} if name in STORED:
             return with_parts(STORED[name], parts, arrays)
         case {"model": model}:
@@ -478,7 +472,8 @@ def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     """Return an object with the parameters and attributes of `packed_parts`."""
     stored = parts["parameters"].items()
     parameters = {name: unpacked(value, arrays) for name, value in stored}
-    # Parameters that are newer than the file have their defaults.
+    # Of older files. Parameters that are newer than the file have their defaults.
+    parameters = {n: v for n, v in parameters.items() if n not in ("density", "fun")}
     defaults = kind().get_params(deep=False)
     check_names({**defaults, **parameters}, defaults, "parameters")
     created = kind(**parameters)

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ _MISSING = (
 )
 
 
-Missing = Literal["zeros"] | float | Sequence[float] | None
+Missing = float | Sequence[float] | None
 
 
 class LandmarkTable(NamedTuple):
@@ -178,9 +178,9 @@ def landmark_table(
         The landmark columns, if their names are ambiguous: patterns of x and
         y columns in turn, such as ``"x_#,y_#"``, with ``#`` for a number and ``*`` for
         any text.
-    missing : {"zeros"}, float or sequence of float, optional
-        The x and y of missing points, such as -1, exactly; they become NaN. "zeros" is
-        the number 0. Of several numbers, a point has one.
+    missing : float or sequence of float, optional
+        The x and y of missing points, such as 0 or -1, exactly; they become NaN. Of
+        several numbers, a point has one.
     individuals : str or sequence of str, optional
         The individuals in one row, such as ``"1,2"`` for nose_1_x and nose_2_x: the
         parts by which their columns differ. Each has a row of its own, and the other
@@ -204,7 +204,7 @@ def landmark_table(
     >>> from isa_nrsfm.io import landmark_table
     >>> frame = pd.DataFrame({"id": ["a", "b"], "x1": [1, 0], "x2": [3, 0],
     ...                       "y2": [4, 5], "y1": [2, 0]})
-    >>> points, other = landmark_table(frame, columns="x#,y#", missing="zeros")
+    >>> points, other = landmark_table(frame, columns="x#,y#", missing=0)
     >>> points
         x1   y1   x2   y2
     0  1.0  2.0  3.0  4.0
@@ -263,12 +263,9 @@ def _codes(missing: Missing) -> list[float]:
     """Return the numbers of missing points, or raise."""
     if missing is None:
         return []
-    zeros = isinstance(missing, str) and missing == "zeros"
-    codes = np.atleast_1d(0.0 if zeros else missing)
+    codes = np.atleast_1d(missing)
     if codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
-        raise ValueError(
-            f'missing must be None, "zeros" or finite numbers; got {missing!r}'
-        )
+        raise ValueError(f"missing must be None or finite numbers; got {missing!r}")
     return codes.astype(float).tolist()
 
 
@@ -451,12 +448,7 @@ def read_parquet(path: Path) -> "pd.DataFrame":
     frame = pd.read_parquet(path)
     if frame.empty:
         raise ValueError("it has no rows")
-    unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
-    if len(unnamed) == frame.index.nlevels:
-        return frame.reset_index(drop=True)
-    index = frame.index.droplevel(unnamed)
-    refuse_same_names([str(name) for name in (*index.names, *frame)])
-    return frame.set_axis(index).reset_index()
+    return frame.reset_index(drop=not any(frame.index.names))
 
 
 def read_columns(

@@ -1,6 +1,5 @@
 """Independent subspace analysis: estimators that can be used separately."""
 
-from isa_nrsfm.isa._base import SqrtDensity
 from isa_nrsfm.isa._strategies import FastISA, PooledFastICA
 
-__all__ = ["FastISA", "PooledFastICA", "SqrtDensity"]
+__all__ = ["FastISA", "PooledFastICA"]

@@ -7,7 +7,7 @@ and the grouping of signals into subspaces by greedy pairwise swaps.
 from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Sequence
 from numbers import Integral, Real
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
 from isa_nrsfm._tables.sources import unmasked
+
+# Smoothing of the density at the origin, for sources of unit variance.
+EPS = 0.1
 
 
 class BaseSubspaceAnalysis(
@@ -107,83 +110,15 @@ def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
     return np.ascontiguousarray(whitening @ centred.T), whitening
 
 
-class SubspaceDensity(Protocol):
-    """Density of FastISA: F(u) ~ log p and its first two derivatives."""
-
-    def log_density(self, energy: NDArray) -> NDArray:
-        """Return F(u)."""
-
-    def derivatives(self, energy: NDArray) -> tuple[NDArray, NDArray]:
-        """Return F'(u) and F''(u)."""
+def log_density(energy: NDArray) -> NDArray:
+    """Return ``F(u) = -sqrt(u + 0.1)`` of energies, the squared norms of points."""
+    return -np.sqrt(energy + EPS)
 
 
-class SqrtDensity(BaseEstimator):
-    """
-    The heavy-tailed density ``F(u) = -sqrt(u + eps)`` of a subspace's energy u.
-
-    Up to a constant, ``F`` is the logarithm of the density of a point of the subspace.
-    The energy u is the squared norm of the point. Sources have unit variance.
-
-    Parameters
-    ----------
-    eps : float, default=0.1
-        Smoothing of the density at the origin. Must be positive.
-
-    References
-    ----------
-    A. Hyvarinen, U. Koster, "FastISA: A fast fixed-point algorithm for independent
-    subspace analysis", ESANN 2006.
-
-    Examples
-    --------
-    >>> from isa_nrsfm.isa import SqrtDensity
-    >>> float(SqrtDensity(eps=0.25).log_density(2.0))
-    -1.5
-    """
-
-    def __init__(self, eps: float = 0.1):
-        self.eps = eps
-
-    def log_density(self, energy: NDArray) -> NDArray:
-        """
-        Return F(u).
-
-        Parameters
-        ----------
-        energy : ndarray
-            The energies u, non-negative.
-
-        Returns
-        -------
-        ndarray
-            F at each energy.
-        """
-        return -np.sqrt(energy + self._checked_eps())
-
-    def derivatives(self, energy: NDArray) -> tuple[NDArray, NDArray]:
-        """
-        Return the first two derivatives g = F' and g' = F''.
-
-        Parameters
-        ----------
-        energy : ndarray
-            The energies u, non-negative.
-
-        Returns
-        -------
-        g : ndarray
-            F' at each energy.
-        dg : ndarray
-            F'' at each energy.
-        """
-        root = 1.0 / np.sqrt(energy + self._checked_eps())
-        return -0.5 * root, 0.25 * root**2 * root
-
-    def _checked_eps(self) -> float:
-        """Return eps, or raise an error if it is not positive."""
-        if not self.eps > 0:
-            raise ValueError(f"eps must be above zero; got {self.eps}")
-        return self.eps
+def derivatives(energy: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the first two derivatives g = F' and g' = F''."""
+    root = 1.0 / np.sqrt(energy + EPS)
+    return -0.5 * root, 0.25 * root**2 * root
 
 
 def orthogonalise(W: NDArray) -> NDArray:
@@ -204,23 +139,20 @@ def orthogonalise(W: NDArray) -> NDArray:
     return nearest
 
 
-def log_likelihood(
-    W: NDArray, Z: NDArray, subspace_size: int, density: SubspaceDensity
-) -> NDArray:
+def log_likelihood(W: NDArray, Z: NDArray, subspace_size: int) -> NDArray:
     """Return ``sum_k E F(u_k)``, the mean log-likelihood of a sample up to a constant.
 
     W is (..., n_signals, n_signals), orthogonal, Z (n_signals, n_samples), white.
     """
     Y = W @ Z
     u = (Y * Y).reshape(*W.shape[:-2], -1, subspace_size, Z.shape[1]).sum(axis=-2)
-    return density.log_density(u).mean(axis=-1).sum(axis=-1)
+    return log_density(u).mean(axis=-1).sum(axis=-1)
 
 
 def fixed_point_step(
     W: NDArray,
     Z: NDArray,
     subspace_size: int,
-    density: SubspaceDensity,
     length: NDArray | float = 1.0,
 ) -> NDArray:
     """Return W (n_batch, n, n) after one step of FastISA (Hyvarinen and Koster 2006).
@@ -233,7 +165,7 @@ def fixed_point_step(
     n_batch, n_signals, n_samples = len(W), *Z.shape
     Y = (W @ Z).reshape(n_batch, -1, subspace_size, n_samples)
     square = Y * Y
-    g, dg = density.derivatives(square.sum(axis=2))
+    g, dg = derivatives(square.sum(axis=2))
     curvature = g.sum(axis=-1)[..., None] + 2.0 * np.vecdot(square, dg[:, :, None])
     Y *= g[:, :, None]
     step = Y.reshape(n_batch, n_signals, n_samples) @ Z.T
@@ -259,7 +191,6 @@ def iterate(
     W: NDArray,
     Z: NDArray,
     subspace_size: int,
-    density: SubspaceDensity,
     *,
     max_iter: int,
     tol: float,
@@ -280,7 +211,7 @@ def iterate(
     for _ in range(max_iter):
         # A step of each running start. Its change is scaled to a step of length 1.
         lengths = length[running]
-        new = fixed_point_step(W[running], Z, subspace_size, density, lengths)
+        new = fixed_point_step(W[running], Z, subspace_size, lengths)
         change = subspace_change(W[running], new, subspace_size) / lengths**2
         W[running] = new
         n_iter[running] += 1
@@ -350,7 +281,7 @@ def energy_shares(covariance: NDArray) -> Values:
     return lambda groups: energy[groups[:, :, None], groups[:, None]].sum(axis=(1, 2))
 
 
-def likelihoods(signals: NDArray, density: SubspaceDensity) -> Values:
+def likelihoods(signals: NDArray) -> Values:
     """Return the values for the likelihood ``sum_k E F(u_k)`` of white signals."""
     square = signals**2
 
@@ -358,7 +289,7 @@ def likelihoods(signals: NDArray, density: SubspaceDensity) -> Values:
         values = np.empty(len(groups))
         for part in gen_batches(len(groups), 1 + 2**20 // square.shape[1]):
             energy = square[groups[part]].sum(axis=1)
-            values[part] = density.log_density(energy).mean(axis=1)
+            values[part] = log_density(energy).mean(axis=1)
         return values
 
     return value

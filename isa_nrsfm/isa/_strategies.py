@@ -13,11 +13,9 @@ from sklearn.utils import check_array, check_random_state
 from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import HasMethods, StrOptions, fit_context
+from isa_nrsfm._compat.scikit_learn import fit_context
 from isa_nrsfm.isa._base import (
     BaseSubspaceAnalysis,
-    SqrtDensity,
-    SubspaceDensity,
     Values,
     energy_shares,
     iterate,
@@ -40,9 +38,10 @@ class FastISA(BaseSubspaceAnalysis):
     `subspace_size` sources are as independent of each other as possible. Inside a
     group, the energies of the sources depend on each other.
 
-    Each start takes a random orthogonal matrix, runs symmetric FastICA with the same
-    density (subspaces of size one), groups its rows by greedy swaps and runs FastISA.
-    The start with the largest likelihood is kept.
+    Each start takes a random orthogonal matrix, runs symmetric FastICA (subspaces of
+    size one), groups its rows by greedy swaps and runs FastISA. The start with the
+    largest likelihood is kept. The logarithm of the density of a subspace is
+    ``-sqrt(u + 0.1)``, with its energy u, the squared norm of the point.
 
     Parameters
     ----------
@@ -51,10 +50,6 @@ class FastISA(BaseSubspaceAnalysis):
     n_init : int, default=30
         Maximum number of starts. Three starts, or six, are enough if three of them
         agree in the largest likelihood, up to a difference of `tol`.
-    density : object, default=None
-        Logarithm of the density of a subspace's energy, with the methods
-        ``log_density(energy)`` and ``derivatives(energy)``; None is
-        ``SqrtDensity(eps=0.1)``.
     max_iter : int, default=500
         Maximum number of steps of each of the two iterations of a start.
     tol : float, default=1e-4
@@ -114,7 +109,6 @@ class FastISA(BaseSubspaceAnalysis):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **BaseSubspaceAnalysis._parameter_constraints,
-        "density": [None, HasMethods(["log_density", "derivatives"])],
         "n_jobs": [None, Integral],
         "verbose": ["verbose"],
     }
@@ -124,7 +118,6 @@ class FastISA(BaseSubspaceAnalysis):
         subspace_size: int = 3,
         *,
         n_init: int = 30,
-        density: SubspaceDensity | None = None,
         max_iter: int = 500,
         tol: float = 1e-4,
         random_state: Any = None,
@@ -133,7 +126,6 @@ class FastISA(BaseSubspaceAnalysis):
     ):
         self.subspace_size = subspace_size
         self.n_init = n_init
-        self.density = density
         self.max_iter = max_iter
         self.tol = tol
         self.random_state = random_state
@@ -166,7 +158,6 @@ class FastISA(BaseSubspaceAnalysis):
         return self._fit_signals(signals)
 
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
-        density = SqrtDensity() if self.density is None else self.density
         random_state = check_random_state(self.random_state)
         n_signals = len(Z)
         starts = orthogonalise(
@@ -180,7 +171,7 @@ class FastISA(BaseSubspaceAnalysis):
         for group in filter(None, (batches[:1], batches[1:2], batches[2:])):
             n_jobs = min(effective_n_jobs(self.n_jobs), len(group))
             runs = Parallel(n_jobs=n_jobs, return_as="generator")(
-                delayed(self._run)(batch, Z, density) for batch in group
+                delayed(self._run)(batch, Z) for batch in group
             )
             for run in runs:
                 results.append(run)
@@ -207,22 +198,20 @@ class FastISA(BaseSubspaceAnalysis):
         return W[best]
 
     def _run(
-        self, starts: NDArray, Z: NDArray, density: SubspaceDensity
+        self, starts: NDArray, Z: NDArray
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return unmixing, likelihood, steps, convergence of starts (n_batch, n, n)."""
         size, max_iter, tol = self.subspace_size, self.max_iter, self.tol
         # FastICA: subspaces of size one. Inside a subspace the components may be
         # undetermined, so a moderate convergence is enough.
-        W, n_iter_ica, _ = iterate(
-            starts, Z, 1, density, max_iter=max_iter, tol=max(tol, 1e-4)
-        )
+        W, n_iter_ica, _ = iterate(starts, Z, 1, max_iter=max_iter, tol=max(tol, 1e-4))
         # Group the components into subspaces.
         in_order = np.arange(len(Z)) // size
         for r in range(len(W)):
-            W[r] = W[r][swap_until_best([in_order], likelihoods(W[r] @ Z, density))[0]]
+            W[r] = W[r][swap_until_best([in_order], likelihoods(W[r] @ Z))[0]]
         # FastISA.
-        W, n_iter, converged = iterate(W, Z, size, density, max_iter=max_iter, tol=tol)
-        return W, log_likelihood(W, Z, size, density), n_iter_ica + n_iter, converged
+        W, n_iter, converged = iterate(W, Z, size, max_iter=max_iter, tol=tol)
+        return W, log_likelihood(W, Z, size), n_iter_ica + n_iter, converged
 
 
 class PooledFastICA(BaseSubspaceAnalysis):
@@ -241,8 +230,6 @@ class PooledFastICA(BaseSubspaceAnalysis):
     n_init : int, default=16
         Number of runs of FastICA from different starts. With few samples the runs end
         in different local optima. The best run by the criterion of `fit` is kept.
-    fun : {"exp", "logcosh", "cube"}, default="exp"
-        Contrast function of FastICA.
     max_iter : int, default=200
         Maximum number of steps of a run of FastICA.
     tol : float, default=1e-4
@@ -288,24 +275,17 @@ class PooledFastICA(BaseSubspaceAnalysis):
     (6, 6)
     """
 
-    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        **BaseSubspaceAnalysis._parameter_constraints,
-        "fun": [StrOptions({"exp", "logcosh", "cube"})],
-    }
-
     def __init__(
         self,
         subspace_size: int = 3,
         *,
         n_init: int = 16,
-        fun: str = "exp",
         max_iter: int = 200,
         tol: float = 1e-4,
         random_state: Any = None,
     ):
         self.subspace_size = subspace_size
         self.n_init = n_init
-        self.fun = fun
         self.max_iter = max_iter
         self.tol = tol
         self.random_state = random_state
@@ -378,7 +358,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         for start in starts:
             W, n_iter, converged = self._components(Z, start)
             if covariance is None:
-                value = likelihoods(W @ Z, SqrtDensity())
+                value = likelihoods(W @ Z)
             else:
                 value = energy_shares(W @ covariance @ W.T)
             orders = swap_until_best(groupings, value)
@@ -400,11 +380,10 @@ class PooledFastICA(BaseSubspaceAnalysis):
             )
             W = W[rows]
         if not converged:
-            other = "another fun or " if "fun" in self.get_params() else ""
             warn_caller(
                 f"{type(self).__name__} did not converge in max_iter={self.max_iter} "
                 "steps in the run that is kept: its sources may be ill determined; try "
-                f"{other}larger n_init or max_iter",
+                "larger n_init or max_iter",
                 ConvergenceWarning,
             )
         return W
@@ -418,7 +397,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         from sklearn.decomposition import FastICA
 
         ica = FastICA(
-            whiten=False, fun=self.fun, max_iter=self.max_iter, tol=self.tol, w_init=W
+            whiten=False, fun="exp", max_iter=self.max_iter, tol=self.tol, w_init=W
         )
         with warnings.catch_warnings(record=True, action="always") as caught:
             ica.fit(Z.T)

@@ -2,14 +2,12 @@
 
 from isa_nrsfm.plotting._basis_shapes import BasisShapeDisplay
 from isa_nrsfm.plotting._coefficients import CoefficientsDisplay
-from isa_nrsfm.plotting._component_choice import ComponentChoiceDisplay
 from isa_nrsfm.plotting._mode_covariance import ModeCovarianceDisplay
 from isa_nrsfm.plotting._reprojection import ReprojectionDisplay
 
 __all__ = [
     "BasisShapeDisplay",
     "CoefficientsDisplay",
-    "ComponentChoiceDisplay",
     "ModeCovarianceDisplay",
     "ReprojectionDisplay",
 ]

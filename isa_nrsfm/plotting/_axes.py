@@ -78,29 +78,13 @@ def wrap_title(title: str, axes: NDArray) -> str:
     """Break a title in small print if it is wider than the axes below it."""
     import textwrap
 
-    from matplotlib.font_manager import FontProperties
-
-    size = FontProperties(size="small").get_size_in_points() / 72  # inches
-    # Letters of the default font are 0.5 to 0.6 times as wide as it is high.
-    letters = max(int(row_width(axes) / (0.6 * size)), 8)
+    first, last = axes[0].get_position(), axes[-1].get_position()
+    width = (last.x1 - first.x0) * axes[0].figure.get_figwidth()
+    letters = max(int(width / 0.06), 8)  # inches of a letter of the default font
     if len(title) <= letters:
         return title
     lines = title.replace(" (", "\n(").splitlines()
     return "\n".join(textwrap.fill(line, letters) for line in lines)
-
-
-def row_width(axes: NDArray) -> float:
-    """Return the width in inches from the first of the axes to the last one."""
-    figure, first = axes[0].figure, axes[0].get_position()
-    start, stop = axes[0].get_subplotspec(), axes[-1].get_subplotspec()
-    share = axes[-1].get_position().x1 - first.x0
-    if figure.get_layout_engine() and start and stop:
-        # Not laid out yet: use the ratios of the columns.
-        ratios = np.asarray(start.get_gridspec().get_width_ratios(), dtype=float)
-        shown = ratios[start.colspan.start : stop.colspan.stop]
-        share = 0.97 * shown.sum() / ratios.sum()
-    # If the axes are not side by side, use the width of the first one.
-    return (share if share > 0 else first.width) * figure.bbox.width / figure.dpi
 
 
 # The two coordinates that the front view and the side view show.

@@ -232,7 +232,7 @@ class BasisShapeDisplay:
         self,
         ax: Any = None,
         *,
-        n_std: float | ArrayLike = 2.0,
+        n_std: float = 2.0,
         components: ArrayLike | None = None,
         n_columns: int | None = None,
         point_kw: dict[str, Any] | None = None,
@@ -245,10 +245,9 @@ class BasisShapeDisplay:
         ax : array-like of matplotlib Axes, default=None
             Axes to draw on, two per shape, the mean shape first. By default a new
             figure with a legend below.
-        n_std : float or array-like of shape (n_drawn,), default=2.0
+        n_std : float, default=2.0
             Length of the drift to both sides, in standard deviations of the
-            coefficients. Give an array with a number for each drawn basis shape to
-            enlarge weak ones. The titles give the numbers.
+            coefficients.
         components : array-like of int, default=None
             The basis shapes to draw. By default all of them.
         n_columns : int, default=None
@@ -264,23 +263,15 @@ class BasisShapeDisplay:
         Raises
         ------
         ValueError
-            If there are not two axes per shape, if `components` names a basis shape
-            that does not exist, or if `n_std` is neither a number nor one per basis
-            shape.
+            If there are not two axes per shape, or if `components` names a basis shape
+            that does not exist.
         """
         import_optional("matplotlib", extra="plot")
         self.components_ = _axes.chosen_numbers(
             components, "components", len(self.basis), "numbers of basis shapes"
         )
         n_drawn = len(self.components_)
-        amplitudes = np.asarray(n_std, dtype=float)
-        if amplitudes.shape not in ((), (n_drawn,)):
-            raise ValueError(
-                f"n_std must be a number or {n_drawn} numbers, one for each basis "
-                f"shape that is drawn; got shape {amplitudes.shape}"
-            )
-        sizes = np.broadcast_to(amplitudes, n_drawn)[:, None, None]
-        drift, mean = sizes * self.basis[self.components_], self.mean_shape
+        drift, mean = n_std * self.basis[self.components_], self.mean_shape
         limits, reduction = _axes.block_limits(
             [mean[None], *(np.stack([mean, mean + d, mean - d]) for d in drift)]
         )
@@ -290,10 +281,8 @@ class BasisShapeDisplay:
         axes = _axes.flat_axes(page, 2 + 2 * n_drawn, "two views for each shape")
         self.axes_, self.figure_ = axes.reshape(-1, 2), axes[0].figure
 
-        below, above = "negative end of the drift", "positive end of the drift"
-        if not amplitudes.ndim:
-            size = f"{amplitudes:g} standard deviations"
-            below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
+        size = f"{n_std:g} standard deviations"
+        below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
         self.mean_: list[Any] = []
         self.minus_: list[Any] = []
         self.plus_: list[Any] = []
@@ -313,7 +302,7 @@ class BasisShapeDisplay:
                     self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE))
                 _axes.hide_frame(axis)
                 _axes.show_view(axis, view, limits[block], self.origin)
-            title = self._title(block, amplitudes, reduction[block])
+            title = self._title(block, reduction[block])
             title = _axes.wrap_title(title, pair)
             pair[0].set_title(title, loc="left", fontsize="small")
             pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
@@ -334,7 +323,7 @@ class BasisShapeDisplay:
             style = {"s": 2.0} | style
         return _axes.draw_points(axis, points, **style)
 
-    def _title(self, block: int, amplitudes: NDArray, reduction: float) -> str:
+    def _title(self, block: int, reduction: float) -> str:
         """Return the title of the mean shape (0) or of a basis shape."""
         if block == 0:
             return "Mean shape, front and side"
@@ -343,8 +332,6 @@ class BasisShapeDisplay:
         title, notes = f"Basis shape {name}" if name == str(k + 1) else name, []
         if self.energy_share is not None:
             notes.append(f"{_axes.percent(self.energy_share[k])} of energy")
-        if amplitudes.ndim:
-            notes.append(f"±{amplitudes[block - 1]:g} s.d.")
         if reduction > 1:
             notes.append(f"drawn 1:{reduction:.2g}")
         return f"{title} ({', '.join(notes)})" if notes else title

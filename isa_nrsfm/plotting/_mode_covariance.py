@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
@@ -14,14 +14,6 @@ from isa_nrsfm.skeletons._column_names import checked_names
 
 BLOCK = 3  # directions of space, rows and columns of one basis shape's block
 LINEAR_SHARE = 0.02  # of the largest absolute value, end of the linear colour scale
-
-
-def asinh_ticks(largest: float) -> NDArray:
-    """Return zero and the powers of ten within the range of an asinh scale."""
-    # The lowest one is far enough from zero for both numbers to be readable.
-    lowest = np.ceil(np.log10(LINEAR_SHARE / 2 * largest))
-    powers = 10.0 ** np.arange(lowest, np.floor(np.log10(largest)) + 1)
-    return np.concatenate([-powers[::-1], [0.0], powers])
 
 
 class ModeCovarianceDisplay:
@@ -56,7 +48,7 @@ class ModeCovarianceDisplay:
         The image.
     boundaries_ : matplotlib LineCollection
         The lines between the blocks, vertical ones first.
-    colorbar_ : matplotlib Colorbar or None
+    colorbar_ : matplotlib Colorbar
         The colour bar.
 
     Raises
@@ -112,7 +104,6 @@ class ModeCovarianceDisplay:
         *,
         component_names: list[str] | None = None,
         ax: Any = None,
-        **kw: Any,
     ) -> ModeCovarianceDisplay:
         """
         Draw the mode covariance matrix of a fitted estimator.
@@ -125,8 +116,6 @@ class ModeCovarianceDisplay:
             Names of the basis shapes. By default their numbers, from 1.
         ax : matplotlib Axes, default=None
             Axes to draw on. By default a new figure.
-        **kw : dict
-            Further arguments of `plot`.
 
         Returns
         -------
@@ -145,32 +134,20 @@ class ModeCovarianceDisplay:
         display = cls(
             mode_covariance=estimator.mode_covariance_, component_names=component_names
         )
-        return display.plot(ax, **kw)
+        return display.plot(ax)
 
-    def plot(
-        self,
-        ax: Any = None,
-        *,
-        normalize: bool = False,
-        scale: Literal["asinh", "linear"] | None = None,
-        colorbar: bool = True,
-    ) -> ModeCovarianceDisplay:
+    def plot(self, ax: Any = None) -> ModeCovarianceDisplay:
         """
         Draw the matrix: blue is negative, red positive and white zero.
+
+        The scale of the colours is linear up to 2 % of the largest absolute value, and
+        logarithmic beyond: the energy of basis shapes falls quickly, and on a linear
+        scale only the first ones may be visible.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
             Axes to draw on. By default a new figure.
-        normalize : bool, default=False
-            Whether to show correlations instead of covariances.
-        scale : {"asinh", "linear"}, default=None
-            Scale of the colours. "asinh" is linear up to 2 % of the largest absolute
-            value, and logarithmic beyond. By default "linear" for correlations and
-            "asinh" for covariances: the energy of basis shapes falls quickly, and on a
-            linear scale only the first ones may be visible.
-        colorbar : bool, default=True
-            Whether to add a colour bar.
 
         Returns
         -------
@@ -180,31 +157,20 @@ class ModeCovarianceDisplay:
         Raises
         ------
         ValueError
-            If `ax` holds several axes, or `scale` is not one of those above.
+            If `ax` holds several axes.
         """
         import_optional("matplotlib", extra="plot")
         from matplotlib.collections import LineCollection
-        from matplotlib.colors import AsinhNorm, Normalize
+        from matplotlib.colors import AsinhNorm
 
         options: dict[str, Any] = {"figsize": (4.4, 3.6), "layout": "compressed"}
         (self.ax_,) = flat_axes(ax, 1, "the matrix", **options)
         self.figure_ = self.ax_.figure
 
         values = self.mode_covariance
-        label = "correlation" if normalize else "covariance"
-        if normalize:  # zero where a variance is zero
-            scales = np.sqrt(np.diag(values))
-            inverse = np.divide(1.0, scales, np.zeros(len(scales)), where=scales > 0)
-            values = values * np.outer(inverse, inverse)
         largest = np.abs(values).max() or 1.0
-        limits: dict[str, Any] = {"vmin": -largest, "vmax": largest}
-        if scale is None:
-            scale = "linear" if normalize else "asinh"
-        linear, asinh = Normalize(**limits), AsinhNorm(LINEAR_SHARE * largest, **limits)
-        norms = {"linear": linear, "asinh": asinh}
-        if scale not in norms:
-            raise ValueError(f'scale must be "asinh" or "linear"; got {scale!r}')
-        style = {"cmap": "RdBu_r", "norm": norms[scale], "interpolation": "nearest"}
+        norm = AsinhNorm(LINEAR_SHARE * largest, vmin=-largest, vmax=largest)
+        style = {"cmap": "RdBu_r", "norm": norm, "interpolation": "nearest"}
         self.im_ = self.ax_.imshow(values, **style)
 
         n_modes, names = len(values), self.component_names
@@ -220,19 +186,12 @@ class ModeCovarianceDisplay:
         for axis in (self.ax_.xaxis, self.ax_.yaxis):
             axis.set_ticks(centres, labels=names[::step])
             axis.set_label_text("basis shape")
-        if not normalize:
-            title = f"{percent(self.off_block_share)} outside the diagonal blocks"
-            self.ax_.set_title(f"{title}\n(0 % if uncorrelated)", fontsize="small")
+        title = f"{percent(self.off_block_share)} outside the diagonal blocks"
+        self.ax_.set_title(f"{title}\n(0 % if uncorrelated)", fontsize="small")
         self.ax_.tick_params(length=0)
         if max(map(len, names)) > 3:
             self.ax_.tick_params("x", rotation=90)
-        self.colorbar_ = None
-        if colorbar:
-            self.colorbar_ = self.figure_.colorbar(self.im_, ax=self.ax_, label=label)
-            if scale == "asinh":
-                ticks = asinh_ticks(largest)
-                texts = [f"{tick:g}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
-                self.colorbar_.set_ticks(ticks, labels=texts)
-                self.colorbar_.minorticks_off()
-            self.colorbar_.outline.set_linewidth(0.6)
+        bar = self.figure_.colorbar(self.im_, ax=self.ax_, label="covariance")
+        bar.minorticks_off()
+        self.colorbar_ = bar
         return self

@@ -301,4 +301,4 @@ class ReprojectionDisplay:
         axes.set_aspect("equal", adjustable="datalim")
         axes.yaxis.set_inverted(self.origin == "upper")
         share = f"inverse SNR {_axes.percent(self.inverse_snr[i])}"
-        axes.set_title(f"frame {self.frame_names[i]}\n{share}", fontsize="small")
+        axes.set_title(f"row {self.frame_names[i]}\n{share}", fontsize="small")

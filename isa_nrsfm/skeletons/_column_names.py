@@ -40,19 +40,13 @@ _SIDE = re.compile(
     "lew[aey]|praw[aey]|upper|lower|front|hind|fore|rear|back|top|bottom|inner|outer|"
     "middle|^(?:l[it]|r[et]|der)$|^[lrx]|[lr]$"
 )
-# Parts that a body has several times, and parts that it has once.
+# Parts that a body has several times.
 _SERIES = re.compile(
     "(?<![a-z])(finger|thumb|index|middle|ring|pinky|pinkie|little|toe|leg|arm|limb|"
     "wing|fin|coxa|trochanter|femur|tibia|tarsus|claw|antenna|tentacle|rib|vertebra|"
     "daumen|zeige|mittel|kleiner|bein|row|col|column)(?:finger|tip|s)?(?![a-z])"
 )
 _ANIMAL = re.compile("mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|person")
-_ONCE = re.compile(
-    "(?<![a-z])(?:nose|snout|beak|mouth|chin|head|neck|spine|back|body|cent(?:er|re)|"
-    "chest|thorax|abdomen|pelvis|tail|nase|mund|kinn|kopf|hals|schwanz)"
-)
-
-
 # The axis, 0, 1 or 2 for x, y or z; the point, the name without its axis letter ("3",
 # "nose", "eye_lmk_3"); and the sets, the narrowest first: the text before the axis
 # letter, the three letters and the text after it, each with the key of the point.
@@ -224,11 +218,6 @@ def _are_parts(keys: Iterable[str], points: Iterable[str]) -> bool:
         return True
     are_sides = len({_SIDE.sub("", key) for key in keys}) < 2
     return are_sides and not any(map(_ANIMAL.search, [*keys, *points]))
-
-
-def has_single_parts(points: Iterable[str]) -> bool:
-    """Return whether one of some points is of a part that a body has once."""
-    return any(_ONCE.search(point.lower()) for point in points)
 
 
 def individuals_with(names: Sequence[Hashable], own: Iterable[str]) -> list[str]:

@@ -12,12 +12,12 @@ fitted.
 
 from textwrap import fill
 
+import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.plotting import ComponentChoiceDisplay
 
 tracks = make_nonrigid_tracks(
     n_frames=200, n_points=40, n_components=3, noise=0.02, random_state=0
@@ -34,14 +34,19 @@ K = search.cv_results_["param_n_components"]
 models = {k: AffineNRSfM(k, random_state=0).fit(tracks.data) for k in K.tolist()}
 fitted = [model.inverse_snr_ for model in models.values()]
 
-display = ComponentChoiceDisplay.from_estimator(search)
-display.ax_.plot(K, 100 * np.array(fitted), "s--", color="0.6", label="inverse SNR")
-display.ax_.legend(frameon=False)
-print("held-out errors, %:", -100 * search.cv_results_["mean_test_score"].round(6))
+held_out = -search.cv_results_["mean_test_score"]
+deviation = search.cv_results_["std_test_score"]
+
+_, axis = plt.subplots()
+axis.errorbar(K, 100 * held_out, 100 * deviation, capsize=3, label="held-out error")
+axis.plot(K, 100 * np.array(fitted), "s--", color="0.6", label="inverse SNR")
+axis.set(xlabel="number of basis shapes", ylabel="%", yscale="log", xticks=K)
+axis.legend(frameon=False)
+print("held-out errors, %:", 100 * held_out.round(6))
 
 # %%
 # ``best_estimator_`` is `AffineNRSfM` with the selected number, fitted to all frames.
-# `transform`, `reconstruct` and other methods use it. ``select="one_standard_error"``
+# `transform`, `inverse_transform` and `score` use it. ``select="one_standard_error"``
 # selects the fewest basis shapes whose error is within one standard error of the
 # lowest.
 #

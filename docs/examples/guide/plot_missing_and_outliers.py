@@ -55,7 +55,7 @@ for i in (order[-1], order[0]):
 #   is not.
 # - A point with only one coordinate counts as missing, with a warning.
 # - Some programs write zeros or -1 for missing points. Convert them to NaN with
-#   ``landmark_table(frame, missing="zeros")`` or ``missing=-1``, on the command line
+#   ``landmark_table(frame, missing=0)`` or ``missing=-1``, on the command line
 #   with ``--zeros-missing`` or ``--missing-value -1``.
 # - Points may be missing systematically in some poses (such as the far ear in profile
 #   views) if they are visible in other frames.
