@@ -127,7 +127,7 @@ class TestInvariance:
         assert_allclose(got.covariance, expected.covariance, atol=1e-8)
 
     @GAPS
-    @pytest.mark.parametrize("unit", [1e-100, 1e-6, 1e6, 1e100])
+    @pytest.mark.parametrize("unit", [1e-100, 1e100])
     def test_units(self, camera, gaps, unit):
         # Of single images, or of the whole table and the shapes
         scene = scene_of(camera, gaps)
@@ -325,8 +325,9 @@ def test_unusual_frames_are_those_of_the_search_for_many(camera):
         assert model.single_search.fit(frame, NOISE**2) is None
 
 
-@pytest.mark.parametrize("length", [1, 2, 5, 11, 12, 40])
-@pytest.mark.parametrize("n", [0, 1, 2, 3, 11, 12, 13])
+@pytest.mark.parametrize(
+    ("n", "length"), [(0, 5), (1, 5), (2, 1), (11, 5), (12, 11), (13, 12), (13, 40)]
+)
 def test_no_block_of_several_has_one_frame(n, length):
     slices = block_slices(n, length)
     assert [i for part in slices for i in range(n)[part]] == list(range(n))
@@ -410,14 +411,6 @@ class TestOptimum:
 
 
 class TestSpecial:
-    @pytest.mark.parametrize("n_frames", [30, 32])
-    def test_complete_frames_among_others(self, n_frames):
-        tracks, shapes, _ = noisy_scene(0, n_frames=32)
-        tracks[::7] = with_gaps(tracks[::7], 0)
-        expected = fit_posterior(tracks[:23], shapes, NOISE**2)
-        fits = fit_posterior(tracks[:n_frames], shapes, NOISE**2)
-        assert_array_equal(fits.motion[:23], expected.motion)
-
     def test_flat_shapes_have_cameras_that_are_zero_across(self):
         tracks, shapes, _ = noisy_scene(0)
         shapes[:, 2] = 0
@@ -558,17 +551,10 @@ class TestMinima:
         assert_allclose(found, np.sign(start) * np.sqrt(a), rtol=1e-7)
         assert converged.all()
 
-    def test_frames_are_separate(self):
-        a, start = [1.0, 4.0, 0.25], [0.1, -7.0, 3.0]
-        together, _ = ended(Wells(a), start)
-        alone = [ended(Wells([x]), [y])[0][0] for x, y in zip(a, start, strict=True)]
-        assert_array_equal(together, alone)
-
-    @pytest.mark.parametrize("max_steps", range(8))
-    def test_value_never_rises(self, max_steps):
+    def test_value_never_rises(self):
         problem = Wells([1.0, 4.0, 2.0])
         start = np.array([0.01, 1.2, -0.6])
-        ends = (ended(problem, start, n)[0] for n in range(max_steps + 1))
+        ends = (ended(problem, start, n)[0] for n in range(9))
         values = [problem.value(end[None], problem.problem[0].a) for end in ends]
         assert (np.diff(values, axis=0) <= 1e-13).all()
 

@@ -71,11 +71,6 @@ class TestSpace:
         assert np.trace(view[:, :2]) > 0
         assert np.linalg.det(view[:, :2]) > 0
 
-    @pytest.mark.parametrize("seed", range(4))
-    def test_depth_is_skewed_to_the_positive_side(self, seed):
-        gauge, _ = Scene(seed).canonical()
-        assert np.sum(gauge.mean_shape[:, 2] ** 3) > 0
-
     def test_scattered_views_have_their_principal_axes(self):
         gauge, motion = Scene(n_frames=300).scattered().canonical()
         assert mean_view(motion) is None
@@ -102,8 +97,7 @@ class TestSpace:
         assert_allclose(gauge.basis, expected.basis, atol=1e-8)
         assert_allclose(motion, expected_motion, atol=1e-10)
 
-    @pytest.mark.parametrize("flat", [1, 2])
-    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    @pytest.mark.parametrize(("flat", "unit"), [(1, 1e-9), (2, 1e9)])
     def test_flat_object(self, flat, unit):
         scene = Scene(flat=flat)
         R = random_rotation(4)
@@ -295,9 +289,8 @@ class TestSameFit:
 
 class TestConditions:
     @EACH
-    @pytest.mark.parametrize("seed", range(3))
-    def test_hold(self, independence, seed):
-        result, _ = canonical(regauged(random_fit(seed)), independence)
+    def test_hold(self, independence):
+        result, _ = canonical(regauged(random_fit()), independence)
         mean_shape, basis = result.shapes[0], result.shapes[1:]
         n_points = mean_shape.shape[1]
         assert_allclose(result.shapes.mean(axis=2), 0, atol=1e-12)
@@ -311,17 +304,15 @@ class TestConditions:
         energy = np.sum((result.alpha[..., None, None] * moved) ** 2, axis=(0, 2, 3))
         assert (np.diff(energy) <= 0).all()
 
-    @pytest.mark.parametrize("seed", range(3))
-    def test_shapes_recovers_independent_basis_shapes(self, seed):
-        fit = random_fit(seed, n_points=400)
+    def test_shapes_recovers_independent_basis_shapes(self):
+        fit = random_fit(n_points=400)
         result, _ = canonical(regauged(fit), "shapes")
         truth = whitened(fit)
         cosines = basis_similarity(truth, result.shapes[1:].transpose(0, 2, 1))
         assert np.min(cosines) > 0.97
 
-    @pytest.mark.parametrize("seed", range(3))
-    def test_coefficients_recovers_independent_coefficients(self, seed):
-        fit = random_fit(seed, n_frames=3000, n_points=20)
+    def test_coefficients_recovers_independent_coefficients(self):
+        fit = random_fit(n_frames=3000, n_points=20)
         result, _ = canonical(regauged(fit, shift=0.02), "coefficients")
         # Up to the scales of the frames, which change a little with the basis.
         correlation = np.corrcoef(fit.alpha.T, result.alpha.T)[:3, 3:]
@@ -348,15 +339,13 @@ def whitened(fit):
 
 
 @EACH
-@pytest.mark.parametrize("n_components", [1, 3, 5])
+@pytest.mark.parametrize("n_components", [1, 3])
 def test_gauge_of_the_fit_makes_no_difference(independence, n_components):
     fit = random_fit(n_components=n_components, n_points=150)
     expected, _ = canonical(fit, independence)
-    for seed in (1, 2, 3):
-        other = regauged(fit, seed, shift=0.01)
-        assert_allclose(other.images(), fit.images(), atol=1e-10)
-        got, _ = canonical(other, independence)
-        assert_same(got, expected)
+    other = regauged(fit, shift=0.01)
+    assert_allclose(other.images(), fit.images(), atol=1e-10)
+    assert_same(canonical(other, independence)[0], expected)
 
 
 def calibrated(fit, camera):
@@ -490,8 +479,7 @@ class TestDegenerate:
         self.check_extreme(fit, independence)
 
     @EACH
-    @pytest.mark.parametrize("still", [1, slice(None)])
-    @pytest.mark.parametrize("value", [0.0, 0.3])
+    @pytest.mark.parametrize(("still", "value"), [(1, 0.3), (slice(None), 0.0)])
     def test_coefficients_that_do_not_vary(self, independence, value, still):
         fit = random_fit()
         fit.alpha[:, still] = value
