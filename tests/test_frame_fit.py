@@ -117,21 +117,12 @@ class TestRigidFrames:
             assert_allclose(fitted.translation[i], t, atol=1e-11)
             assert_allclose(fitted.alpha[i], alpha, atol=1e-10)
 
-    def test_flat_mean_shape(self):
-        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        mean_shape = mean_shape.copy()
-        mean_shape[:, 2] = 0
-        fitted = rigid(tracks, mean_shape, basis)
-        assert_allclose(fitted.motion[:, :, 2], 0, atol=1e-12)
-        assert np.isfinite(fitted.alpha).all()
-
-    @pytest.mark.parametrize("seed", range(4))
-    def test_basis_shape_that_no_camera_sees(self, seed):
+    def test_basis_shape_that_no_camera_sees(self):
         # The mean shape is flat, so the cameras do not see along its normal.
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
         mean_shape, basis = mean_shape * [1.0, 1.0, 0.0], basis.copy()
         basis[1] *= [0.0, 0.0, 1.0]
-        R = random_rotation(seed)
+        R = random_rotation(0)
         fitted = rigid(tracks, mean_shape @ R, basis @ R)
         assert_array_equal(fitted.alpha[:, 1], 0)
 
@@ -539,7 +530,7 @@ class TestFrontalFaces:
             assert axes.get_xlabel() == "depth not determined"
 
     def test_affine_angles_are_withheld_likewise(self):
-        X, *_ = faces_turned_by(2)
+        X, *_ = faces_turned_by(2, n_frames=60)
         model = fitted(X, camera="affine")
         poses = warned("hardly determine the metric", frame_poses, model, X)
         assert np.isnan(poses[:3]).all()
