@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from layers import may_not_converge, one_start, slow_after
+from layers import may_not_converge, slow_after
 from refusals import refused
 from scenes import random_rotation
 from scipy.spatial.transform import Rotation
@@ -23,7 +23,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
 # Tables of few points: that FastICA does not converge makes no difference here.
-pytestmark = [may_not_converge, one_start]
+pytestmark = may_not_converge
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = [

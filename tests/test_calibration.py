@@ -454,12 +454,6 @@ class TestOrthonormalCameras:
         assert orthonormal_cameras(U[:, :6]).cost < 0.005
         assert orthonormal_cameras(U[:, :30]).cost < 3e-6
 
-    def test_more_noise_means_smaller_mixtures(self):
-        P, _ = deforming_scene(0, noise=0.02)
-        found = [orthonormal_cameras(P, v) for v in (0.0, 1e-3, 1e-1, 10.0)]
-        assert (np.diff([np.linalg.norm(f.mixing) for f in found]) < 0).all()
-        assert (np.diff([f.cost for f in found]) > 0).all()
-
     def test_dependent_columns_are_left_out(self):
         P, _ = deforming_scene(0, noise=0.02)
         expected = orthonormal_cameras(P)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import FIGURES, FILES as FIT_FILES, MODEL, Results
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -25,8 +25,6 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import ModeCovarianceDisplay
-
-pytestmark = one_start
 
 N_FRAMES, N_COMPONENTS = 60, 2
 QUICK = ["--n-components", str(N_COMPONENTS), "--isa", "fast", "--n-init", "2"]
@@ -181,7 +179,7 @@ def test_options_reach_the_estimator(fits, table, options, expected):
     assert (" % (outliers count fully): energy " in fit.out) == ("huber" in options)
 
 
-@pytest.mark.parametrize("adapt", ["mean", "shapes"])
+@pytest.mark.parametrize("adapt", slow_after(1, ["shapes", "mean"]))
 def test_a_prior_of_another_table(fits, fails, transforms, tmp_path, adapt):
     options = {"n_components": 2, "camera": "weak_perspective", "random_state": 0}
     prior = AffineNRSfM(**options).fit(make_face_tracks(100, **options).data)
@@ -486,7 +484,8 @@ def test_transform_gives_each_row_its_coefficients(transforms, fitted, faces, tm
 
 
 @pytest.mark.parametrize(
-    ("number", "option"), [(0, ["--zeros-missing"]), (-1, ["--missing-value", "-1"])]
+    ("number", "option"),
+    slow_after(1, [(-1, ["--missing-value", "-1"]), (0, ["--zeros-missing"])]),
 )
 def test_transform_knows_missing_points(
     fits, transforms, faces, tmp_path, number, option

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
-from layers import may_not_converge, one_start, slow_after
+from layers import may_not_converge, slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from sklearn.base import BaseEstimator, clone
@@ -23,8 +23,6 @@ from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
-
-pytestmark = one_start
 
 N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from frame_parts import OF_FRAMES
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused, warned
 from sklearn.base import clone
@@ -18,8 +18,6 @@ from sklearn.preprocessing import FunctionTransformer
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
-
-pytestmark = one_start
 
 K = 2
 REFINEMENTS = ["joint", "alternating", None]

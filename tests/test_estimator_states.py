@@ -26,7 +26,6 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from layers import one_start
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from sklearn.base import clone
@@ -37,8 +36,6 @@ import isa_nrsfm
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
-
-pytestmark = one_start
 
 PACKAGE = str(Path(isa_nrsfm.__file__).parent)
 ESTIMATOR = inspect.getsourcefile(AffineNRSfM)

@@ -16,6 +16,7 @@ from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
+ALL_STARTS = True
 REAL_TABLES = (
     "akhter_yoga muct_68 hands_kazuhito_21 akhter_drink akhter_pickup "
     "flag_mocap_30x250 expressions_dlib_68 faces_wild_68_combined ict_bu3dfe_like_68 "
@@ -192,15 +193,6 @@ def test_robust_fit_of_a_rigid_object(loss):
     assert np.linalg.norm(model.basis_) < 1e-6 * np.linalg.norm(model.mean_shape_)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_flat_objects_that_deform_in_their_plane(dtype):
-    tracks = bending_tracks(flat=(1, 1, 0)).astype(dtype)
-    for n_components in (1, 3):
-        model = fitted(tracks, n_components)
-        assert model.inverse_snr_ < 0.02
-        assert model.singular_values_[4] < 1e-5 * model.singular_values_[0]
-
-
 @pytest.mark.parametrize(("n_different", "n_components"), [(1, 5), (3, 1)])
 def test_repeated_frames(n_different, n_components, rng):
     tracks = rng.normal(size=(n_different, 20, 2))
@@ -212,26 +204,6 @@ def test_repeated_frames(n_different, n_components, rng):
     # 3 K + 3 directions hold the two rows of each different frame.
     if n_different == 1:
         assert_zero_from(model, 0)
-
-
-def test_repeated_points_change_nothing_but_their_number():
-    tracks = FACES
-    once = fitted(tracks, 2)
-    twice = fitted(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 2)
-    assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-4)
-    assert_allclose(twice.basis_[:, 68:], twice.basis_[:, 67::-1], atol=1e-9)
-    # More points than the table has directions: those left over are empty.
-    few = np.tile(tracks[:, ::10], (1, 5, 1))
-    model = fitted(few, 4)
-    assert model.rank_floor_ < 1e-25
-    assert_zero_from(model, 1)
-
-
-def test_frames_repeated_as_often_as_others_change_nothing():
-    tracks = FACES
-    once, twice = fitted(tracks, 2), fitted(np.tile(tracks, (2, 1, 1)), 2)
-    assert_allclose(twice.alpha_, np.tile(once.alpha_, (2, 1)), atol=1e-6)
-    assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-6)
 
 
 def test_tables_of_integers():
@@ -256,14 +228,6 @@ def test_smallest_tables(n_components, isa, dtype):
     model = fitted(tracks, n_components, isa=isa)
     if dtype == np.float64:
         assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
-
-
-def test_cameras_that_never_turn():
-    # Depth is not seen at all: the rigid part is filled up with deformation.
-    tracks = bending_tracks(np.broadcast_to(np.eye(2, 3), (40, 2, 3)))
-    for n_components in (1, 3):
-        model = fitted(tracks, n_components)
-        assert model.inverse_snr_ < 1e-3
 
 
 def lines_and_tiny_frames():

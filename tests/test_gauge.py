@@ -269,14 +269,12 @@ class TestSameFit:
     """What a fit says of the table and of the shapes is not changed."""
 
     @pytest.mark.parametrize("n_components", [1, 3])
-    def test_images(self, independence, n_components):
+    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(
+        self, independence, n_components
+    ):
         fit = random_fit(n_components=n_components)
         result, _ = canonical(fit, independence)
         assert_allclose(result.images(), fit.images(), atol=1e-11)
-
-    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(self, independence):
-        fit = random_fit()
-        result, _ = canonical(fit, independence)
         frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
         assert affine_shape_error(*frames) < 1e-10
         # The affinity is that of the map.
@@ -384,10 +382,6 @@ class TestCalibratedCameras:
             assert np.mean(result.shapes[0] ** 2) == pytest.approx(1.0)
         else:
             assert size[0] == pytest.approx(unit)
-
-    def test_conditions(self, camera, independence):
-        fit = calibrated(random_fit(), camera)
-        result, _ = canonical(fit, independence, camera)
         assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
         assert_allclose(result.alpha.std(axis=0), 1, rtol=1e-12)
         if camera == "weak_perspective":

@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
-
-pytestmark = one_start
 
 NOISE = 0.02
 N_FOLDS, FOLD_SEED = 5, 0

@@ -19,7 +19,6 @@ from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, _line_search, refine_joint
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpack3
 
-N_FRAMES = 30
 DEVIATION = 0.03
 AFFINE = CAMERAS["affine"]
 
@@ -34,7 +33,7 @@ def random_scene(seed=0, noise=DEVIATION, kind="complete", camera="affine"):
     """Return a table that follows the model, and what made it."""
     kind = {"complete": "complete", "weighted": "missing"}[kind]
     options = {"noise": noise, "kind": kind, "camera": camera, "deformation": 0.25}
-    scene = scenes.random_scene(seed, N_FRAMES, 18, 2, **options)
+    scene = scenes.random_scene(seed, 30, 18, 2, **options)
     truth = JointState(scene.shapes, scene.motion, max(noise, 1e-3) ** 2)
     tracks = scene.centred if scene.weights is None else scene.tracks
     return Scene(tracks, scene.weights, truth)
@@ -110,17 +109,7 @@ class TestOptimum:
     def test_is_the_same_from_other_starts(self, kind, size):
         scene, expected = optimum(kind)
         start = disturbed(scene.truth, 2, size)
-        self.check(scene, refined(scene, start, tol=1e-7), expected)
-
-    @pytest.mark.parametrize("factor", slow_after(1, [1e-4, 1e2]))
-    def test_is_the_same_from_a_wrong_noise_variance(self, factor):
-        scene, expected = optimum()
-        start = disturbed(scene.truth)
-        start = start._replace(noise=factor * start.noise)
-        self.check(scene, refined(scene, start, tol=1e-7), expected)
-
-    @staticmethod
-    def check(scene, got, expected):
+        got = refined(scene, start, tol=1e-7)
         assert got.history[-1] == pytest.approx(expected.history[-1], abs=1e-2)
         assert got.state.noise == pytest.approx(expected.state.noise, rel=1e-3)
         assert_allclose(images(scene, got), images(scene, expected), atol=1e-3)
@@ -192,9 +181,8 @@ def moved(cameras, motion, step):
 def disturbed_by(cameras, state, seed=1, size=0.1):
     """Return a state that is some way off, with cameras of the model."""
     other = disturbed(state, seed, size)
-    step = size * np.random.default_rng(seed).normal(
-        size=(cameras.n_parameters, N_FRAMES)
-    )
+    sizes = cameras.n_parameters, len(state.motion)
+    step = size * np.random.default_rng(seed).normal(size=sizes)
     return other._replace(motion=moved(cameras, state.motion, step))
 
 

@@ -14,9 +14,7 @@ from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm.io import load_model, save_model
 
 F, CENTRE = 1000.0, (640.0, 360.0)
-# Few steps for the errors of depths; where nothing more is said one start
-Quick = limited(LIMITS._replace(error_steps=3))
-OneStart = limited(Quick._limits._replace(few_frames=0, widths=()))
+AllStarts = limited(LIMITS._replace(error_steps=3))
 
 
 def scene(
@@ -42,7 +40,7 @@ def scene(
     return SimpleNamespace(X=X, S=S, R=R, T=T, noise=noise * size)
 
 
-def fitted(X, kind=OneStart, **params):
+def fitted(X, kind=AffineNRSfM, **params):
     """Return a fit with perspective cameras."""
     given = {"n_components": 2, "camera": "perspective", "random_state": 0}
     given |= {"focal_length": F, "principal_point": CENTRE}
@@ -64,7 +62,7 @@ def frame_error(shapes, truth):
 def noisy():
     """A table with noise, its truth and its fit."""
     table = scene(noise=0.005)
-    table.model = fitted(table.X, Quick)
+    table.model = fitted(table.X)
     return table
 
 
@@ -171,12 +169,12 @@ def same_model(model, other, rows=slice(None), tol=2e-3, turn=None):
 
 
 def test_units_order_memory_maps_blocks_and_threads(noisy, tmp_path):
-    X, model = noisy.X, noisy.model
+    X, model = noisy.X, fitted(noisy.X, AllStarts)
     order = np.random.RandomState(0).permutation(len(X))
     np.save(tmp_path / "X.npy", 10 * X[order])
     mapped = np.load(tmp_path / "X.npy", mmap_mode="r")
     options = {"focal_length": 10 * F, "principal_point": (6400, 3600)}
-    other = fitted(mapped, Quick, n_jobs=2, working_memory=0.1, **options)
+    other = fitted(mapped, AllStarts, n_jobs=2, working_memory=0.1, **options)
     same_model(model, other, order)
     place, position = model.translation_[order], model.positions_[order]
     np.testing.assert_allclose(other.translation_, 10 * place, rtol=1e-3)
@@ -244,10 +242,11 @@ def test_tables_without_perspective_say_so():
     assert min(frame_error(shapes * (1, 1, z), S) for z in (-1, 1)) < 0.02
 
 
+@pytest.mark.slow
 def test_frontal_objects_in_the_middle_say_so():
     X = scene(n_frames=30, yaw=0.5, spread=0.02, noise=0.01).X
     with warnings.catch_warnings(record=True, action="always") as messages:
-        model = fitted(X, Quick)
+        model = fitted(X, AllStarts)
     assert any("has not settled" in str(each.message) for each in messages)
     assert not model._model.pinhole.near
     np.testing.assert_array_equal(model.transform(X), model.alpha_)

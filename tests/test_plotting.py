@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from cameras import lorentz_cameras
-from layers import may_not_converge, one_start, slow_after
+from layers import may_not_converge, slow_after
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
@@ -36,7 +36,7 @@ from isa_nrsfm.plotting import (
 from isa_nrsfm.skeletons import get_skeleton
 
 # The figures do not depend on how far the iterations of the fit got.
-pytestmark = [may_not_converge, one_start]
+pytestmark = may_not_converge
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
 SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
@@ -225,7 +225,7 @@ def test_shapes_are_inside_limits_of_one_scale(rng):
     assert all(np.ptp(ax.get_xlim()) > 0 for ax in display.axes_.ravel())
 
 
-@pytest.mark.parametrize("n_shapes", [2, 3, 10])
+@pytest.mark.parametrize("n_shapes", [2, 10])
 def test_shapes_fit_on_a_page(n_shapes, rng):
     for aspect in (0.25, 3.0):
         mean = rng.uniform(size=(20, 3)) * [aspect, 1, aspect]
@@ -283,8 +283,6 @@ def test_points_that_are_near_in_the_images_are_joined():
 @pytest.mark.parametrize(
     ("shape", "edges", "flipped"),
     [
-        (FACE, "auto", "lower"),
-        (FACE, None, "lower"),
         (FACE, [[0, 1]], "lower"),
         (BODY, "coco-17", "lower"),
         (BODY, "auto", "upper"),
@@ -684,7 +682,7 @@ def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     assert len(display.figure_.axes) == 1
 
 
-@pytest.mark.parametrize("n_components", [12, 13, 99])
+@pytest.mark.parametrize("n_components", [13, 99])
 def test_labels_of_the_matrix_do_not_touch(n_components):
     display = ModeCovarianceDisplay(mode_covariance=covariance(n_components)).plot()
     display.figure_.canvas.draw()
@@ -698,7 +696,7 @@ def test_labels_of_the_matrix_do_not_touch(n_components):
         assert axis.get_ticklocs()[-1] == place
 
 
-@pytest.mark.parametrize("largest", [3e-7, 0.017, 1.0, 99.0])
+@pytest.mark.parametrize("largest", [3e-7, 99.0])
 def test_ticks_of_the_asinh_scale(largest):
     display = ModeCovarianceDisplay(mode_covariance=largest * np.eye(6)).plot()
     display.figure_.canvas.draw()

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import sklearn
-from layers import one_start, slow_after, start_may_not_converge
+from layers import slow_after, start_may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from refusals import refused, warned
@@ -26,7 +26,7 @@ from isa_nrsfm.io import open_table, read_landmarks
 from isa_nrsfm.metrics import affine_shape_error
 
 # Of the start, which the joint refinement does not say.
-pytestmark = [one_start, start_may_not_converge]
+pytestmark = start_may_not_converge
 
 CAMERAS = pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
 N_FRAMES, N_POINTS, K = 60, 20, 2

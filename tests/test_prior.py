@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sklearn.base
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from scenes import likelihood_of, random_scene, with_gaps
@@ -33,8 +33,6 @@ from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
-
-pytestmark = one_start
 
 # For errors of depths
 Thorough = limited(LIMITS)

@@ -90,16 +90,10 @@ FITS = [
 ]
 SLOW_FITS = [
     ("npy", 0.1, ALL, {}, HOLES),
-    *(("memmap", memory, SAMPLED, {}, HOLES) for memory in (0.02, 1000)),
-    *(("memmap", memory, SAMPLED, {}, {}) for memory in (0.02, 0.1, 1000)),
+    *(("memmap", memory, SAMPLED, {}, {}) for memory in (0.02, 1000)),
     ("memmap", 0.02, SAMPLED, {"loss": "cauchy"}, WRONG),
-    ("memmap", 1000, SAMPLED, {"loss": "huber"}, WRONG),
-    ("memmap", 0.1, ALL, {"loss": "cauchy"}, WRONG),
     ("memmap", 1000, ALL, {"loss": "huber"}, WRONG),
     ("memmap", 1, KRYLOV, {}, {"n_points": 400, "n_frames": 160}),
-    ("memmap", 0.1, ALL, {"layout": "planar"}, {"planar": True}),
-    ("memmap", 0.1, ALL, {"scale_frames": False}, {}),
-    ("dask", None, ALL, {}, {}),
     ("dask", None, ALL, {"loss": "huber"}, WRONG),
 ]
 

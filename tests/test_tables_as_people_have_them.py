@@ -4,7 +4,7 @@ import re
 import shlex
 import warnings
 from itertools import pairwise, product
-from string import ascii_lowercase, ascii_uppercase
+from string import ascii_lowercase
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -61,10 +61,9 @@ QUESTION = r"can be (.*) or (\d*), and no other number decides it"
         (".csv", ";", "4.25 1e3", ""),
     ],
 )
-@pytest.mark.parametrize("title", ["note", "note, or text"])
 @pytest.mark.filterwarnings("ignore:(the cells|numbers have)")
-def test_commas_in_numbers(tmp_path, suffix, sign, numbers, told, title):
-    cells = np.resize(numbers.split(), (3, 16))
+def test_commas_in_numbers(tmp_path, suffix, sign, numbers, told):
+    cells, title = np.resize(numbers.split(), (3, 16)), "note, or text"
     table = table_of("{part}_{axis}", cells).assign(**{title: ["1,2", "3,4", "a, b"]})
     table["p"], path = ["0,5", "27,5", "3"], tmp_path / f"a{suffix}"
     table.to_csv(path, sep=sign, index=False)
@@ -121,6 +120,8 @@ def test_individuals_in_a_row_are_a_question(tmp_path, fits, name, who):
         assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
     assert (rows.confidence == 1).all(axis=None)
     options = re.findall(r"command line: (--\w+ .*?)\)", told)
+    if name != "{part}_{who}_{axis}":
+        return
     for option, found in zip(
         options, ("80 frames of 8", "40 frames of 16"), strict=True
     ):
@@ -168,13 +169,10 @@ def test_parts_of_one_body_are_no_individuals(name, first, second):
     ("name", "first", "second"),
     [
         ("m_{}_{}", range(8), range(8)),  # a grid of markers
-        ("{}{}", "ABCDEFGH", range(8)),
         ("{}_{}", range(3), range(5)),
         ("brow{1}_{0}", "123", range(5)),
-        ("{}_p{}", ("resident", "intruder"), range(8)),
         ("{}_mouse_{}", ("left", "right"), range(8)),
         ("{}_{}", ("finch1", "finch2"), range(8)),
-        ("{}_{}", ("colony1", "colony2"), range(8)),
     ],
 )
 def test_motion_decides_where_names_do_not(tmp_path, fits, name, first, second):
@@ -250,7 +248,7 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
         assert_allclose(points, shares * [1280, 720])
 
 
-@pytest.mark.parametrize("code", [(0, 0), (-1, -1), (-1280, -720), (-310, -205)])
+@pytest.mark.parametrize("code", [(0, 0), (-310, -205)])
 def test_codes_of_missing_points_in_python(tmp_path, code):
     tracks, hidden = POINTS.copy(), np.random.default_rng(1).random((N, 8)) < 0.1
     tracks[hidden] = code
@@ -412,7 +410,7 @@ def test_results_of_all_versions_of_mediapipe(name, wrap, nobody):
     refused("got part='body'", from_mediapipe, results, (5, 5), "body")
 
 
-@pytest.mark.parametrize("word", ["p", "prob", "Likelihood", "v", "visibility"])
+@pytest.mark.parametrize("word", ["p", "Likelihood", "visibility"])
 @pytest.mark.parametrize("size", [[], ["--image-size", "1000x1000"]])
 def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
     score, path = np.random.default_rng(0).uniform(0.2, 1.0, (N, 8)), tmp_path / "a.csv"
@@ -430,9 +428,9 @@ def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
         assert fits(path, *options, *told[2].split()).err == ""
 
 
-@pytest.mark.parametrize("word", ["p", "v", "c", "V"])
 @pytest.mark.parametrize(
-    "numbers", ["-3 310", "0 1013.2", "2 3", "0.2 1", "0 1 2", "0.5"]
+    ("word", "numbers"),
+    [("p", "0 1013.2"), ("v", "-3 310"), ("c", "2 3"), ("V", "0 1 2"), ("p", "0.5")],
 )
 def test_pressures_and_velocities_are_no_confidences(
     tmp_path, fits, fails, word, numbers
@@ -506,8 +504,14 @@ def test_specimens_of_tps(tmp_path):
     refused("there are more than 7 landmarks", read_landmarks, path)
 
 
-@pytest.mark.parametrize("names", ["frame landmark_index", "t bodypart", "Frame id"])
-@pytest.mark.parametrize("further", [[], ["video"], ["hand", "participant"]])
+@pytest.mark.parametrize(
+    ("names", "further"),
+    [
+        ("frame landmark_index", []),
+        ("t id", ["video"]),
+        ("Frame id", ["hand", "participant"]),
+    ],
+)
 def test_the_recipe_for_a_row_a_point_has_the_names_of_the_table(names, further):
     frame, point = names.split()
     rows = [(i, j, *TRACKS[i, j]) for i in range(12) for j in range(8)]
@@ -640,13 +644,9 @@ def test_corners_of_boxes_are_no_points(box, name):
     assert_array_equal(landmark_table(table, **options).points, FLAT)
 
 
-@pytest.mark.parametrize("letters", [ascii_lowercase, ascii_uppercase])
-@pytest.mark.parametrize(
-    "name",
-    ["{part}_{axis}", "{axis}_{part}", "{part}.{axis}", "{axis}{part}", "{part}{axis}"],
-)
-def test_points_w_and_h_are_no_sizes_of_boxes(letters, name):
-    table, options = table_of(name, files.scene(2, 26), letters), {}
+@pytest.mark.parametrize("name", ["{part}_{axis}", "{axis}_{part}", "{part}{axis}"])
+def test_points_w_and_h_are_no_sizes_of_boxes(name):
+    table, options = table_of(name, files.scene(2, 26), ascii_lowercase), {}
     if not {*"_."} & {*name}:
         told = str(refused("--columns", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")

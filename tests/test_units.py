@@ -10,15 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layers import one_start, slow_after, start_may_not_converge
+from layers import slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from sklearn.base import BaseEstimator, TransformerMixin, clone
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks
-
-pytestmark = one_start
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "conventions.md"
 # The second table is the first one times ten, turned, and moved.
