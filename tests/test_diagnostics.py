@@ -21,11 +21,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.models import DepthCertainty
 from isa_nrsfm._joint.uncertainty import reliabilities
 from isa_nrsfm.analysis._advice import Facts, advice, gross_residuals
-from isa_nrsfm.analysis._diagnostics import (
-    outlier_text,
-    pose_share,
-    weak_information,
-)
+from isa_nrsfm.analysis._diagnostics import outlier_text, pose_share, weak_information
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.skeletons import get_skeleton
 
@@ -402,10 +398,7 @@ class TestAdvice:
                 "Fit more frames, best of objects that turn further",
             ),
             ({"certainty": UNKNOWN["parts"]}, 'Use n_components="auto"'),
-            (
-                {"certainty": UNKNOWN["parts"], "noise_ratio": 20.0},
-                "Make sure that x",
-            ),
+            ({"certainty": UNKNOWN["parts"], "noise_ratio": 20.0}, "Make sure that x"),
             ({"certainty": UNKNOWN["parts"], "auto": True}, 'refinement="consensus"'),
             ({"noise_ratio": 1.5}, 'n_components="auto" finds how many'),
             (

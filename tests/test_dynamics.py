@@ -100,11 +100,7 @@ def dense_posterior(data, dynamics):
     prior = across @ block_diag(first, *[Q] * (n_steps - 1)) @ across.T
     change = np.pad(change, ((0, 0), (0, size - n)))
     change[0] = 0.0
-    mean, fit, L = (
-        -across @ change.ravel(),
-        fit.ravel(),
-        block_diag(*precision),
-    )
+    mean, fit, L = (-across @ change.ravel(), fit.ravel(), block_diag(*precision))
     growth, far = np.eye(len(prior)) + L @ prior, mean - fit
     covariance, off = np.linalg.solve(growth.T, prior).T, fit - L @ far
     likelihood = far @ (fit + off) + off @ covariance @ off

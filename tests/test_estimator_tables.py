@@ -270,8 +270,7 @@ def test_joint_refinement_of_the_shark(load_data, k, loss):
 
 
 @pytest.mark.parametrize(
-    ("n_components", "noise"),
-    slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)]),
+    ("n_components", "noise"), slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)])
 )
 def test_joint_refinement_of_flat_objects(n_components, noise):
     model = jointly(bending_tracks(flat=(1, 1, 0), noise=noise), n_components)

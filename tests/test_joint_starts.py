@@ -14,11 +14,7 @@ from scenes import random_scene as random_model, with_gaps
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._joint.fit import _first_fit, relevant_components
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.problem import (
-    FactorisedTable,
-    JointProblem,
-    JointState,
-)
+from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
     affine_start,

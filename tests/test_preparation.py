@@ -497,10 +497,7 @@ def test_the_error_is_near_the_noise(noise):
 # reached; filling in with the centroid has 100, the mean of the 5 nearest frames 0.7.
 @pytest.mark.parametrize(
     ("name", "n_components", "largest"),
-    [
-        ("ict_bu3dfe_like_68", 9, 0.06),
-        ("akhter_drink", 3, 0.016),
-    ],
+    [("ict_bu3dfe_like_68", 9, 0.06), ("akhter_drink", 3, 0.016)],
 )
 def test_random_points_of_real_tables(load_data, name, n_components, largest):
     tracks = load_data(name)["W2d"]
