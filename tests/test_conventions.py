@@ -158,32 +158,6 @@ def test_every_module_can_be_imported_without_optional_libraries():
     assert status == 0, output
 
 
-# Methods of named tuples have such names, and a parser of options is private there.
-NAMED_TUPLES = {"_asdict", "_replace", "_fields", "_make"}
-LOOKED_INTO = {"argparse._ActionsContainer"}
-
-
-@pytest.mark.parametrize(
-    "folder",
-    [
-        "isa_nrsfm/cli",
-        "isa_nrsfm/export",
-        "isa_nrsfm/plotting",
-        "benchmarks",
-        "docs/examples",
-    ],
-)
-def test_what_stands_on_top_uses_public_attributes(folder):
-    for file in sorted((ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.Attribute) or node.attr[:1] != "_":
-                continue
-            own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
-            known = node.attr in NAMED_TUPLES or node.attr.startswith("__")
-            name = ast.unparse(node)
-            assert own or known or name in LOOKED_INTO, f"{file}: {name}"
-
-
 @pytest.mark.parametrize("file", source_files())
 def test_modules_take_public_names_of_each_other(file):
     for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):

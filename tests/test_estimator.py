@@ -525,16 +525,6 @@ def test_results_do_not_depend_on_how_the_table_is_kept(kind, tmp_path):
         assert_allclose(reference.transform(table), reference.alpha_, atol=1e-9)
 
 
-@may_not_converge
-def test_planar_tables_equal_interleaved_ones():
-    reference = fitted()
-    model = clone(reference).set_params(layout="planar").fit(planar(TABLE))
-    assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
-    assert_allclose(model.basis_, reference.basis_, atol=1e-10)
-    expected = planar(reference.reproject(TABLE))
-    assert_allclose(model.reproject(planar(TABLE)), expected, rtol=1e-9)
-
-
 # --- errors -------------------------------------------------------------------------
 
 
@@ -679,18 +669,6 @@ def test_threads_work_on_new_frames_to_the_bit():
     together = model.decompose(many), model.score(many)
     assert_equal(alone[0], together[0])
     assert alone[1] == together[1]
-
-
-def test_shapes_of_frames_do_not_depend_on_the_independence(model):
-    assert model.independence == "shapes"
-    shapes, score = model.reconstruct(TABLE), model.score(TABLE)
-    for name in ("coefficients", None):
-        other = estimator(independence=name).fit(TABLE)
-        assert_allclose(other.mean_shape_, model.mean_shape_, atol=1e-9)
-        assert_allclose(other.reconstruct(TABLE), shapes, atol=1e-8)
-        assert_allclose(other.inverse_snr_, model.inverse_snr_, rtol=1e-9)
-        assert_allclose(other.score(TABLE), score, rtol=1e-7)
-        assert np.abs(other.alpha_ - model.alpha_).max() > 0.1
 
 
 def test_refinement_that_is_cut_short_says_so():
@@ -931,17 +909,6 @@ def test_a_table_that_asks_for_more_components_says_so():
     truth = make_nonrigid_tracks(120, 19, 5, noise=0.005, random_state=0)
     with pytest.warns(UserWarning, match="relevant: try a larger n_components"):
         AffineNRSfM("auto", random_state=0).fit(truth.data)
-
-
-@pytest.mark.slow
-def test_outliers_are_no_components(rng):
-    truth = make_nonrigid_tracks(150, 20, 2, noise=0.01, random_state=1)
-    moved = rng.random((150, 20)) < 0.05
-    size = np.sqrt(np.mean(truth.clean**2))
-    X = truth.tracks + size * moved[..., None] * rng.normal(size=(150, 20, 2))
-    model = AffineNRSfM("auto", loss="cauchy", random_state=0).fit(X.reshape(150, -1))
-    assert len(model.basis_) == 2
-    assert (model.reliability_ > 0.9).all()
 
 
 @pytest.mark.parametrize("camera", slow_after(1, ["affine", "weak_perspective"]))

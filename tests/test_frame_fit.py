@@ -707,20 +707,6 @@ def test_deviations_hold_for_a_body_that_deforms_further_than_the_model(camera):
     assert 0.5 < np.sqrt(np.mean((off / deviation) ** 2)) < 2
 
 
-@pytest.mark.slow
-def test_weak_perspective_has_no_jumps_over_n_components_or_units(load_data):
-    arrays = load_data("akhter_pickup")
-    tracks, truth = arrays["W2d"], arrays["S3d"]
-    X = tracks.reshape(len(tracks), -1)
-    errors = {}
-    for K, factor in ((6, 1), (7, 1), (7, 100), (8, 1)):
-        model = fitted(factor * X, K)
-        shapes = model.reconstruct(factor * X)
-        errors[K, factor] = mean_shape_error_3d(truth, shapes, convention="frame")
-    assert_allclose(errors[7, 100], errors[7, 1], rtol=0.02)
-    assert errors[8, 1] < 1.5 * errors[7, 1] < 1.5**2 * errors[6, 1] < 0.06
-
-
 def swinging_body(seed, n_frames=150, turn=90):
     """Return a table of a body whose limbs swing as it turns, and its shapes."""
     rng, time = np.random.default_rng(seed), np.linspace(0, 6 * np.pi, n_frames)

@@ -104,10 +104,6 @@ class TestStrategies:
         first = clone(isa).fit(signals).components_
         assert_allclose(isa.fit(signals[order]).components_, first, atol=1e-8)
 
-    def test_signals_in_different_units(self, isa, signals):
-        sources = isa.fit_transform(signals * [1e3, 1.0, 1.0, 1e-3, 1e-6, 1.0])
-        assert_allclose(sources.T @ sources / 500, np.eye(6), atol=1e-11)
-
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_units_and_offset(self, isa, signals, unit):
         first = clone(isa).fit(signals).components_
@@ -220,15 +216,6 @@ class TestOptimality:
 
 
 class TestInvariances:
-    @pytest.mark.slow
-    def test_n_jobs_change_no_bit(self):
-        signals = few_samples()
-        kwargs = {"n_init": 18, "random_state": 0}
-        one, two = (FastISA(**kwargs, n_jobs=n).fit(signals) for n in (1, 2))
-        assert_array_equal(two.components_, one.components_)
-        assert_array_equal(two.log_likelihoods_, one.log_likelihoods_)
-        assert_array_equal(two.n_iters_, one.n_iters_)
-
     def test_threads_change_no_bit(self):
         signals, _ = mixed(0, 500)
         one = FastISA(n_init=17, random_state=0).fit(signals)

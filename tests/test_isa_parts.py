@@ -368,17 +368,6 @@ class TestDegenerate:
         assert_allclose(np.abs(shared_mixing(signals)), [[0.2]], rtol=1e-12)
 
     @pytest.mark.parametrize("size", [1, 3])
-    def test_signal_of_zeros(self, size):
-        truth = sources(["product"] * 4, 0, 200, size)
-        padded = np.insert(truth, 2, 0.0, axis=0)
-        W = shared_mixing(padded)
-        assert np.linalg.cond(W) < 1e3
-        Y = np.tensordot(W, padded, 1)
-        assert_allclose(Y[4], 0.0, atol=1e-12)
-        assert_allclose(matched(unmix(truth), Y[:4]), unmix(truth), atol=1e-9)
-        assert_allclose(W[:4, 2], 0.0, atol=1e-12)
-
-    @pytest.mark.parametrize("size", [1, 3])
     def test_dependent_signals(self, size):
         truth = sources(["product"] * 3, 0, 300, size)
         signals = np.tensordot(np.random.default_rng(0).normal(size=(5, 3)), truth, 1)

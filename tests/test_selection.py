@@ -4,7 +4,6 @@ import re
 from typing import ClassVar
 
 import numpy as np
-import pandas as pd
 import pytest
 import sklearn
 from layers import may_not_converge
@@ -93,15 +92,6 @@ def test_cameras_and_missing_points_are_those_of_a_plain_search(camera, missing)
     assert search.n_components_ == 2
 
 
-@pytest.mark.slow
-def test_a_robust_loss_is_kept():
-    spoilt = X.copy()
-    spoilt[::7, 4] += 3.0
-    search = AffineNRSfMCV([1, 2], estimator=inner(loss="cauchy"), cv=2).fit(spoilt)
-    plain = cross_val_score(inner(loss="cauchy", n_components=2), spoilt, cv=2)
-    assert_allclose(search.cv_results_["mean_test_score"][1], plain.mean(), rtol=0.02)
-
-
 def test_the_best_estimator_is_the_fit_of_all_frames(fitted):
     alone = inner(n_components=2).fit(X)
     best = fitted.best_estimator_
@@ -146,23 +136,6 @@ def test_lines_come_while_the_search_runs_and_parameters_stay(capsys):
     names = [f"[AffineNRSfMCV] n_components={k}" for k in (1, 2)]
     assert [line.split(":")[0] for line in lines] == names
     assert all("held-out error" in line and line.endswith(" s") for line in lines)
-
-
-@pytest.mark.slow
-def test_names_of_columns_are_kept():
-    names = [f"{axis}_{i}" for i in range(20) for axis in "xy"]
-    table = pd.DataFrame(X, columns=names)
-    search = AffineNRSfMCV((1, 2), estimator=inner()).fit(table)
-    assert_array_equal(search.feature_names_in_, names)
-    search.fit(X)
-    assert not hasattr(search, "feature_names_in_")
-
-
-@pytest.mark.slow
-def test_the_path_may_begin_anywhere_and_leave_gaps():
-    search = AffineNRSfMCV((2, 5), estimator=inner()).fit(X)
-    plain = cross_val_score(inner(n_components=5), X, cv=3).mean()
-    assert_allclose(search.cv_results_["mean_test_score"][1], plain, rtol=0.02)
 
 
 @pytest.mark.slow
@@ -296,15 +269,6 @@ def test_rows_without_points_are_held_out_like_others():
     with pytest.warns(UserWarning, match="no point is visible"):
         plain = cross_val_score(inner(n_components=2), empty, cv=3)
     assert_allclose(search.cv_results_["mean_test_score"][1], plain.mean(), rtol=0.01)
-
-
-@pytest.mark.slow
-def test_a_memory_map_is_a_table(tmp_path, fitted):
-    np.save(tmp_path / "table.npy", X)
-    stored = np.load(tmp_path / "table.npy", mmap_mode="r")
-    search = AffineNRSfMCV(range(1, 4), estimator=inner()).fit(stored)
-    name = "mean_test_score"
-    assert_allclose(search.cv_results_[name], fitted.cv_results_[name], rtol=1e-6)
 
 
 @may_not_converge
