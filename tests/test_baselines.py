@@ -92,21 +92,9 @@ class TestContract:
         model = PseudoInverseNRSfM(1)
         getattr(estimator_checks, name)(type(model).__name__, model)
 
-    @pytest.mark.parametrize(
-        ("method", "name", "value"),
-        [
-            *((method, "ordered", "yes") for method in METHODS),
-            *(("block matrix", name, -1) for name in ("max_iter", "tol")),
-            ("block matrix", "accelerated", 2),
-            *(("compressible", k, 0) for k in ("n_atoms", "sparsity", "max_iter")),
-            *(("compressible", k, -0.1) for k in ("penalty", "tol", "ridge")),
-            ("compressible", "ridge", 0.3),
-            ("compressible", "random_state", "seed"),
-        ],
-    )
-    def test_parameters(self, method, name, value):
-        model = METHODS[method](2, **{name: value})
-        refused(f"The '{name}' parameter", model.fit, table().data)
+    @each
+    def test_parameters(self, method, landmark_tables):
+        estimator_checks.check_param_validation(method, METHODS[method](1))
 
     @each
     def test_in_a_pipeline_and_pickled(self, method):

@@ -212,6 +212,7 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path, adapt):
     assert "--adapt shapes needs --prior" in fails(*again[:4], "--adapt", "shapes")
 
 
+@pytest.mark.slow
 def test_the_face_prior_that_a_warning_names(fits, tmp_path):
     X = make_face_tracks(60, n_components=2, random_state=0).shapes[..., :2] - 500
     table = saved(pd.DataFrame(X.reshape(60, -1), columns=LANDMARKS), tmp_path)

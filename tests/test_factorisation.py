@@ -119,16 +119,6 @@ class TestMissingRank:
         assert np.linalg.norm(f.motion[:, 2]) > 0
         assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
 
-    def test_shark_has_two_non_rigid_directions(self, load_data):
-        W = measurements(load_data("shark_torresani")["W2d"])
-        f = factorise(W, 4)
-        assert f.signals.shape == (3, 91)
-        assert np.linalg.norm(f.motion[:, 1]) > 1e-3
-        assert_array_equal(f.motion[:, 2], 0)
-        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
-        assert_allclose(f.signals @ f.signals.T / 91, np.eye(3), atol=1e-12)
-        assert_allclose(approximation(f), W, atol=1e-12)
-
 
 class TestOrientations:
     @pytest.mark.parametrize("unit", [1e-250, 1e250])

@@ -286,28 +286,18 @@ class TestDepthDeviations:
             expected = np.sqrt(factors[i] * variances)
             assert_allclose(found[i], expected, rtol=1e-5)
 
-    def test_variances_of_points_and_of_the_frame_add_up(self):
+    def test_variances_of_points_grow_with_the_leverage_of_the_frame(self):
         frames, tracks = posterior_frames(0)
         frames = replace(frames, camera="weak_perspective")
         sizes = np.linspace(1.0, 2.0, len(tracks))
-        tracks = sizes[:, None, None] * tracks
-        alone = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
-        points = np.linspace(0.0, 1e-2, tracks.shape[1])
-        frames = replace(frames, certainty=DepthCertainty(points=points))
-        expected = alone**2 + sizes[:, None] ** 2 * points
-        found = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
-        assert_allclose(found**2, expected, rtol=1e-9)
-
-    def test_variances_of_points_grow_with_the_leverage_of_the_frame(self):
-        frames, tracks = posterior_frames(0)
-        frames, sizes = replace(frames, camera="weak_perspective"), np.ones(len(tracks))
-        alone = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
+        rows = (sizes[:, None, None] * tracks).transpose(0, 2, 1)
+        alone = frames.depth_deviations(rows, sizes)
         certainty = DepthCertainty(points=np.linspace(0.0, 1e-2, 20), leverage=3.0)
         frames = replace(frames, certainty=certainty)
         alpha = frames.posterior(tracks.transpose(0, 2, 1)).alpha
         leverage = 1.0 + np.sum(alpha**2, axis=1)
-        expected = alone**2 + np.outer(leverage / 3.0, certainty.points)
-        found = frames.depth_deviations(tracks.transpose(0, 2, 1), sizes)
+        expected = alone**2 + np.outer(sizes**2 * leverage / 3.0, certainty.points)
+        found = frames.depth_deviations(rows, sizes)
         assert_allclose(found**2, expected, rtol=1e-9)
         assert np.ptp(leverage) > 1.0
 
@@ -531,6 +521,7 @@ class TestFrontalFaces:
         for axes in display.axes_[:, 1]:
             assert axes.get_xlabel() == "depth not determined"
 
+    @pytest.mark.slow
     def test_affine_angles_are_withheld_likewise(self):
         X, *_ = faces_turned_by(2, n_frames=60)
         model = fitted(X, camera="affine")

@@ -165,16 +165,16 @@ class TestDegenerate:
         shapes = scene.shapes.copy()
         KINDS[kind](shapes)
         shapes = random_rotation(5) @ shapes
-        for tracks in (scene.tracks, with_gaps(scene.tracks)):
-            starts = np.ones((2, 3))
-            fits = fit_posterior(tracks, shapes, variance, camera, starts=starts)
-            for each in numbers_of(fits):
-                assert np.isfinite(each).all()
-            variances = np.diagonal(fits.covariance, axis1=1, axis2=2)
-            assert (variances >= 0).all()
-            if camera == "affine":
-                rigid = fit_posterior(tracks, shapes[:1], 1.0)
-                assert (fits.objective <= rigid.objective * (1 + 1e-6)).all()
+        scene.tracks[10:] = with_gaps(scene.tracks[10:])
+        starts = np.ones((2, 3))
+        fits = fit_posterior(scene.tracks, shapes, variance, camera, starts=starts)
+        for each in numbers_of(fits):
+            assert np.isfinite(each).all()
+        variances = np.diagonal(fits.covariance, axis1=1, axis2=2)
+        assert (variances >= 0).all()
+        if camera == "affine":
+            rigid = fit_posterior(scene.tracks, shapes[:1], 1.0)
+            assert (fits.objective <= rigid.objective * (1 + 1e-6)).all()
 
     def test_no_basis_shape_is_the_rigid_fit(self, camera):
         scene = scene_of(camera)
@@ -433,17 +433,6 @@ class TestStarts:
         assert (fits.objective <= zero.objective).all()
         assert (zero.objective > 1.1 * least).any()
         assert np.mean(fits.objective <= 1.001 * least) >= 0.995
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("gaps", [0.0, 0.4])
-    def test_faces_do_not(self, load_data, gaps):
-        tracks = load_data("faces_wild_68_combined")["W2d"][::8]
-        tracks, shapes, _, variance = fitted_shapes(tracks, 9)
-        tracks = with_gaps(tracks[::2], gaps)
-        least = self.best(tracks, shapes, variance)
-        fits = fit_posterior(tracks, shapes, variance)
-        assert np.mean(fits.objective <= 1.001 * least) >= 0.995
-        assert fits.converged.all()
 
     def test_every_search_ends_in_a_minimum(self, mocap):
         tracks, shapes, _, variance = mocap

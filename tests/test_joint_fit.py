@@ -168,15 +168,6 @@ class TestCameras:
         assert euclidean_error(model, tracks, frames) < 0.02
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n_components", [0, 2])
-def test_number_of_components_of_many_points(n_components):
-    sizes = {"n_frames": 80, "n_points": 300, "n_components": n_components}
-    tracks, _ = random_table(deviation=0.02, **sizes)
-    model = fitted(tracks, "auto", camera="weak_perspective")
-    assert len(model.basis_) == max(n_components, 1)
-
-
 class TestNoiseVariance:
     # The median is less precise, and the fit bends towards the inner half, with
     # "cauchy" most of all.

@@ -27,7 +27,7 @@ def fits(X, **options):
 
 
 @pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_after(2, KINDS))
 @pytest.mark.parametrize("side", slow_after(1, [-1, 1]))
 def test_missing_points_are_farther_away(side, kind):
     options = KINDS[kind]

@@ -171,7 +171,7 @@ class TestAccuracy:
 @pytest.mark.filterwarnings("ignore:the points of X lie")
 class TestMethods:
     @pytest.mark.parametrize(
-        "camera", slow_after(2, ["affine", "weak_perspective", "orthographic"])
+        "camera", slow_after(1, ["weak_perspective", "affine", "orthographic"])
     )
     def test_agree_with_the_fit(self, camera):
         model, (X, weights, _) = fitted(camera), noisy()

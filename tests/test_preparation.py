@@ -493,19 +493,6 @@ def test_the_error_is_near_the_noise(noise):
     assert noise**2 < held_out_error(scene.tracks, seen, 3) < 2 * noise**2
 
 
-# Inverse SNR in percent of hidden points of some frames, a little above what is
-# reached; filling in with the centroid has 100, the mean of the 5 nearest frames 0.7.
-@pytest.mark.parametrize(
-    ("name", "n_components", "largest"),
-    [("ict_bu3dfe_like_68", 9, 0.06), ("akhter_drink", 3, 0.016)],
-)
-def test_random_points_of_real_tables(load_data, name, n_components, largest):
-    tracks = load_data(name)["W2d"]
-    tracks = tracks[:: max(len(tracks) // 200, 1)]
-    seen = random_mask(tracks.shape[:2], 0.3, 0)
-    assert 100 * held_out_error(tracks, seen, n_components) < largest
-
-
 def test_faces_that_hide_a_side(load_data):
     tracks = load_data("muct_68")["W2d"].astype(float)
     seen = ~np.isnan(tracks).any(axis=2)

@@ -12,7 +12,6 @@ from refusals import refused
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.model_selection import (
     GridSearchCV,
-    GroupKFold,
     KFold,
     LeaveOneGroupOut,
     cross_val_score,
@@ -159,17 +158,6 @@ def test_a_scorer_sees_fitted_estimators_and_held_out_rows():
 
 
 @pytest.mark.slow
-def test_frames_of_a_group_stay_together():
-    splits = list(GroupKFold(3).split(X, groups=PERSON))
-    by_group = AffineNRSfMCV((1, 2), estimator=inner(), cv=GroupKFold(3))
-    by_group.fit(X, groups=PERSON)
-    given = AffineNRSfMCV((1, 2), estimator=inner(), cv=splits).fit(X)
-    for i in range(3):
-        name = f"split{i}_test_score"
-        assert_array_equal(by_group.cv_results_[name], given.cv_results_[name])
-
-
-@pytest.mark.slow
 def test_groups_are_routed_through_a_pipeline():
     search = AffineNRSfMCV((1, 2), estimator=inner(), cv=LeaveOneGroupOut())
     with sklearn.config_context(enable_metadata_routing=True):
@@ -258,17 +246,6 @@ def test_the_limit_of_the_parts_is_named():
     hidden[6:, :2] = np.nan  # five of the six rows that show it are held out
     with pytest.raises(ValueError, match=r"split 0 of cv fits .* needs every point"):
         AffineNRSfMCV((1, 2), cv=KFold(12)).fit(hidden)
-
-
-@pytest.mark.slow
-def test_rows_without_points_are_held_out_like_others():
-    empty = X.copy()
-    empty[[0, 40]] = np.nan
-    with pytest.warns(UserWarning, match="no point is visible"):
-        search = AffineNRSfMCV((1, 2), estimator=inner()).fit(empty)
-    with pytest.warns(UserWarning, match="no point is visible"):
-        plain = cross_val_score(inner(n_components=2), empty, cv=3)
-    assert_allclose(search.cv_results_["mean_test_score"][1], plain.mean(), rtol=0.01)
 
 
 @may_not_converge

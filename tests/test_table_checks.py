@@ -47,14 +47,6 @@ class TestPoints:
         found = warned(message + "missing$", fit, half, layout=layout)
         assert_array_equal(found.alpha_, fit(whole, layout=layout).alpha_)
 
-    def test_points_in_too_few_frames(self):
-        names = [f"{axis}_{j}" for axis in "xy" for j in range(30)]
-        X = pd.DataFrame(table_of(FACES, "planar"), columns=names)
-        X.loc[5:, ["x_4", "y_4"]] = X.loc[4:, ["x_9", "y_9"]] = np.nan
-        message = r"n_components=3 needs every point in at least 6 frames; fewer show "
-        message += r"2 of 30 points \(first: point 4 \(x_4, y_4\), in 5 of 40 frames\)"
-        refused(message, fit, X, 3, layout="planar")
-
     @pytest.mark.parametrize("K", [1, 5])
     def test_count_of_all_equations(self, K, rng):
         # The smallest complete table has hardly more equations than unknowns: those of
@@ -139,21 +131,6 @@ class TestNames:
         message = rf"layout='{layout}' contradicts the column names "
         message += rf"\({', '.join(names[:4])}, ...\), whose order is {order}$"
         X = pd.DataFrame(FACES[:, :3, 0].repeat(2, 1), columns=names)
-        refused(message, fit, X, layout=layout)
-
-    @both_layouts
-    @pytest.mark.parametrize(
-        ("names", "n_others", "first"),
-        [
-            ("x_0 y_0 likelihood_0 x_1 y_1 likelihood_1", 2, "likelihood_0"),
-            ("frame person x_0 y_0 x_1 y_1", 2, "frame"),
-            ("nose_x nose_y nose_z chin_x chin_y chin_z", 2, "nose_z"),
-        ],
-    )
-    def test_columns_beside_those_of_points(self, names, n_others, first, layout):
-        message = rf"^{n_others} of the 6 columns are not named as the x or y of a "
-        message += rf"point \(first: '{first}'\)\. .*isa_nrsfm\.io\.landmark_table"
-        X = pd.DataFrame(FACES[:, :3, 0].repeat(2, 1), columns=names.split())
         refused(message, fit, X, layout=layout)
 
 

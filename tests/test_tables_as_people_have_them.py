@@ -139,16 +139,11 @@ LEGS = ("coxa", "femur", "tibia", "tarsus", "claw")
         ("{}_{}", ("left", "right"), BODYPARTS),
         ("{}_{}", ("lefthand", "righthand"), range(21)),
         ("{}{}", ("LeftHand", "RightHand"), range(21)),
-        ("{}_{}", ("links", "rechts"), range(17)),
         ("{1}_{0}", ("gauche", "droite"), range(17)),
-        ("{}_{}", ("izq", "der"), range(17)),
         ("{}{}", ("vänster", "höger"), range(17)),
         ("hand{}_{}", "LR", range(21)),
         ("{}_{}", FINGERS, "123"),
-        ("{}{}", FINGERS, range(1, 4)),
         ("{}_{}", ("finger1", "finger2", "finger3"), range(7)),
-        ("leg{}_{}", range(6), ("hip", "knee", "foot")),
-        ("L{}_{}", "123", LEGS),
         ("L{}{}", "123", ("Coxa", "Femur", "Tibia", "Tarsus")),
         ("{}_{}", ("L1", "L2", "L3", "R1", "R2", "R3"), LEGS),
         ("{}_{}", (f"leg{i}" for i in range(1, 7)), range(8)),
@@ -209,7 +204,7 @@ def test_individuals_of_few_points_are_not_fitted():
     refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
 
 
-@pytest.mark.parametrize("decimal", [",", "."])
+@pytest.mark.parametrize("decimal", slow_after(1, [",", "."]))
 def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
     expected = read_landmarks(path)
@@ -266,7 +261,6 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
     ("names", "numbers"),
     [
         ("labeled-data/v/img0010.png labeled-data/v/img0030.png", [10, 30]),
-        ("0.jpg 10.jpg 2.jpg", [0, 10, 2]),
         ("v1_7_x2.png v1_9_x2.png v1_30_x2.png", [7, 9, 30]),
         ("a/1.png a/5.png b/1.png b/5.png", [1, 5, 1, 5]),
         ("e3a1.png 77b0.png 0c9d.png", [0, 1, 2]),  # no numbers of frames
@@ -274,13 +268,11 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
         ("2023-05-01_12-00-30.png 2023-05-01_12-00-31.png", [0, 1]),
         ("20230501120030.png 20230501120130.png 20230501120230.png", [0, 1, 2]),
         ("v/20230501_120030.png v/20230501_120031.png", [0, 1]),
-        ("2023-05-01.png 2023-05-02.png 2023-06-01.png", [0, 1, 2]),
         ("2023-05-01_0001.png 2023-05-01_0130.png", [1, 130]),
         ("20230501_01.png 20230501_02.png 20230502_01.png 20230502_02.png", [1, 2] * 2),
         ("12h00m30s.png 12h00m50s.png 12h01m10s.png", [0, 1, 2]),
         ("frame_0.04.png frame_0.96.png frame_1.04.png", [0, 1, 2]),
         ("1682935230040.jpg 1682935230080.jpg", [0, 1]),
-        ("20230501_120030_12.png 20230501_120030_15.png", [12, 15]),
         ("cam1.012.png cam1.015.png cam2.012.png cam2.015.png", [12, 15] * 2),
         ("000000000139.jpg 000000000785.jpg", [139, 785]),
     ],

@@ -165,7 +165,7 @@ def results(model, X):
     return found
 
 
-@pytest.mark.parametrize("column", slow_after(3, [0, 2, 4, 1, 3]))
+@pytest.mark.parametrize("column", slow_after(2, [0, 2, 4, 1, 3]))
 def test_methods(column):
     settings = COLUMNS[column] | {"refinement": "joint"}
     first, second = models(**settings)
