@@ -159,14 +159,6 @@ class TestAssociation:
         alpha[:, 1] += 5.0 * y
         assert association(alpha, y, random_state=0).p_value[1] < 0.05
 
-    def test_an_effect_in_a_rhythm_is_found(self):
-        def trial(seed):
-            alpha, y = rhythm(rng_of(seed)), video(seed, n=900)[1]
-            alpha[:, 1] += 0.5 * alpha[:, 1].std() * y
-            return alpha, y
-
-        assert np.mean(least_p(trial, n_trials=20) <= 0.05) > 0.7
-
     def test_copies_of_a_frame_count_once(self, rng):
         alpha, y = related()
         copies = rng.permutation(np.repeat(np.arange(120), 6))

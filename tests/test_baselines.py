@@ -94,7 +94,8 @@ class TestContract:
 
     @each
     def test_parameters(self, method, landmark_tables):
-        estimator_checks.check_param_validation(method, METHODS[method](1))
+        model = METHODS[method](1)
+        estimator_checks.check_param_validation(type(model).__name__, model)
 
     @each
     def test_in_a_pipeline_and_pickled(self, method):

@@ -725,7 +725,6 @@ class TestTruth:
             *slow_after(
                 0,
                 [
-                    ("akhter_drink", 3, (0.019, 0.097)),
                     ("akhter_pickup", 3, (0.040, 0.125)),
                     ("akhter_yoga", 4, (0.068, 0.245)),
                 ],

@@ -240,11 +240,6 @@ class TestFullRotations:
         assert_array_equal(np.isnan(rotations).any(axis=(1, 2)), missing)
         assert_array_equal(np.isnan(scales), missing)
 
-    def test_cameras_of_zero_stay_finite(self):
-        rotations, scales = full_rotations(np.zeros((1, 2, 3)))
-        assert np.isfinite(rotations).all()
-        assert_array_equal(scales, [0.0])
-
 
 class TestMeanView:
     def test_is_the_mean(self, rng):

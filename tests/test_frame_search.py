@@ -522,11 +522,6 @@ class TestMinima:
 
 
 class TestEnds:
-    def test_converged_start_is_told_without_a_step(self):
-        found, converged = ended(Wells([1.0, 4.0]), [1.0, 2.0 + 1e-9], 0)
-        assert converged.all()
-        assert_allclose(found, [1.0, 2.0], rtol=1e-15)
-
     def test_frames_that_have_ended_are_not_evaluated(self):
         # Those that are left are filled up to a multiple of LANES.
         problem = Wells([1.0] * 3 * LANES)

@@ -57,7 +57,6 @@ CASES = {
     "names": {},
     "planar": {"layout": "planar", "independence": None, "scale_frames": False},
     "alternating": ALTERNATING | {"isa": STRATEGY},
-    "alternating, calibrated": ALTERNATING | CALIBRATED,
     "not refined": {"refinement": None, "keep_frames": False}
     | {"isa": PooledFastICA(n_init=2)},
     "single precision": {},
@@ -67,7 +66,6 @@ CASES = {
     "weak perspective": CALIBRATED | {"loss": "cauchy"},
     "orthographic": {"camera": "orthographic", "keep_frames": False},
     "folder": {"frames_folder": "folder"},
-    "path of a folder": {"frames_folder": Path("folder")},
     "mirrored": CALIBRATED | {"mirror": True},
     "prior": CALIBRATED | {"n_components": "auto", "prior": "a model"},
     "numbers of numpy": {"n_components": np.int64(2), "tol": np.float32(0.05)}

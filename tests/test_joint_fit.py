@@ -137,17 +137,6 @@ class TestCameras:
         assert model.noise_variance_ < 1e-9
         assert_allclose(model.transform(table_of(tracks)), model.alpha_, atol=1e-10)
 
-    @pytest.mark.slow
-    @CALIBRATED
-    @pytest.mark.parametrize(("deviation", "largest"), [(0.0, EXACT), (0.01, 0.01)])
-    def test_calibrated_cameras_show_true_shapes(self, camera, deviation, largest):
-        # Also where the object deforms as much as it is large: the mirror image of
-        # space is all that is free.
-        options = {"deviation": deviation, "amplitude": 1.0, "n_components": 3}
-        tracks, truth = random_table(camera, **options)
-        model = fitted(tracks, 3, camera=camera)
-        assert euclidean_error(model, tracks, truth) < largest
-
     @KINDS
     def test_noise_is_true_within_the_error_of_sampling(self, camera, gaps):
         tracks, _, model = fit_of(camera, gaps)

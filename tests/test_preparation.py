@@ -507,13 +507,6 @@ def test_faces_that_hide_a_side(load_data):
 # --- degenerate tables --------------------------------------------------------------
 
 
-def test_shark_has_a_lower_rank(load_data):
-    tracks = load_data("shark_torresani")["W2d"].astype(float)
-    seen = random_mask(tracks.shape[:2], 0.3, 0)
-    for n_components in (1, 2, 6):
-        assert np.sqrt(held_out_error(tracks, seen, n_components)) < 1e-5
-
-
 @pytest.mark.parametrize(
     ("n_components", "dtype", "limit"),
     [(1, np.float64, 1e-5), (5, np.float64, 3e-4), (5, np.float32, 3e-4)],

@@ -138,18 +138,6 @@ def test_lines_come_while_the_search_runs_and_parameters_stay(capsys):
 
 
 @pytest.mark.slow
-@may_not_converge
-def test_the_pipeline_of_the_paper_is_searched_plainly():
-    estimator = inner(refinement="alternating")
-    search = AffineNRSfMCV((1, 2), estimator=estimator).fit(X)
-    for row, k in enumerate((1, 2)):
-        plain = cross_val_score(estimator.set_params(n_components=k), X, cv=3)
-        ours = [search.cv_results_[f"split{i}_test_score"][row] for i in range(3)]
-        assert_array_equal(ours, plain)
-    assert_array_equal(search.cv_results_["path_fit_time"], 0)
-
-
-@pytest.mark.slow
 def test_a_scorer_sees_fitted_estimators_and_held_out_rows():
     search = AffineNRSfMCV((1, 2), estimator=inner(), scoring=mean_abs_alpha).fit(X)
     results = search.cv_results_
