@@ -66,6 +66,7 @@ CASES = {
     "weak perspective": CALIBRATED | {"loss": "cauchy"},
     "orthographic": {"camera": "orthographic", "keep_frames": False},
     "folder": {"frames_folder": "folder"},
+    "path of a folder": {"frames_folder": Path("folder")},
     "mirrored": CALIBRATED | {"mirror": True},
     "prior": CALIBRATED | {"n_components": "auto", "prior": "a model"},
     "numbers of numpy": {"n_components": np.int64(2), "tol": np.float32(0.05)}

@@ -13,6 +13,11 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
 
+pytestmark = [
+    may_not_converge,
+    pytest.mark.filterwarnings("ignore:layout=:UserWarning"),  # the tables have none
+]
+
 # Checks of what a fit leaves behind, whose outcome depends on the way of fitting.
 CHECKS_OF_RESULTS = (
     "check_estimators_dtypes check_estimators_pickle check_fit_idempotent "
@@ -42,31 +47,23 @@ def search(refinement):
     return AffineNRSfMCV((1, 2), estimator=estimator, cv=2)
 
 
-@may_not_converge
-@pytest.mark.filterwarnings("ignore:layout=:UserWarning")  # the tables have none
 @parametrize_with_checks([alternating()])
 def test_contract_on_landmark_tables(estimator, check, landmark_tables):
     check(estimator)
 
 
 @pytest.mark.slow
-@may_not_converge
-@pytest.mark.filterwarnings("ignore:layout=:UserWarning")  # the tables have none
 @parametrize_with_checks([search(None)])
 def test_contract_of_a_search_on_landmark_tables(estimator, check, landmark_tables):
     check(estimator)
 
 
-@may_not_converge
-@pytest.mark.filterwarnings("ignore:layout=:UserWarning")  # the tables have none
 @pytest.mark.parametrize("name", CHECKS_OF_RESULTS)
 def test_results_of_the_joint_refinement(name, landmark_tables):
     getattr(estimator_checks, name)("AffineNRSfM", joint())
 
 
 @pytest.mark.slow
-@may_not_converge
-@pytest.mark.filterwarnings("ignore:layout=:UserWarning")  # the tables have none
 @pytest.mark.parametrize(
     "name",
     [
@@ -79,7 +76,6 @@ def test_results_of_a_search_with_the_joint_refinement(name, landmark_tables):
     getattr(estimator_checks, name)("AffineNRSfMCV", search("joint"))
 
 
-@may_not_converge
 # The checks of dataframe output mix tables with and without names.
 @pytest.mark.filterwarnings("ignore:X does not have valid feature names:UserWarning")
 @pytest.mark.filterwarnings("ignore:X has feature names:UserWarning")
