@@ -98,15 +98,15 @@ VARIANTS = [
     {"camera": "orthographic"},
     {"camera": "weak_perspective", "refinement": None},
     {"n_components": 1},
-    {"n_components": 6},
     {"refinement": "alternating"},
-    {"refinement": "alternating", "scale_frames": False},
     {"refinement": "alternating", "block_recovery": "eigen", "n_components": 6},
     {"refinement": None, "layout": "planar", "scale_frames": False},
-    {"refinement": None, "block_recovery": "irls"},
     {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
 ]
 SLOW_VARIANTS = [
+    {"n_components": 6},
+    {"refinement": "alternating", "scale_frames": False},
+    {"refinement": None, "block_recovery": "irls"},
     {"loss": "cauchy", "independence": None},
     {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
 ]
