@@ -41,10 +41,9 @@ def quick(session: nox.Session) -> None:
 
 @nox.session
 def full(session: nox.Session) -> None:
-    """Run all tests, with more examples of properties."""
+    """Run all tests."""
     session.install("-e", ".[test]")
-    env = {**THREADS, "HYPOTHESIS_PROFILE": "ci"}
-    session.run("pytest", "-n", "2", "-m", "", *session.posargs, env=env)
+    session.run("pytest", "-n", "2", "-m", "", *session.posargs, env=THREADS)
 
 
 @nox.session(venv_backend="uv")

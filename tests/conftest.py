@@ -24,11 +24,9 @@ from isa_nrsfm import AffineNRSfM
 
 matplotlib.use("Agg")
 
-# The same examples each time; HYPOTHESIS_PROFILE=ci tries many more.
-SAME = settings(deadline=None, derandomize=True, database=None)
-settings.register_profile("quick", SAME, max_examples=5)
-settings.register_profile("ci", SAME, max_examples=100)
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
+# The same examples each time
+settings.register_profile("same", deadline=None, derandomize=True, database=None)
+settings.load_profile("same")
 
 NO_DATA = "tables that are no part of this project (docs/benchmarks/README.md, Sets)"
 
@@ -89,10 +87,15 @@ def load_data(data_path):
     return load
 
 
-@pytest.fixture(scope="module")
-def one_start():
-    """Let joint fits have one start, and few steps for the errors of their depths."""
+@pytest.fixture(scope="module", autouse=True)
+def one_start(request):
+    """Let joint fits have one start, and few steps for the errors of their depths.
+
+    In modules with the name ALL_STARTS they have those of users.
+    """
     limits = {"few_frames": 0, "widths": (), "error_steps": 3}
+    if hasattr(request.module, "ALL_STARTS"):
+        limits = {}
     quick = AffineNRSfM._limits._replace(**limits)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(AffineNRSfM, "_limits", quick)

@@ -308,13 +308,7 @@ WRITERS = {
     "pyfeat": lambda d: write_pyfeat(d / "a.csv", TRACKS),
     "pyfeat-v2": lambda d: write_pyfeat(d / "a.csv", TRACKS, detector="Detectorv2"),
     "pyfeat-mp": lambda d: write_pyfeat(d / "a.csv", MESH, detector="MPDetector"),
-    "pyfeat-parquet": lambda d: saved_again(
-        write_pyfeat(d / "a.csv", MESH, detector="MPDetector"), ".parquet"
-    ),
     "mediapipe-pixels": lambda d: write_mesh(d / "a.csv", MESH, shares=False),
-    "mediapipe-tsv": lambda d: saved_again(
-        write_mesh(d / "a.csv", MESH, sizes=True), ".tsv"
-    ),
     "mediapipe-sizes": lambda d: write_mesh(d / "a.csv", MESH, sizes=True),
     "pts": lambda d: write_pts(d / "a", TRACKS),
     "pts-file": lambda d: write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
@@ -356,6 +350,6 @@ WRITERS = {
 }
 # The points that are not `TRACKS`.
 IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
-EXPECTED = dict.fromkeys([*IN_MESH, "pyfeat-parquet"], MESH)
+EXPECTED = dict.fromkeys(IN_MESH, MESH)
 EXPECTED |= dict.fromkeys(["pts-file", "openpose-file", "mmpose-image"], TRACKS[:1])
 EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}

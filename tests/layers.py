@@ -10,8 +10,6 @@ may_not_converge = pytest.mark.filterwarnings(
 start_may_not_converge = pytest.mark.filterwarnings(
     "ignore:PooledFastICA did not converge"
 )
-# For tests of what is done with a fit, which is then three times as quick.
-one_start = pytest.mark.usefixtures("one_start")
 
 
 def slow_after(n_quick, values):

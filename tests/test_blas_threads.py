@@ -11,7 +11,7 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_array_equal, assert_equal
 from refusals import refused
 from threadpoolctl import ThreadpoolController, threadpool_limits
@@ -19,8 +19,6 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm.datasets import make_nonrigid_tracks
-
-pytestmark = one_start
 
 # Python does not interrupt between the last call of a block and the release of a lock.
 WITH = "with self._lock:"

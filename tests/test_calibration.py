@@ -8,7 +8,7 @@ from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
-from scenes import measurements
+from scenes import measurements, random_rotation
 from scipy.linalg import expm
 from scipy.optimize import approx_fprime, minimize
 from scipy.spatial.transform import Rotation
@@ -50,10 +50,9 @@ def scene(seed, camera, n_frames=20, spread=None, stretch=(0.2, 1.0, 3.0)):
 
 @both_cameras
 class TestMetricUpgrade:
-    @pytest.mark.parametrize("seed", range(5))
-    @pytest.mark.parametrize("stretch", [(1, 1, 1), (0.2, 1, 3), (1, 1, 300)])
-    def test_exact_cameras(self, camera, seed, stretch):
-        motion, turns, scales, affinity = scene(seed, camera, stretch=stretch)
+    @pytest.mark.parametrize("stretch", [(1, 1, 1), (1, 1, 300)])
+    def test_exact_cameras(self, camera, stretch):
+        motion, turns, scales, affinity = scene(0, camera, stretch=stretch)
         upgrade = metric_upgrade(motion, camera)
         size = np.sqrt(np.mean(scales**2))
         # What is left of the affinity is an orthogonal matrix and the unit of length.
@@ -163,14 +162,6 @@ class TestLeastResidual:
         least = min(minimize(value, rng.standard_normal(9)).fun for _ in range(20))
         assert n * metric_upgrade(motion).residual ** 2 <= least * (1 + 1e-6)
 
-    @both_cameras
-    def test_many_frames_are_worked_on_in_blocks(self, camera):
-        motion = noisy_cameras(np.random.default_rng(3))
-        many = np.tile(motion, (70, 1, 1))
-        few, whole = metric_upgrade(motion, camera), metric_upgrade(many, camera)
-        assert_allclose(whole.Q, few.Q, atol=1e-8)
-        assert whole.residual == pytest.approx(few.residual, rel=1e-9)
-
     def test_strains_of_many_frames_do_not_depend_on_their_order(self, rng):
         motion, alpha = noisy_cameras(rng, 2100), rng.standard_normal((2100, 2))
         one = deformation_metric(motion, alpha)
@@ -244,9 +235,8 @@ def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
 
 
 class TestDeformationMetric:
-    @pytest.mark.parametrize("seed", range(5))
-    def test_exact_cameras(self, seed):
-        motion, alpha, Q, strain, *_ = strained_scene(seed)
+    def test_exact_cameras(self):
+        motion, alpha, Q, strain, *_ = strained_scene(0)
         metric = deformation_metric(motion, alpha)
         assert_allclose(metric.Q / np.trace(metric.Q), Q / np.trace(Q), atol=1e-8)
         assert_allclose(metric.strain, strain, atol=1e-7)
@@ -410,9 +400,8 @@ def cost_of(cameras):
 
 
 class TestOrthonormalCameras:
-    @pytest.mark.parametrize("seed", range(4))
-    def test_are_found(self, seed):
-        P, cameras = deforming_scene(seed)
+    def test_are_found(self):
+        P, cameras = deforming_scene(0)
         found = orthonormal_cameras(P)
         assert found.cost < 1e-17
         rows = found.cameras @ found.cameras.transpose(0, 2, 1)
@@ -463,12 +452,6 @@ class TestOrthonormalCameras:
         assert orthonormal_cameras(U[:, :6]).cost < 0.005
         assert orthonormal_cameras(U[:, :30]).cost < 3e-6
 
-    def test_more_noise_means_smaller_mixtures(self):
-        P, _ = deforming_scene(0, noise=0.02)
-        found = [orthonormal_cameras(P, v) for v in (0.0, 1e-3, 1e-1, 10.0)]
-        assert (np.diff([np.linalg.norm(f.mixing) for f in found]) < 0).all()
-        assert (np.diff([f.cost for f in found]) > 0).all()
-
     def test_dependent_columns_are_left_out(self):
         P, _ = deforming_scene(0, noise=0.02)
         expected = orthonormal_cameras(P)
@@ -478,7 +461,6 @@ class TestOrthonormalCameras:
         assert_allclose(found.cameras, expected.cameras, atol=1e-6)
 
 
-ROTATIONS = Rotation.random(5, random_state=0).as_matrix()
 # The directions of `face`, by points: nose, chin, brow, eyes and ears.
 LEFT_RIGHT = [[36, 45], [0, 16]]
 UP, FRONT = [[8, 27]], [[0, 30], [16, 30]]
@@ -496,10 +478,10 @@ def angle_between(one, two):
 
 
 class TestPoses:
-    @pytest.mark.parametrize("turn", ROTATIONS)
     @pytest.mark.parametrize("mirror", [np.eye(3), MIRROR], ids=["same", "mirrored"])
     @pytest.mark.parametrize("options", [POINTS, {"scheme": "ibug-68"}])
-    def test_turned_and_mirrored_shapes_agree(self, face, turn, mirror, options):
+    def test_turned_and_mirrored_shapes_agree(self, face, mirror, options):
+        turn = random_rotation(0)
         given = face @ mirror @ turn.T
         pose = canonical_pose(given, **options)
         assert_allclose(pose.shape, canonical_pose(face, **options).shape, atol=1e-10)
@@ -563,24 +545,17 @@ class TestPoses:
         assert angle_between(one.rotation, two.rotation) > 5
 
 
-class TestPrincipalAxes:
-    @pytest.fixture
-    def points(self):
-        return np.random.default_rng(0).standard_normal((200, 3)) * [1.0, 3.0, 2.0]
-
-    @pytest.mark.parametrize("seed", range(5))
-    def test_nearest_axes(self, points, seed):
-        rng = np.random.default_rng(seed)
-        turn = Rotation.from_rotvec(0.2 * rng.standard_normal(3)).as_matrix()
-        upright = canonical_pose(points)
-        pose = canonical_pose(points @ turn.T + 4.0)
-        assert_allclose(pose.rotation @ turn, upright.rotation, atol=1e-9)
-        assert np.linalg.det(pose.rotation) == pytest.approx(1)
-        centred = pose.shape - pose.shape.mean(axis=0)
-        scatter = centred.T @ centred
-        assert_allclose(scatter, np.diag(np.diag(scatter)), atol=1e-8 * scatter.max())
-        assert_array_equal(np.argsort(np.diag(scatter)), [0, 2, 1])
-        assert not pose.mirrored
+def test_nearest_principal_axes(rng):
+    points = rng.standard_normal((200, 3)) * [1.0, 3.0, 2.0]
+    turn = Rotation.from_rotvec(0.2 * rng.standard_normal(3)).as_matrix()
+    upright = canonical_pose(points)
+    pose = canonical_pose(points @ turn.T + 4.0)
+    assert_allclose(pose.rotation @ turn, upright.rotation, atol=1e-9)
+    assert np.linalg.det(pose.rotation) == pytest.approx(1)
+    scatter = np.cov(pose.shape.T)
+    assert_allclose(scatter, np.diag(np.diag(scatter)), atol=1e-8 * scatter.max())
+    assert_array_equal(np.argsort(np.diag(scatter)), [0, 2, 1])
+    assert not pose.mirrored
 
 
 @pytest.mark.parametrize(
@@ -739,12 +714,6 @@ class TestTruth:
         assert frame_error(photos.shapes, ortho / 2, scale=False) < 0.012
         assert mean_shape_error_3d(photos.shapes, ortho / 2) < 0.05
 
-    def test_photos_of_different_resolution(self):
-        photos = make_face_tracks(n_frames=300, random_state=1)
-        model = AffineNRSfM(n_components=4, random_state=0).fit(photos.data)
-        shapes = model.reconstruct(photos.data, camera="weak_perspective")
-        assert frame_error(photos.shapes, shapes) < 0.012
-
     @pytest.mark.parametrize(
         ("name", "n_components", "errors"),
         [
@@ -754,7 +723,6 @@ class TestTruth:
             *slow_after(
                 0,
                 [
-                    ("akhter_drink", 3, (0.019, 0.097)),
                     ("akhter_pickup", 3, (0.040, 0.125)),
                     ("akhter_yoga", 4, (0.068, 0.245)),
                 ],
@@ -779,12 +747,6 @@ class TestTruth:
 
 
 class TestReconstruct:
-    def test_affine_shapes_by_default(self, photos, model):
-        expected = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
-        assert_allclose(model.reconstruct(photos.data), expected, atol=1e-8)
-        shapes = model.reconstruct(photos.data)
-        assert_array_equal(model.reconstruct(photos.data, camera=None), shapes)
-
     def test_shapes_are_those_of_the_calibration(self, photos, model):
         motion, translation, alpha, _ = model.decompose(photos.data)
         metric = deformation_metric(model.motion_, model.alpha_)
@@ -808,7 +770,7 @@ class TestReconstruct:
         some = model.reconstruct(new.data[7:9], camera=camera)
         assert_allclose(some, shapes[7:9], rtol=1e-6)
 
-    @pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+    @pytest.mark.parametrize("refinement", ["alternating", None])
     def test_every_refinement(self, photos, refinement):
         model = AffineNRSfM(n_components=2, refinement=refinement, random_state=0)
         model.fit(photos.data)

@@ -6,7 +6,7 @@ import sys
 
 import joblib
 import pytest
-from layers import one_start, start_may_not_converge
+from layers import start_may_not_converge
 from numpy.testing import assert_array_equal
 from refusals import refused, warned
 from sklearn.base import clone
@@ -20,7 +20,7 @@ from isa_nrsfm.io import load_model, save_model
 
 callback = pytest.importorskip("sklearn.callback", reason="new in scikit-learn 1.9")
 
-pytestmark = [one_start, start_may_not_converge]
+pytestmark = start_may_not_converge
 
 TABLE = make_nonrigid_tracks(40, 16, 1, noise=0.02, random_state=0).data
 JOINT, LAST = "joint refinement", "gauge and coefficients"

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import FIGURES, FILES as FIT_FILES, MODEL, Results
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -26,8 +26,6 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import ModeCovarianceDisplay
-
-pytestmark = one_start
 
 N_FRAMES, N_COMPONENTS = 60, 2
 QUICK = ["--n-components", str(N_COMPONENTS), "--isa", "fast", "--n-init", "2"]
@@ -213,6 +211,7 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     assert "--prior needs one number of basis shapes" in fails(*again, "-k", "1-2")
 
 
+@pytest.mark.slow
 def test_the_face_prior_that_a_warning_names(fits, tmp_path):
     X = make_face_tracks(60, n_components=2, random_state=0).shapes[..., :2] - 500
     table = saved(pd.DataFrame(X.reshape(60, -1), columns=LANDMARKS), tmp_path)
@@ -480,7 +479,8 @@ def test_transform_gives_each_row_its_coefficients(transforms, fitted, faces, tm
 
 
 @pytest.mark.parametrize(
-    ("number", "option"), [(0, ["--zeros-missing"]), (-1, ["--missing-value", "-1"])]
+    ("number", "option"),
+    slow_after(1, [(-1, ["--missing-value", "-1"]), (0, ["--zeros-missing"])]),
 )
 def test_transform_knows_missing_points(
     fits, transforms, faces, tmp_path, number, option

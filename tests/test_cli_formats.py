@@ -6,13 +6,11 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from layers import one_start, slow_after
+from layers import slow_after
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import find_format, read_landmarks
-
-pytestmark = one_start
 
 N_FRAMES = 40
 LOST, EMPTY = 3, 7
@@ -73,7 +71,7 @@ def write_sleap(folder):
 @pytest.mark.parametrize(
     "write",
     slow_after(
-        3, [write_openface, write_sleap, write_openpose, write_pts, write_mediapipe]
+        2, [write_openface, write_openpose, write_sleap, write_pts, write_mediapipe]
     ),
 )
 def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
@@ -154,9 +152,7 @@ def write_coco(folder):
     [
         (write_openface, "--principal-point 1 2 --focal-length 3", "(1.0, 2.0) 3.0"),
         (write_openface, "--image-size 640x480", "(320.0, 240.0) None"),
-        (write_mediapipe, "", "(320.0, 240.0) None"),
         (write_sized_mesh, "--principal-point 3 4", "(3.0, 4.0) None"),
-        (write_sized_mesh, "", "(320.0, 240.0) None"),
         (write_sized_pyfeat, "", "(320.0, 240.0) None"),
         (write_several_sizes, "", "needs the size of the images"),
         (write_coco, "", "(320.0, 240.0) None"),
@@ -284,16 +280,12 @@ def write_shares(folder, change=lambda shares: shares):
 @pytest.mark.parametrize(
     ("change", "is_named"),
     [
-        (lambda shares: shares, True),
         (lambda shares: shares - np.quantile(shares, 0.04), True),
         (lambda shares: shares - np.quantile(shares, 0.2, axis=(0, 1)), False),
         (lambda shares: shares * [1, 2] + [0, 0.1], True),
-        (lambda shares: (shares - shares[:, :1, :1]) * [1, 0.5], False),
-        (lambda shares: shares - shares.mean(axis=1, keepdims=True), False),
-        (lambda shares: (shares - shares.min()) / np.ptp(shares), False),
         (lambda shares: shares * [1920, 1080], False),
     ],
-    ids="shares border corner cut_off aligned centred scaled pixels".split(),
+    ids="border corner cut_off pixels".split(),
 )
 def test_shares_of_an_image_are_named(fits, tmp_path, change, is_named):
     err = fits(write_shares(tmp_path, change), *QUICK).err

@@ -7,14 +7,12 @@ import pandas as pd
 import pytest
 from exported_files import Read, content_of
 from fit_runs import Results
-from layers import one_start, slow_after
+from layers import slow_after
 
 from isa_nrsfm import datasets
 from isa_nrsfm.cli import main
 from isa_nrsfm.export import frame_poses
 from isa_nrsfm.skeletons import get_skeleton
-
-pytestmark = one_start
 
 QUICK = [*"--n-components 1 --refinement none --isa fast --n-init 2".split()]
 
@@ -93,19 +91,20 @@ def test_fit_takes_a_skeleton_for_all_that_it_draws(run, table, tmp_path, monkey
 
 def test_edges_of_a_file(fits, succeeds, table, bodies_fit, tmp_path):
     own, config = tmp_path / "edges.csv", tmp_path / "config.yaml"
-
-    def drawn(*options):
+    own.write_text("5,7\n7,9\n")
+    for options in ([], ["--edges", own]):
         found = fits(table, "--no-figures", *QUICK, *options)
         # Without any, the report names the options.
         advice = "--edges FILE or --skeleton LAYOUT (of 17 points: coco-17, h36m-17)"
-        is_noted = advice in " ".join(found.out.split())
-        assert is_noted == (options == ())
-        return edges_of(tmp_path / "viewer.html")[0]
+        assert (advice in " ".join(found.out.split())) == (options == [])
+    assert edges_of(tmp_path / "viewer.html")[0] == {(5, 7), (7, 9)}
 
-    assert len(drawn()) == 16
+    def drawn(*options):
+        export = ["export", bodies_fit.path, "-o", tmp_path / "a.html", "--force"]
+        succeeds(*export, *options)
+        return edges_of(tmp_path / "a.html")[0]
+
     assert drawn("--edges", "none") == set()
-    own.write_text("5,7\n7,9\n")
-    assert drawn("--edges", own) == {(5, 7), (7, 9)}
     # Of triangles the sides are drawn, each once.
     own.write_text("0,1,2\n2,1,3\n")
     assert drawn("--edges", own) == {(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)}

@@ -258,14 +258,6 @@ class TestRandomTables:
         assert_allclose(np.mean(alpha**4, axis=0), expected, rtol=0.1)
         assert_allclose(np.mean(alpha[:, 0] * alpha[:, 1]), 0, atol=0.02)
 
-    def test_orientations_are_uniform(self):
-        options = {"camera": "orthographic", "random_state": 0}
-        scene = make_nonrigid_tracks(20_000, 4, 0, **options)
-        assert_allclose(scene.motion.mean(axis=0), 0, atol=0.02)
-        axes = scene.motion[:, 0]
-        assert_allclose(axes.T @ axes / len(axes), np.eye(3) / 3, atol=0.01)
-        assert_allclose(np.mean(axes**4, axis=0), 1 / 5, atol=0.01)
-
 
 @pytest.fixture(scope="module")
 def expressive():

@@ -197,17 +197,6 @@ class TestShark:
             assert shark[name].flags.c_contiguous
             assert shark[name].flags.writeable
 
-    def test_original(self, data_path, load_data, without_pooch):
-        folder = data_path("raw/jaws.mat").parent
-        shark = fetch_shark(data_home=folder, download_if_missing=False)
-        known = load_data("shark_torresani")
-        assert_array_equal(shark.shapes, known["S3d"])
-        assert_array_equal(shark.tracks, known["W2d"])
-        assert shark.data.shape == (240, 182)
-        centred = shark.tracks - shark.tracks.mean(axis=1, keepdims=True)
-        W = centred.transpose(0, 2, 1).reshape(480, 91)
-        assert np.linalg.matrix_rank(W) == 5
-
 
 class TestMuct:
     def test_points_at_zero_are_missing(self, tmp_path, muct_file):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
@@ -33,8 +33,6 @@ from isa_nrsfm.datasets import (
 )
 from isa_nrsfm.skeletons import get_skeleton
 
-pytestmark = one_start
-
 TABLE = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
 
 
@@ -52,9 +50,8 @@ def of_known_shapes(alpha, covariance):
 
 
 class TestReliabilities:
-    @pytest.mark.parametrize("seed", range(3))
-    def test_are_shares_of_the_variance(self, seed):
-        alpha, covariance = random_coefficients(seed)
+    def test_are_shares_of_the_variance(self):
+        alpha, covariance = random_coefficients(0)
         moment = sum(np.outer(a, a) for a in alpha) / len(alpha)
         expected = np.sort(eigvals(moment, moment + covariance).real)[::-1]
         assert_allclose(of_known_shapes(alpha, covariance), expected, rtol=1e-9)
@@ -69,7 +66,7 @@ class TestReliabilities:
         expected = of_known_shapes(alpha[:, kept], covariance[np.ix_(kept, kept)])
         assert_allclose(found[:2], expected, rtol=1e-9)
 
-    @pytest.mark.parametrize("gamma", [0.2, 2.0, 20.0])
+    @pytest.mark.parametrize("gamma", [0.2, 20.0])
     def test_are_correlations_with_the_truth(self, gamma, rng):
         # A random matrix of rank one and noise: its left singular vector.
         n_frames, signal = 300, 10 * np.sqrt(gamma)
@@ -85,8 +82,7 @@ class TestReliabilities:
         # The margin of chance makes it a little smaller.
         assert correlation - 0.05 < found[0] < correlation + 0.02
 
-    @pytest.mark.parametrize("gamma", [0.2, 2.0])
-    @pytest.mark.parametrize("above", [1.05, 2.0, 10.0])
+    @pytest.mark.parametrize(("gamma", "above"), [(0.2, 1.05), (2.0, 10.0)])
     def test_by_their_formula_from_the_limit_of_detection_on(self, gamma, above):
         signal = above * np.sqrt(gamma)
         y = (1 + signal) * (1 + gamma / signal)
@@ -437,7 +433,9 @@ class TestAdvice:
         (message,) = advice(facts(**known))
         assert expected in message
 
-    @pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+    @pytest.mark.parametrize(
+        "camera", slow_after(1, ["weak_perspective", "orthographic"])
+    )
     def test_parameters_that_are_named_are_accepted(self, camera):
         cases = product(
             [camera] if camera == "orthographic" else [camera, "perspective"],
@@ -491,11 +489,6 @@ class TestAdvice:
         few = facts(reliability=np.array([0.9, 0.8, 0.0]))
         assert "at most n_components=2" in advice(few)[0]
         assert advice(few._replace(prior=True, pose="the outline")) == ()
-
-    @pytest.mark.parametrize("ratio", [1.0, 1.5, 100.0])
-    def test_on_cameras_does_not_lead_back(self, ratio):
-        given = facts(camera="affine", noise_ratio=ratio, deviation=0.3)
-        assert not any("perspective" in message for message in advice(given))
 
 
 # --- what a notebook shows of a model ------------------------------------------------

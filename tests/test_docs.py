@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 import sklearn
 from landmark_files import write_openface
-from layers import one_start
 from scipy.io import savemat
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
@@ -28,7 +27,7 @@ from isa_nrsfm.plotting import BasisShapeDisplay
 from isa_nrsfm.skeletons import SKELETONS
 
 ROOT = Path(__file__).resolve().parents[1]
-pytestmark = [pytest.mark.lint, one_start]
+pytestmark = pytest.mark.lint
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 

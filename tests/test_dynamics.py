@@ -2,7 +2,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from layers import one_start, slow_after, start_may_not_converge
+from layers import slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
 from scenes import waving_scene
 from scipy.linalg import block_diag
@@ -23,8 +23,6 @@ from isa_nrsfm.analysis._smoothing import (
 )
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
-
-pytestmark = one_start
 
 K = 3
 # Of fits that are compared with each other
@@ -102,11 +100,7 @@ def dense_posterior(data, dynamics):
     prior = across @ block_diag(first, *[Q] * (n_steps - 1)) @ across.T
     change = np.pad(change, ((0, 0), (0, size - n)))
     change[0] = 0.0
-    mean, fit, L = (
-        -across @ change.ravel(),
-        fit.ravel(),
-        block_diag(*precision),
-    )
+    mean, fit, L = (-across @ change.ravel(), fit.ravel(), block_diag(*precision))
     growth, far = np.eye(len(prior)) + L @ prior, mean - fit
     covariance, off = np.linalg.solve(growth.T, prior).T, fit - L @ far
     likelihood = far @ (fit + off) + off @ covariance @ off

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
-from layers import may_not_converge, one_start, slow_after
+from layers import may_not_converge, slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from sklearn.base import BaseEstimator, clone
@@ -23,8 +23,6 @@ from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
-
-pytestmark = one_start
 
 N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
@@ -40,9 +38,9 @@ def estimator(n_components=K, **params):
 
 
 @cache
-def fitted(n_components=K, refinement="joint"):
+def fitted(refinement="joint"):
     """Return a model of the table, to be left as it is."""
-    return estimator(n_components, isa=None, refinement=refinement).fit(TABLE)
+    return estimator(refinement=refinement).fit(TABLE)
 
 
 def planar(table):
@@ -100,15 +98,15 @@ VARIANTS = [
     {"camera": "orthographic"},
     {"camera": "weak_perspective", "refinement": None},
     {"n_components": 1},
-    {"n_components": 6},
     {"refinement": "alternating"},
-    {"refinement": "alternating", "scale_frames": False},
     {"refinement": "alternating", "block_recovery": "eigen", "n_components": 6},
     {"refinement": None, "layout": "planar", "scale_frames": False},
-    {"refinement": None, "block_recovery": "irls"},
     {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
 ]
 SLOW_VARIANTS = [
+    {"n_components": 6},
+    {"refinement": "alternating", "scale_frames": False},
+    {"refinement": None, "block_recovery": "irls"},
     {"loss": "cauchy", "independence": None},
     {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
 ]
@@ -155,8 +153,9 @@ def variant(request):
 # --- attributes ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("refinement", ["joint", "alternating"])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("refinement", "dtype"), [("joint", np.float32), ("alternating", np.float64)]
+)
 def test_attributes_have_the_documented_shapes_and_types(dtype, refinement):
     n_components = 4
     model = estimator(n_components, refinement=refinement).fit(TABLE.astype(dtype))
@@ -526,16 +525,6 @@ def test_results_do_not_depend_on_how_the_table_is_kept(kind, tmp_path):
         assert_allclose(reference.transform(table), reference.alpha_, atol=1e-9)
 
 
-@may_not_converge
-def test_planar_tables_equal_interleaved_ones():
-    reference = fitted()
-    model = clone(reference).set_params(layout="planar").fit(planar(TABLE))
-    assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
-    assert_allclose(model.basis_, reference.basis_, atol=1e-10)
-    expected = planar(reference.reproject(TABLE))
-    assert_allclose(model.reproject(planar(TABLE)), expected, rtol=1e-9)
-
-
 # --- errors -------------------------------------------------------------------------
 
 
@@ -682,18 +671,6 @@ def test_threads_work_on_new_frames_to_the_bit():
     assert alone[1] == together[1]
 
 
-def test_shapes_of_frames_do_not_depend_on_the_independence(model):
-    assert model.independence == "shapes"
-    shapes, score = model.reconstruct(TABLE), model.score(TABLE)
-    for name in ("coefficients", None):
-        other = estimator(independence=name).fit(TABLE)
-        assert_allclose(other.mean_shape_, model.mean_shape_, atol=1e-9)
-        assert_allclose(other.reconstruct(TABLE), shapes, atol=1e-8)
-        assert_allclose(other.inverse_snr_, model.inverse_snr_, rtol=1e-9)
-        assert_allclose(other.score(TABLE), score, rtol=1e-7)
-        assert np.abs(other.alpha_ - model.alpha_).max() > 0.1
-
-
 def test_refinement_that_is_cut_short_says_so():
     with pytest.warns(
         ConvergenceWarning, match="converge in max_iter=1 steps"
@@ -796,13 +773,13 @@ def test_verbose_prints_a_line_for_each_stage(capsys):
 
 
 def test_grid_search_over_own_and_nested_parameters():
-    grid = {"n_components": [1, 3], "isa__n_init": [1, 2]}
+    grid = [{"n_components": [1]}, {"n_components": [K], "isa__n_init": [2]}]
     model = AffineNRSfM(isa=FastISA(), refinement="alternating", random_state=0)
     search = GridSearchCV(model, grid, cv=2)
     search.fit(TABLE)
     assert np.isfinite(search.cv_results_["mean_test_score"]).all()
     assert search.best_params_["n_components"] == K
-    assert search.best_estimator_.isa_.n_init == search.best_params_["isa__n_init"]
+    assert search.best_estimator_.isa_.n_init == 2
     assert search.best_estimator_.basis_.shape == (3, N_POINTS, 3)
     assert search.score(TABLE) == search.best_estimator_.score(TABLE)
 
@@ -831,7 +808,7 @@ def calibrated(camera, refinement="joint"):
         return model.fit(truth.data), truth
 
 
-@pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+@pytest.mark.parametrize("refinement", ["joint", "alternating"])
 @pytest.mark.parametrize("camera", CALIBRATED)
 def test_images_are_those_of_scaled_rotations(camera, refinement):
     model, truth = calibrated(camera, refinement)
@@ -865,8 +842,10 @@ def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
     assert np.degrees(angle) < 2
 
 
-@pytest.mark.parametrize("camera", ["affine", *CALIBRATED])
-@pytest.mark.parametrize("refinement", ["joint", "alternating"])
+@pytest.mark.parametrize(
+    ("camera", "refinement"),
+    [*((each, "joint") for each in ("affine", *CALIBRATED)), ("affine", "alternating")],
+)
 def test_mirror_images_fit_as_well(camera, refinement):
     model, truth = calibrated(camera, refinement)
     mirrored = model.mirrored()
@@ -932,17 +911,6 @@ def test_a_table_that_asks_for_more_components_says_so():
         AffineNRSfM("auto", random_state=0).fit(truth.data)
 
 
-@pytest.mark.slow
-def test_outliers_are_no_components(rng):
-    truth = make_nonrigid_tracks(150, 20, 2, noise=0.01, random_state=1)
-    moved = rng.random((150, 20)) < 0.05
-    size = np.sqrt(np.mean(truth.clean**2))
-    X = truth.tracks + size * moved[..., None] * rng.normal(size=(150, 20, 2))
-    model = AffineNRSfM("auto", loss="cauchy", random_state=0).fit(X.reshape(150, -1))
-    assert len(model.basis_) == 2
-    assert (model.reliability_ > 0.9).all()
-
-
 @pytest.mark.parametrize("camera", slow_after(1, ["affine", "weak_perspective"]))
 @pytest.mark.parametrize("loss", slow_after(2, ["linear", "cauchy", "huber"]))
 def test_intervals_of_coefficients_hold(loss, camera, rng):
@@ -979,13 +947,12 @@ def test_intervals_contain_the_errors_of_shapes(loss, missing):
 
 
 @pytest.mark.parametrize(
-    ("truth", "least", "most", "meaning"),
+    ("camera", "truth", "least", "most", "meaning"),
     [
-        ("weak_perspective", 1.0, 1.1, "as well as affine ones"),
-        ("affine", 10.0, np.inf, "probably not calibrated"),
+        ("affine", "weak_perspective", 1.0, 1.1, "as well as affine ones"),
+        ("weak_perspective", "affine", 10.0, np.inf, "probably not calibrated"),
     ],
 )
-@pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
 def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meaning):
     made = make_nonrigid_tracks(150, 40, 2, camera=truth, noise=0.02, random_state=0)
     model = AffineNRSfM(2, camera=camera, random_state=0).fit(made.data)

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from frame_parts import OF_FRAMES
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused, warned
 from sklearn.base import clone
@@ -18,8 +18,6 @@ from sklearn.preprocessing import FunctionTransformer
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
-
-pytestmark = one_start
 
 K = 2
 REFINEMENTS = ["joint", "alternating", None]
@@ -96,10 +94,10 @@ def frames_with_outliers(n_frames=24):
 @pytest.mark.parametrize(
     ("loss", "camera"),
     slow_after(
-        2,
+        1,
         [
-            ("linear", "affine"),
             ("huber", "affine"),
+            ("linear", "affine"),
             ("cauchy", "affine"),
             ("linear", "weak_perspective"),
             ("cauchy", "weak_perspective"),
@@ -271,18 +269,6 @@ def test_missing_points_of_dataframes_are_named():
     refused(r"point 7 \(x_7, y_7\), in 0 of 90", estimator().fit, table)
 
 
-@pytest.mark.parametrize("method", ["fit_transform", "transform", "reproject", "score"])
-def test_points_with_one_coordinate_count_as_missing_and_warn(complete_model, method):
-    half, whole = COMPLETE.data.copy(), COMPLETE.data.copy()
-    half[4, 7] = np.nan
-    whole[4, 6:8] = np.nan
-    model = estimator() if method == "fit_transform" else complete_model
-    with pytest.warns(UserWarning, match="in 1 of 90 rows .* point 3 in row 4") as w:
-        result = getattr(model, method)(half)
-    assert len(w) == 1
-    assert_array_equal(result, getattr(model, method)(whole))
-
-
 # --- methods ------------------------------------------------------------------------
 
 
@@ -386,19 +372,6 @@ def test_shapes_of_tables_with_missing_points(seed):
         error(estimator().fit(each.data), each.data, each.shapes) for each in tables
     )
     assert holed < 1.4 * complete
-
-
-@pytest.mark.slow
-def test_shapes_of_real_faces_with_missing_points(load_data):
-    data = load_data("ict_bu3dfe_like_68")
-    tracks, truth = data["W2d"], data["S3d"]
-    hidden = np.random.default_rng(0).random(tracks.shape[:2]) < 0.3
-    holed = np.where(hidden[..., None], np.nan, tracks)
-    errors = []
-    for each in (tracks, holed):
-        X = each.reshape(len(each), -1)
-        errors.append(error(AffineNRSfM(5, random_state=0).fit(X), X, truth))
-    assert errors[1] < 1.15 * errors[0]
 
 
 def with_outliers(made, seed, share=0.05, size=1.0):

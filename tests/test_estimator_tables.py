@@ -1,7 +1,6 @@
 """AffineNRSfM on real and degenerate tables: layouts, accuracy, finite numbers."""
 
 import warnings
-from functools import cache
 
 import numpy as np
 import pytest
@@ -11,15 +10,19 @@ from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm._estimator import limited
+from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
-from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
+ALL_STARTS = True
 REAL_TABLES = (
-    "akhter_drink akhter_pickup akhter_yoga expressions_dlib_68 faces_wild_68_combined "
-    "flag_mocap_30x250 hands_kazuhito_21 ict_bu3dfe_like_68 muct_68 shark_torresani"
+    "akhter_yoga muct_68 hands_kazuhito_21 akhter_drink akhter_pickup "
+    "flag_mocap_30x250 expressions_dlib_68 faces_wild_68_combined ict_bu3dfe_like_68 "
+    "shark_torresani"
 ).split()
 FAST = FastISA(n_init=2)
+OneStart = limited(LIMITS._replace(few_frames=0, widths=()))
 FACES = make_face_tracks(60, n_components=2, random_state=0).tracks
 
 
@@ -49,7 +52,7 @@ def messages_of_fit(table, **params):
 
 
 @pytest.mark.parametrize("right", ["interleaved", "planar"])
-@pytest.mark.parametrize("name", REAL_TABLES)
+@pytest.mark.parametrize("name", slow_after(3, REAL_TABLES))
 def test_right_layout_gives_no_warning_and_the_wrong_one_does(load_data, name, right):
     tracks = real_tracks(load_data, name)
     # Planar tables stand in for those whose frames count by size.
@@ -71,7 +74,7 @@ def assert_finite(model):
             assert np.isfinite(value).all(), name
 
 
-def fitted(tracks, n_components, **params):
+def fitted(tracks, n_components, kind=AffineNRSfM, **params):
     """Return the model of tracks by the paper's pipeline, if nothing else is said.
 
     Warnings of ISA's convergence do not count.
@@ -79,7 +82,7 @@ def fitted(tracks, n_components, **params):
     params = {"isa": FAST, "refinement": "alternating", "random_state": 0} | params
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        model = AffineNRSfM(n_components, **params).fit(table_of(tracks))
+        model = kind(n_components, **params).fit(table_of(tracks))
     assert_finite(model)
     table = table_of(tracks)
     assert np.isfinite(model.reproject(table)).all()
@@ -116,9 +119,11 @@ def assert_zero_from(model, first):
     assert_allclose(model.alpha_[:, :first].std(axis=0), 1, rtol=1e-6)
 
 
-@pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
-@pytest.mark.parametrize("refinement", ["alternating", None])
-@pytest.mark.parametrize("n_components", [2, 3, 6])
+@pytest.mark.parametrize(
+    ("n_components", "refinement", "isa"),
+    [(2, "alternating", FAST), (6, None, PooledFastICA(n_init=2))],
+    ids=str,
+)
 def test_shark_has_one_shape_of_rank_two(load_data, n_components, refinement, isa):
     tracks = real_tracks(load_data, "shark_torresani")
     model = fitted(tracks, n_components, isa=isa, refinement=refinement)
@@ -127,21 +132,6 @@ def test_shark_has_one_shape_of_rank_two(load_data, n_components, refinement, is
     assert_zero_from(model, 1)
     one = fitted(tracks, 1, isa=isa, refinement=refinement)
     assert_allclose(model.inverse_snr_, one.inverse_snr_, rtol=1e-6)
-
-
-@pytest.mark.parametrize("block_recovery", ["generalized_eigen", "eigen", "irls"])
-@pytest.mark.parametrize("refinement", ["alternating", None])
-def test_shark_with_all_methods(load_data, block_recovery, refinement):
-    tracks = real_tracks(load_data, "shark_torresani")
-    params = {"block_recovery": block_recovery, "refinement": refinement}
-    model = fitted(tracks, 2, **params)
-    assert np.all(model.basis_[1] == 0)
-    assert np.all(model.alpha_[:, 1] == 0)
-    S = model.singular_values_
-    rigid = np.sum(S[3:] ** 2) / np.sum(S**2)
-    assert model.inverse_snr_ <= rigid * (1 + 1e-9)
-    if refinement == "alternating":
-        assert_allclose(model.inverse_snr_, fitted(tracks, 2).inverse_snr_, rtol=1e-6)
 
 
 def cameras(rng, n_frames):
@@ -173,10 +163,9 @@ def bending_tracks(motion=None, flat=(1, 1, 1), noise=0.0):
 FLAT = pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
 
 
-@pytest.mark.parametrize("n_components", [1, 2, 5])
 @FLAT
-def test_rigid_objects_have_no_basis_shapes(flat, n_components):
-    model = fitted(rigid_tracks(flat), n_components)
+def test_rigid_objects_have_no_basis_shapes(flat):
+    model = fitted(rigid_tracks(flat), 5)
     assert model.inverse_snr_ < 1e-25
     assert_zero_from(model, 0)
     rank = sum(flat)
@@ -196,94 +185,11 @@ def test_joint_refinement_of_rigid_objects(flat, n_components, independence):
     assert_zero_from(model, 0)
 
 
-def test_joint_refinement_of_a_rigid_object_with_noise():
-    # What is found is noise, and the deviations say so.
-    tracks = rigid_tracks()
-    noise = np.random.default_rng(1).normal(size=tracks.shape)
-    model = jointly(tracks + 0.02 * noise, 1)
-    assert model.inverse_snr_ < 1e-3
-    assert np.linalg.norm(model.basis_) < 0.02 * np.linalg.norm(model.mean_shape_)
-
-
 @pytest.mark.parametrize("loss", slow_after(1, ["huber", "cauchy"]))
 def test_robust_fit_of_a_rigid_object(loss):
     model = jointly(rigid_tracks(), 1, loss=loss)
     assert model.inverse_snr_ < 1e-10
     assert np.linalg.norm(model.basis_) < 1e-6 * np.linalg.norm(model.mean_shape_)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_flat_objects_that_deform_in_their_plane(dtype):
-    tracks = bending_tracks(flat=(1, 1, 0)).astype(dtype)
-    for n_components in (1, 3):
-        model = fitted(tracks, n_components)
-        assert model.inverse_snr_ < 0.02
-        assert model.singular_values_[4] < 1e-5 * model.singular_values_[0]
-
-
-@pytest.mark.parametrize("n_components", [1, 2, 5])
-@pytest.mark.parametrize("n_different", [1, 2, 3])
-def test_repeated_frames(n_different, n_components, rng):
-    tracks = rng.normal(size=(n_different, 20, 2))
-    model = fitted(np.repeat(tracks, 15, axis=0), n_components)
-    assert model.rank_floor_ < 1e-25
-    for i in range(n_different):
-        same = model.alpha_[15 * i : 15 * i + 15]
-        assert_allclose(same, same[:1].repeat(15, axis=0), atol=1e-9)
-    # 3 K + 3 directions hold the two rows of each different frame.
-    if n_different == 1:
-        assert_zero_from(model, 0)
-
-
-def test_repeated_points_change_nothing_but_their_number():
-    tracks = FACES
-    once = fitted(tracks, 2)
-    twice = fitted(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 2)
-    assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-4)
-    assert_allclose(twice.basis_[:, 68:], twice.basis_[:, 67::-1], atol=1e-9)
-    # More points than the table has directions: those left over are empty.
-    few = np.tile(tracks[:, ::10], (1, 5, 1))
-    model = fitted(few, 4)
-    assert model.rank_floor_ < 1e-25
-    assert_zero_from(model, 1)
-
-
-def test_frames_repeated_as_often_as_others_change_nothing():
-    tracks = FACES
-    once, twice = fitted(tracks, 2), fitted(np.tile(tracks, (2, 1, 1)), 2)
-    assert_allclose(twice.alpha_, np.tile(once.alpha_, (2, 1)), atol=1e-6)
-    assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-6)
-
-
-@pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
-def test_tables_of_integers(isa):
-    tracks = make_face_tracks(60, n_components=2, noise=0, random_state=0).tracks
-    tables = tracks, np.round(tracks).astype(int)
-    exact, rounded = (fitted(each, 2, isa=isa) for each in tables)
-    coarse = fitted(np.round(tracks / 40).astype(np.int8), 2, isa=isa)
-    assert exact.rank_floor_ < 1e-20 < rounded.rank_floor_ < coarse.rank_floor_
-    assert exact.inverse_snr_ < 0.05
-    assert coarse.inverse_snr_ < 0.05
-
-
-@pytest.mark.parametrize("n_components", [1, 2, 3, 6])
-@pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_smallest_tables(n_components, isa, dtype):
-    rng = np.random.default_rng(n_components)
-    n_frames = -(-8 * (n_components + 2) // 5)
-    tracks = rng.normal(size=(n_frames, 3 * n_components + 4, 2)).astype(dtype)
-    model = fitted(tracks, n_components, isa=isa)
-    if dtype == np.float64:
-        assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
-
-
-def test_cameras_that_never_turn():
-    # Depth is not seen at all: the rigid part is filled up with deformation.
-    tracks = bending_tracks(np.broadcast_to(np.eye(2, 3), (40, 2, 3)))
-    for n_components in (1, 3):
-        model = fitted(tracks, n_components)
-        assert model.inverse_snr_ < 1e-3
 
 
 def lines_and_tiny_frames():
@@ -321,13 +227,12 @@ def test_joint_refinement_of_the_shark(load_data, k, loss):
     # The refinement has hardly an end where the table determines so little. Most points
     # hardly move: those that do are no outliers.
     tracks = real_tracks(load_data, "shark_torresani")[::8]
-    model = jointly(tracks, k, repeat=k == 1, loss=loss, max_iter=100)
+    model = jointly(tracks, k, repeat=k == 1, kind=OneStart, loss=loss, max_iter=100)
     assert model.inverse_snr_ < fitted(tracks, k).inverse_snr_
 
 
 @pytest.mark.parametrize(
-    ("n_components", "noise"),
-    slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)]),
+    ("n_components", "noise"), slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)])
 )
 def test_joint_refinement_of_flat_objects(n_components, noise):
     model = jointly(bending_tracks(flat=(1, 1, 0), noise=noise), n_components)
@@ -336,7 +241,7 @@ def test_joint_refinement_of_flat_objects(n_components, noise):
 
 @pytest.mark.parametrize(
     ("n_different", "n_components", "seed"),
-    slow_after(2, [(1, 5, 0), (3, 1, 0), (1, 1, 0), (2, 1, 0), (2, 2, 0), (3, 5, 4)]),
+    slow_after(1, [(1, 5, 0), (3, 1, 0), (2, 2, 0), (3, 5, 4)]),
 )
 def test_joint_refinement_of_repeated_frames(n_different, n_components, seed):
     tracks = np.random.default_rng(seed).normal(size=(n_different, 20, 2))
@@ -349,30 +254,21 @@ def test_joint_refinement_of_repeated_frames(n_different, n_components, seed):
 
 
 def test_joint_refinement_of_duplicated_points_and_frames():
-    tracks = make_face_tracks(60, n_components=3, random_state=0).tracks
-    once = jointly(tracks, 3)
+    tracks = FACES[:40, ::2]
+    once = jointly(tracks, 2, kind=OneStart)
     # A point that is seen twice tells a little more of the noise, a frame counts twice.
-    points = jointly(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 3)
+    twice = np.concatenate([tracks, tracks[:, ::-1]], axis=1)
+    points = jointly(twice, 2, kind=OneStart)
     assert_allclose(points.inverse_snr_, once.inverse_snr_, rtol=1e-2)
-    assert_allclose(points.basis_[:, 68:], points.basis_[:, 67::-1], atol=1e-6)
-    frames = jointly(np.tile(tracks, (2, 1, 1)), 3)
-    assert_allclose(frames.alpha_[60:], frames.alpha_[:60], atol=1e-9)
+    assert_allclose(points.basis_[:, 34:], points.basis_[:, 33::-1], atol=1e-6)
+    frames = jointly(np.tile(tracks, (2, 1, 1)), 2, kind=OneStart)
+    assert_allclose(frames.alpha_[40:], frames.alpha_[:40], atol=1e-9)
     assert_allclose(frames.inverse_snr_, once.inverse_snr_, rtol=1e-2)
 
 
 @pytest.mark.parametrize(
     ("n_components", "n_cameras", "noise"),
-    slow_after(
-        3,
-        [
-            (1, 1, 0.0),
-            (2, 1, 0.0),
-            (1, 2, 0.02),
-            (2, 2, 0.0),
-            (2, 1, 0.02),
-            (2, 2, 0.02),
-        ],
-    ),
+    slow_after(2, [(1, 1, 0.0), (1, 2, 0.02), (2, 1, 0.0), (2, 2, 0.02)]),
 )
 def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, noise):
     # All frames from one place, or from two: depth is seen in part or not at all.
@@ -382,7 +278,7 @@ def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, n
 
 
 @pytest.mark.parametrize(
-    ("n_components", "dtype"), [(1, np.float64), (2, np.float32), (3, np.float64)]
+    ("n_components", "dtype"), slow_after(1, [(1, np.float64), (2, np.float32)])
 )
 def test_joint_refinement_of_smallest_tables(n_components, dtype):
     rng = np.random.default_rng(n_components)
@@ -395,13 +291,6 @@ def test_joint_refinement_of_smallest_tables(n_components, dtype):
         assert_allclose(deviation[model.basis_.any(axis=(1, 2))], 1, rtol=1e-6)
 
 
-@cache
-def of_unit(unit, refinement):
-    """Return a model of faces in another unit, to be left as it is."""
-    fit = {"joint": jointly, "alternating": fitted}[refinement]
-    return fit(unit * FACES, 2)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("loss", "scale_frames"), [("linear", False), ("huber", True), ("cauchy", False)]
@@ -410,56 +299,36 @@ def test_joint_refinement_of_frames_that_are_lines_or_tiny(loss, scale_frames):
     tracks = lines_and_tiny_frames()
     model = jointly(tracks, 2, loss=loss, scale_frames=scale_frames)
     others = np.setdiff1d(np.arange(60), [3, 5, 7])
-    models, table = (model, of_unit(1.0, "joint")), table_of(tracks)
+    models, table = (model, jointly(FACES, 2)), table_of(tracks)
     errors = [each.reproject(table)[others] - table[others] for each in models]
     assert np.median(np.abs(errors[0])) < 2 * np.median(np.abs(errors[1]))
-
-
-@pytest.mark.parametrize("scale", slow_after(2, [1e-136, 1e136, 1e-30, 1e30]))
-@pytest.mark.parametrize("refinement", ["joint", "alternating"])
-def test_any_unit_is_fitted(scale, refinement):
-    once, scaled = (of_unit(unit, refinement) for unit in (1.0, scale))
-    assert_allclose(scaled.alpha_, once.alpha_, atol=1e-6)
-    assert_allclose(scaled.inverse_snr_, once.inverse_snr_, rtol=1e-6)
 
 
 # --- accuracy -----------------------------------------------------------------------
 
 
 @may_not_converge
-@pytest.mark.parametrize("seed", slow_after(1, [0, 1]))
 @pytest.mark.parametrize(
-    ("name", "n_components", "params", "percent"),
-    [
-        ("shark_torresani", 1, {"scale_frames": False}, 0.160),
-        ("shark_torresani", 1, {"scale_frames": False, "isa": FastISA()}, 0.160),
-        ("ict_bu3dfe_like_68", 9, {}, 0.108),
-        ("akhter_drink", 3, {}, 0.150),
-        ("faces_wild_68_combined", 9, {}, 0.360),
-    ],
-    ids=lambda value: str(value),
+    ("name", "n_components", "scale_frames", "percent"),
+    slow_after(
+        2,
+        [
+            ("shark_torresani", 1, False, 0.160),
+            ("ict_bu3dfe_like_68", 9, True, 0.108),
+            ("akhter_drink", 3, True, 0.150),
+            ("faces_wild_68_combined", 9, True, 0.360),
+        ],
+    ),
 )
-def test_inverse_snr_of_tables(load_data, name, n_components, params, percent, seed):
+def test_inverse_snr_of_tables(load_data, name, n_components, scale_frames, percent):
     table = table_of(real_tracks(load_data, name))
-    params = {"refinement": "alternating"} | params
-    model = AffineNRSfM(n_components, random_state=seed, **params).fit(table)
+    params = {"refinement": "alternating", "scale_frames": scale_frames}
+    model = AffineNRSfM(n_components, random_state=0, **params).fit(table)
     assert round(100 * model.inverse_snr_, 3) <= percent
 
 
-@may_not_converge
-@pytest.mark.parametrize("name", ["akhter_yoga", "ict_bu3dfe_like_68", "muct_68"])
-def test_one_basis_shape_needs_no_independence(load_data, name):
-    # There is one subspace only: neither strategy nor seed have a say.
-    table = table_of(real_tracks(load_data, name))
-    strategies = PooledFastICA(n_init=2), FastISA(n_init=2)
-    models = [AffineNRSfM(1, isa=isa, refinement="alternating") for isa in strategies]
-    models = (m.set_params(random_state=seed) for m in models for seed in (0, 1))
-    values = [model.fit(table).inverse_snr_ for model in models]
-    assert_allclose(values, values[0], rtol=1e-5)
-
-
 @pytest.mark.slow
-def test_calibrated_cameras_have_more_basis_shapes_than_the_factorisation(tmp_path):
+def test_calibrated_cameras_have_more_basis_shapes_than_the_factorisation():
     # 17 points allow 4 basis shapes with affine cameras. Bodies have many more.
     bodies = make_body_tracks(200, camera="orthographic", random_state=0)
     fitted = AffineNRSfM(4, camera="orthographic", random_state=0)
@@ -470,9 +339,6 @@ def test_calibrated_cameras_have_more_basis_shapes_than_the_factorisation(tmp_pa
     assert many.basis_.shape == (12, 17, 3)
     assert many.singular_values_.shape == (16,)
     assert many.rank_floor_ < 1e-20
-    save_model(many, tmp_path / "model.npz")
-    again = load_model(tmp_path / "model.npz").transform(bodies.data)
-    assert_array_equal(again, many.alpha_)
     for refused in ({"camera": "affine"}, {"refinement": "alternating"}):
         with pytest.raises(ValueError, match="with 17 points the largest possible"):
             clone(many).set_params(**refused).fit(bodies.data)

@@ -8,7 +8,6 @@ import pytest
 from export_models import face_model, faces
 from exported_files import Read, content_of
 from fit_runs import MODEL
-from layers import one_start
 from numpy.testing import assert_array_equal, assert_equal
 
 from isa_nrsfm import AffineNRSfM
@@ -21,8 +20,6 @@ from isa_nrsfm.export import (
     write_viewer,
 )
 from isa_nrsfm.io import save_model
-
-pytestmark = one_start
 
 QUICK = [*"--n-components 1 --isa fast --n-init 2 --no-figures --output".split()]
 NAMED = f"named_{MODEL}"

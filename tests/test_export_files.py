@@ -21,7 +21,7 @@ from export_models import (
     faces,
 )
 from exported_files import Read, content_of, numbers
-from layers import may_not_converge, one_start
+from layers import may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused, warned
 from scipy.io import loadmat
@@ -48,7 +48,7 @@ from isa_nrsfm.export import (
 )
 from isa_nrsfm.skeletons import get_skeleton
 
-pytestmark = [may_not_converge, one_start]
+pytestmark = may_not_converge
 
 
 @pytest.fixture

@@ -81,8 +81,9 @@ class TestIdentities:
 
 
 class TestMissingRank:
-    @pytest.mark.parametrize("rank", range(1, 13))
-    @pytest.mark.parametrize("K", [1, 2, 3])
+    @pytest.mark.parametrize(
+        ("rank", "K"), [(1, 1), (3, 2), (4, 2), (7, 1), (8, 2), (12, 3)]
+    )
     def test_only_directions_above_rounding_errors_are_used(self, rank, K):
         W = low_rank(rank, rank)
         f = factorise(W, K)
@@ -104,9 +105,8 @@ class TestMissingRank:
         if rank <= 3 * K + 3:
             assert_allclose(approximation(f), W, atol=1e-12)
 
-    @pytest.mark.parametrize("rank", range(1, 7))
-    def test_as_few_points_as_possible(self, rank):
-        f = factorise(low_rank(rank, rank, n_points=7), 1)
+    def test_as_few_points_as_possible(self):
+        f = factorise(low_rank(4, 4, n_points=7), 1)
         assert_allclose(f.signals @ f.signals.T / 7, np.eye(3), atol=1e-12)
         assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
 
@@ -119,20 +119,9 @@ class TestMissingRank:
         assert np.linalg.norm(f.motion[:, 2]) > 0
         assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
 
-    @pytest.mark.parametrize(("K", "n_signals"), [(1, 3), (2, 3), (4, 3)])
-    def test_shark_has_two_non_rigid_directions(self, load_data, K, n_signals):
-        W = measurements(load_data("shark_torresani")["W2d"])
-        f = factorise(W, K)
-        assert f.signals.shape == (n_signals, 91)
-        assert np.linalg.norm(f.motion[:, 1]) > 1e-3
-        assert_array_equal(f.motion[:, 2], 0)
-        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
-        assert_allclose(f.signals @ f.signals.T / 91, np.eye(3), atol=1e-12)
-        assert_allclose(approximation(f), W, atol=1e-12)
-
 
 class TestOrientations:
-    @pytest.mark.parametrize("unit", [1e-250, 1e-9, 1e9, 1e250])
+    @pytest.mark.parametrize("unit", [1e-250, 1e250])
     def test_opposite_rows_permutations_and_units(self, unit, rng):
         rows = rng.normal(size=(6, 11))
         signs = orientations(rows)
@@ -156,10 +145,9 @@ LARGE = 30  # matrices with more rows and columns count as large
 
 
 class TestLargeBothWays:
-    @pytest.mark.parametrize("size", [(60, 90), (40, 120)])
     @pytest.mark.parametrize("noise", [1e-2, 1e-6])
-    def test_the_leading_triplets_are_those_of_the_whole(self, size, noise):
-        W = low_rank(0, 8, *size) + noise * centred_matrix(1, *size)
+    def test_the_leading_triplets_are_those_of_the_whole(self, noise):
+        W = low_rank(0, 8, 60, 90) + noise * centred_matrix(1, 60, 90)
         whole, leading = leading_triplets(W, 9), leading_triplets(W, 9, LARGE)
         factors = [factorise(W, 2, triplets=each) for each in (whole, leading)]
         shapes = [each.rigid_shape for each in factors]
@@ -170,17 +158,18 @@ class TestLargeBothWays:
         assert_allclose(leading[2], whole[2], rtol=1e-6, atol=1e-14 * kept)
         assert_allclose(leading[0], whole[0], rtol=1e-3)
 
-    @pytest.mark.parametrize(("first", "ratio"), [(1, 0.95), (1, 0.97), (1e3, 0.97)])
-    def test_energies_that_are_alike(self, first, ratio):
+    @pytest.mark.parametrize("first", [1, 1e3])
+    def test_energies_that_are_alike(self, first):
         U, V = np.linalg.qr(np.random.default_rng(0).normal(size=(2, 150, 150)))[0]
-        values = ratio ** np.arange(150)
+        values = 0.97 ** np.arange(150)
         values[:5] *= first
         rest = np.sum(values[9:] ** 2)
         found = leading_triplets((U * values) @ V.T, 9, LARGE)[2]
         assert found == pytest.approx(rest, rel=1e-6)
 
-    @pytest.mark.parametrize("block_frames", [1, 7, 60])
-    @pytest.mark.parametrize("size", [(60, 70), (40, 25), (60, 8)])
+    @pytest.mark.parametrize(
+        ("size", "block_frames"), [((60, 70), 7), ((40, 25), 1), ((60, 8), 60)]
+    )
     def test_blocks_make_no_difference(self, size, block_frames):
         W = low_rank(0, 8, *size) + 1e-2 * centred_matrix(1, *size)
         frames = W.reshape(len(W) // 2, 2, -1)

@@ -71,11 +71,6 @@ class TestSpace:
         assert np.trace(view[:, :2]) > 0
         assert np.linalg.det(view[:, :2]) > 0
 
-    @pytest.mark.parametrize("seed", range(4))
-    def test_depth_is_skewed_to_the_positive_side(self, seed):
-        gauge, _ = Scene(seed).canonical()
-        assert np.sum(gauge.mean_shape[:, 2] ** 3) > 0
-
     def test_scattered_views_have_their_principal_axes(self):
         gauge, motion = Scene(n_frames=300).scattered().canonical()
         assert mean_view(motion) is None
@@ -102,8 +97,7 @@ class TestSpace:
         assert_allclose(gauge.basis, expected.basis, atol=1e-8)
         assert_allclose(motion, expected_motion, atol=1e-10)
 
-    @pytest.mark.parametrize("flat", [1, 2])
-    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    @pytest.mark.parametrize(("flat", "unit"), [(1, 1e-9), (2, 1e9)])
     def test_flat_object(self, flat, unit):
         scene = Scene(flat=flat)
         R = random_rotation(4)
@@ -144,13 +138,6 @@ class TestEuclideanSpace:
         assert_allclose(A @ A.T, size**2 * np.eye(3), atol=1e-12 * size**2)
         expected = canonical_rotation(scene.mean_shape, scene.motion)
         assert_allclose(A, size * expected, rtol=1e-12)
-
-    def test_mean_square_of_the_mean_shape_is_one(self):
-        scene = self.scene()
-        for unit in (1e-9, 1.0, 1e9):
-            A = euclidean_space(unit * scene.mean_shape, scene.motion / unit, None)
-            shape = unit * scene.mean_shape @ A.T
-            assert np.mean(shape**2) == pytest.approx(1.0)
 
     def test_mean_shape_of_zeros(self):
         scene = self.scene()
@@ -275,14 +262,12 @@ class TestSameFit:
     """What a fit says of the table and of the shapes is not changed."""
 
     @pytest.mark.parametrize("n_components", [1, 3])
-    def test_images(self, independence, n_components):
+    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(
+        self, independence, n_components
+    ):
         fit = random_fit(n_components=n_components)
         result, _ = canonical(fit, independence)
         assert_allclose(result.images(), fit.images(), atol=1e-11)
-
-    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(self, independence):
-        fit = random_fit()
-        result, _ = canonical(fit, independence)
         frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
         assert affine_shape_error(*frames) < 1e-10
         # The affinity is that of the map.
@@ -295,9 +280,8 @@ class TestSameFit:
 
 class TestConditions:
     @EACH
-    @pytest.mark.parametrize("seed", range(3))
-    def test_hold(self, independence, seed):
-        result, _ = canonical(regauged(random_fit(seed)), independence)
+    def test_hold(self, independence):
+        result, _ = canonical(regauged(random_fit()), independence)
         mean_shape, basis = result.shapes[0], result.shapes[1:]
         n_points = mean_shape.shape[1]
         assert_allclose(result.shapes.mean(axis=2), 0, atol=1e-12)
@@ -311,17 +295,15 @@ class TestConditions:
         energy = np.sum((result.alpha[..., None, None] * moved) ** 2, axis=(0, 2, 3))
         assert (np.diff(energy) <= 0).all()
 
-    @pytest.mark.parametrize("seed", range(3))
-    def test_shapes_recovers_independent_basis_shapes(self, seed):
-        fit = random_fit(seed, n_points=400)
+    def test_shapes_recovers_independent_basis_shapes(self):
+        fit = random_fit(n_points=400)
         result, _ = canonical(regauged(fit), "shapes")
         truth = whitened(fit)
         cosines = basis_similarity(truth, result.shapes[1:].transpose(0, 2, 1))
         assert np.min(cosines) > 0.97
 
-    @pytest.mark.parametrize("seed", range(3))
-    def test_coefficients_recovers_independent_coefficients(self, seed):
-        fit = random_fit(seed, n_frames=3000, n_points=20)
+    def test_coefficients_recovers_independent_coefficients(self):
+        fit = random_fit(n_frames=3000, n_points=20)
         result, _ = canonical(regauged(fit, shift=0.02), "coefficients")
         # Up to the scales of the frames, which change a little with the basis.
         correlation = np.corrcoef(fit.alpha.T, result.alpha.T)[:3, 3:]
@@ -348,15 +330,13 @@ def whitened(fit):
 
 
 @EACH
-@pytest.mark.parametrize("n_components", [1, 3, 5])
+@pytest.mark.parametrize("n_components", [1, 3])
 def test_gauge_of_the_fit_makes_no_difference(independence, n_components):
     fit = random_fit(n_components=n_components, n_points=150)
     expected, _ = canonical(fit, independence)
-    for seed in (1, 2, 3):
-        other = regauged(fit, seed, shift=0.01)
-        assert_allclose(other.images(), fit.images(), atol=1e-10)
-        got, _ = canonical(other, independence)
-        assert_same(got, expected)
+    other = regauged(fit, shift=0.01)
+    assert_allclose(other.images(), fit.images(), atol=1e-10)
+    assert_same(canonical(other, independence)[0], expected)
 
 
 def calibrated(fit, camera):
@@ -395,10 +375,6 @@ class TestCalibratedCameras:
             assert np.mean(result.shapes[0] ** 2) == pytest.approx(1.0)
         else:
             assert size[0] == pytest.approx(unit)
-
-    def test_conditions(self, camera, independence):
-        fit = calibrated(random_fit(), camera)
-        result, _ = canonical(fit, independence, camera)
         assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
         assert_allclose(result.alpha.std(axis=0), 1, rtol=1e-12)
         if camera == "weak_perspective":
@@ -436,25 +412,6 @@ class TestStandardDeviations:
         alpha = np.array([result[1] for result in results])
         assert_allclose(got, alpha.std(axis=0), rtol=5 / np.sqrt(2 * n_draws))
 
-    def test_do_not_depend_on_the_gauge_of_the_fit(self):
-        # The covariance of the coefficients of a fit that is as good, to first order.
-        fit = random_fit()
-        mixing = random_mixing(1, 4)
-        root = np.random.default_rng(3).normal(size=(60, 3, 3))
-        step = 1e-6
-        ends = (fit.alpha + sign * step * e for e in np.eye(3) for sign in (1, -1))
-        ends = [remixed(alpha, mixing)[0] for alpha in ends]
-        slopes = np.subtract(ends[::2], ends[1::2])
-        moved = np.stack(slopes, axis=2) / (2 * step) @ root
-        other = regauged(fit)
-        deviations = [
-            independent_gauge(*one, "shapes")[-1].apply(
-                one.motion, one.alpha, each @ each.swapaxes(1, 2)
-            )[2]
-            for one, each in ((fit, root), (other, moved))
-        ]
-        assert_allclose(deviations[1], deviations[0], rtol=1e-5)
-
 
 class TestDegenerate:
     @EACH
@@ -490,8 +447,7 @@ class TestDegenerate:
         self.check_extreme(fit, independence)
 
     @EACH
-    @pytest.mark.parametrize("still", [1, slice(None)])
-    @pytest.mark.parametrize("value", [0.0, 0.3])
+    @pytest.mark.parametrize(("still", "value"), [(1, 0.3), (slice(None), 0.0)])
     def test_coefficients_that_do_not_vary(self, independence, value, still):
         fit = random_fit()
         fit.alpha[:, still] = value
@@ -511,12 +467,6 @@ class TestDegenerate:
     @EACH
     def test_frames_whose_scale_would_be_negative(self, independence):
         self.check_extreme(self.stretched(4.5), independence)
-
-    @pytest.mark.parametrize("far", [1.5, 2.75])
-    def test_frames_whose_scale_is_small(self, far):
-        result, _ = canonical(self.stretched(far))
-        along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
-        assert_allclose(along, 0, atol=1e-8)
 
     @pytest.mark.parametrize(("far", "removed"), [(2.9, True), (3.05, False)])
     def test_scales_stay_above_a_tenth_of_their_mean(self, far, removed):

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from damage import as_json, damaged_array, damaged_tree, pick
-from layers import may_not_converge, one_start, slow_after
+from layers import may_not_converge, slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from sklearn.base import clone
@@ -49,7 +49,6 @@ CASES = {
     "names": {},
     "planar": {"layout": "planar", "independence": None, "scale_frames": False},
     "alternating": ALTERNATING | {"isa": STRATEGY},
-    "alternating, calibrated": ALTERNATING | CALIBRATED,
     "not refined": {"refinement": None, "keep_frames": False}
     | {"isa": PooledFastICA(n_init=2)},
     "single precision": {},
@@ -75,7 +74,6 @@ TABLES = {
     "missing points": HOLED,
 }
 pytestmark = [
-    one_start,
     may_not_converge,
     pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined"),
 ]

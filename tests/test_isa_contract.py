@@ -16,7 +16,10 @@ from scenes import random_rotation, spherical_sources
 from scipy.optimize import approx_fprime
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils.estimator_checks import parametrize_with_checks
+from sklearn.utils.estimator_checks import (
+    check_param_validation,
+    parametrize_with_checks,
+)
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, isa as strategies
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -75,7 +78,7 @@ class TestStrategies:
     def test_arguments_that_are_not_known(self, isa, signals):
         refused("weights", isa.fit, signals, weights=np.ones(500), error=TypeError)
 
-    @pytest.mark.parametrize("size", [1, 2, 3, 4])
+    @pytest.mark.parametrize("size", [1, 2, 3])
     def test_any_size_of_subspaces_is_found(self, isa, size):
         sources = spherical_sources(0, 3000, 3, size)
         A = random_rotation(0, 3 * size)
@@ -104,10 +107,6 @@ class TestStrategies:
         first = clone(isa).fit(signals).components_
         assert_allclose(isa.fit(signals[order]).components_, first, atol=1e-8)
 
-    def test_signals_in_different_units(self, isa, signals):
-        sources = isa.fit_transform(signals * [1e3, 1.0, 1.0, 1e-3, 1e-6, 1.0])
-        assert_allclose(sources.T @ sources / 500, np.eye(6), atol=1e-11)
-
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_units_and_offset(self, isa, signals, unit):
         first = clone(isa).fit(signals).components_
@@ -127,19 +126,8 @@ class TestStrategies:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("subspace_size", 0),
-        ("subspace_size", 1.5),
-        ("n_init", 0),
-        ("max_iter", 0),
-        ("tol", 0.0),
-        ("random_state", "seed"),
-    ],
-)
-def test_bad_values_of_parameters(kind, signals, name, value):
-    refused(f"The '{name}' parameter of", kind(**{name: value}).fit, signals)
+def test_bad_values_of_parameters(kind):
+    check_param_validation(kind.__name__, kind())
 
 
 # With subspaces of one signal any number of columns will do, so no check may fail that
@@ -203,15 +191,6 @@ class TestOptimality:
 
 
 class TestInvariances:
-    @pytest.mark.slow
-    def test_n_jobs_change_no_bit(self):
-        signals = few_samples()
-        kwargs = {"n_init": 18, "random_state": 0}
-        one, two = (FastISA(**kwargs, n_jobs=n).fit(signals) for n in (1, 2))
-        assert_array_equal(two.components_, one.components_)
-        assert_array_equal(two.log_likelihoods_, one.log_likelihoods_)
-        assert_array_equal(two.n_iters_, one.n_iters_)
-
     def test_threads_change_no_bit(self):
         signals, _ = mixed(0, 500)
         one = FastISA(n_init=17, random_state=0).fit(signals)
@@ -221,13 +200,13 @@ class TestInvariances:
         assert_array_equal(three.log_likelihoods_, one.log_likelihoods_)
 
     @may_not_converge
-    @pytest.mark.parametrize("n_init", [1, 8, 9])
-    def test_fewer_starts_are_the_first_of_more(self, n_init):
-        signals = few_samples()
+    def test_fewer_starts_are_the_first_of_more(self):
+        signals, few = few_samples(), (1, 9)
         more = FastISA(n_init=10, random_state=0).fit(signals)
-        fewer = FastISA(n_init=n_init, random_state=0).fit(signals)
-        assert_array_equal(fewer.log_likelihoods_, more.log_likelihoods_[:n_init])
-        assert_array_equal(fewer.n_iters_, more.n_iters_[:n_init])
+        for n_init in few:
+            fewer = FastISA(n_init=n_init, random_state=0).fit(signals)
+            assert_array_equal(fewer.log_likelihoods_, more.log_likelihoods_[:n_init])
+            assert_array_equal(fewer.n_iters_, more.n_iters_[:n_init])
 
     def test_general_mixing_leaves_the_subspaces(self):
         signals, _ = mixed(0, n_subspaces=3)

@@ -50,7 +50,7 @@ def published_step(W, Z, size):
 
 
 class TestOrthogonalise:
-    @pytest.mark.parametrize("smallest", [1e-1, 1e-3, 1e-5, 1e-7, 1e-12])
+    @pytest.mark.parametrize("smallest", [1e-1, 1e-5, 1e-12])
     def test_nearly_singular_matrices(self, smallest):
         U, V = random_rotation(0, 6), random_rotation(1, 6)
         S = np.array([3.0, 2.0, 1.0, 1.0, 0.5, smallest])
@@ -157,7 +157,7 @@ def white(signals):
 
 
 class TestRecovery:
-    @pytest.mark.parametrize("seed", slow_after(2, range(5)))
+    @pytest.mark.parametrize("seed", slow_after(1, range(5)))
     @pytest.mark.parametrize(
         ("n_components", "n_points", "least"),
         [(2, 68, 0.97), (5, 68, 0.95), (9, 500, 0.99)],
@@ -168,19 +168,15 @@ class TestRecovery:
         mixed = np.tensordot(random_mixing(seed, n_components), truth, 1)
         assert cosines(truth, unmix(mixed)).min() > least
 
-    @pytest.mark.parametrize("n_components", [3, 5])
     @pytest.mark.parametrize(("n_frames", "least"), [(400, 0.96), (1500, 0.99)])
-    @pytest.mark.parametrize("seed", range(3))
-    def test_coefficients(self, n_components, n_frames, least, seed):
-        sizes = {"n_frames": n_frames, "n_components": n_components}
-        options = {"coefficients": "heavy_tailed", "random_state": seed}
-        truth = make_nonrigid_tracks(**sizes, **options).alpha
-        mixed = truth @ random_mixing(seed, n_components).T
+    def test_coefficients(self, n_frames, least):
+        options = {"coefficients": "heavy_tailed", "random_state": 0}
+        truth = make_nonrigid_tracks(n_frames, n_components=5, **options).alpha
+        mixed = truth @ random_mixing(0, 5).T
         found = mixed @ independent_coefficients(mixed).T
         assert cosines(truth.T[..., None], found.T[..., None]).min() > least
 
-    @pytest.mark.parametrize("size", [1, 2, 3])
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize(("size", "seed"), [(1, 0), (2, 1), (3, 2)])
     def test_heavy_light_and_gaussian_tails_together(self, size, seed):
         kinds = ["product", "gaussian", "uniform", "student", "laplace", "uniform"]
         truth = sources(kinds, seed, 1500, size)
@@ -221,18 +217,17 @@ class TestReturned:
 
 
 @pytest.mark.parametrize("size", [1, 3])
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     "kinds",
     [["product"] * 4, ["student", "product", "gaussian", "uniform"], ["gaussian"] * 4],
     ids=["heavy", "mixed", "gaussian"],
 )
-def test_invariance_to_basis_order_of_samples_and_rotations(kinds, size, seed):
-    signals = sources(kinds, seed, 200 if size == 1 else 68, size)
+def test_invariance_to_basis_order_of_samples_and_rotations(kinds, size, rng):
+    signals = sources(kinds, 0, 200 if size == 1 else 68, size)
     found = unmix(signals)
-    mixed = np.tensordot(random_mixing(seed + 7, len(kinds)), signals, 1)
-    order = np.random.default_rng(seed).permutation(signals.shape[1])
-    R = -random_rotation(seed, size)  # or reflections
+    mixed = np.tensordot(random_mixing(7, len(kinds)), signals, 1)
+    order = rng.permutation(signals.shape[1])
+    R = -random_rotation(0, size)  # or reflections
     for changed, expected in (
         (1e-6 * mixed, found),
         (signals[:, order], found[:, order]),
@@ -371,17 +366,6 @@ class TestDegenerate:
         assert_allclose(np.abs(shared_mixing(signals)), [[0.2]], rtol=1e-12)
 
     @pytest.mark.parametrize("size", [1, 3])
-    def test_signal_of_zeros(self, size):
-        truth = sources(["product"] * 4, 0, 200, size)
-        padded = np.insert(truth, 2, 0.0, axis=0)
-        W = shared_mixing(padded)
-        assert np.linalg.cond(W) < 1e3
-        Y = np.tensordot(W, padded, 1)
-        assert_allclose(Y[4], 0.0, atol=1e-12)
-        assert_allclose(matched(unmix(truth), Y[:4]), unmix(truth), atol=1e-9)
-        assert_allclose(W[:4, 2], 0.0, atol=1e-12)
-
-    @pytest.mark.parametrize("size", [1, 3])
     def test_dependent_signals(self, size):
         truth = sources(["product"] * 3, 0, 300, size)
         signals = np.tensordot(np.random.default_rng(0).normal(size=(5, 3)), truth, 1)
@@ -396,8 +380,7 @@ class TestDegenerate:
         assert_array_equal(shared_mixing(np.zeros((3, 10, 3))), np.eye(3))
         assert_array_equal(independent_coefficients(np.ones((10, 2))), np.eye(2))
 
-    @pytest.mark.parametrize("size", [1, 3])
-    @pytest.mark.parametrize("n_samples", [1, 2, 3, 5, 8])
+    @pytest.mark.parametrize(("n_samples", "size"), [(1, 3), (2, 1), (3, 3), (8, 1)])
     def test_few_samples(self, n_samples, size):
         signals = np.random.default_rng(0).normal(size=(6, n_samples, size))
         rank = min(6, n_samples * size)
@@ -406,8 +389,7 @@ class TestDegenerate:
         Y = np.tensordot(W, signals, 1)
         assert_allclose(np.mean(Y**2, axis=(1, 2)), np.arange(6) < rank, atol=1e-9)
 
-    @pytest.mark.parametrize("n_moving", [1, 8, 20])
-    @pytest.mark.parametrize("shift", [0.0, 1.0])
+    @pytest.mark.parametrize(("n_moving", "shift"), [(1, 0.0), (8, 1.0), (20, 0.0)])
     def test_most_points_rest(self, n_moving, shift, rng):
         # Signals that vanish at most samples: the likelihood must have a bound.
         signals = np.zeros((5, 68, 3)) + shift * rng.normal(size=(5, 1, 3))

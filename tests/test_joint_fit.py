@@ -20,7 +20,7 @@ from isa_nrsfm._joint.fit import residual_deviations
 from isa_nrsfm._joint.problem import FactorisedTable, JointState
 from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm._parameters.choices import LOSSES
-from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 DEVIATION = 0.03
@@ -88,9 +88,9 @@ class Fit(NamedTuple):
 
 
 @cache
-def fit_of(camera, seed=0, gaps=False, deviation=DEVIATION):
+def fit_of(camera, gaps=False, deviation=DEVIATION):
     """Return a table of a camera model, and its fit."""
-    tracks, truth = random_table(camera, seed, deviation)
+    tracks, truth = random_table(camera, deviation=deviation)
     tracks = with_gaps(tracks, 0.1) if gaps else tracks
     return Fit(tracks, truth, fitted(tracks, camera=camera))
 
@@ -131,36 +131,15 @@ class TestCameras:
 
     @KINDS
     def test_without_noise_shapes_are_exact(self, camera, gaps):
-        tracks, truth, model = fit_of(camera, 0, gaps, 0.0)
+        tracks, truth, model = fit_of(camera, gaps, 0.0)
         assert error_of(model, tracks, truth) < EXACT
         assert model.inverse_snr_ < EXACT**2
         assert model.noise_variance_ < 1e-9
         assert_allclose(model.transform(table_of(tracks)), model.alpha_, atol=1e-10)
 
-    @pytest.mark.parametrize("n_components", slow_after(1, [2, 4]))
-    def test_without_noise_few_faces_are_nearly_exact(self, n_components):
-        # Faces that hardly turn: depths are determined ten to a hundred times worse.
-        options = {"noise": 0.0, "random_state": 0}
-        faces = make_face_tracks(60, n_components=n_components, **options)
-        model = fitted(faces.tracks, n_components)
-        assert model.inverse_snr_ < EXACT**2
-        assert error_of(model, faces.tracks, faces.shapes) < 5e-4
-
-    @pytest.mark.slow
-    @CALIBRATED
-    @pytest.mark.parametrize(("deviation", "largest"), [(0.0, EXACT), (0.01, 0.01)])
-    def test_calibrated_cameras_show_true_shapes(self, camera, deviation, largest):
-        # Also where the object deforms as much as it is large: the mirror image of
-        # space is all that is free.
-        options = {"deviation": deviation, "amplitude": 1.0, "n_components": 3}
-        tracks, truth = random_table(camera, **options)
-        model = fitted(tracks, 3, camera=camera)
-        assert euclidean_error(model, tracks, truth) < largest
-
     @KINDS
-    @pytest.mark.parametrize("seed", slow_after(1, range(2)))
-    def test_noise_is_true_within_the_error_of_sampling(self, camera, gaps, seed):
-        tracks, _, model = fit_of(camera, seed, gaps)
+    def test_noise_is_true_within_the_error_of_sampling(self, camera, gaps):
+        tracks, _, model = fit_of(camera, gaps)
         freedom = np.isfinite(tracks).sum() - 3 * 3 * 39
         freedom -= (2 + CAMERAS[camera].n_parameters) * 60
         size = np.mean(np.nanmean(tracks**2, axis=(1, 2)))
@@ -178,15 +157,6 @@ class TestCameras:
         assert euclidean_error(model, tracks, frames) < 0.02
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n_components", [0, 2])
-def test_number_of_components_of_many_points(n_components):
-    sizes = {"n_frames": 80, "n_points": 300, "n_components": n_components}
-    tracks, _ = random_table(deviation=0.02, **sizes)
-    model = fitted(tracks, "auto", camera="weak_perspective")
-    assert len(model.basis_) == max(n_components, 1)
-
-
 class TestNoiseVariance:
     # The median is less precise, and the fit bends towards the inner half, with
     # "cauchy" most of all.
@@ -197,9 +167,7 @@ class TestNoiseVariance:
             [
                 ("huber", 150, 40, 2, 0.15),
                 ("cauchy", 300, 8, 1, 0.2),
-                ("cauchy", 150, 40, 2, 0.15),
                 ("huber", 150, 30, 5, 0.1),
-                ("huber", 300, 8, 1, 0.2),
             ],
         ),
     )
@@ -290,11 +258,6 @@ class TestRobustLoss:
         moved[where] += 2.0 * rng.normal(size=(where.sum(), 2))
         assert error_of(fitted(moved, loss=loss), tracks, truth) < 1e-3
 
-    def test_a_point_that_is_an_outlier_in_all_frames(self):
-        tracks, _ = random_table(n_frames=40, n_points=25)
-        tracks[:, 7] = 5.0 * np.random.default_rng(0).normal(size=(40, 2))
-        assert np.isfinite(fitted(tracks, loss="huber").basis_).all()
-
 
 class TestDegenerate:
     @CALIBRATED
@@ -308,13 +271,9 @@ class TestDegenerate:
         assert model.inverse_snr_ < max(1.5 * deviation**2, 1e-7)
 
     @EACH
-    @pytest.mark.parametrize("deviation", [0.0, DEVIATION])
+    @pytest.mark.parametrize("deviation", slow_after(1, [0.0, DEVIATION]))
     def test_rigid_objects(self, camera, deviation):
         options = {"n_frames": 40, "n_points": 25, "n_components": 0}
         tracks, truth = random_table(camera, deviation=deviation, **options)
         model = fitted(tracks, 2, camera=camera)
         assert error_of(model, tracks, truth) < max(3 * deviation, 1e-4)
-
-    def test_more_basis_shapes_than_the_table_has(self):
-        tracks, truth = random_table(n_frames=150, n_components=1)
-        assert error_of(fitted(tracks, 3), tracks, truth) < 0.03

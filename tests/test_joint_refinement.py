@@ -33,7 +33,7 @@ def random_scene(seed=0, noise=DEVIATION, kind="complete", camera="affine"):
     """Return a table that follows the model, and what made it."""
     kind = {"complete": "complete", "weighted": "missing"}[kind]
     options = {"noise": noise, "kind": kind, "camera": camera, "deformation": 0.25}
-    scene = scenes.random_scene(seed, 40, 25, 2, **options)
+    scene = scenes.random_scene(seed, 30, 18, 2, **options)
     truth = JointState(scene.shapes, scene.motion, max(noise, 1e-3) ** 2)
     tracks = scene.centred if scene.weights is None else scene.tracks
     return Scene(tracks, scene.weights, truth)
@@ -95,7 +95,7 @@ def counted(scene):
 KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
 
 
-@pytest.mark.parametrize("max_iter", [0, 1, 4])
+@pytest.mark.parametrize("max_iter", [0, 4])
 def test_max_iter_cuts_the_history_short(max_iter):
     scene = random_scene()
     whole, part = refined(scene), refined(scene, max_iter=max_iter)
@@ -109,17 +109,7 @@ class TestOptimum:
     def test_is_the_same_from_other_starts(self, kind, size):
         scene, expected = optimum(kind)
         start = disturbed(scene.truth, 2, size)
-        self.check(scene, refined(scene, start, tol=1e-7), expected)
-
-    @pytest.mark.parametrize("factor", slow_after(1, [1e-4, 1e2]))
-    def test_is_the_same_from_a_wrong_noise_variance(self, factor):
-        scene, expected = optimum()
-        start = disturbed(scene.truth)
-        start = start._replace(noise=factor * start.noise)
-        self.check(scene, refined(scene, start, tol=1e-7), expected)
-
-    @staticmethod
-    def check(scene, got, expected):
+        got = refined(scene, start, tol=1e-7)
         assert got.history[-1] == pytest.approx(expected.history[-1], abs=1e-2)
         assert got.state.noise == pytest.approx(expected.state.noise, rel=1e-3)
         assert_allclose(images(scene, got), images(scene, expected), atol=1e-3)
@@ -162,7 +152,7 @@ def test_first_step_is_that_of_expectation_maximisation(kind, penalty):
 
 
 class TestTolerance:
-    @pytest.mark.parametrize("tol", [1.0, 1e-2, 1e-4])
+    @pytest.mark.parametrize("tol", [1.0, 1e-4])
     def test_is_of_two_steps_one_after_the_other_and_a_frame(self, tol):
         scene = random_scene()
         result = refined(scene, tol=tol)
@@ -191,7 +181,8 @@ def moved(cameras, motion, step):
 def disturbed_by(cameras, state, seed=1, size=0.1):
     """Return a state that is some way off, with cameras of the model."""
     other = disturbed(state, seed, size)
-    step = size * np.random.default_rng(seed).normal(size=(cameras.n_parameters, 40))
+    sizes = cameras.n_parameters, len(state.motion)
+    step = size * np.random.default_rng(seed).normal(size=sizes)
     return other._replace(motion=moved(cameras, state.motion, step))
 
 
@@ -392,22 +383,17 @@ class TestDegenerate:
         assert_array_equal(result.state.shapes[1:], 0)
 
     @pytest.mark.parametrize("part", ["shapes", "motion", "noise"])
-    @pytest.mark.parametrize("value", [np.nan, np.inf])
     @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-    def test_ends_where_the_start_is_not_finite(self, part, value):
+    def test_ends_where_the_start_is_not_finite(self, part):
         scene, start = scene_and_start()
         if part == "noise":
-            start = start._replace(noise=value)
+            start = start._replace(noise=np.nan)
         else:
-            getattr(start, part)[3 if part == "motion" else (..., 3)] = value
+            getattr(start, part)[3 if part == "motion" else (..., 3)] = np.inf
         likelihood = counted(scene)
-        refine_joint(likelihood, start, AFFINE, max_iter=1000, tol=1e-3)
+        end = refine_joint(likelihood, start, AFFINE, max_iter=1000, tol=1e-3)
         assert likelihood.n_calls < 100
-
-    def test_has_not_converged_where_the_objective_is_not_finite(self):
-        scene, start = scene_and_start()
-        start.motion[3] = np.nan
-        assert not refined(scene, start).converged
+        assert not end.converged
 
     def test_point_that_no_frame_shows_stays_where_it_is(self):
         scene, start = scene_and_start(kind="weighted")

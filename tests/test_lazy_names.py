@@ -72,7 +72,12 @@ def command(*arguments):
 def test_names_are_those_that_type_checkers_see(name):
     package = importlib.import_module(name)
     seen = for_type_checkers(package)
-    assert set(package.__all__) <= {*seen, "__version__"}
+    assert len({*package.__all__}) == len(package.__all__)
+    assert package.__doc__
+    # Folders are imported for type checkers, and not listed.
+    listed = {public for public, module in seen.items() if module != "isa_nrsfm"}
+    assert listed == {*package.__all__} - {"__version__"}
+    assert not [public for public in listed if public.startswith("_")]
     assert {*seen, *package.__all__} <= set(dir(package))
     if "__getattr__" in vars(package):
         assert {each for each in dir(package) if each[:2] != "__"} == {*seen}

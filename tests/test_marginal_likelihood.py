@@ -68,7 +68,7 @@ def scene(request):
 
 
 PRICES = np.array([0.3, 7.0, 2.0])  # one for each basis shape
-PENALTIES = pytest.mark.parametrize("penalty", [0.0, PENALTY, PRICES], ids=str)
+PENALTIES = pytest.mark.parametrize("penalty", [0.0, PRICES], ids=str)
 
 
 class TestValue:
@@ -216,7 +216,7 @@ def assert_same(got, expected, but=()):
             assert_allclose(one, other, rtol=1e-9, atol=1e-11 * scale, err_msg=name)
 
 
-@pytest.mark.parametrize("size", [1, 4, 11, 50])
+@pytest.mark.parametrize("size", [1, 4])
 def test_size_of_blocks_makes_no_difference(scene, size):
     whole = scene.at(PENALTY, block_frames=len(scene.tracks))
     assert_same(scene.at(PENALTY, block_frames=size), whole)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
@@ -11,8 +11,6 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
-
-pytestmark = one_start
 
 KINDS = {
     "affine": {},
@@ -29,7 +27,7 @@ def fits(X, **options):
 
 
 @pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_after(2, KINDS))
 @pytest.mark.parametrize("side", slow_after(1, [-1, 1]))
 def test_missing_points_are_farther_away(side, kind):
     options = KINDS[kind]

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from cameras import lorentz_cameras
-from layers import may_not_converge, one_start, slow_after
+from layers import may_not_converge, slow_after
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
@@ -35,7 +35,7 @@ from isa_nrsfm.plotting import (
 from isa_nrsfm.skeletons import get_skeleton
 
 # The figures do not depend on how far the iterations of the fit got.
-pytestmark = [may_not_converge, one_start]
+pytestmark = may_not_converge
 RNG = np.random.default_rng(0)
 POINTS = RNG.standard_normal((6, 10, 2))
 # Of each display: arguments, and the number of its axes.
@@ -127,8 +127,6 @@ def test_points_can_have_another_style():
         (BasisShapeDisplay, {"energy_share": [1.0]}, r"3 numbers.*got shape \(1,\)"),
         (BasisShapeDisplay, {"component_names": ["a"]}, "must hold 3 names.*got 1"),
         (BasisShapeDisplay, {"edges": [[0, 20]]}, "points 0 to 19; got 0 to 20"),
-        (BasisShapeDisplay, {"edges": [[-1, 0]]}, "points 0 to 19; got -1 to 0"),
-        (BasisShapeDisplay, {"edges": [0, 1]}, r"shape \(n_pairs, 2\).*shape \(2,\)"),
         (BasisShapeDisplay, {"edges": [[0.0, 1.0]]}, "must be integers"),
         (BasisShapeDisplay, {"edges": "tree"}, "the skeletons are .*; got 'tree'"),
         (BasisShapeDisplay, {"edges": "hand-21"}, "has 21 points, the shape 20"),
@@ -213,7 +211,7 @@ def test_shapes_are_inside_limits_of_one_scale(rng):
     assert all(np.ptp(ax.get_xlim()) > 0 for ax in display.axes_.ravel())
 
 
-@pytest.mark.parametrize("n_shapes", [2, 3, 10])
+@pytest.mark.parametrize("n_shapes", [2, 10])
 def test_shapes_fit_on_a_page(n_shapes, rng):
     for aspect in (0.25, 3.0):
         mean = rng.uniform(size=(20, 3)) * [aspect, 1, aspect]
@@ -271,8 +269,6 @@ def test_points_that_are_near_in_the_images_are_joined():
 @pytest.mark.parametrize(
     ("shape", "edges", "flipped"),
     [
-        (FACE, "auto", "lower"),
-        (FACE, None, "lower"),
         (FACE, [[0, 1]], "lower"),
         (BODY, "coco-17", "lower"),
         (BODY, "auto", "upper"),
@@ -395,9 +391,7 @@ def rigid_view(motion, shape):
     return model, BasisShapeDisplay.from_estimator(model)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_turntable_is_seen_upright_from_its_broad_side(seed):
-    rng = np.random.default_rng(seed)
+def test_a_turntable_is_seen_upright_from_its_broad_side(rng):
     turns = Rotation.from_euler("y", 2 * np.pi * np.arange(40)[:, None] / 40)
     # Points with y down, broad along a direction between x and z.
     points = rng.standard_normal((50, 3)) * [3, 5, 1]
@@ -637,7 +631,7 @@ def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     assert display.colorbar_.ax.get_ylabel() == "covariance"
 
 
-@pytest.mark.parametrize("n_components", [12, 13, 99])
+@pytest.mark.parametrize("n_components", [13, 99])
 def test_labels_of_the_matrix_do_not_touch(n_components):
     display = ModeCovarianceDisplay(mode_covariance=covariance(n_components)).plot()
     display.figure_.canvas.draw()

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import sklearn
-from layers import one_start, slow_after, start_may_not_converge
+from layers import slow_after, start_may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from refusals import refused, warned
@@ -26,7 +26,7 @@ from isa_nrsfm.io import open_table, read_landmarks
 from isa_nrsfm.metrics import affine_shape_error
 
 # Of the start, which the joint refinement does not say.
-pytestmark = [one_start, start_may_not_converge]
+pytestmark = start_may_not_converge
 
 CAMERAS = pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
 N_FRAMES, N_POINTS, K = 60, 20, 2
@@ -117,26 +117,6 @@ class TestMeaning:
         with pytest.warns(UserWarning, match="only one of"):
             assert_array_equal(fitted().transform(X, point_weight=weights), expected)
 
-    @pytest.mark.slow
-    @CAMERAS
-    def test_whole_numbers_are_repeated_points(self, camera):
-        options = {"noise": 0.02, "random_state": 3}
-        X = make_nonrigid_tracks(N_FRAMES, N_POINTS, K, **options).tracks
-        counts = np.arange(N_POINTS) % 3 + 1
-        many = np.repeat(np.arange(N_POINTS), counts)
-        weights, model = np.tile(counts, (N_FRAMES, 1)), estimator(camera=camera)
-        expected = clone(model).fit(X[:, many].reshape(N_FRAMES, -1))
-        X = X.reshape(N_FRAMES, -1)
-        model.fit(X, point_weight=weights)
-        found, images = (
-            m.inverse_transform(m.alpha_, m.motion_, m.translation_)
-            for m in (model, expected)
-        )
-        images = images.reshape(N_FRAMES, -1, 2)[:, np.cumsum(counts) - 1]
-        images = images.reshape(N_FRAMES, -1)
-        # A few hundredths of the noise
-        assert_allclose(found, images, rtol=0, atol=0.03 * np.std(found - X))
-
     def test_a_row_of_zeros_is_a_row_without_points(self):
         weights = noisy().weights.copy()
         weights[7] = 0.0
@@ -186,17 +166,12 @@ class TestAccuracy:
         error = affine_shape_error(scene.shapes, found)
         assert error < 0.5 * affine_shape_error(scene.shapes, plain)
 
-    @pytest.mark.slow
-    def test_number_of_basis_shapes(self):
-        model = estimator(n_components="auto")
-        assert len(model.fit(noisy().X, point_weight=noisy().weights).basis_) == K
-
 
 # Without weights the noise of the points is larger than that of the fit.
 @pytest.mark.filterwarnings("ignore:the points of X lie")
 class TestMethods:
     @pytest.mark.parametrize(
-        "camera", slow_after(2, ["affine", "weak_perspective", "orthographic"])
+        "camera", slow_after(1, ["weak_perspective", "affine", "orthographic"])
     )
     def test_agree_with_the_fit(self, camera):
         model, (X, weights, _) = fitted(camera), noisy()
@@ -398,28 +373,6 @@ class TestCommandLine:
         path.write_text(json.dumps(rows))
         return path
 
-    @staticmethod
-    def coefficients(path):
-        return pd.read_csv(path).filter(like="alpha_").to_numpy()
-
-    def test_fit_and_transform(self, results, tmp_path, succeeds):
-        options = ["--weights", "confidence"]
-        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
-        found = read_landmarks(results)
-        camera = "weak_perspective"
-        model = estimator(camera=camera)
-        model.fit(found.points, point_weight=found.confidence)
-        alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
-        assert_allclose(alpha, model.alpha_, atol=1e-6)
-        plain = estimator(camera=camera).fit(found.points)
-        assert np.abs(alpha - plain.alpha_).max() > 0.1
-        cameras = pd.read_csv(tmp_path / "out" / "cameras.csv")
-        assert_allclose(cameras.filter(regex="^m"), model.motion_.reshape(-1, 6))
-        new = tmp_path / "new.csv"
-        saved = tmp_path / "out" / "model.npz"
-        succeeds("transform", saved, results, *options, "-o", new)
-        assert_allclose(self.coefficients(new), model.alpha_, atol=1e-6)
-
     def test_all_results_of_some_points_are_weighted(self, results, tmp_path, succeeds):
         options = ["--weights", "confidence"]
         options += ["--points", "without:3,7", "--fps", 25, "--std"]
@@ -438,6 +391,10 @@ class TestCommandLine:
         smooth = model.smooth(X, time=np.arange(N_FRAMES) / 25, **weights)
         assert_allclose(table["alpha_1_smooth"], smooth.alpha[:, 0], atol=1e-6)
         assert_allclose(frame_poses(model).yaw, poses.yaw, atol=1e-6)
+        saved, new = tmp_path / "out" / "model.npz", tmp_path / "new.csv"
+        succeeds("transform", saved, results, *options[:2], "-o", new)
+        again = pd.read_csv(new)[["alpha_1", "alpha_2"]]
+        assert_allclose(again, model.alpha_, atol=1e-6)
 
     def test_refusals(self, results, tmp_path, fails):
         options = ["--weights", "confidence", "-o", tmp_path / "out", "--no-figures"]

@@ -4,7 +4,6 @@ import threading
 
 import numpy as np
 import pytest
-from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.optimize import minimize
@@ -207,8 +206,7 @@ class TestSpatialMedian:
         got = spatial_median(turned(10 * rows, angle) + 3.0)
         assert_allclose(got, expected, atol=1e-9)
 
-    @pytest.mark.parametrize("n_points", [5, 7, 31])
-    @pytest.mark.parametrize("far", [1e9, 1e16, 2e153])
+    @pytest.mark.parametrize(("n_points", "far"), [(5, 2e153), (31, 1e9)])
     def test_a_point_at_any_distance_costs_no_digits_of_the_others(self, n_points, far):
         rows = np.random.default_rng(0).normal(size=(20, 2, n_points))
         near = np.delete(rows, 2, axis=2)
@@ -287,9 +285,7 @@ class TestGrossOutliers:
     def test_of_clean_tables_there_are_none(self, noise):
         assert not gross_outliers(rigid_tracks(noise)).any()
 
-    @pytest.mark.parametrize(
-        ("n_frames", "distance"), [(40, 0.5), (40, 2.0), (40, 8.0), (200, 2.0)]
-    )
+    @pytest.mark.parametrize(("n_frames", "distance"), [(40, 0.5), (200, 2.0)])
     def test_are_those_that_were_moved(self, n_frames, distance):
         # The object is that of at most 60 frames.
         tracks, where = spoilt(rigid_tracks(n_frames=n_frames), distance)
@@ -448,14 +444,13 @@ def test_the_fit_is_a_stationary_point_of_the_likelihood(small, rng):
 # --- exact tables -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", slow_after(1, range(3)))
 @pytest.mark.parametrize(
     ("n_frames", "n_points", "n_components", "missing"),
-    [(60, 30, 2, 0.2), (60, 30, 3, 0.3), (300, 68, 5, 0.3), (300, 68, 9, 0.2)],
+    [(60, 30, 3, 0.3), (300, 68, 9, 0.2)],
 )
-def test_tables_without_noise(n_frames, n_points, n_components, missing, seed):
-    scene = make_nonrigid_tracks(n_frames, n_points, n_components, random_state=seed)
-    seen = random_mask((n_frames, n_points), missing, seed)
+def test_tables_without_noise(n_frames, n_points, n_components, missing):
+    scene = make_nonrigid_tracks(n_frames, n_points, n_components, random_state=0)
+    seen = random_mask((n_frames, n_points), missing, 0)
     determined = seen.sum(axis=1) >= 3 * n_components + 4
     assert determined.mean() > 0.95
     error = held_out_error(scene.tracks, seen, n_components, determined)
@@ -472,10 +467,9 @@ def seen_from_outside(n_frames, n_points, least_cosine, seed):
     return image[..., :2], image[..., 2] > least_cosine
 
 
-@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("least_cosine", [-0.3, 0.0])
-def test_a_ball_of_which_every_frame_sees_one_side(least_cosine, seed):
-    tracks, seen = seen_from_outside(100, 30, least_cosine, seed)
+def test_a_ball_of_which_every_frame_sees_one_side(least_cosine):
+    tracks, seen = seen_from_outside(100, 30, least_cosine, 0)
     assert not seen.all(axis=1).any()
     assert seen.mean() < 0.7
     assert np.sqrt(held_out_error(tracks, seen, 0)) < 1e-6
@@ -499,23 +493,6 @@ def test_the_error_is_near_the_noise(noise):
     assert noise**2 < held_out_error(scene.tracks, seen, 3) < 2 * noise**2
 
 
-# Inverse SNR in percent of hidden points of some frames, a little above what is
-# reached; filling in with the centroid has 100, the mean of the 5 nearest frames 0.7.
-@pytest.mark.parametrize(
-    ("name", "n_components", "largest"),
-    [
-        ("ict_bu3dfe_like_68", 9, 0.06),
-        ("faces_wild_68_combined", 9, 0.20),
-        ("akhter_drink", 3, 0.016),
-    ],
-)
-def test_random_points_of_real_tables(load_data, name, n_components, largest):
-    tracks = load_data(name)["W2d"]
-    tracks = tracks[:: max(len(tracks) // 200, 1)]
-    seen = random_mask(tracks.shape[:2], 0.3, 0)
-    assert 100 * held_out_error(tracks, seen, n_components) < largest
-
-
 def test_faces_that_hide_a_side(load_data):
     tracks = load_data("muct_68")["W2d"].astype(float)
     seen = ~np.isnan(tracks).any(axis=2)
@@ -528,13 +505,6 @@ def test_faces_that_hide_a_side(load_data):
 
 
 # --- degenerate tables --------------------------------------------------------------
-
-
-def test_shark_has_a_lower_rank(load_data):
-    tracks = load_data("shark_torresani")["W2d"].astype(float)
-    seen = random_mask(tracks.shape[:2], 0.3, 0)
-    for n_components in (1, 2, 6):
-        assert np.sqrt(held_out_error(tracks, seen, n_components)) < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -550,10 +520,10 @@ def test_rigid_and_flat_objects_and_more_basis_shapes(n_components, dtype, limit
         assert np.sqrt(error) < limit
 
 
-@pytest.mark.parametrize(("n_frames", "n_points"), [(8, 13), (8, 68), (30, 100)])
-def test_the_smallest_tables(n_frames, n_points):
-    tracks = make_nonrigid_tracks(n_frames, n_points, 3, random_state=0).tracks
-    seen = random_mask((n_frames, n_points), 0.1, 3)
+@pytest.mark.parametrize("n_points", [13, 68])
+def test_the_smallest_tables(n_points):
+    tracks = make_nonrigid_tracks(8, n_points, 3, random_state=0).tracks
+    seen = random_mask((8, n_points), 0.1, 3)
     assert np.isfinite(completed(hide(tracks, seen), 3)).all()
 
 

@@ -20,11 +20,13 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._joint.fit import widened
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem
+from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._other_tables import prior_start
 from isa_nrsfm._parameters.choices import ADAPTED
 from isa_nrsfm._prepare.scaling import scaled_table
@@ -32,6 +34,8 @@ from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
+# For errors of depths
+Thorough = limited(LIMITS)
 N_POINTS = 16
 BOTH = pytest.mark.parametrize("adapt", ADAPTED)
 PERSPECTIVE = {"camera": "perspective", "principal_point": (0, 0)}
@@ -59,11 +63,11 @@ def study(seed, n_frames, degrees, *, change=0.0, noise=0.3, focal=np.inf, sprea
     return SimpleNamespace(X=X.reshape(n_frames, -1), S=S, depths=points[..., 2])
 
 
-def fitted(X, prior=None, **params):
+def fitted(X, prior=None, kind=AffineNRSfM, **params):
     """Return a weak-perspective fit, by default with a prior."""
     given = {"camera": "weak_perspective", "random_state": 0}
     given |= {"n_components": 2, "prior": prior}
-    return AffineNRSfM(**given | params).fit(X)
+    return kind(**given | params).fit(X)
 
 
 def error(model, S, X):
@@ -134,15 +138,15 @@ def test_widths_of_zero_give_the_shapes_of_the_prior(frontal, adapt):
 @BOTH
 def test_first_widths_make_no_difference(frontal, adapt):
     ends = []
-    for widths in ((0.01, 0.003), (0.05, 0.01), (0.2, 0.03)):
+    for widths in ((0.01, 0.003), (0.2, 0.03)):
         problem, start = problem_of(frontal, adapt)
         prior = problem.settings.shape_prior._replace(widths=widths)
         problem = problem.with_prior(prior)
         fit = widened(problem, problem.unreversed(start, problem.cameras))
         ends.append((fit.prior.widths, fit.state.shapes))
-    for widths, shapes in ends[1:]:
-        assert widths[0] == pytest.approx(ends[0][0][0], rel=0.02)
-        assert_allclose(shapes, ends[0][1], atol=0.005)
+    (few, some), (many, other) = ends
+    assert few[0] == pytest.approx(many[0], rel=0.02)
+    assert_allclose(some, other, atol=0.005)
 
 
 # --- shapes ---------------------------------------------------------------------------
@@ -155,7 +159,7 @@ def test_accuracy(turned, adapt, degrees):
     with warnings.catch_warnings(action="ignore"):  # of depth, and of other objects
         own, prior = fitted(table.X), turned.model
         others = [error(model, table.S, table.X) for model in (own, prior)]
-    model = fitted(table.X, prior, adapt=adapt)
+    model = fitted(table.X, prior, Thorough, adapt=adapt)
     reached = error(model, table.S, table.X)
     assert reached < 0.6 * others[1]
     assert reached < (0.65 if degrees == 3 else 1.2) * others[0]
@@ -270,7 +274,7 @@ def test_perspective_cameras(turned, focal_length):
     assert_allclose(model.basis_ * sign, turned.model.basis_, atol=1e-12)
 
 
-@pytest.mark.parametrize("certainty", [1.0, 0.5])
+@pytest.mark.parametrize("certainty", slow_after(1, [0.5, 1.0]))
 def test_prior_and_perspective_decide_the_mirror_image(turned, certainty):
     table, same = study(1, 20, 10, focal=4000), []
     for prior in (copy.copy(turned.model), turned.model.mirrored()):
@@ -323,7 +327,8 @@ def test_other_points_are_refused(turned, frontal):
     order = np.random.default_rng(0).permutation(N_POINTS)
     other = X.reshape(len(X), -1, 2)[:, order].reshape(X.shape)
     refused("the same points in the same order", fitted, other, turned.model)
-    frontal_only = warned("depth of the shapes is not determined", fitted, X)
+    message = "depth of the shapes is not determined"
+    frontal_only = warned(message, fitted, X, kind=Thorough)
     refused("depth of the prior is not determined", fitted, X, frontal_only)
 
 
@@ -355,11 +360,10 @@ def test_searches_pipelines_and_copies(turned, frontal, tmp_path):
 # --- tables that do not fit a model ---------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5])
-def test_new_frames_fit_their_model(turned, seed):
+def test_new_frames_fit_their_model(turned):
     model = turned.model
     for noise in (0.3, 0.0):  # a warning would be an error
-        model.transform(study(seed, 40, 30, noise=noise).X)
+        model.transform(study(3, 40, 30, noise=noise).X)
     model.transform(turned.X)
     model.transform(turned.X[:3])
 
@@ -369,7 +373,6 @@ def test_new_frames_fit_their_model(turned, seed):
     [
         ({}, "order"),
         ({}, "object"),
-        ({"camera": "affine"}, "order"),
         ({"camera": "affine"}, "object"),
         ({"layout": "planar"}, "object"),
         pytest.param(

@@ -86,24 +86,14 @@ def test_names_with_sides_are_on_these_sides(name):
                 assert skeleton.point_names[other] == point.replace("left", "right")
 
 
-def test_edges_of_coco_are_those_of_the_annotations():
-    # Counted from 1, as the file has them.
-    skeleton = [(16, 14), (14, 12), (17, 15), (15, 13), (12, 13), (6, 12), (7, 13)]
-    skeleton += [(6, 7), (6, 8), (7, 9), (8, 10), (9, 11), (2, 3), (1, 2), (1, 3)]
-    skeleton += [(2, 4), (3, 5), (4, 6), (5, 7)]
-    expected = undirected(np.array(skeleton) - 1)
-    assert undirected(get_skeleton("coco-17").edges) == expected
-
-
 @pytest.mark.parametrize("name", ["coco-17", "h36m-17"])
-@pytest.mark.parametrize("seed", range(3))
-def test_bodies_are_turned_upright_and_mirrored_back(name, seed):
-    body = make_body_tracks(200, scheme=name, random_state=seed).mean_shape
+def test_bodies_are_turned_upright_and_mirrored_back(name):
+    body = make_body_tracks(200, scheme=name, random_state=0).mean_shape
     upright = canonical_pose(body, scheme=name)
     assert not upright.mirrored
     # Bodies of the generator stand upright, but for how far they lean.
     assert np.rad2deg(Rotation.from_matrix(upright.rotation).magnitude()) < 15
-    turned = Rotation.random(random_state=seed).apply(body)
+    turned = Rotation.random(random_state=0).apply(body)
     assert_allclose(canonical_pose(turned, scheme=name).shape, upright.shape, atol=1e-6)
     mirrored = canonical_pose(turned * [1, 1, -1], scheme=name)
     assert mirrored.mirrored
@@ -143,19 +133,19 @@ def test_real_tables_are_recognised(load_data, name, layout):
         assert (left[:, 0] > right[:, 0]).all()
 
 
-@pytest.mark.parametrize("name", ["ibug-68", "hand-21", "h36m-17"])
-@pytest.mark.parametrize("seed", range(3))
-def test_generated_shapes_are_recognised_in_their_own_order_only(name, seed):
-    maker = {
-        "ibug-68": make_face_tracks,
-        "hand-21": make_hand_tracks,
-        "h36m-17": partial(make_body_tracks, scheme="h36m-17"),
-    }[name]
-    shape = maker(100, random_state=seed).mean_shape
+@pytest.mark.parametrize(
+    ("name", "maker"),
+    [
+        ("ibug-68", make_face_tracks),
+        ("hand-21", make_hand_tracks),
+        ("h36m-17", partial(make_body_tracks, scheme="h36m-17")),
+    ],
+)
+def test_generated_shapes_are_recognised_in_their_own_order_only(name, maker, rng):
+    shape = maker(100, random_state=0).mean_shape
     n_points = len(shape)
     assert find_skeleton(n_points, shape=shape).name == name
     assert find_skeleton(n_points, shape=7 * shape + 3).name == name
-    rng = np.random.default_rng(seed)
     for other in (
         rng.standard_normal((n_points, 3)),
         rng.uniform(size=(n_points, 2)),

@@ -20,14 +20,12 @@ from isa_nrsfm._linalg.small_matrices import (
     diagonal_of,
     inverse3,
     invert_positive,
-    of_frames,
     packed_products,
     padded,
     pair_indices,
     procrustes,
     solve_positive,
     sweep,
-    unpack3,
     unpacked,
 )
 
@@ -66,8 +64,7 @@ class TestThreeByThree:
         unscaled = inverse * scale[:, None, None] * scale[:, None]
         assert_allclose(unscaled, inverse3(A[ROWS, COLUMNS]), rtol=1e-13)
 
-    @pytest.mark.parametrize("rank", [0, 1, 2])
-    @pytest.mark.parametrize("unit", [1e-100, 1.0, 1e100])
+    @pytest.mark.parametrize(("rank", "unit"), [(0, 1.0), (1, 1e-100), (2, 1e100)])
     def test_singular_matrices_have_a_generalised_inverse(self, rank, unit):
         X = np.random.default_rng(rank).normal(size=(40, 3, rank))
         X[:10, 0] = 0  # flat along an axis
@@ -79,7 +76,7 @@ class TestThreeByThree:
 
 @pytest.mark.parametrize("n", NUMBERS)
 class TestPositiveDefinite:
-    @pytest.mark.parametrize("k", range(1, 16))
+    @pytest.mark.parametrize("k", [1, 3, 9, 15])
     def test_solution_and_inverse(self, k, n):
         A = positive_matrices(k, k, n)
         b = np.random.default_rng(0).normal(size=(k, n))
@@ -92,7 +89,7 @@ class TestPositiveDefinite:
         assert_allclose(last_to_first(unpacked(inverse)), expected, atol=1e-9)
         assert positive.all()
 
-    @pytest.mark.parametrize("k", [2, 5, 9])
+    @pytest.mark.parametrize("k", [2, 9])
     def test_indefinite_matrices_are_told(self, k, n):
         rng = np.random.default_rng(k)
         A = positive_matrices(k, k, n) - 0.05 * rng.random(n) * np.eye(k)[..., None]
@@ -202,15 +199,6 @@ def test_lanes_are_full(n):
     assert_array_equal(np.unique(filled), frames)
 
 
-def test_frames_that_are_taken_stay_last_in_memory():
-    values = np.random.default_rng(0).normal(size=(4, 3, 20))
-    frames = np.array([2, 3, 5, 19])
-    taken = of_frames(values, frames)
-    assert_array_equal(taken, values[..., frames])
-    assert taken.flags.c_contiguous
-    assert_array_equal(of_frames(values, slice(3, 7)), values[..., 3:7])
-
-
 @pytest.mark.parametrize(("k", "n"), [(0, 4), (0, 200), (3, 0)])
 def test_nothing_to_solve(k, n):
     A = np.ones((k, k, n))
@@ -218,11 +206,6 @@ def test_nothing_to_solve(k, n):
     assert x.shape == (k, n)
     assert positive.all()
     assert unpacked(invert_positive(packed(A))[0]).shape == (k, k, n)
-
-
-def test_packing_of_3x3_matrices():
-    entries = np.random.default_rng(0).normal(size=(4, 6, 5))
-    assert_array_equal(unpack3(entries)[:, ROWS, COLUMNS], entries)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
-from layers import one_start, slow_after
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from sklearn.exceptions import ConvergenceWarning
@@ -14,8 +14,6 @@ from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
-
-pytestmark = one_start
 
 FACES = make_nonrigid_tracks(40, 30, 2, amplitude=0.2, random_state=0).tracks
 LAYOUTS = ["interleaved", "planar"]
@@ -49,15 +47,7 @@ class TestPoints:
         found = warned(message + "missing$", fit, half, layout=layout)
         assert_array_equal(found.alpha_, fit(whole, layout=layout).alpha_)
 
-    def test_points_in_too_few_frames(self):
-        names = [f"{axis}_{j}" for axis in "xy" for j in range(30)]
-        X = pd.DataFrame(table_of(FACES, "planar"), columns=names)
-        X.loc[5:, ["x_4", "y_4"]] = X.loc[4:, ["x_9", "y_9"]] = np.nan
-        message = r"n_components=3 needs every point in at least 6 frames; fewer show "
-        message += r"2 of 30 points \(first: point 4 \(x_4, y_4\), in 5 of 40 frames\)"
-        refused(message, fit, X, 3, layout="planar")
-
-    @pytest.mark.parametrize("K", range(1, 6))
+    @pytest.mark.parametrize("K", [1, 5])
     def test_count_of_all_equations(self, K, rng):
         # The smallest complete table has hardly more equations than unknowns: those of
         # cameras, coefficients and shapes, but for the gauge.
@@ -90,8 +80,7 @@ class TestPoints:
         tracks[::2] += 1e-9 * rng.normal(size=(20, 30, 2))
         fit(table_of(tracks))
 
-    @pytest.mark.parametrize("unit", [1e-9, 1e9])
-    @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+    @pytest.mark.parametrize(("unit", "dtype"), [(1e-9, np.float32), (1e9, float)])
     def test_one_place_is_a_matter_of_rounding(self, rng, unit, dtype):
         place = 3.0 * np.ones((1, 2))
         noise, eps = rng.normal(size=(30, 2)), np.finfo(dtype).eps
@@ -103,7 +92,7 @@ class TestPoints:
         fit(table_of((unit * tracks).astype(dtype)))
 
 
-@pytest.mark.parametrize(("n_points", "n_components"), [(7, 3), (15, 8), (17, 10)])
+@pytest.mark.parametrize(("n_points", "n_components"), [(7, 3), (17, 10)])
 def test_numbers_of_frames_for_calibrated_cameras(n_points, n_components, rng):
     # Equations and unknowns: rotation, scale and position of a frame, coefficients,
     # shapes, but for the gauge. Affine cameras could not have as many basis shapes.
@@ -144,21 +133,6 @@ class TestNames:
         X = pd.DataFrame(FACES[:, :3, 0].repeat(2, 1), columns=names)
         refused(message, fit, X, layout=layout)
 
-    @both_layouts
-    @pytest.mark.parametrize(
-        ("names", "n_others", "first"),
-        [
-            ("x_0 y_0 likelihood_0 x_1 y_1 likelihood_1", 2, "likelihood_0"),
-            ("frame person x_0 y_0 x_1 y_1", 2, "frame"),
-            ("nose_x nose_y nose_z chin_x chin_y chin_z", 2, "nose_z"),
-        ],
-    )
-    def test_columns_beside_those_of_points(self, names, n_others, first, layout):
-        message = rf"^{n_others} of the 6 columns are not named as the x or y of a "
-        message += rf"point \(first: '{first}'\)\. .*isa_nrsfm\.io\.landmark_table"
-        X = pd.DataFrame(FACES[:, :3, 0].repeat(2, 1), columns=names.split())
-        refused(message, fit, X, layout=layout)
-
 
 class TestOtherLayout:
     @pytest.mark.parametrize("scale_frames", [True, False])
@@ -173,21 +147,19 @@ class TestOtherLayout:
     # The object has size 1 and may be far away from the corner of the image.
     @pytest.mark.parametrize("scale_frames", [True, False])
     @both_layouts
-    @pytest.mark.parametrize(
-        ("unit", "offset"), [(1e-9, 0), (1e9, 0), (1, 3), (1, 300.0)]
-    )
+    @pytest.mark.parametrize(("unit", "offset"), [(1e-9, 0), (1, 300.0)])
     def test_the_right_layout_is_quiet(self, layout, scale_frames, unit, offset):
         X = table_of(unit * (FACES + np.array([offset, 0.0])), layout)
         fit(X, layout=layout, scale_frames=scale_frames)
 
     @pytest.mark.filterwarnings("ignore:in 60 of 60 rows points have only one")
-    @pytest.mark.parametrize("kind", ["long", *range(3)])
+    @pytest.mark.parametrize("kind", ["long", "missing"])
     def test_long_tables_and_those_with_missing_points(self, kind):
         # Long ones are sampled evenly.
         if kind == "long":
             X = table_of(np.tile(FACES, (100, 1, 1)))
         else:
-            X = make_face_tracks(60, missing=0.3, random_state=kind).data
+            X = make_face_tracks(60, missing=0.3, random_state=0).data
         fit(X)
         warned("layout='interleaved' explains", fit, X, layout="planar")
 
@@ -227,12 +199,6 @@ def test_masked_entries_are_missing(model):
     assert_array_equal(masked.mask, HIDDEN)
 
 
-def test_masked_entries_of_memory_maps_are_missing(model, tmp_path):
-    np.save(tmp_path / "X.npy", X)
-    masked = np.ma.masked_array(np.load(tmp_path / "X.npy", mmap_mode="r"), HIDDEN)
-    assert_array_equal(estimator().fit(masked).alpha_, model.alpha_)
-
-
 def test_masked_whole_numbers_and_single_precision(model):
     whole = np.ma.masked_array(np.round(1000 * X).astype(np.int16), HIDDEN)
     expected = model.transform(np.where(HIDDEN, np.nan, np.round(1000 * X)))
@@ -266,9 +232,7 @@ def test_pandas_na_is_missing(model, dtype):
 @pytest.mark.parametrize(
     "params",
     [
-        {},
         {"loss": "cauchy"},
-        {"scale_frames": False},
         {"camera": "weak_perspective"},
         {"camera": "orthographic"},
         {"refinement": None, "scale_frames": False},
@@ -284,7 +248,7 @@ def test_sizes_within_the_range_change_no_coefficient(params, size):
     assert_allclose(scaled.inverse_snr_, usual.inverse_snr_, rtol=1e-6)
 
 
-@pytest.mark.parametrize("size", [1e160, 1e300, 1e-160, 1e-300])
+@pytest.mark.parametrize("size", [1e160, 1e-300])
 def test_coordinates_outside_the_range_are_refused(model, size, tmp_path):
     match = "between 1e-150 and 2e\\+153 .* another unit"
     refused(match, estimator().fit, size * X)
@@ -300,9 +264,8 @@ def test_flags_are_no_numbers(name):
     refused(rf"'{name}' parameter .* Got True instead", AffineNRSfM(**params).fit, X)
 
 
-@pytest.mark.parametrize("size", [1e-25, 1e25])
-def test_rotations_and_scales_of_single_precision(size):
-    table = (size * X).astype(np.float32)
+def test_rotations_and_scales_of_single_precision():
+    table = (1e25 * X).astype(np.float32)
     model = estimator(camera="weak_perspective").fit(table)
     rows = model.rotations_[:, :2]
     expected = np.broadcast_to(np.eye(2), (30, 2, 2))

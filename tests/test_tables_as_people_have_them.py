@@ -4,7 +4,7 @@ import re
 import shlex
 import warnings
 from itertools import pairwise, product
-from string import ascii_lowercase, ascii_uppercase
+from string import ascii_lowercase
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -61,10 +61,9 @@ QUESTION = r"can be (.*) or (\d*), and no other number decides it"
         (".csv", ";", "4.25 1e3", ""),
     ],
 )
-@pytest.mark.parametrize("title", ["note", "note, or text"])
 @pytest.mark.filterwarnings("ignore:(the cells|numbers have)")
-def test_commas_in_numbers(tmp_path, suffix, sign, numbers, told, title):
-    cells = np.resize(numbers.split(), (3, 16))
+def test_commas_in_numbers(tmp_path, suffix, sign, numbers, told):
+    cells, title = np.resize(numbers.split(), (3, 16)), "note, or text"
     table = table_of("{part}_{axis}", cells).assign(**{title: ["1,2", "3,4", "a, b"]})
     table["p"], path = ["0,5", "27,5", "3"], tmp_path / f"a{suffix}"
     table.to_csv(path, sep=sign, index=False)
@@ -121,6 +120,8 @@ def test_individuals_in_a_row_are_a_question(tmp_path, fits, name, who):
         assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
     assert (rows.confidence == 1).all(axis=None)
     options = re.findall(r"command line: (--\w+ .*?)\)", told)
+    if name != "{part}_{who}_{axis}":
+        return
     for option, found in zip(
         options, ("80 frames of 8", "40 frames of 16"), strict=True
     ):
@@ -138,16 +139,11 @@ LEGS = ("coxa", "femur", "tibia", "tarsus", "claw")
         ("{}_{}", ("left", "right"), BODYPARTS),
         ("{}_{}", ("lefthand", "righthand"), range(21)),
         ("{}{}", ("LeftHand", "RightHand"), range(21)),
-        ("{}_{}", ("links", "rechts"), range(17)),
         ("{1}_{0}", ("gauche", "droite"), range(17)),
-        ("{}_{}", ("izq", "der"), range(17)),
         ("{}{}", ("vänster", "höger"), range(17)),
         ("hand{}_{}", "LR", range(21)),
         ("{}_{}", FINGERS, "123"),
-        ("{}{}", FINGERS, range(1, 4)),
         ("{}_{}", ("finger1", "finger2", "finger3"), range(7)),
-        ("leg{}_{}", range(6), ("hip", "knee", "foot")),
-        ("L{}_{}", "123", LEGS),
         ("L{}{}", "123", ("Coxa", "Femur", "Tibia", "Tarsus")),
         ("{}_{}", ("L1", "L2", "L3", "R1", "R2", "R3"), LEGS),
         ("{}_{}", (f"leg{i}" for i in range(1, 7)), range(8)),
@@ -173,7 +169,7 @@ def test_individuals_of_few_points_are_not_fitted():
     refused("same names but for 1, 3", landmark_table, table, individuals="1,3")
 
 
-@pytest.mark.parametrize("decimal", [",", "."])
+@pytest.mark.parametrize("decimal", slow_after(1, [",", "."]))
 def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
     expected = read_landmarks(path)
@@ -209,7 +205,7 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
         assert_allclose(points, shares * [1280, 720])
 
 
-@pytest.mark.parametrize("code", [(0, 0), (-1, -1), (-1280, -720), (-310, -205)])
+@pytest.mark.parametrize("code", [(0, 0), (-310, -205)])
 def test_codes_of_missing_points_in_python(tmp_path, code):
     tracks, hidden = POINTS.copy(), np.random.default_rng(1).random((N, 8)) < 0.1
     tracks[hidden] = code
@@ -227,7 +223,6 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
     ("names", "numbers"),
     [
         ("labeled-data/v/img0010.png labeled-data/v/img0030.png", [10, 30]),
-        ("0.jpg 10.jpg 2.jpg", [0, 10, 2]),
         ("v1_7_x2.png v1_9_x2.png v1_30_x2.png", [7, 9, 30]),
         ("a/1.png a/5.png b/1.png b/5.png", [1, 5, 1, 5]),
         ("e3a1.png 77b0.png 0c9d.png", [0, 1, 2]),  # no numbers of frames
@@ -235,13 +230,11 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
         ("2023-05-01_12-00-30.png 2023-05-01_12-00-31.png", [0, 1]),
         ("20230501120030.png 20230501120130.png 20230501120230.png", [0, 1, 2]),
         ("v/20230501_120030.png v/20230501_120031.png", [0, 1]),
-        ("2023-05-01.png 2023-05-02.png 2023-06-01.png", [0, 1, 2]),
         ("2023-05-01_0001.png 2023-05-01_0130.png", [1, 130]),
         ("20230501_01.png 20230501_02.png 20230502_01.png 20230502_02.png", [1, 2] * 2),
         ("12h00m30s.png 12h00m50s.png 12h01m10s.png", [0, 1, 2]),
         ("frame_0.04.png frame_0.96.png frame_1.04.png", [0, 1, 2]),
         ("1682935230040.jpg 1682935230080.jpg", [0, 1]),
-        ("20230501_120030_12.png 20230501_120030_15.png", [12, 15]),
         ("cam1.012.png cam1.015.png cam2.012.png cam2.015.png", [12, 15] * 2),
         ("000000000139.jpg 000000000785.jpg", [139, 785]),
     ],
@@ -364,7 +357,7 @@ def test_results_of_all_versions_of_mediapipe(name, wrap, nobody):
     refused("got part='body'", from_mediapipe, results, (5, 5), "body")
 
 
-@pytest.mark.parametrize("word", ["p", "prob", "Likelihood", "v", "visibility"])
+@pytest.mark.parametrize("word", ["p", "Likelihood", "visibility"])
 @pytest.mark.parametrize("size", [[], ["--image-size", "1000x1000"]])
 def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
     score, path = np.random.default_rng(0).uniform(0.2, 1.0, (N, 8)), tmp_path / "a.csv"
@@ -382,9 +375,9 @@ def test_confidences_are_read_beside_sizes(tmp_path, fits, word, size):
         assert fits(path, *options, *told[2].split()).err == ""
 
 
-@pytest.mark.parametrize("word", ["p", "v", "c", "V"])
 @pytest.mark.parametrize(
-    "numbers", ["-3 310", "0 1013.2", "2 3", "0.2 1", "0 1 2", "0.5"]
+    ("word", "numbers"),
+    [("p", "0 1013.2"), ("v", "-3 310"), ("c", "2 3"), ("V", "0 1 2"), ("p", "0.5")],
 )
 def test_pressures_and_velocities_are_no_confidences(
     tmp_path, fits, fails, word, numbers
@@ -458,8 +451,14 @@ def test_specimens_of_tps(tmp_path):
     refused("there are more than 7 landmarks", read_landmarks, path)
 
 
-@pytest.mark.parametrize("names", ["frame landmark_index", "t bodypart", "Frame id"])
-@pytest.mark.parametrize("further", [[], ["video"], ["hand", "participant"]])
+@pytest.mark.parametrize(
+    ("names", "further"),
+    [
+        ("frame landmark_index", []),
+        ("t id", ["video"]),
+        ("Frame id", ["hand", "participant"]),
+    ],
+)
 def test_the_recipe_for_a_row_a_point_has_the_names_of_the_table(names, further):
     frame, point = names.split()
     rows = [(i, j, *TRACKS[i, j]) for i in range(12) for j in range(8)]
@@ -589,13 +588,9 @@ def test_corners_of_boxes_are_no_points(box, name):
     assert_array_equal(landmark_table(table, **options).points, FLAT)
 
 
-@pytest.mark.parametrize("letters", [ascii_lowercase, ascii_uppercase])
-@pytest.mark.parametrize(
-    "name",
-    ["{part}_{axis}", "{axis}_{part}", "{part}.{axis}", "{axis}{part}", "{part}{axis}"],
-)
-def test_points_w_and_h_are_no_sizes_of_boxes(letters, name):
-    table, options = table_of(name, files.scene(2, 26), letters), {}
+@pytest.mark.parametrize("name", ["{part}_{axis}", "{axis}_{part}", "{part}{axis}"])
+def test_points_w_and_h_are_no_sizes_of_boxes(name):
+    table, options = table_of(name, files.scene(2, 26), ascii_lowercase), {}
     if not {*"_."} & {*name}:
         told = str(refused("--columns", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")

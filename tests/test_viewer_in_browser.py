@@ -12,12 +12,11 @@ from export_models import (
     face_model,
     faces,
 )
-from layers import one_start
 from numpy.testing import assert_allclose
 
 from isa_nrsfm.export import write_viewer
 
-pytestmark = [pytest.mark.browser, one_start]
+pytestmark = pytest.mark.browser
 
 FRAME = "new Promise((done) => requestAnimationFrame("
 DRAWN = FRAME + "() => requestAnimationFrame(done)))"
