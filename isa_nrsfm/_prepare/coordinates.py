@@ -66,9 +66,8 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     coordinates is one point in all frames, and others are around it.
     """
     places = np.ascontiguousarray(tracks, dtype=float).view(complex)[..., 0]
-    known = np.flatnonzero(~np.isnan(places))
-    some = known[:: -(-len(known) // MOST_PLACES) or 1]
-    shown = places.ravel()[some] + 0  # -0.0 + 0.0 is 0.0
+    shown = places[~np.isnan(places)]
+    shown = shown[:: -(-len(shown) // MOST_PLACES) or 1] + 0  # -0.0 + 0.0 is 0.0
     found, warned = {0j}, False
     for some in (shown, shown[shown.real == shown.imag]):
         if len(some):
