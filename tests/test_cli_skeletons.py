@@ -105,9 +105,8 @@ def test_edges_of_a_file(fits, succeeds, table, bodies_fit, tmp_path):
         return edges_of(tmp_path / "a.html")[0]
 
     assert drawn("--edges", "none") == set()
-    # Of triangles the sides are drawn, each once.
-    own.write_text("0,1,2\n2,1,3\n")
-    assert drawn("--edges", own) == {(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)}
+    own.write_text("5,7\n7,9\n")
+    assert drawn("--edges", own) == {(5, 7), (7, 9)}
     config.write_text("skeleton:\n- ['5', '7']\n- ['6', '8']\n")
     assert drawn("--skeleton", config) == {(5, 7), (6, 8)}
     export = ["export", bodies_fit.path, "-o", tmp_path / "a.glb"]
@@ -171,7 +170,7 @@ def test_edges_are_numbers_of_named_points(run, fails, bodies, tmp_path):
     edges, out = tmp_path / "edges.csv", tmp_path / "out"
     fit = ["fit", table, "-o", out, "--no-figures", *QUICK, "--edges", edges]
     edges.write_text("5,7\n7,17\n")
-    assert "line 2: expected the names of two or three points" in run(*fit)[2]
+    assert "line 2: expected the names of two points" in run(*fit)[2]
     edges.write_text("5,7\n7,j09\n")
     # Of some of the points, numbers could be those of the table or of these points.
     message = "such as j05, j06 (without --points also their numbers from zero)"

@@ -267,12 +267,9 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
     ("change", "message"),
     [
         ({"kind": "tree"}, "kind must be one of"),
-        ({"curves": ((0,),)}, "at least two points"),
         ({"curves": ((0, 4),)}, "are 0 to 3; got 4"),
         ({"up": ((-1, 2),)}, "are 0 to 3; got -1"),
         ({"point_names": ("a", "b", "b", "c")}, "4 different names; got 3"),
-        ({"left": (0, 1), "right": (2,)}, "got 2 and 1, 3 different"),
-        ({"left": (0,), "right": (0,)}, "got 1 and 1, 1 different"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(change, message):

@@ -115,11 +115,6 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     """
     cameras, usable = usable_cameras(motion)
     weights = np.asarray(alpha, dtype=np.float64)
-    if weights.ndim != 2 or len(weights) != len(cameras):
-        raise ValueError(
-            f"alpha must be of the shape ({len(cameras)}, n_components) for "
-            f"{len(cameras)} cameras; got {weights.shape}"
-        )
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
     fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
@@ -198,12 +193,6 @@ def euclidean_frames(
     weights = np.asarray(alpha, dtype=np.float64)
     mean = np.asarray(mean_shape, dtype=np.float64)
     directions = np.asarray(basis, dtype=np.float64)
-    n_components = len(metric.strain)
-    if weights.shape != (len(cameras), n_components):
-        raise ValueError(
-            f"alpha must be of the shape ({len(cameras)}, {n_components}), for the "
-            f"cameras and the metric; got {weights.shape}"
-        )
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
 

@@ -1,7 +1,7 @@
 """Metric upgrade of affine cameras of a rigid shape, and Euclidean shapes."""
 
 from operator import itemgetter
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,21 +64,6 @@ class MetricUpgrade(NamedTuple):
     residual: float
     condition_number: float
 
-    def mirrored(self) -> Self:
-        """
-        Return the upgrade to the mirror image, which fits equally well.
-
-        Returns
-        -------
-        MetricUpgrade
-            With ``Q @ diag(1, 1, -1)``; Euclidean shapes become their mirror images
-            with the opposite sign of z, and rotations ``D R D`` with ``D = diag(1, 1,
-            -1)``.
-        """
-        depth = np.array([1.0, 1.0, -1.0])
-        rotations = depth[:, None] * self.rotations * depth
-        return self._replace(Q=self.Q * depth, rotations=rotations)
-
 
 def metric_upgrade(
     motion: ArrayLike, camera: CalibratedCamera = "weak_perspective"
@@ -104,7 +89,7 @@ def metric_upgrade(
     MetricUpgrade
         Named tuple of Q, rotations, scales, residual and condition_number. Q and ``Q @
         diag(1, 1, -1)`` fit the cameras equally well. The returned Q has a positive
-        determinant; `MetricUpgrade.mirrored` returns the other one.
+        determinant.
 
     Raises
     ------

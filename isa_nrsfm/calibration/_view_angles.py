@@ -103,11 +103,6 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
         where the object looks straight up or down, as yaw and roll have no meaning
         there.
 
-    Raises
-    ------
-    ValueError
-        If there is not one covariance for each frame.
-
     Notes
     -----
     With ``R = Z(roll) X(x) Y(y)``, x = -pitch and y = -yaw, the rotation vector of
@@ -124,12 +119,7 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
            [ 0. ]])
     """
     C = np.asarray(covariance, dtype=np.float64)
-    n_frames = len(angles.yaw)
-    if C.shape != (n_frames, 3, 3):
-        raise ValueError(
-            f"covariance must be of the shape ({n_frames}, 3, 3); got {C.shape}"
-        )
-    deviations = np.full((3, n_frames), np.nan)
+    deviations = np.full((3, len(C)), np.nan)
     known = np.isfinite(angles.yaw) & np.isfinite(C).all(axis=(1, 2))
     if known.any():
         Y = Rotation.from_euler("y", -angles.yaw[known, None], degrees=True)

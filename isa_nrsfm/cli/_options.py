@@ -198,7 +198,7 @@ HELP = {
     "alpha_1_std; with calibrated cameras the viewer has error bars of the depths",
     "viewer FILE": "write a page that shows the new frames in 3D (.html)",
     "edges FILE": "lines to draw between points: a .csv file with the names or numbers "
-    "of two points per line, or of three for a surface; 'none' draws only points",
+    "of two points per line; 'none' draws only points",
     "skeleton LAYOUT": "the layout of the points, if names, number and order of the "
     f"points do not determine it: {', '.join(choices.SKELETON_NAMES)}, or the "
     "config.yaml of DeepLabCut",

@@ -439,7 +439,7 @@ def drawing_files(args: Namespace) -> list[str]:
 def drawing(
     args: Namespace, names: Sequence[str], stored: Skeleton | None
 ) -> dict[str, Any]:
-    """Return the options of displays: lines or surfaces to draw, where y is zero.
+    """Return the options of displays: lines to draw, where y is zero.
 
     The lines are those of an option, or of the skeleton stored in the table.
     """
@@ -463,7 +463,7 @@ def drawing(
 
 
 def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
-    """Read pairs or triples of points (n_edges, 2 or 3), by name or also by number."""
+    """Read pairs of points (n_edges, 2), by name or also by number."""
     with reading(path, "a list of edges"):
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     edges: list[list[int]] = []
@@ -473,11 +473,10 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
         if not line.strip():
             continue
         edges.append([numbers.get(name.strip(), -1) for name in line.split(",")])
-        sizes = {len(edge) for edge in edges}
-        if sizes not in ({2}, {3}) or -1 in edges[-1]:
+        if len(edges[-1]) != 2 or -1 in edges[-1]:
             raise ValueError(
-                f"{path}, line {number}: expected the names of two or three points "
-                f"with commas between them, such as {', '.join(names[:2])} (without "
+                f"{path}, line {number}: expected the names of two points with "
+                f"a comma between them, such as {', '.join(names[:2])} (without "
                 f"--points also their numbers from zero); got {line!r}"
             )
     if not edges:

@@ -111,8 +111,8 @@ def write_viewer(
     n_frames : int, default=1000
         Maximum number of frames of the page, spread evenly over the table.
     edges : "auto", Skeleton, str, None or array-like, default="auto"
-        Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, pairs of points
-        (n_edges, 2), or triangles (n_triangles, 3), whose sides are drawn. "auto"
+        Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
+        points (n_edges, 2). "auto"
         recognises a known layout by the names or by the number and order of the points.
         A layout has separate colours for left and right. Up to 400 points without a
         known one are joined by a minimal spanning tree: of all trees the one with the
@@ -312,11 +312,9 @@ def write_glb(
         The file, with the suffix ``.glb``. An existing file is replaced.
     edges : "auto", Skeleton, str, None or array-like, default="auto"
         Parts to draw in addition to the points: a layout of `isa_nrsfm.skeletons` or
-        its name, with left and right as separate primitives and colours; integers of
-        shape (n_edges, 2), pairs of points to be joined; or (n_triangles, 3), the
-        triangles of a surface, counter-clockwise as seen from outside; or None for
-        nothing. "auto" recognises the layout of hands and bodies by the names or the
-        number and order of the points. Otherwise it is a surface of the Delaunay
+        its name; pairs of points (n_edges, 2); or None for nothing. "auto" recognises
+        the layout of hands and bodies by the names or the number and order of the
+        points. Otherwise it is a surface of the Delaunay
         triangles of the front view, with the layout of a face drawn on it, or the tree
         of `write_viewer`. More than 400 points of a surface are not drawn as points.
     names : sequence of str of length n_components, default=None
@@ -363,9 +361,7 @@ def write_glb(
     factor = 1 / np.ptp(shapes[0], axis=0).max()
     shapes = factor * shapes
     lines, surface = space.lines, None
-    if np.shape(cast(Any, edges))[1:] == (3,):
-        lines, surface = None, np.asarray(edges)
-    elif isinstance(edges, str) and edges == "auto":
+    if isinstance(edges, str) and edges == "auto":
         if lines is None or lines.kind in ("face", "other"):
             surface = frontal_triangles(shapes[0])
 

@@ -254,7 +254,7 @@ class ReprojectionDisplay:
         import_optional("matplotlib", extra="plot")
         n_frames = len(self.frames)
         n_columns = min(3, n_frames) if n_columns is None else n_columns
-        height = (self._panel_height() + 0.4) * -(-n_frames // n_columns)
+        height = (PANEL_WIDTH + 0.4) * -(-n_frames // n_columns)
         size = (PANEL_WIDTH * n_columns, height + _axes.LEGEND_HEIGHT)
         self.axes_ = _axes.flat_axes(
             ax, n_frames, "one for each frame", n_columns, figsize=size
@@ -271,13 +271,6 @@ class ReprojectionDisplay:
             scale = 4.0 if _axes.is_dense(self.observed[0]) else 1.0
             _axes.add_legend(self.figure_, entries, self.skeleton, markerscale=scale)
         return self
-
-    def _panel_height(self) -> float:
-        """Return the height of panels that suits most frames, in inches."""
-        points = np.concatenate([self.observed, self.reprojected], axis=1)
-        width, height = (np.nanmax(points, axis=1) - np.nanmin(points, axis=1)).T
-        aspect = np.divide(height, width, out=np.ones_like(width), where=width > 0)
-        return PANEL_WIDTH * float(np.clip(np.median(aspect), 0.4, 1.3))
 
     def _plot_frame(self, axes: Any, i: int) -> None:
         """Draw one frame."""

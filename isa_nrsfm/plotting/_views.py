@@ -19,9 +19,9 @@ from isa_nrsfm.calibration import _metric, canonical_pose
 from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
-from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton, edges_of
+from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
 
-# A name of a layout or "auto", the layout itself, pairs of points or triangles.
+# A name of a layout or "auto", the layout itself, or pairs of points.
 Edges = ArrayLike | Skeleton | str | None
 Origin = Literal["auto", "upper", "lower"]
 
@@ -139,7 +139,7 @@ def choose_lines(
     if edges is None:
         lines = None
     elif not named:
-        pairs = edges_of(checked_links("edges", edges, len(shape), triangles=True))
+        pairs = checked_links("edges", edges, len(shape))
     elif layout is None and not is_dense(shape):
         pairs = spanning_tree(shape if seen is None else seen)
     if pairs is not None:

@@ -89,17 +89,13 @@ def checked_skeleton(given: Any, n_points: int) -> Skeleton:
     return skeleton
 
 
-def checked_links(
-    name: str, links: Any, n_points: int, *, triangles: bool = False
-) -> NDArray[np.intp]:
-    """Return pairs of points, or triangles if these are allowed, or raise."""
+def checked_links(name: str, links: Any, n_points: int) -> NDArray[np.intp]:
+    """Return pairs of points, or raise."""
     found = np.asarray(links)
-    widths = (2, 3) if triangles else (2,)
-    if found.ndim != 2 or found.shape[1] not in widths or found.dtype.kind not in "iu":
-        other = " or (n_triangles, 3)" * triangles
+    if found.ndim != 2 or found.shape[1] != 2 or found.dtype.kind not in "iu":
         raise ValueError(
-            f"{name} must be integers of shape (n_pairs, 2){other}, the numbers of "
-            f"points; got shape {found.shape} and dtype {found.dtype}"
+            f"{name} must be integers of shape (n_pairs, 2), the numbers of points; "
+            f"got shape {found.shape} and dtype {found.dtype}"
         )
     if found.size and (found.min() < 0 or found.max() >= n_points):
         raise ValueError(
@@ -107,14 +103,6 @@ def checked_links(
             f"{found.max()}"
         )
     return found.astype(np.intp)
-
-
-def edges_of(links: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return pairs of points as they are, and the sides of triangles, once."""
-    if links.shape[1] == 2:
-        return links
-    sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    return np.unique(np.sort(sides, axis=1), axis=0)
 
 
 def find_skeleton(

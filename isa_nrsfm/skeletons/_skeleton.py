@@ -58,8 +58,7 @@ class Skeleton:
     Raises
     ------
     ValueError
-        If points do not exist, a name is not given to one point, or the sides are not
-        of equal length or have points in common.
+        If points do not exist, or a name is not given to one point.
 
     See Also
     --------
@@ -95,8 +94,6 @@ class Skeleton:
         """Check that the parts fit together."""
         if self.kind not in KINDS:
             raise ValueError(f"kind must be one of {KINDS}; got {self.kind!r}")
-        if any(len(curve) < 2 for curve in self.curves):
-            raise ValueError("a curve needs at least two points")
         parts = *self.curves, *self.up, *self.front, *self.across
         named = chain(*parts, self.left, self.right, self.contour)
         strange = [j for j in named if not 0 <= j < self.n_points]
@@ -110,12 +107,6 @@ class Skeleton:
             raise ValueError(
                 f"point_names must hold {self.n_points} different names; got "
                 f"{len({*names})}"
-            )
-        sides = {*self.left, *self.right}
-        if len(self.left) != len(self.right) or len(sides) != 2 * len(self.left):
-            raise ValueError(
-                "left and right must have as many points each, and none in common; got "
-                f"{len(self.left)} and {len(self.right)}, {len(sides)} different ones"
             )
 
     @property
