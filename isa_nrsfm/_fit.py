@@ -236,9 +236,6 @@ def _factorised(
 ) -> FactorisedTable:
     """Return a table with outliers (robust loss), completed frames and factors."""
     limits, n_points = settings.limits, table.n_points
-    # Frames with many points are fitted by directions.
-    many = settings.joint and settings.prior is None
-    many = many and n_points > max(24 * (n_components + 1), limits.many_points)
     # Calibrated cameras can have more basis shapes than the factorisation.
     n_triplets = min(3 * n_components + 3, n_points - 1)
     n_components = min(n_components, largest_n_components(n_points))
@@ -265,7 +262,8 @@ def _factorised(
         W, parts = completed.whole().reshape(shape), []
     factors = factorise(W, n_components, table.precision, triplets)
     compressed = None
-    if many:
+    few = max(24 * (n_components + 1), limits.many_points)
+    if settings.prior is None and n_points > few:
         directions = np.concatenate([factors.rigid_shape, factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         compressed = JointFrames.from_directions(completed, directions)

@@ -320,6 +320,23 @@ def test_a_stream_of_frames_keeps_its_memory(model):
     assert after - before < 100 * 500
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "most"), [("complete", 2.5), ("holes", 3.5), ("weights", 4.0)]
+)
+def test_a_fit_takes_few_times_the_memory_of_its_table(kind, most):
+    X = make_nonrigid_tracks(20_000, 68, 5, noise=0.02, random_state=0).data
+    weights = np.random.default_rng(0).uniform(0.5, 1.5, (20_000, 68))
+    if kind == "holes":
+        X.reshape(*weights.shape, 2)[weights < 0.55] = np.nan
+    model = AffineNRSfM(5, random_state=0)
+    tracemalloc.start()
+    model.fit(X, point_weight=weights if kind == "weights" else None)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < most * X.nbytes
+
+
 def with_unknown_rows():
     """Return a table of which rows 1, 4, 5 and 6 do not tell their camera."""
     tracks = COMPLETE.tracks[:10].copy()

@@ -61,6 +61,10 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
     calls.clear()
     FrameBlocks.of_array(array, 10).derive(recorded).whole()
     assert calls == [10, 10, 3]
+    again = FrameBlocks.of_array(array, 10).derive(recorded, kept=False)
+    again.whole()
+    again.whole()
+    assert calls == [10, 10, 3] * 3
 
 
 @pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])

@@ -176,8 +176,7 @@ def _problems(
     """Yield the problems of growing samples, one at a time, and of all frames."""
     limits, frames = settings.limits, table.compressed or _visible_frames(table)
     thorough = frames.n_frames <= limits.few_frames
-    prior = settings.shape_prior
-    penalty = 0.0 if prior else frames.basis_penalty(limits.basis_std)
+    penalty = 0.0 if settings.shape_prior else frames.basis_penalty(limits.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
     # Each parameter that fits noise only lowers -2 log L by about one. Steps on a
     # sample end when they gain less than 3 % of the number of shape parameters.

@@ -240,9 +240,8 @@ def orientations(rows: NDArray) -> NDArray:
     """Return the sign of the third moment, or largest entry, of rows (n, m)."""
     largest = np.abs(rows).max(axis=1, keepdims=True)
     scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
-    cubes = scaled**3
-    moment = np.sum(cubes, axis=1)
-    decisive = np.abs(moment) > 1e-9 * np.sum(np.abs(cubes), axis=1)
+    moment = np.sum(scaled**3, axis=1)
+    decisive = np.abs(moment) > 1e-9 * np.sum(np.abs(scaled) ** 3, axis=1)
     extreme = scaled[np.arange(len(rows)), np.abs(scaled).argmax(axis=1)]
     return np.where(np.where(decisive, moment, extreme) < 0, -1.0, 1.0)
 

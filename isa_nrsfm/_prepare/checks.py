@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from sklearn.utils import check_array
 from sklearn.utils.validation import validate_data
 
@@ -211,13 +210,12 @@ def check_points(
             f"determine {equations} numbers of the shapes, which have {unknowns}. Take "
             "fewer basis shapes, or leave out points that are rarely visible"
         )
-    # Points of the first one's group, frame by frame; all groups if others are left
-    before, group = np.array(False), np.arange(n_points) == 0
+    # Points seen together take the least number of their frames, until none changes.
+    before, group = np.array(-1), np.arange(n_points)
     while (group != before).any():
-        before, group = group, group | seen[seen[:, group].any(axis=1)].any(axis=0)
-    if not group.all():
-        shown = seen.astype(np.float32)
-        n_groups, group = connected_components(shown.T @ shown)
+        least = np.where(seen, group, n_points).min(axis=1, keepdims=True)
+        before, group = group, np.where(seen, least, n_points).min(axis=0)
+    if (n_groups := len(np.unique(group))) > 1:
         raise ValueError(
             f"the points fall into {n_groups} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "

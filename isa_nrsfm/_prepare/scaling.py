@@ -231,14 +231,12 @@ def weighted_rows(
             f"point {point}. Give points without information the weight 0"
         )
     nan = rows.empty.dtype.type(np.nan)
-    visible = rows.derive(
-        lambda r, w: np.where(w[:, None] == 0, nan, r), weights, kept=False
-    )
-    seen = visible.joined(seen_points)
+    shown = rows.derive(lambda r, w: np.where(w, r, nan), weights[:, None], kept=False)
+    seen = shown.joined(seen_points)
     weights = np.where(seen, weights, 0.0)
     least = LEAST_WEIGHT * weights.max(axis=1, keepdims=True, initial=0.0)
     weights = np.where(weights > 0, np.maximum(weights, least), 0.0)
-    return visible, () if (weights == seen).all() else (weights,)
+    return shown, () if (weights == seen).all() else (weights,)
 
 
 def check_weights(weights: NDArray, n_components: int, camera: str | None) -> None:

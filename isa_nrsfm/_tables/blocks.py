@@ -78,9 +78,7 @@ class FrameBlocks:
             return map(result, numbers)
         return in_threads(result, numbers, self.n_threads)
 
-    def derive(
-        self, function: Callable[..., Any], *by_frame: NDArray, kept: bool = True
-    ) -> Self:
+    def derive(self, function: Callable, *by_frame: NDArray, kept: bool = True) -> Self:
         """Return blocks of the results of a function of each block (see `map`)."""
         read = self._results(function, by_frame)
         if self.cached and kept:
@@ -185,9 +183,7 @@ class DaskBlocks(FrameBlocks):
         """Return the results of a function of each block, in order."""
         return iter(self._run("compute", self._tasks(function, *by_frame)))
 
-    def derive(
-        self, function: Callable[..., Any], *by_frame: NDArray, kept: bool = True
-    ) -> Self:
+    def derive(self, function: Callable, *by_frame: NDArray, kept: bool = True) -> Self:
         """Return new blocks, the results of a function of each of these."""
         tasks = self._tasks(function, *by_frame)
         derived = type(self)(self._run("persist", tasks), self.lengths)

@@ -64,12 +64,10 @@ def open_table(
     empty = np.empty((0, 2, X.shape[1] // 2), dtype)
     if not is_read_later(X):
         # Views of the table: each block is copied when it is read.
-        views = table_to_tracks(X, layout).transpose(0, 2, 1)
-        rows = clean_rows(views, layout, names)
+        rows = clean_rows(table_to_tracks(X, layout).transpose(0, 2, 1), layout, names)
         blocks = FrameBlocks.of_array(rows, min(length, 2048), n_threads)
-        blocks = blocks.derive(np.ascontiguousarray, kept=False)
         blocks.empty = empty
-        return blocks
+        return blocks.derive(np.ascontiguousarray, kept=False)
     if is_on_dask(X):
         blocks = DaskBlocks.of_chunks(X)
     else:
