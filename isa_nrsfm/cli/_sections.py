@@ -495,7 +495,7 @@ def _score(label: dict[str, Any]) -> str:
 def _many(label: dict[str, Any]) -> list[str]:
     """Return that classes have too many coefficients for their frames, if they have.
 
-    From half of the frames of a fit: docs/benchmarks/README.md, "Thresholds".
+    From .4 coefficients a frame: docs/benchmarks/README.md, "Thresholds".
     """
     n_frames, n_components = label["n_frames"], len(label["values"])
     if label["score"] != "accuracy" or n_components < 0.4 * n_frames:
