@@ -21,6 +21,7 @@ from hypothesis import settings
 from sklearn.utils import estimator_checks
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._joint.settings import LIMITS
 
 matplotlib.use("Agg")
 
@@ -100,6 +101,13 @@ def one_start(request):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(AffineNRSfM, "_limits", quick)
         yield
+
+
+@pytest.fixture(autouse=True)
+def all_starts(request, one_start, monkeypatch):
+    """Let joint fits of slow tests have all starts, as those of users."""
+    if request.node.get_closest_marker("slow"):
+        monkeypatch.setattr(AffineNRSfM, "_limits", LIMITS)
 
 
 @pytest.fixture

@@ -157,7 +157,7 @@ def test_first_widths_make_no_difference(frontal, adapt):
 def test_accuracy(turned, adapt, degrees):
     table = study(2, 40, degrees, change=0.04, noise=0.6)
     with warnings.catch_warnings(action="ignore"):  # of depth, and of other objects
-        own, prior = fitted(table.X), turned.model
+        own, prior = fitted(table.X), fitted(turned.X, kind=Thorough)
         others = [error(model, table.S, table.X) for model in (own, prior)]
     model = fitted(table.X, prior, Thorough, adapt=adapt)
     reached = error(model, table.S, table.X)

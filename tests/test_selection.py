@@ -116,7 +116,8 @@ def test_nothing_is_there_before_the_fit():
 
 
 @pytest.mark.slow
-def test_neither_order_nor_workers_change_the_result(fitted):
+def test_neither_order_nor_workers_change_the_result():
+    fitted = AffineNRSfMCV((1, 2, 3), estimator=inner(), cv=3).fit(X)
     other = AffineNRSfMCV((3, 1, 2), estimator=inner(), cv=3, n_jobs=2).fit(X)
     for name in ("param_n_components", "split1_test_score"):
         assert_array_equal(other.cv_results_[name], fitted.cv_results_[name])
