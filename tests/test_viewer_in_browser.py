@@ -228,7 +228,7 @@ def test_pages_fit_the_width_of_the_window(browser, page, width, mobile):
 
 def test_one_basis_shape_and_no_face(browser, tmp_path):
     path = tmp_path / "viewer.html"
-    write_viewer(blob_model(), path, n_frames=0, edges=[[0, 1, 2]])
+    write_viewer(blob_model(), path, n_frames=0, edges=[[0, 1], [1, 2]])
     browser.open(path.as_uri())
     browser.run(DRAWN)
     assert browser.complaints() == []

@@ -9,12 +9,12 @@ import warnings
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, export
+from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
@@ -22,6 +22,9 @@ from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
 from isa_nrsfm.skeletons._column_names import names_of_points
+
+if TYPE_CHECKING:
+    from isa_nrsfm import AffineNRSfMCV
 
 PAGE = "report.html"
 REPORT = "report.json"
@@ -59,7 +62,7 @@ class Fit(NamedTuple):
 
     estimator: AffineNRSfM
     frames: Frames
-    search: AffineNRSfMCV | None
+    search: "AffineNRSfMCV | None"
     smooth: Any
     drawn: dict[str, Any]
     explained: NDArray
