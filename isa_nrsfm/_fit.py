@@ -57,6 +57,7 @@ from isa_nrsfm._joint.problem import FactorisedTable, JointState
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
+    FrameFits,
     depth_certainty,
     fitted_frames,
     frame_certainty,
@@ -263,7 +264,7 @@ def _factorised(
     factors = factorise(W, n_components, table.precision, triplets)
     compressed = None
     few = max(24 * (n_components + 1), limits.many_points)
-    if settings.prior is None and n_points > few:
+    if settings.joint and settings.prior is None and n_points > few:
         directions = np.concatenate([factors.rigid_shape, factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         compressed = JointFrames.from_directions(completed, directions)
@@ -320,7 +321,7 @@ def _paper_frames(
 
 
 def _joint_frames(
-    table: ScaledTable, model: PosteriorFrames, fits: Any, s: FitSettings
+    table: ScaledTable, model: PosteriorFrames, fits: FrameFits, s: FitSettings
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of fits in the independent gauge."""
     posteriors, motion, alpha, covariance, _ = fits

@@ -70,6 +70,10 @@ LEAST_NOISE = 1e-6
 FAR = 1000.0
 
 
+# Result of `fitted_frames`.
+FrameFits = tuple[FrameBlocks, NDArray, NDArray, NDArray, float]
+
+
 def inlying_rows(
     model: PosteriorFrames, rows: FrameBlocks, most: int, weights: NDArray | None = None
 ) -> tuple[NDArray, FramePosterior, NDArray | None]:
@@ -91,7 +95,7 @@ def inlying_rows(
 
 def fitted_frames(
     model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
-) -> tuple[FrameBlocks, NDArray, NDArray, NDArray, float]:
+) -> FrameFits:
     """Return the fits of all frames in blocks of FramePosterior, before the gauge.
 
     Also returns cameras, coefficients, the mean of their covariances (K, K), and the
@@ -135,12 +139,12 @@ def shape_information(
 
 def frame_certainty(
     frames: PosteriorFrames,
-    fits: Any,
+    fits: FrameFits,
     n_seen: NDArray,
     weight: NDArray,
     prior: ShapePrior | None,
 ) -> DepthCertainty:
-    """Return the certainty with that of `fits`, the result of `fitted_frames`.
+    """Return the certainty with that of the residuals of frames.
 
     n_seen (n,): numbers of seen points. weight (n,): sums of their weights. Camera,
     position and coefficients fit a part of the coordinates of a frame. All other

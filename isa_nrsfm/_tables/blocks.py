@@ -269,23 +269,16 @@ def read_rows(table: Any, rows: slice) -> NDArray:
     return block
 
 
-def order_by_halves(rows: FrameBlocks) -> NDArray:
-    """Return an order of frames (n_frames,) that stays the same when they are permuted.
+def _share_of_x(rows: NDArray) -> NDArray:
+    """Return the share (n_frames,) of x in the energy of rows (n_frames, 2, n_points).
 
-    Frames (n_frames, ...) are sorted by the share of their energy in the first half of
-    their entries: for rows (2, n_points) the share of x. NaN counts as zero.
+    NaN counts as zero.
     """
-    return np.argsort(rows.joined(_first_half), kind="stable")
-
-
-def _first_half(rows: NDArray) -> NDArray:
-    """Return the share (n_frames,) of the energy in the first half of each row."""
-    flat = rows.reshape(len(rows), -1)
-    if np.isnan(flat.sum()):
-        flat = np.where(np.isnan(flat), 0.0, flat)
-    half, rest = (energies(part) for part in np.array_split(flat, 2, axis=1))
-    energy = half + rest
-    return np.divide(half, energy, where=energy > 0, out=np.zeros_like(energy))
+    if np.isnan(rows.sum()):
+        rows = np.where(np.isnan(rows), 0.0, rows)
+    x, y = map(energies, rows.swapaxes(0, 1))
+    energy = x + y
+    return np.divide(x, energy, where=energy > 0, out=np.zeros_like(energy))
 
 
 def spread(order: NDArray, n: int) -> NDArray:
@@ -298,12 +291,13 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     """
     Return indices of about `most` frames of rows (I, 2, J), for the model of a table.
 
-    They are spread evenly over `order_by_halves`, independent of the order of the
-    table. For each point that few of them show, frames that show it are added.
+    They are spread evenly over the frames in the order of their share of x, which does
+    not depend on the order of the table. For each point that few of them show, frames
+    that show it are added.
     """
     if rows.n_frames <= most:
         return np.arange(rows.n_frames)
-    order = order_by_halves(rows)
+    order = np.argsort(rows.joined(_share_of_x), kind="stable")
     chosen = np.isin(np.arange(rows.n_frames), spread(order, most))
     fewest = min(200, most // 5)
     shown = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))

@@ -13,13 +13,7 @@ from typing import Any
 import numpy as np
 from sklearn.model_selection import GroupKFold
 
-from isa_nrsfm import (
-    AffineNRSfM,
-    AffineNRSfMCV,
-    FastISA,
-    PooledFastICA,
-    __version__,
-)
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
 from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
@@ -35,11 +29,7 @@ from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, NONE, flag_of
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
-from isa_nrsfm.cli._report import (
-    model_report,
-    perspective_report,
-    table_report,
-)
+from isa_nrsfm.cli._report import model_report, perspective_report, table_report
 from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
@@ -105,7 +95,8 @@ def fit_table(
             earlier = _outputs.entry_of_report(folder, "sha256")
             own = {*earlier, _outputs.REPORT} if earlier else ()
             _outputs.refuse_replacing([folder / name for name in files], own)
-        removed = {*_old_figures(folder), *figures}
+        old = _outputs.entry_of_report(folder, "files")
+        removed = {*figures, *(name for name in old if name.endswith(".png"))}
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
@@ -277,12 +268,6 @@ def _fitted(
     estimator.set_params(verbose=0)
     clock["fit"] = time.perf_counter()
     return estimator, search, diagnostics, perspective
-
-
-def _old_figures(folder: Path) -> list[str]:
-    """Return the figures that the report of an earlier run lists."""
-    files = _outputs.entry_of_report(folder, "files")
-    return [name for name in files if name.endswith(".png")]
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:

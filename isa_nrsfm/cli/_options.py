@@ -258,7 +258,8 @@ HELP = {
     "share of the variance that they explain, such as 0.98 (default: number of basis "
     "shapes)",
     "names NAMES": "for .html and .glb, names of the basis shapes with commas",
-    "mirrored": "take the mirror image in depth, which has the same images",
+    "mirrored": "take the mirror image in depth, which has the same images; faces and "
+    "bodies of known layouts have the nose in front in any case",
 }
 # The values of options that have few.
 CHOICES: dict[str, Sequence[str]] = {

@@ -349,7 +349,7 @@ def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
 def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str]:
     """Return comparison, focal length and unit of positions of perspective cameras."""
     focal, deviation = model["focal_length"], model["focal_length_std"]
-    compared = [_sentence(text) for text in [model["perspective"]] if text]
+    compared = [_sentence(model["perspective"])] if model["perspective"] else []
     if focal is None:
         return compared
     if not math.isfinite(focal):

@@ -112,11 +112,11 @@ def write_viewer(
         Maximum number of frames of the page, spread evenly over the table.
     edges : "auto", Skeleton, str, None or array-like, default="auto"
         Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
-        points (n_edges, 2). "auto"
-        recognises a known layout by the names or by the number and order of the points.
-        A layout has separate colours for left and right. Up to 400 points without a
-        known one are joined by a minimal spanning tree: of all trees the one with the
-        shortest lines, by the distances in the images.
+        points (n_edges, 2). "auto" recognises a known layout by the names or by the
+        number and order of the points. A layout has separate colours for left and
+        right. Up to 400 points without a known one are joined by a minimal spanning
+        tree: of all trees the one with the shortest lines, by the distances in the
+        images.
     names : sequence of str of length n_components, default=None
         Names of the basis shapes; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
@@ -314,9 +314,9 @@ def write_glb(
         Parts to draw in addition to the points: a layout of `isa_nrsfm.skeletons` or
         its name; pairs of points (n_edges, 2); or None for nothing. "auto" recognises
         the layout of hands and bodies by the names or the number and order of the
-        points. Otherwise it is a surface of the Delaunay
-        triangles of the front view, with the layout of a face drawn on it, or the tree
-        of `write_viewer`. More than 400 points of a surface are not drawn as points.
+        points. Otherwise it is a surface of the Delaunay triangles of the front view,
+        with the layout of a face drawn on it, or the tree of `write_viewer`. More than
+        400 points of a surface are not drawn as points.
     names : sequence of str of length n_components, default=None
         Names of the morph targets; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"

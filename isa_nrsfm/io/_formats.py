@@ -146,12 +146,11 @@ def read_landmarks(
         Points with a lower confidence become NaN, where the format has confidences.
     **options : dict
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
-        pixels, for coordinates in shares of the image's size; ``part``
-        of "openpose", one of "pose", "face",
-        "hand_left" and "hand_right"; ``part`` of whole bodies of "coco" and "mmpose",
-        one of "body", "feet", "face", "left_hand", "right_hand" and "all"; ``columns``
-        and ``missing`` of "table" and "mediapipe", and ``individuals`` of "table", as
-        in `landmark_table`.
+        pixels, for coordinates in shares of the image's size; ``part`` of "openpose",
+        one of "pose", "face", "hand_left" and "hand_right"; ``part`` of whole bodies of
+        "coco" and "mmpose", one of "body", "feet", "face", "left_hand", "right_hand"
+        and "all"; ``columns`` and ``missing`` of "table" and "mediapipe", and
+        ``individuals`` of "table", as in `landmark_table`.
 
     Returns
     -------

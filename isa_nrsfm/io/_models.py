@@ -79,7 +79,7 @@ class NamedStrategy(BaseEstimator):
     transform = fit
 
 
-# Strategies and densities of which parameters and fitted attributes are stored.
+# Strategies of which parameters and fitted attributes are stored.
 STORED: dict[str, Any] = {
     "NamedStrategy": NamedStrategy,
     **{name: getattr(isa, name) for name in vars(isa)["__all__"]},

@@ -150,10 +150,7 @@ def log_likelihood(W: NDArray, Z: NDArray, subspace_size: int) -> NDArray:
 
 
 def fixed_point_step(
-    W: NDArray,
-    Z: NDArray,
-    subspace_size: int,
-    length: NDArray | float = 1.0,
+    W: NDArray, Z: NDArray, subspace_size: int, length: NDArray | float = 1.0
 ) -> NDArray:
     """Return W (n_batch, n, n) after one step of FastISA (Hyvarinen and Koster 2006).
 
@@ -188,12 +185,7 @@ def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
 
 
 def iterate(
-    W: NDArray,
-    Z: NDArray,
-    subspace_size: int,
-    *,
-    max_iter: int,
-    tol: float,
+    W: NDArray, Z: NDArray, subspace_size: int, *, max_iter: int, tol: float
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Repeat `fixed_point_step` on each start until `subspace_change` is below `tol`.
 

@@ -99,11 +99,7 @@ class ModeCovarianceDisplay:
 
     @classmethod
     def from_estimator(
-        cls,
-        estimator: Any,
-        *,
-        component_names: list[str] | None = None,
-        ax: Any = None,
+        cls, estimator: Any, *, component_names: list[str] | None = None, ax: Any = None
     ) -> ModeCovarianceDisplay:
         """
         Draw the mode covariance matrix of a fitted estimator.
