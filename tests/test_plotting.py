@@ -62,7 +62,6 @@ EACH = pytest.mark.parametrize("kind", DISPLAYS)
 
 @pytest.fixture(autouse=True)
 def close_figures():
-    yield
     plt.close("all")
 
 

@@ -151,10 +151,10 @@ def perspective_report(
 ) -> dict[str, Any]:
     """Compare fits of some rows with perspective and without; say what is better.
 
-    Nothing is compared if the fit had other cameras, or outliers that bend it, and if
-    the point of the image on the axis of the camera is not known. The first focal
-    length is too long for most cameras, which does no harm. It takes two or three times
-    as long as the fit without perspective, and the estimate ten.
+    Nothing is compared if the fit had other cameras, or outliers bend it, or the point
+    on the axis of the camera is not known. The first focal length is too long for most
+    cameras, which does no harm. It takes two or three times as long as the fit without
+    perspective, and the estimate ten.
     """
     from isa_nrsfm._selection import StartedNRSfM  # not needed by transform
 

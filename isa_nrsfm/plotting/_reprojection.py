@@ -226,10 +226,7 @@ class ReprojectionDisplay:
         return display.plot(ax, **kw)
 
     def plot(
-        self,
-        ax: Any = None,
-        *,
-        n_columns: int | None = None,
+        self, ax: Any = None, *, n_columns: int | None = None
     ) -> ReprojectionDisplay:
         """
         Draw the frames.
