@@ -460,7 +460,8 @@ def test_transform_gives_each_row_its_coefficients(transforms, fitted, faces, tm
     new["alpha_1"] = "mine"
     path = tmp_path / "new.parquet"
     new[[*LANDMARKS[1::2], "alpha_1", "name", *LANDMARKS[0::2]]].to_parquet(path)
-    alpha, out, _ = transforms(fitted.path, path, "--skip-rows", "name=^ir")
+    alpha, out, err = transforms(fitted.path, path, "--skip-rows", "name=^ir")
+    assert "columns alpha_1: results of these names have an underscore" in err
     assert out.startswith("2 coefficients of 54 frames\n")
     assert " 1 points (0.0272 %) are missing in 1 of these rows\n" in out
     assert out.endswith("54 rows\n")

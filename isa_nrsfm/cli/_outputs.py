@@ -106,6 +106,11 @@ def write_alpha(
     results = results.reindex(frames.points.index)
     results.insert(0, "row", results.index)
     taken = {str(name) for name in frames.other.columns}
+    if renamed := [name for name in results if name in taken]:
+        warn_caller(
+            f"the table has columns {', '.join(renamed)}: results of these names have "
+            "an underscore after theirs"
+        )
     while not taken.isdisjoint(results):
         results = results.rename(columns=lambda name: f"{name}{'_' * (name in taken)}")
     parts = [results.iloc[:, :1], frames.other, results.iloc[:, 1:]]
