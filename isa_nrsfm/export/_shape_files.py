@@ -310,9 +310,14 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     (for doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
     """
     suffix = suffix_of(path, SUFFIXES)
-    checked = PointDistributionModel(*map(np.asarray, pdm))
-    _check_shapes(checked)
-    mean, modes, eigenvalues = checked
+    mean, modes, eigenvalues = checked = PointDistributionModel(*map(np.asarray, pdm))
+    fitting = mean.ndim == 2 and mean.shape[1] == 3 and eigenvalues.ndim == 1
+    if not fitting or modes.shape != (*eigenvalues.shape, *mean.shape):
+        raise ValueError(
+            "mean must have shape (n_points, 3), modes (n_modes, n_points, 3) and "
+            f"eigenvalues (n_modes,); got {mean.shape}, {modes.shape} and "
+            f"{eigenvalues.shape}"
+        )
     M = mean.T.reshape(-1, 1)
     V = modes.transpose(2, 1, 0).reshape(mean.size, len(eigenvalues))
     with whole_file(path) as file:
@@ -362,17 +367,6 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
         if not all(np.isfinite(part).all() for part in pdm):
             raise ValueError("its numbers should be finite; got NaN or infinity")
         return pdm
-
-
-def _check_shapes(pdm: PointDistributionModel) -> None:
-    """Raise if the arrays of a model do not fit each other."""
-    mean, modes, eigenvalues = map(np.shape, pdm)
-    fitting = len(mean) == 2 and mean[1] == 3 and len(eigenvalues) == 1
-    if not fitting or modes != (*eigenvalues, *mean):
-        raise ValueError(
-            "mean must have shape (n_points, 3), modes (n_modes, n_points, 3) and "
-            f"eigenvalues (n_modes,); got {mean}, {modes} and {eigenvalues}"
-        )
 
 
 def _from_matrices(M: NDArray, V: NDArray, E: NDArray) -> PointDistributionModel:

@@ -381,7 +381,7 @@ def write_glb(
         "extras": extras,
     }
     times, weights = _swings(len(targets))
-    sampler = {"input": file.add(times, bounds=True), "interpolation": "LINEAR"}
+    sampler = {"input": file.add(times), "interpolation": "LINEAR"}
     animation = {
         "name": "basis shapes in turn",
         "samplers": [sampler | {"output": file.add(weights.ravel())}],
@@ -407,27 +407,23 @@ class Binary:
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def add(
-        self, array: NDArray, use: int | None = None, *, bounds: bool = False
-    ) -> int:
-        """Add numbers (n,) or vectors (n, 3), integers as indices; return their number.
-
-        The use of the bytes is VERTICES or INDICES; bounds add minimum and maximum.
-        """
-        is_index = array.dtype.kind in "iu"
+    def add(self, array: NDArray) -> int:
+        """Add numbers (n,), vectors (n, 3) or indices (n,); return their number."""
+        is_index, is_vertex = array.dtype.kind in "iu", array.ndim == 2
         array = array.astype("<u4" if is_index else "<f4")
+        rows = array.reshape(len(array), -1)
         accessor = {
             "bufferView": len(self.views),
             "componentType": INTEGERS if is_index else FLOATS,
             "count": len(array),
-            "type": "SCALAR" if array.ndim == 1 else "VEC3",
+            "type": "VEC3" if is_vertex else "SCALAR",
+            "min": rows.min(axis=0).tolist(),
+            "max": rows.max(axis=0).tolist(),
         }
-        if bounds:
-            rows = array.reshape(len(array), -1).astype(float)
-            accessor |= {"min": rows.min(axis=0).tolist()}
-            accessor |= {"max": rows.max(axis=0).tolist()}
         view = {"buffer": 0, "byteOffset": len(self.arrays), "byteLength": array.nbytes}
-        self.views.append(view | ({} if use is None else {"target": use}))
+        if is_index or is_vertex:
+            view["target"] = INDICES if is_index else VERTICES
+        self.views.append(view)
         self.accessors.append(accessor)
         self.arrays += _padded(array.tobytes(), b"\0")
         return len(self.accessors) - 1
@@ -456,7 +452,7 @@ def _primitives(
     file: Binary, shapes: NDArray, surface: NDArray | None, edges: NDArray | None
 ) -> list[dict[str, Any]]:
     """Return a surface, the points, unless there are many on it, and the edges."""
-    position, *drifts = (file.add(x, VERTICES, bounds=True) for x in shapes)
+    position, *drifts = map(file.add, shapes)
     bare: dict[str, Any] = {
         "attributes": {"POSITION": position},
         "targets": [{"POSITION": drift} for drift in drifts],
@@ -466,10 +462,10 @@ def _primitives(
     if surface is None or not is_dense(shapes[0]):
         primitives.append(bare | {"mode": POINTS})
     if surface is not None:
-        indices = file.add(surface.ravel(), INDICES)
+        indices = file.add(surface.ravel())
         primitives.append(bare | {"mode": TRIANGLES, "indices": indices, "material": 1})
     if edges is not None and len(edges):
-        indices = file.add(edges.ravel(), INDICES)
+        indices = file.add(edges.ravel())
         primitives.append(bare | {"mode": LINES, "indices": indices})
     return primitives
 

@@ -136,8 +136,14 @@ class Skeleton:
 
     @property
     def edge_sides(self) -> NDArray[np.intp]:
-        """Return the side of each edge; one from side to side is in the middle."""
-        return sides_of_edges(self.sides, self.edges)
+        """
+        Return the side of each edge: the common side of its ends, otherwise the middle.
+
+        An edge from the middle to a side is on that side.
+        """
+        first, second = self.sides[self.edges].T
+        one = np.where(first == MIDDLE, second, first)
+        return np.where((second == MIDDLE) | (second == one), one, MIDDLE)
 
     @property
     def inner(self) -> NDArray[np.intp]:
@@ -219,16 +225,6 @@ class Skeleton:
             raise ValueError(f"these are not the names of the points of {self.name!r}")
         order = [self.point_names.index(name) for name in names]
         return replace(self.subset(order), name=self.name)
-
-
-def sides_of_edges(sides: NDArray, edges: NDArray) -> NDArray[np.intp]:
-    """Return the side of each edge: the common side of its ends, otherwise the middle.
-
-    An edge from the middle to a side is on that side.
-    """
-    first, second = sides[edges].T
-    one = np.where(first == MIDDLE, second, first)
-    return np.where((second == MIDDLE) | (second == one), one, MIDDLE)
 
 
 def run(first: int, last: int, *, closed: bool = False) -> tuple[int, ...]:
