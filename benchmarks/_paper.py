@@ -98,8 +98,8 @@ Inverse SNR in percent, median over the seeds and range. "Printed" is the figure
 Brandt, Ackermann and Grasshof (2018) for ISA. Only the shark is the same table; the
 others stand in for tables that are not to be had. ISA1 and ISA2 are the paper's
 pipeline: FastISA, and FastICA with pooled components, both with the alternating
-refinement. The other columns are the joint refinement with affine cameras, with weak-
-perspective cameras, and the consensus of groups of points. No model with K basis shapes
+refinement. The other columns are the joint refinement with affine cameras, with
+weak-perspective cameras, and the consensus of groups of points. No model with K basis shapes
 is below the rank floor.
 """
 OTHERS = """\

@@ -561,7 +561,8 @@ default="affine"
             if auto:
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
                     table = scaled_table(source, weights, 1, settings)
-                n_components, most = supported_components(table, isa, settings)
+                numbers = supported_components(table, isa, settings, progress)
+                n_components, most = numbers
             table = scaled_table(source, weights, n_components, settings)
             fit = fit_table(
                 table, n_components, isa, settings, progress, start, auto, errors

@@ -82,6 +82,7 @@ from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import of_all_rows
 
+AUTO_STAGE = "number of basis shapes"
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
 PERSPECTIVE_STAGE = "perspective"
@@ -93,6 +94,8 @@ def stages_of(estimator: Any) -> list[str]:
     """Return the names of the stages of a fit, in order."""
     stages = ["table", "factorisation"]
     if estimator.prior is None:
+        if estimator.n_components == "auto" and estimator.camera != "perspective":
+            stages.insert(0, AUTO_STAGE)
         stages += ["independent subspaces", "block structure and refinement"]
     if estimator.refinement in JOINT_REFINEMENTS:
         stages.append(JOINT_STAGE)
@@ -207,7 +210,10 @@ def fit_table(
 
 @one_blas_thread
 def supported_components(
-    table: ScaledTable, isa: Any, settings: FitSettings
+    table: ScaledTable,
+    isa: Any,
+    settings: FitSettings,
+    progress: FitProgress | NoProgress,
 ) -> tuple[int, int]:
     """Return the number of relevant basis shapes of a table, and how many were tried.
 
@@ -226,6 +232,7 @@ def supported_components(
     if consensus and settings.loss != "linear":
         model, *_ = fit_table(table, supported, isa, settings, quiet, free=True)
         supported = len(model.basis)
+    progress(AUTO_STAGE)
     return supported, most
 
 

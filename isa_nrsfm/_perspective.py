@@ -186,7 +186,7 @@ class PerspectiveTable(NamedTuple):
         options.setdefault("progress", NoProgress())
         if n_components is None:
             table = self.straight(pinhole, 1, before)
-            n_components, _ = supported_components(table, isa, settings)
+            n_components, _ = supported_components(table, isa, settings, NoProgress())
             if before is not None and n_components == before.n_components:
                 return before
         table = self.straight(pinhole, n_components, before)

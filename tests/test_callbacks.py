@@ -93,6 +93,12 @@ class TestAlone:
         recorder.assert_nested()
         assert recorder.tasks() == [*PAPER_STAGES, LAST, "fit"]
 
+    def test_auto_begins_with_the_number_of_basis_shapes(self):
+        _, recorder = recorded(AffineNRSfM("auto", random_state=0))
+        recorder.assert_nested()
+        stages = [task for task in recorder.tasks() if task != "step"]
+        assert stages == ["number of basis shapes", *PAPER_STAGES, JOINT, LAST, "fit"]
+
     def test_callbacks_are_dismissed_when_a_fit_fails(self):
         recorder = Recorder()
         model = estimator(loss="huber", refinement=None).set_callbacks(recorder)

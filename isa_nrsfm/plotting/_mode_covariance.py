@@ -158,6 +158,7 @@ class ModeCovarianceDisplay:
         import_optional("matplotlib", extra="plot")
         from matplotlib.collections import LineCollection
         from matplotlib.colors import AsinhNorm
+        from matplotlib.ticker import SymmetricalLogLocator
 
         options: dict[str, Any] = {"figsize": (4.4, 3.6), "layout": "compressed"}
         (self.ax_,) = flat_axes(ax, 1, "the matrix", **options)
@@ -187,7 +188,11 @@ class ModeCovarianceDisplay:
         self.ax_.tick_params(length=0)
         if max(map(len, names)) > 3:
             self.ax_.tick_params("x", rotation=90)
-        bar = self.figure_.colorbar(self.im_, ax=self.ax_, label="covariance")
+        # In the linear part, numbers beside zero would overlap.
+        ticks = SymmetricalLogLocator(base=10, linthresh=10 * LINEAR_SHARE * largest)
+        bar = self.figure_.colorbar(
+            self.im_, ax=self.ax_, label="covariance", ticks=ticks
+        )
         bar.minorticks_off()
         self.colorbar_ = bar
         return self

@@ -73,7 +73,7 @@ print(by_person.fit(tracks.data, groups=person).n_components_)
 # -------------------
 #
 # ``isa-nrsfm fit faces.csv -k 1-8 --output out`` selects K in the same way. If this is
-# the largest number tried, it prints the expected time of the next three.
+# the largest number tried, it says that a larger one may be better.
 #
 # Without a search
 # ----------------

@@ -16,7 +16,7 @@ Summary:
   proportions, and rotations are poses. The unit of length is undetermined.
 - With orthographic cameras, shapes are in the units of the table.
 - One known length, such as the distance of the pupils, determines the unit.
-- The mirror image in depth is undetermined in all cases.
+- The mirror image in depth is undetermined, unless hidden points or perspective decide.
 """
 
 # sphinx_gallery_thumbnail_number = 2
