@@ -342,6 +342,7 @@ def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
         np.testing.assert_allclose(report[name], values, rtol=1e-6)
     best = 1 + of_parts.mean(axis=1).argmin()
     assert report["chosen"] == search.n_components_ == best
+    assert min(report["seconds"]) > 0
     message = fails("fit", path, "-o", tmp_path, *options, "--group", "same")
     assert "needs two groups; got 1" in message
 
@@ -361,7 +362,7 @@ def test_larger_numbers_are_advised_if_the_table_allows_them(fits, tmp_path):
 @pytest.mark.parametrize(
     ("errors", "chosen", "expected"),
     [
-        ([1.23, 0.05], 2, "larger K may be better"),
+        ([1.23, 0.05], 2, "those tried; three more take at least 10 s"),
         ([0.05, 1.23], 1, "the least\n"),
         ([1.2, 1.1], 2, "no number of basis shapes predicts held-out points"),
     ],
@@ -371,6 +372,7 @@ def test_the_choice_in_words(answers, errors, chosen, expected):
         "n_components": [1, 2],
         "held_out_error": errors,
         "held_out_error_standard_error": [0.12, 0.003],
+        "seconds": [2.0, 3.4],
         "chosen": chosen,
         "larger_may_be_better": chosen == 2,
     }

@@ -271,13 +271,14 @@ def _fitted(
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
-    """Return the numbers tried, their held-out errors, and the one chosen.
+    """Return the numbers tried, their held-out errors, seconds, and the one chosen.
 
     Also whether a larger one may be better: it is the largest, and the table supports
     it and allows others.
     """
     results, n_parts = search.cv_results_, search.n_splits_
     tried, chosen = results["param_n_components"], search.n_components_
+    of_part = results["mean_fit_time"] + results["mean_score_time"]
     scores = [results[f"split{part}_test_score"] for part in range(n_parts)]
     of_parts = -np.transpose(scores)
     fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
@@ -290,6 +291,7 @@ def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
         "held_out_error": -results["mean_test_score"],
         "held_out_error_standard_error": standard_errors(of_parts),
         "held_out_error_of_parts": of_parts,
+        "seconds": results["path_fit_time"] + n_parts * of_part,
         "chosen": chosen,
         "larger_may_be_better": bool(supported and chosen == tried[-1] < most),
     }

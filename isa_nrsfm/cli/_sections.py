@@ -429,7 +429,10 @@ def _choice(choice: dict[str, Any]) -> Section:
         return [cells, NO_SHAPE]
     parts: list[str | Cells] = [cells, "as under Fit, in frames left out of the fit"]
     if choice["larger_may_be_better"]:
-        parts.append("larger K may be better: this is the largest that was tried")
+        more = f"three more take at least {3 * choice['seconds'][-1]:.0f} s"
+        parts.append(
+            f"larger K may be better: this is the largest of those tried; {more}"
+        )
     return parts
 
 
