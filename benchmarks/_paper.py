@@ -99,8 +99,8 @@ Brandt, Ackermann and Grasshof (2018) for ISA. Only the shark is the same table;
 others stand in for tables that are not to be had. ISA1 and ISA2 are the paper's
 pipeline: FastISA, and FastICA with pooled components, both with the alternating
 refinement. The other columns are the joint refinement with affine cameras, with
-weak-perspective cameras, and the consensus of groups of points. No model with K basis shapes
-is below the rank floor.
+weak-perspective cameras, and the consensus of groups of points. No model with K
+basis shapes is below the rank floor.
 """
 OTHERS = """\
 The other methods of the paper's table: printed; measured.

@@ -181,7 +181,9 @@ def perspective_report(
         return none
     weak, *_, error = errors
     better = error < MUCH_LOWER * weak and np.isfinite(model.focal_length_)
-    what = "explains the table better" if better else "hardly explains the table better"
+    what = "explains the table better"
+    if not better:
+        what = "does not explain the table much better"
     if np.isinf(model.focal_length_):
         what = "is too weak to estimate the focal length"
     text = f"error of held-out points {percent(error)} instead of {percent(weak)}"
