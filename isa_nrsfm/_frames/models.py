@@ -23,10 +23,15 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.search import FramePosterior, FrameSearch, largest_objective
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, padded
-from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
+from isa_nrsfm._prepare.robust import (
+    MEDIAN_DISTANCE,
+    distant_points,
+    frame_weights,
+    robust_sizes,
+)
 from isa_nrsfm._tables.tracks import seen_points
 
 # Depths are not determined above this error, relative to their root mean square:
@@ -459,18 +464,22 @@ class PosteriorFrames:
                 if alone is not None:
                     return alone
             return fitted(rows, weights=weights, starts=self.starts)
-        # Robust loss: outliers alone are no reason for further starts.
-        fit, weights = self._reweighted(rows, fitted)
-        poor = np.flatnonzero(fit.objective > largest_objective(weights.sum(1), noise))
+        # Robust loss: outliers are no reason for further starts. The median of the
+        # residuals hardly depends on them.
+        fit = self._reweighted(rows, fitted)
+        distance = np.sort(distances(rows, self.shapes, *fit[:3]), axis=1)  # NaN last
+        middle = (seen_points(rows).sum(axis=1, keepdims=True) - 1) // 2
+        median = np.take_along_axis(distance, middle, axis=1)[:, 0]
+        poor = np.flatnonzero(median > MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
         if len(poor):
             fitted = partial(fitted, starts=self.starts)
-            fit.put(poor, self._reweighted(rows[poor], fitted)[0])
+            fit.put(poor, self._reweighted(rows[poor], fitted))
         return fit
 
     def _reweighted(
         self, rows: NDArray, fitted: Callable[..., FramePosterior]
-    ) -> tuple[FramePosterior, NDArray]:
-        """Return the fit of rows (n, 2, J) with a robust loss, and its weights."""
+    ) -> FramePosterior:
+        """Return the fit of rows (n, 2, J) with a robust loss."""
         # First without gross outliers
         weights = np.where(distant_points(rows), 0.0, 1.0)
         fit = fitted(rows, weights=weights)
@@ -500,7 +509,7 @@ class PosteriorFrames:
             kept = np.isfinite(refit.objective)
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
-        return fit, weights
+        return fit
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
