@@ -30,6 +30,7 @@ from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
     distant_points,
     frame_weights,
+    lower_medians,
     robust_sizes,
 )
 from isa_nrsfm._tables.tracks import seen_points
@@ -465,11 +466,10 @@ class PosteriorFrames:
                     return alone
             return fitted(rows, weights=weights, starts=self.starts)
         # Robust loss: outliers are no reason for further starts. The median of the
-        # residuals hardly depends on them.
+        # residuals hardly depends on them. The threshold is as in `largest_objective`.
         fit = self._reweighted(rows, fitted)
-        distance = np.sort(distances(rows, self.shapes, *fit[:3]), axis=1)  # NaN last
-        middle = (seen_points(rows).sum(axis=1, keepdims=True) - 1) // 2
-        median = np.take_along_axis(distance, middle, axis=1)[:, 0]
+        distance = distances(rows, self.shapes, *fit[:3])
+        median = lower_medians(distance, seen_points(rows))[:, 0]
         poor = np.flatnonzero(median > MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
         if len(poor):
             fitted = partial(fitted, starts=self.starts)

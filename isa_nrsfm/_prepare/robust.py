@@ -63,6 +63,15 @@ def median_noise(distance: NDArray) -> float:
     return float(np.median(distance) / MEDIAN_DISTANCE)
 
 
+def lower_medians(distance: NDArray, seen: NDArray) -> NDArray:
+    """Return lower medians (I, 1) of distances (I, J) of seen points (I, J).
+
+    Distances of other points are infinite or NaN.
+    """
+    last = (seen.sum(axis=1, keepdims=True) - 1) // 2
+    return np.take_along_axis(np.sort(distance, axis=1), last, axis=1)
+
+
 def distant_points(rows: NDArray) -> NDArray:
     """Return a mask (I, J) of points far from their frame, `robustly_centred`."""
     return np.linalg.norm(rows, axis=1) > DISTANT * robust_sizes(rows)[:, None]
@@ -123,8 +132,7 @@ def _nearest_half(
     """
     _, distance = _weighted_middle(points, weights)
     distance = np.where(seen, distance, np.inf)
-    last = (seen.sum(axis=1, keepdims=True) - 1) // 2
-    median = np.take_along_axis(np.sort(distance, axis=1), last, axis=1)
+    median = lower_medians(distance, seen)
     return (distance <= median) * 1.0, distance, median
 
 
