@@ -14,7 +14,6 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
@@ -100,12 +99,12 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
 
 def _choice(fit: Fit) -> Any:
     """Draw the held-out errors by the number of basis shapes."""
-    assert fit.search is not None
-    results, splits = fit.search.cv_results_, range(fit.search.n_splits_)
-    scores = np.transpose([results[f"split{i}_test_score"] for i in splits])
-    numbers, error = results["param_n_components"], -100 * scores.mean(axis=1)
+    choice = fit.choice
+    assert choice is not None
+    numbers, error = choice["n_components"], 100 * choice["held_out_error"]
+    deviation = 100 * choice["held_out_error_standard_error"]
     (axes,) = _axes.grid(1, 1, figsize=(5.2, 3.2))
-    axes.errorbar(numbers, error, 100 * standard_errors(scores), fmt="o-", capsize=3)
+    axes.errorbar(numbers, error, deviation, fmt="o-", capsize=3)
     axes.set(
         xlabel="number of basis shapes", ylabel="held-out error, %", xticks=numbers
     )

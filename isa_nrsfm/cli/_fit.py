@@ -119,7 +119,8 @@ def fit_table(
             explained = _outputs.fitted_table(estimator)
             energy, error, _ = frame_energies(X, explained, estimator.layout)
             snr = error / energy
-            fit = Fit(estimator, frames, search, smooth, drawn, explained, snr)
+            choice = None if search is None else choice_report(search, X)
+            fit = Fit(estimator, frames, choice, smooth, drawn, explained, snr)
             _outputs.write_results(new, fit, unit, **shown)
             if prior is not None:
                 answers["prior"] = {"name": prior, "std": estimator.prior_std_}
@@ -128,7 +129,7 @@ def fit_table(
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args, frames) | {"other_columns": unused},
-                **({} if search is None else {"choice": choice_report(search, X)}),
+                **({} if choice is None else {"choice": choice}),
                 "model": model_report(fit, diagnostics, perspective),
                 **answers,
                 "warnings": warned,

@@ -9,7 +9,7 @@ import warnings
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,6 @@ from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
 from isa_nrsfm.skeletons._column_names import names_of_points
-
-if TYPE_CHECKING:
-    from isa_nrsfm import AffineNRSfMCV
 
 PAGE = "report.html"
 REPORT = "report.json"
@@ -55,14 +52,14 @@ RESULTS = {
 
 
 class Fit(NamedTuple):
-    """A fit to write and draw: model, frames, search, smoothed coefficients, lines.
+    """A fit to write and draw: model, frames, choice of K, smoothing, lines.
 
     ``explained`` is the `fitted_table`, and ``inverse_snr`` (n_frames,) that of frames.
     """
 
     estimator: AffineNRSfM
     frames: Frames
-    search: "AffineNRSfMCV | None"
+    choice: dict[str, Any] | None
     smooth: Any
     drawn: dict[str, Any]
     explained: NDArray
