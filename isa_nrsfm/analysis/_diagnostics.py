@@ -26,9 +26,6 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
 # to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
 MOST_POSE = 0.3
-# Parts of the rows of a table, each predicted from the others. Videos change slowly:
-# neighbours of a single frame predict it without any relation to the pose.
-N_PARTS = 5
 
 
 class Diagnostics(NamedTuple):
@@ -183,7 +180,9 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     third = np.cross(rows[:, 0], rows[:, 1])
     predictors = np.hstack([np.ones((len(alpha), 1)), rows.reshape(-1, 6), third])
     left_out = alpha.copy()
-    for part in np.array_split(np.arange(len(alpha)), N_PARTS):
+    # Neighbours of single frames of a video predict them without any relation to the
+    # pose, fifths do not: docs/benchmarks/README.md, "Thresholds".
+    for part in np.array_split(np.arange(len(alpha)), 5):
         known, others = (np.delete(x, part, axis=0) for x in (predictors, alpha))
         left_out[part] -= predictors[part] @ np.linalg.lstsq(known, others, OF_RANKS)[0]
     energy = np.sum((alpha - alpha.mean(axis=0)) ** 2, axis=0)

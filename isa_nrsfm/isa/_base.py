@@ -24,9 +24,6 @@ from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
 from isa_nrsfm._tables.sources import unmasked
 
-# Smoothing of the density at the origin, for sources of unit variance.
-EPS = 0.1
-
 
 class BaseSubspaceAnalysis(
     ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator, metaclass=ABCMeta
@@ -112,12 +109,12 @@ def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
 
 def log_density(energy: NDArray) -> NDArray:
     """Return ``F(u) = -sqrt(u + 0.1)`` of energies, the squared norms of points."""
-    return -np.sqrt(energy + EPS)
+    return -np.sqrt(energy + 0.1)
 
 
 def derivatives(energy: NDArray) -> tuple[NDArray, NDArray]:
     """Return the first two derivatives g = F' and g' = F''."""
-    root = 1.0 / np.sqrt(energy + EPS)
+    root = -1.0 / log_density(energy)
     return -0.5 * root, 0.25 * root**2 * root
 
 
