@@ -619,6 +619,7 @@ def test_deviations_of_angles_are_those_of_random_small_turns(rng):
         (orthonormal_cameras, (np.eye(6, 3), -1.0), "must not be negative; got -1"),
         (view_angles, (np.eye(3),), r"\(n_frames, 3, 3\); got \(3, 3\)"),
         (view_angles, (-np.eye(3)[None],), "[Nn]on-positive determinant"),
+        (view_angles, (2.0 * np.eye(3)[None],), "without a scale; .* up to 3"),
     ],
 )
 def test_refused_arrays(call, arguments, message):

@@ -270,6 +270,7 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
         ({"curves": ((0, 4),)}, "are 0 to 3; got 4"),
         ({"up": ((-1, 2),)}, "are 0 to 3; got -1"),
         ({"point_names": ("a", "b", "b", "c")}, "4 different names; got 3"),
+        ({"left": (1, 2), "right": (3,)}, "point by point; got 2 and 1 points"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(change, message):

@@ -47,7 +47,7 @@ def view_angles(rotations: ArrayLike) -> ViewAngles:
     Raises
     ------
     ValueError
-        If the array is not of this shape, or a matrix is a mirror image.
+        If the array is not of this shape, or a matrix is no rotation.
 
     Notes
     -----
@@ -69,6 +69,12 @@ def view_angles(rotations: ArrayLike) -> ViewAngles:
             f"rotations must be of the shape (n_frames, 3, 3); got {R.shape}"
         )
     known = np.isfinite(R).all(axis=(1, 2))
+    off = np.abs(R[known] @ R[known].swapaxes(1, 2) - np.eye(3)).max(initial=0.0)
+    if off > 1e-3:
+        raise ValueError(
+            "rotations must be orthogonal matrices R without a scale; R R^T differs "
+            f"from the identity by up to {off:.2g}"
+        )
     angles = np.full((3, len(R)), np.nan)
     if known.any():
         turns = Rotation.from_matrix(R[known]).as_euler("ZXY", degrees=True)

@@ -230,7 +230,9 @@ def _lines(part: str | Cells) -> list[str]:
     Tables with a head end after `MOST_SHOWN`.
     """
     if isinstance(part, str):
-        return textwrap.wrap(part, 90) if part.endswith(".") else [part]
+        if part.endswith("."):
+            return textwrap.wrap(part, 90, break_on_hyphens=False)
+        return [part]
     columns = []
     cells = zip(*part.lines, strict=True)
     for column, is_number in zip(cells, part.numbers, strict=True):
@@ -505,7 +507,8 @@ def _many(label: dict[str, Any]) -> list[str]:
         return []
     return [
         f"{n_components} coefficients are many for {n_frames} frames: fewer predict "
-        f"classes better. Fit without --prior, with -k {max(n_frames // 6, 1)} or less."
+        "classes better. Keep this fit for shapes and depths; for classes, fit again "
+        f"without --prior, with -k {max(n_frames // 6, 1)} or less."
     ]
 
 

@@ -58,7 +58,8 @@ class Skeleton:
     Raises
     ------
     ValueError
-        If points do not exist, or a name is not given to one point.
+        If points do not exist, a name is not given to one point, or the sides have
+        different numbers of points.
 
     See Also
     --------
@@ -101,6 +102,11 @@ class Skeleton:
             raise ValueError(
                 f"the points of {self.name!r} are 0 to {self.n_points - 1}; got "
                 f"{strange[0]}"
+            )
+        if len(self.left) != len(self.right):
+            raise ValueError(
+                "left and right must be mirror images, point by point; got "
+                f"{len(self.left)} and {len(self.right)} points"
             )
         names = self.point_names
         if names is not None and len({*names}) != self.n_points:
