@@ -328,6 +328,7 @@ def test_inverse_snr_of_tables(load_data, name, n_components, scale_frames, perc
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")
 def test_calibrated_cameras_have_more_basis_shapes_than_the_factorisation():
     # 17 points allow 4 basis shapes with affine cameras. Bodies have many more.
     bodies = make_body_tracks(200, camera="orthographic", random_state=0)
