@@ -205,16 +205,20 @@ class Estimator(RuleBasedStateMachine):
             self.alpha = self.model.transform(X)
         self.attributes = set(vars(self.model))
 
+    def note_refusal(self, error):
+        """Note that nothing is fitted, unless parameters are refused before the fit."""
+        self.fitted &= type(error).__name__ == "InvalidParameterError"
+
     @rule(kind_and_seed=tables)
     def fit(self, kind_and_seed):
         X = table(*kind_and_seed)
-        self.fitted = False
         try:
             with only_own_warnings():
                 self.model.fit(X)
         except np.linalg.LinAlgError:  # a ValueError, but of NumPy
             raise
-        except (ValueError, TypeError):
+        except (ValueError, TypeError) as error:
+            self.note_refusal(error)
             return
         self.note_fit(X)
 
@@ -239,8 +243,8 @@ class Estimator(RuleBasedStateMachine):
             self.fitted &= is_fitted(self.model)
         except np.linalg.LinAlgError:
             raise
-        except (ValueError, TypeError):
-            self.fitted = False
+        except (ValueError, TypeError) as error:
+            self.note_refusal(error)
         else:
             self.note_fit(X)
 

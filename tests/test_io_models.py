@@ -228,6 +228,13 @@ def test_a_state_of_random_numbers_is_not_stored(path):
     assert load_model(path).random_state is None
 
 
+@pytest.mark.parametrize("table", [TABLE[[0] * 8], 1e140 * TABLE])
+def test_models_without_motion_and_of_large_units_are_loaded(table, path):
+    model = AffineNRSfM(1, scale_frames=False, random_state=0).fit(table)
+    save_model(model, path)
+    assert_same(load_model(path), model)
+
+
 def test_output_in_dataframes_is_kept(fitted, path):
     model = pickle.loads(pickle.dumps(fitted("default")[0]))
     save_model(model.set_output(transform="pandas"), path)
@@ -296,7 +303,6 @@ def with_entry(value, *place):
         (changed("frames.shapes", lambda x: x.astype("f2")), "shapes is of type"),
         (changed("frames.shapes", lambda x: x * np.nan), "shapes is not finite"),
         (changed("mean_shape_", lambda x: x * np.inf), "mean_shape_ is not finite"),
-        (changed("basis_", lambda x: 1e300 * x), "basis_ is not finite"),
         (changed("frames.space", lambda x: 0.0 * x), "space has no inverse"),
         (changed("alpha_", lambda x: x.astype(int)), "alpha_ should be of shape"),
         (with_entry(-1.0, "frames", "noise_variance"), "noise_variance is negative"),

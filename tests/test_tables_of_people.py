@@ -385,7 +385,9 @@ def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
         (other / name).write_text(text)
         options = [] if name.endswith("png") else ["--no-figures"]
         assert fit(path, other, 0, *options) == 1
-        message = f"would be replaced: {name}. Choose another --output, or .* --force"
+        message = (
+            f"would be replaced: .*/{name}. Choose another --output, or .* --force"
+        )
         assert re.search(message, capsys.readouterr().err)
         assert [file.name for file in other.iterdir()] == [name]
         assert (other / name).read_text() == text
