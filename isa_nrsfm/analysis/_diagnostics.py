@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
@@ -243,6 +244,7 @@ def _of_pose(
     )
 
 
+@one_blas_thread
 def weak_information(
     mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray
 ) -> NDArray:
