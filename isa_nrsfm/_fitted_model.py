@@ -311,7 +311,8 @@ class TableModel(NamedTuple):
         linear = self.pinhole is None and frames.loss == "linear"
         complete = linear and weights is None and bool(seen.all())
         tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
-        energies = counts * (tracks - np.nanmean(tracks, 1, keepdims=True)) ** 2
+        mean_of = np.mean if seen.all() else np.nanmean  # which takes a copy
+        energies = counts * (tracks - mean_of(tracks, 1, keepdims=True)) ** 2
         total = np.zeros(2)
         for fold in range(5):
             held = folds == fold
@@ -337,15 +338,18 @@ class TableModel(NamedTuple):
             # Prediction of the held-out points, and its error
             shapes = compose(mean, others, fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
-            chosen = np.ix_(usable, held)
-            error = counts[chosen] * (tracks[chosen] - predicted) ** 2
-            counted = seen[chosen] & np.isfinite(predicted).all(axis=2)
+            # `compress` is quicker than a mask.
+            size, true, shown, energy = (
+                np.compress(held, part, axis=1)[usable]
+                for part in (counts, tracks, seen, energies)
+            )
+            error = size * (true - predicted) ** 2
+            counted = shown & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)
             # Effect of the threshold 2: docs/benchmarks/README.md, "Thresholds"
             leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
             counted[some] &= leverage[:, held] <= 2.0
-            # `compress` is quicker than a mask.
-            parts = (part.reshape(-1, 2) for part in (error, energies[chosen]))
+            parts = (part.reshape(-1, 2) for part in (error, energy))
             total += [np.compress(counted.ravel(), part, 0).sum() for part in parts]
         return total[None]
 
