@@ -1119,10 +1119,10 @@ default="affine"
         check_is_fitted(self)
         self._jointly_fitted("diagnostics")
         check_frames_kept(self, "diagnostics")
-        distance = None
+        fits, distance = (self.motion_, self.translation_, self.alpha_), None
         if X is not None:
             table, weights = self._opened(X, point_weight)
-            distance = table.joined(self._model.own_distances, *weights)
+            distance = table.joined(self._model.distances, *fits, *weights)
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
         return diagnose(self, distance, rows)
 

@@ -114,6 +114,7 @@ class Diagnostics(NamedTuple):
         return "\n".join(lines)
 
 
+@one_blas_thread
 def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics:
     """Return the diagnostics of a joint fit whose frames were kept.
 
@@ -244,7 +245,6 @@ def _of_pose(
     )
 
 
-@one_blas_thread
 def weak_information(
     mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray
 ) -> NDArray:

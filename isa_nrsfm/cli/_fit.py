@@ -3,7 +3,6 @@
 import contextlib
 import sys
 import time
-import warnings
 from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +10,7 @@ from platform import python_version
 from typing import Any
 
 import numpy as np
+from joblib import parallel_config
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
@@ -18,7 +18,7 @@ from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
-from isa_nrsfm._prepare.coordinates import CoordinateWarning
+from isa_nrsfm._prepare.coordinates import TOLD
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._advice import facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics
@@ -64,7 +64,7 @@ def fit_table(
     _check_options(args)
     folder, clock = Path(args.output), {"": args.since}
     frames = read_frames(args, table=table)
-    warnings.simplefilter("ignore", CoordinateWarning)  # they are said
+    frames.points.attrs[TOLD] = True
     X = frames.X
     if X.empty:
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
@@ -105,7 +105,10 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
-        with whole_files.files_together(folder, removed=removed) as new:
+        with (
+            parallel_config(n_jobs=2),  # threads for blocks of frames
+            whole_files.files_together(folder, removed=removed) as new,
+        ):
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
