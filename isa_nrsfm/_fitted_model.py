@@ -313,7 +313,7 @@ class TableModel(NamedTuple):
         tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
         mean_of = np.mean if seen.all() else np.nanmean  # which takes a copy
         energies = counts * (tracks - mean_of(tracks, 1, keepdims=True)) ** 2
-        total = np.zeros(2)
+        known, total = (counts, tracks, seen, energies), np.zeros(2)
         for fold in range(5):
             held = folds == fold
             # Fit without the held-out points
@@ -339,10 +339,7 @@ class TableModel(NamedTuple):
             shapes = compose(mean, others, fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
             # `compress` is quicker than a mask.
-            size, true, shown, energy = (
-                np.compress(held, part, axis=1)[usable]
-                for part in (counts, tracks, seen, energies)
-            )
+            size, true, shown, energy = (np.compress(held, x, 1)[usable] for x in known)
             error = size * (true - predicted) ** 2
             counted = shown & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)

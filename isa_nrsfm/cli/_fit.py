@@ -48,13 +48,13 @@ _PARAMETERS = (
 
 def run(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
-    return fit_text(fit_table(args, warned), Path(args.output), {})
+    return fit_text(fit_table(args, warned)[0], Path(args.output), {})
 
 
 def fit_table(
     args: Namespace, warned: list[str], table: "pd.DataFrame | None" = None
-) -> dict[str, Any]:
-    """Fit a table, write everything, and return the report.
+) -> tuple[dict[str, Any], AffineNRSfM]:
+    """Fit a table, write everything, and return the report and the model.
 
     A given table is written to the path in the options. `warned` has the warnings so
     far, and grows.
@@ -105,10 +105,8 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
-        with (
-            parallel_config(n_jobs=2),  # threads for blocks of frames
-            whole_files.files_together(folder, removed=removed) as new,
-        ):
+        together = whole_files.files_together(folder, removed=removed)
+        with together as new, parallel_config(n_jobs=2):  # threads for blocks of frames
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
@@ -142,7 +140,7 @@ def fit_table(
             report |= {"seconds": _seconds(clock), "files": results}
             report = write_report(new, report)
         if not figures:
-            return report
+            return report, estimator
         # A figure that fails, or takes long, costs no results: they are in place.
         with whole_files.files_together(folder) as new:
             if _outputs.digests_of(folder, report["sha256"]) != report["sha256"]:
@@ -154,7 +152,7 @@ def fit_table(
             clock["figures"] = time.perf_counter()
             report |= {"seconds": _seconds(clock), "files": results | captions}
             report = write_report(new, report)
-    return report
+    return report, estimator
 
 
 def _load_prior(args: Namespace) -> None:

@@ -169,10 +169,8 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
 def fitted_table(model: AffineNRSfM) -> NDArray:
     """Return the table of the model, in the frames that it was fitted to."""
     blocks = FrameBlocks.of_array(model.alpha_, BLOCK_FRAMES)
-    table: NDArray = blocks.joined(
-        model.inverse_transform, model.motion_, model.translation_
-    )
-    return table
+    cameras = model.motion_, model.translation_
+    return np.asarray(blocks.joined(model.inverse_transform, *cameras))
 
 
 def read_model(args: Namespace) -> AffineNRSfM:

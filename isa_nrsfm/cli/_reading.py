@@ -137,8 +137,7 @@ def read_frames(
     rows, names = np.flatnonzero(kept), columns.interleaved
     stripped = [name.strip() for name in names]
     shown = slice(None) if kept.all() else kept  # large tables are not copied
-    tracks = tracks_in(table[shown], names, args.missing_value)
-    tracks = of_all_rows(tracks, kept)
+    tracks = of_all_rows(tracks_in(table[shown], names, args.missing_value), kept)
     confidence = np.full(tracks.shape[:2], np.nan)
     if not sure.empty:
         confidence = sure[list(columns.x)].to_numpy(np.float64)
@@ -154,8 +153,8 @@ def read_frames(
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     usable = slice(None) if report.usable.all() else report.usable
-    known = None if sure.empty else confidence[usable]
-    warn_of_places(tracks[usable], known, args.format)
+    sure = None if sure.empty else confidence[usable]
+    warn_of_places(tracks[usable], sure, args.format)
     unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
     if unsure.any() and args.min_confidence is None and args.weights is None:
         warn_caller(

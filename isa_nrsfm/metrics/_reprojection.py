@@ -108,13 +108,12 @@ def frame_energies(
             "NaN in X"
         )
 
-    def energies(*rows: NDArray) -> tuple[NDArray, NDArray]:
+    def energies(truth: NDArray, fitted: NDArray) -> tuple[NDArray, NDArray]:
         """Return the energies of a block of frames, and of their errors."""
-        truth, fitted = (centred_frames(each)[0] for each in rows)
+        fitted = np.where(seen_points(truth)[:, None], fitted, np.nan)
+        truth, fitted = (centred_frames(rows)[0] for rows in (truth, fitted))
         error = np.nansum((truth - fitted) ** 2, axis=(1, 2))
         return np.nansum(truth**2, axis=(1, 2)), error
 
-    if not seen.all():
-        fitted = np.where(seen[:, None], fitted, np.nan)
     blocks = FrameBlocks.of_array(truth, BLOCK_FRAMES)
     return *blocks.joined(energies, fitted), seen
