@@ -279,12 +279,6 @@ class TableModel(NamedTuple):
             distance *= np.sqrt(weights[0])
         return distance / of_all_rows(sizes, usable)[:, None]
 
-    def own_distances(self, rows: NDArray, *weights: NDArray) -> NDArray:
-        """Return lengths of residuals (n, n_points) of the fits of rows."""
-        given = weights[0] if weights else None
-        fit = self.decompose(rows, given, False, np.float64)
-        return self.distances(rows, *fit[:3], *weights)
-
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of the error and the signal of held-out points.
 

@@ -51,8 +51,8 @@ def warn_of_places(
     are any.
     """
     have_codes = warn_of_codes(tracks)
-    if confidence is not None:
-        unsure = np.asarray(confidence)[..., None] < UNSURE
+    unsure = np.asarray(confidence, dtype=float)[..., None] < UNSURE
+    if unsure.any():
         tracks = np.where(unsure, np.nan, tracks)
     return warn_of_shares(tracks, format) or have_codes
 

@@ -128,8 +128,7 @@ def diagnose(
     distance = None
     if table is not None:
         if table.n_frames != len(sizes):
-            expected = f"the fitted table, which has {len(sizes)} rows"
-            raise ValueError(f"X must be {expected}; got {table.n_frames}")
+            raise ValueError(f"X must have the {len(sizes)} rows of the fitted table")
         fit = estimator.motion_, estimator.translation_, estimator.alpha_
         distance = table.joined(estimator._model.distances, *fit, *weights)
     fitted = np.isfinite(sizes)

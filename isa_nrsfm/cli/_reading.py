@@ -153,8 +153,7 @@ def read_frames(
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     usable = slice(None) if report.usable.all() else report.usable
-    sure = None if sure.empty else confidence[usable]
-    warn_of_places(tracks[usable], sure, args.format)
+    warn_of_places(tracks[usable], confidence[usable], args.format)
     unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
     if unsure.any() and args.min_confidence is None and args.weights is None:
         warn_caller(
