@@ -1114,17 +1114,14 @@ default="affine"
         ------
         ValueError
             If the model was not refined jointly: the paper's pipeline has no noise
-            variance.
+            variance; or if X has not the rows of the fitted table.
         """
         check_is_fitted(self)
         self._jointly_fitted("diagnostics")
         check_frames_kept(self, "diagnostics")
-        distance = None
-        if X is not None:
-            table, weights = self._opened(X, point_weight)
-            distance = table.joined(self._model.own_distances, *weights)
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
-        return diagnose(self, distance, rows)
+        table, weights = (None, ()) if X is None else self._opened(X, point_weight)
+        return diagnose(self, table, weights, rows)
 
     def _jointly_fitted(self, name: str, calibrated: bool = False) -> PosteriorFrames:
         """Return the model of a frame with noise, and calibrated cameras, or raise."""

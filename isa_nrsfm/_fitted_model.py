@@ -279,12 +279,6 @@ class TableModel(NamedTuple):
             distance *= np.sqrt(weights[0])
         return distance / of_all_rows(sizes, usable)[:, None]
 
-    def own_distances(self, rows: NDArray, *weights: NDArray) -> NDArray:
-        """Return lengths of residuals (n, n_points) of the fits of rows."""
-        given = weights[0] if weights else None
-        fit = self.decompose(rows, given, False, np.float64)
-        return self.distances(rows, *fit[:3], *weights)
-
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of the error and the signal of held-out points.
 
@@ -311,8 +305,9 @@ class TableModel(NamedTuple):
         linear = self.pinhole is None and frames.loss == "linear"
         complete = linear and weights is None and bool(seen.all())
         tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
-        energies = counts * (tracks - np.nanmean(tracks, 1, keepdims=True)) ** 2
-        total = np.zeros(2)
+        mean_of = np.mean if seen.all() else np.nanmean  # which takes a copy
+        energies = counts * (tracks - mean_of(tracks, 1, keepdims=True)) ** 2
+        known, total = (counts, tracks, seen, energies), np.zeros(2)
         for fold in range(5):
             held = folds == fold
             # Fit without the held-out points
@@ -337,15 +332,15 @@ class TableModel(NamedTuple):
             # Prediction of the held-out points, and its error
             shapes = compose(mean, others, fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
-            chosen = np.ix_(usable, held)
-            error = counts[chosen] * (tracks[chosen] - predicted) ** 2
-            counted = seen[chosen] & np.isfinite(predicted).all(axis=2)
+            # `compress` is quicker than a mask.
+            size, true, shown, energy = (np.compress(held, x, 1)[usable] for x in known)
+            error = size * (true - predicted) ** 2
+            counted = shown & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)
             # Effect of the threshold 2: docs/benchmarks/README.md, "Thresholds"
             leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
             counted[some] &= leverage[:, held] <= 2.0
-            # `compress` is quicker than a mask.
-            parts = (part.reshape(-1, 2) for part in (error, energies[chosen]))
+            parts = (part.reshape(-1, 2) for part in (error, energy))
             total += [np.compress(counted.ravel(), part, 0).sum() for part in parts]
         return total[None]
 

@@ -34,7 +34,9 @@ def warn_if_foreign(model: TableModel, table: FrameBlocks, *weights: NDArray) ->
     if table.n_frames < FEWEST_COMPARED or (certainty.weighted and not weights):
         return
     some = spread(np.arange(table.n_frames), 100)
-    distance = model.own_distances(table.take(some), *(w[some] for w in weights))
+    rows, own = table.take(some), [w[some] for w in weights]
+    fit = model.decompose(rows, own[0] if own else None, False, np.float64)
+    distance = model.distances(rows, *fit[:3], *own)
     misfit = model.misfit(distance)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X by itself"

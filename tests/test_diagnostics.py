@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose
+from refusals import refused
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
@@ -304,6 +305,7 @@ class TestOutliers:
         model = AffineNRSfM(3, camera=camera, random_state=0).fit(faces.data)
         assert model.diagnostics(faces.data).outlier_share == 0
         assert np.isnan(model.diagnostics().outlier_share)
+        refused("the 100 rows of the fitted table", model.diagnostics, faces.data[1:])
 
     def test_rows_and_points_have_their_names(self):
         pandas = pytest.importorskip("pandas")

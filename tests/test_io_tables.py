@@ -53,8 +53,11 @@ def test_text_stays_as_it_is_written(write):
 
 
 def test_quotation_marks_are_understood(write):
-    table = read_table(write('\n"name, first",x0\r\n"a ""b""\nc",1\n\n'))
-    assert table.to_dict("list") == {"name, first": ['a "b"\nc'], "x0": [1.0]}
+    rows = 8 * '"a ""b""\nc,\nd",1\n'
+    table = read_table(write(f'\n"name, first",x0\r\n{rows}\n'))
+    assert [*table] == ["name, first", "x0"]
+    assert (table == ['a "b"\nc,\nd', 1.0]).all(axis=None)
+    assert len(table) == 8
 
 
 @pytest.mark.parametrize(
@@ -64,9 +67,11 @@ def test_quotation_marks_are_understood(write):
         ("\n\n", "is empty"),
         ("x0,y0\n", "a header but no rows"),
         ("x0,y0\n1,2\n3\n", "line 3 has 1 values, but the header has 2 names"),
+        ("x0,y0\n" + 9 * "1,2\n" + "3\n", "line 11 has 1 values, but the header has 2"),
         ("x0,y0\n\n1,2,3\n", "line 3 has 3 values, but the header has 2 names"),
         ("x0, x0\n1,2\n", "more than one column is called 'x0'"),
         ("x0,y0\n1\x002,3\n", "line 2 has a null character"),
+        ("x0,y0\n" + 9 * "1,2\n" + "1\x00,2\n", "line 11 has a null character"),
     ],
 )
 def test_files_that_are_no_tables_are_refused(write, text, message):

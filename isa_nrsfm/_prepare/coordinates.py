@@ -51,8 +51,8 @@ def warn_of_places(
     are any.
     """
     have_codes = warn_of_codes(tracks)
-    if confidence is not None:
-        unsure = np.asarray(confidence)[..., None] < UNSURE
+    unsure = np.asarray(confidence, dtype=float)[..., None] < UNSURE
+    if unsure.any():
         tracks = np.where(unsure, np.nan, tracks)
     return warn_of_shares(tracks, format) or have_codes
 
@@ -66,8 +66,9 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     coordinates is one point in all frames, and others are around it.
     """
     places = np.ascontiguousarray(tracks, dtype=float).view(complex)[..., 0]
-    shown = places[~np.isnan(places)]
-    shown = shown[:: -(-len(shown) // MOST_PLACES) or 1] + 0  # -0.0 + 0.0 is 0.0
+    known = np.flatnonzero(~np.isnan(places))
+    shown = places.ravel()[known[:: -(-len(known) // MOST_PLACES) or 1]]
+    shown += 0  # -0.0 + 0.0 is 0.0
     found, warned = {0j}, False
     for some in (shown, shown[shown.real == shown.imag]):
         if len(some):
@@ -148,12 +149,12 @@ def are_shares(tracks: NDArray) -> bool:
     seen = ~(np.isnan(x) | np.isnan(y)) & ((x != 0) | (y != 0))
     if not seen.any():
         return False
-    known = np.stack([x[seen], y[seen]])
-    beyond = np.mean([known < 0, known > 1], axis=2)  # of two borders, in x and y
+    sides = [[(c < 0) & seen, (c > 1) & seen] for c in (x, y)]
+    beyond = np.sum(sides, axis=(2, 3)) / seen.sum()  # of two borders, in x and y
     if beyond.sum() - beyond.max() > 2 * FEW:
         return False
     # Half of the points of a centred body are on either side.
-    centred = (np.abs(np.median(known, axis=1)) < CENTRED).any()
+    centred = any(abs(np.median(c[seen])) < CENTRED for c in (x, y))
     inside = ((tracks >= 0) & (tracks <= 1)).all(axis=2) & seen
     zero, one = (((tracks == end).any(axis=2) & seen) for end in (0, 1))
     ends, few = (zero.sum(), one.sum()), 4 + seen.sum() / 1000

@@ -31,8 +31,8 @@ class FrameBlocks:
     `lengths` are the numbers of frames, `n_frames` their sum. Derived blocks are
     computed once if `cached` and to be kept, otherwise at each reading. `n_threads`
     threads work on blocks at the same time.
-    `empty` is a block without frames of the table, known for blocks of `open_table` and
-    those derived from them.
+    `empty` is a block without frames of the table, known for blocks of arrays and of
+    `open_table`, and those derived from them.
     """
 
     empty: Any = None
@@ -59,8 +59,10 @@ class FrameBlocks:
     @classmethod
     def of_array(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
         """Return the blocks of an array (n_frames, ...), block_frames frames each."""
-        blocks = [array[part] for part in block_slices(len(array), block_frames)]
-        return cls.of_blocks(blocks, list(map(len, blocks)), n_threads)
+        parts = [array[part] for part in block_slices(len(array), block_frames)]
+        blocks = cls.of_blocks(parts, list(map(len, parts)), n_threads)
+        blocks.empty = array[:0]
+        return blocks
 
     @classmethod
     def read_later(

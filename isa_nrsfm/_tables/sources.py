@@ -66,7 +66,6 @@ def open_table(
         # Views of the table: each block is copied when it is read.
         rows = clean_rows(table_to_tracks(X, layout).transpose(0, 2, 1), layout, names)
         blocks = FrameBlocks.of_array(rows, min(length, 2048), n_threads)
-        blocks.empty = empty
         return blocks.derive(np.ascontiguousarray, kept=False)
     if is_on_dask(X):
         blocks = DaskBlocks.of_chunks(X)

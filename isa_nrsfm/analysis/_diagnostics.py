@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.analysis._advice import (
     GROSS,
     MOST_GROSS,
@@ -113,13 +115,22 @@ class Diagnostics(NamedTuple):
         return "\n".join(lines)
 
 
-def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics:
+@one_blas_thread
+def diagnose(
+    estimator: Any, table: FrameBlocks | None, weights: Sequence[NDArray], rows: Any
+) -> Diagnostics:
     """Return the diagnostics of a joint fit whose frames were kept.
 
-    `distance` (n_rows, n_points) are residuals of frames of size one, NaN where a point
-    is missing, and `rows` the names of the rows.
+    `table` is that of the fit, with weights of its points, if any, and `rows` are the
+    names of the rows.
     """
     frames, sizes = estimator._model.frames, estimator._frame_sizes
+    distance = None
+    if table is not None:
+        if table.n_frames != len(sizes):
+            raise ValueError(f"X must have the {len(sizes)} rows of the fitted table")
+        fit = estimator.motion_, estimator.translation_, estimator.alpha_
+        distance = table.joined(estimator._model.distances, *fit, *weights)
     fitted = np.isfinite(sizes)
     motion = np.asarray(estimator.motion_)[fitted] / sizes[fitted, None, None]
     coefficients = np.asarray(estimator.alpha_, dtype=np.float64)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.decomposition import PCA
 
 from isa_nrsfm import AffineNRSfM, analysis
 from isa_nrsfm._compat import pandas as pd
@@ -205,6 +204,8 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray
 
     Of as many components as coefficients, and of the rank of the model.
     """
+    from sklearn.decomposition import PCA  # not needed without labels
+
     table = np.where(X.isna(), fitted_table(estimator), X)
     aligned = analysis.AlignedFrames().fit_transform(table)
     n_shapes = len(estimator.basis_)

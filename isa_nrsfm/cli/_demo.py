@@ -12,7 +12,6 @@ from isa_nrsfm.cli._options import PROGRAM, build_parser
 from isa_nrsfm.cli._reading import drawing_options
 from isa_nrsfm.cli._sections import fit_text
 from isa_nrsfm.datasets import make_face_tracks
-from isa_nrsfm.io import load_model
 from isa_nrsfm.metrics import affine_shape_error
 
 
@@ -31,9 +30,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     ]
     started = Namespace(arguments=options, since=args.since)
     parsed = build_parser().parse_args(options, started)
-    report = fit_table(parsed, warned, table=table)
-    model = load_model(folder / "model.npz")
-    shapes = model.reconstruct(table[list(model.feature_names_in_)])
+    report, model = fit_table(parsed, warned, table=table)
+    shapes = model.shapes(model.alpha_)
     rigid = np.broadcast_to(model.mean_shape_, shapes.shape)
     error, alone = (affine_shape_error(faces.shapes, each) for each in (shapes, rigid))
     truth = (

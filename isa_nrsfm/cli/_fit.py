@@ -3,7 +3,6 @@
 import contextlib
 import sys
 import time
-import warnings
 from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +10,7 @@ from platform import python_version
 from typing import Any
 
 import numpy as np
+from joblib import parallel_config
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
@@ -18,7 +18,7 @@ from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
-from isa_nrsfm._prepare.coordinates import CoordinateWarning
+from isa_nrsfm._prepare.coordinates import TOLD
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._advice import facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics
@@ -48,13 +48,13 @@ _PARAMETERS = (
 
 def run(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
-    return fit_text(fit_table(args, warned), Path(args.output), {})
+    return fit_text(fit_table(args, warned)[0], Path(args.output), {})
 
 
 def fit_table(
     args: Namespace, warned: list[str], table: "pd.DataFrame | None" = None
-) -> dict[str, Any]:
-    """Fit a table, write everything, and return the report.
+) -> tuple[dict[str, Any], AffineNRSfM]:
+    """Fit a table, write everything, and return the report and the model.
 
     A given table is written to the path in the options. `warned` has the warnings so
     far, and grows.
@@ -64,7 +64,7 @@ def fit_table(
     _check_options(args)
     folder, clock = Path(args.output), {"": args.since}
     frames = read_frames(args, table=table)
-    warnings.simplefilter("ignore", CoordinateWarning)  # they are said
+    frames.points.attrs[TOLD] = True
     X = frames.X
     if X.empty:
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
@@ -105,7 +105,8 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
-        with whole_files.files_together(folder, removed=removed) as new:
+        together = whole_files.files_together(folder, removed=removed)
+        with together as new, parallel_config(n_jobs=2):  # threads for blocks of frames
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
@@ -139,7 +140,7 @@ def fit_table(
             report |= {"seconds": _seconds(clock), "files": results}
             report = write_report(new, report)
         if not figures:
-            return report
+            return report, estimator
         # A figure that fails, or takes long, costs no results: they are in place.
         with whole_files.files_together(folder) as new:
             if _outputs.digests_of(folder, report["sha256"]) != report["sha256"]:
@@ -151,7 +152,7 @@ def fit_table(
             clock["figures"] = time.perf_counter()
             report |= {"seconds": _seconds(clock), "files": results | captions}
             report = write_report(new, report)
-    return report
+    return report, estimator
 
 
 def _load_prior(args: Namespace) -> None:

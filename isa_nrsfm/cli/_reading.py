@@ -16,11 +16,13 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
 from isa_nrsfm._prepare.coordinates import UNSURE, warn_of_places
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
     centred_frames,
     clean_rows,
+    of_all_rows,
     tracks_to_table,
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
@@ -134,22 +136,24 @@ def read_frames(
         not_used[f"--points {args.points}"] = len(dropped) // 2
     rows, names = np.flatnonzero(kept), columns.interleaved
     stripped = [name.strip() for name in names]
-    tracks = np.full((len(table), len(columns.points), 2), np.nan)
-    tracks[kept] = tracks_in(table[kept], names, args.missing_value)
+    shown = slice(None) if kept.all() else kept  # large tables are not copied
+    tracks = of_all_rows(tracks_in(table[shown], names, args.missing_value), kept)
     confidence = np.full(tracks.shape[:2], np.nan)
     if not sure.empty:
         confidence = sure[list(columns.x)].to_numpy(np.float64)
     if args.min_confidence is not None:
         tracks[confidence < args.min_confidence] = np.nan
-    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows]
-    tracks, confidence, weighting = cleaned.mT, confidence[rows], {}
+    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[shown]
+    tracks, confidence, weighting = cleaned.mT, confidence[shown], {}
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
-    _, report = centred_frames(cleaned)
+    blocks = FrameBlocks.of_array(cleaned, BLOCK_FRAMES)
+    report = blocks.joined(lambda block: centred_frames(block)[1])
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
-    warn_of_places(tracks[report.usable], confidence[report.usable], args.format)
+    usable = slice(None) if report.usable.all() else report.usable
+    warn_of_places(tracks[usable], confidence[usable], args.format)
     unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
     if unsure.any() and args.min_confidence is None and args.weights is None:
         warn_caller(

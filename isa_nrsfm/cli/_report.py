@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
@@ -59,16 +58,16 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
 
 
 def quality_report(
-    estimator: AffineNRSfM, X: Any, square: NDArray, weighting: dict[str, Any]
+    estimator: AffineNRSfM, X: Any, square: float, weighting: dict[str, Any]
 ) -> dict[str, Any]:
     """Describe how well a model explains a table, whose points may have weights.
 
-    `square` has the squared errors of its coordinates.
+    `square` is the mean of the squared errors of its coordinates.
     """
     return {
         "held_out_error": -estimator.score(X, **weighting),
         "held_out_error_weighted": bool(weighting),
-        "rms_point_error": np.sqrt(2 * np.nanmean(square)),
+        "rms_point_error": np.sqrt(2 * square),
     }
 
 
@@ -86,8 +85,9 @@ def model_report(
 
     estimator, frames, edges = fit.estimator, fit.frames, fit.drawn["edges"]
     X, alpha = frames.X, estimator.alpha_
-    square = (fit.explained - X.to_numpy()) ** 2
-    errors = np.sqrt(2 * np.nanmean(square, axis=1))
+    square, missing = (fit.explained - X.to_numpy()) ** 2, X.isna().any(axis=None)
+    mean_of = np.nanmean if missing else np.mean  # which takes no copy
+    errors = np.sqrt(2 * mean_of(square, axis=1))
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
@@ -99,7 +99,7 @@ def model_report(
         messages = advice(facts_of(estimator, perspective=use))
     for message in messages:
         warn_caller(message)
-    complete = estimator.loss == "linear" and not X.isna().any(axis=None)
+    complete = estimator.loss == "linear" and not missing
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),
@@ -117,7 +117,7 @@ def model_report(
     return {
         "n_components": alpha.shape[1],
         "inverse_snr": estimator.inverse_snr_,
-        **quality_report(estimator, X, square, frames.weighting),
+        **quality_report(estimator, X, mean_of(square), frames.weighting),
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         # Known only if the fit has seen the table as it is.
         "rank_floor": estimator.rank_floor_ if complete else None,

@@ -47,7 +47,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     if len(X):
         motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
         explained = estimator.inverse_transform(alpha, motion, translation)
-        square = (explained - np.asarray(X)) ** 2
+        square = np.nanmean((explained - np.asarray(X)) ** 2)
         found = quality_report(estimator, X, square, frames.weighting)
         layout, scaled = estimator.layout, estimator.frames_scaled_
         snr = inverse_snr(X, explained, layout=layout, scale_frames=scaled)

@@ -5,8 +5,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sklearn.datasets import get_data_home
-
 from isa_nrsfm._compat.optional import import_optional
 
 DataHome = str | os.PathLike[str] | None
@@ -27,6 +25,8 @@ def fetch_file(
     An existing file with the right checksum is used, and never overwritten. A failed
     download leaves nothing in the folder.
     """
+    from sklearn.datasets import get_data_home  # takes a while
+
     home = Path(get_data_home(), "isa_nrsfm") if data_home is None else data_home
     folder = Path(home).expanduser()
     path = folder / url.rpartition("/")[2]

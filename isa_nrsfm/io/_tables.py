@@ -30,6 +30,8 @@ from isa_nrsfm.skeletons._column_names import (
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
+# Rows that are looked at; headers of DeepLabCut have four.
+N_FIRST = 5
 # Numbers with a decimal comma, and with commas between thousands.
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
@@ -405,20 +407,27 @@ def header_names(path: Path) -> list[str]:
 
 
 def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
-    """Yield the non-empty rows of a text file.
+    """Yield the first `N_FIRST` non-empty rows of a text file, and a few others.
 
     Raise if one has not as many cells as the first, if none follows it, or at a null
     character, as files in UTF-16 without a mark have. pandas would pad or cut the
     lines.
     """
-    n_rows, n_columns = 0, 0
+    n_lines, n_rows, n_columns = 0, 0, 0
     if separator != SEPARATORS.get(path.suffix.lower()):
         warn_caller(f"the cells of {path.name} end with {separator!r}")
     with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.reader(file, delimiter=separator)
-        for row in rows:
+
+        def unusual(line: str) -> bool:
+            """Count a line; return whether cells have to be counted one by one."""
+            nonlocal n_lines
+            n_lines += 1
+            full = line.count(separator) + 1 == n_columns
+            return n_rows < N_FIRST or not full or '"' in line or "\0" in line
+
+        for row in csv.reader(filter(unusual, file), delimiter=separator):
             if "\0" in "".join(row):
-                line = f"line {rows.line_num} has a null character"
+                line = f"line {n_lines} has a null character"
                 raise ValueError(f"its text is not in UTF-8: {line}")
             if not row or (len(row) == 1 < n_columns and not row[0].strip()):
                 continue
@@ -431,7 +440,7 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
                         "each column, also that of row names (in R: col.names = NA)"
                     )
                 raise ValueError(
-                    f"line {rows.line_num} has {len(row)} values, but the header has "
+                    f"line {n_lines} has {len(row)} values, but the header has "
                     f"{n_columns} names: {advice}"
                 )
             n_rows += 1

@@ -4,13 +4,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 from isa_nrsfm._tables.sources import CHECKS, unmasked
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
     centred_frames,
     seen_points,
-    table_to_rows,
+    table_to_tracks,
     without_half_points,
 )
 from isa_nrsfm.metrics._checks import check_same_shape
@@ -95,7 +96,7 @@ def frame_energies(
     truth = check_array(unmasked(X), input_name="X", **checks)
     fitted = check_array(unmasked(X_hat), input_name="X_hat", **checks)
     check_same_shape("X", truth, "X_hat", fitted)
-    both = (table_to_rows(table, layout) for table in (truth, fitted))
+    both = (table_to_tracks(table, layout).mT for table in (truth, fitted))
     truth, fitted = (without_half_points(rows)[0] for rows in both)
     seen = seen_points(truth)
     lost = seen & ~seen_points(fitted)
@@ -106,7 +107,13 @@ def frame_energies(
             f"{len(lost)} frames (first: row {rows[0]}). Fill them in, or make them "
             "NaN in X"
         )
-    fitted = np.where(seen[:, None], fitted, np.nan)
-    truth, fitted = (centred_frames(rows)[0] for rows in (truth, fitted))
-    energy = np.nansum(truth**2, axis=(1, 2))
-    return energy, np.nansum((truth - fitted) ** 2, axis=(1, 2)), seen
+
+    def energies(truth: NDArray, fitted: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the energies of a block of frames, and of their errors."""
+        fitted = np.where(seen_points(truth)[:, None], fitted, np.nan)
+        truth, fitted = (centred_frames(rows)[0] for rows in (truth, fitted))
+        error = np.nansum((truth - fitted) ** 2, axis=(1, 2))
+        return np.nansum(truth**2, axis=(1, 2)), error
+
+    blocks = FrameBlocks.of_array(truth, BLOCK_FRAMES)
+    return *blocks.joined(energies, fitted), seen
