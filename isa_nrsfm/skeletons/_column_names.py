@@ -12,7 +12,6 @@ sets, ``thumb_#_x`` and ``*_x``.
 
 import re
 from collections.abc import Hashable, Iterable, Iterator, Sequence
-from functools import cache
 from itertools import pairwise, zip_longest
 from typing import Any, Literal
 
@@ -54,7 +53,6 @@ _ANIMAL = re.compile("mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|per
 Coordinate = tuple[int, str, list[tuple[tuple[str, str, str], int | str]]]
 
 
-@cache
 def parse_coordinate(name: Hashable) -> Coordinate | None:
     """Return axis, point and sets of a landmark coordinate; None for other names."""
     if not isinstance(name, str) or not {",", "#", "*"}.isdisjoint(name):
