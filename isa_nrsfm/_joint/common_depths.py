@@ -74,7 +74,7 @@ def common_coordinates(
             precision, slope, pulled, inverse, w = _turns(shapes, s2)
             n = len(points)
             mixed = np.einsum("abi,kjbi->ajki", R, pulled.reshape(3, n, 3, -1))
-            turns.append((w, inverse, mixed))
+            turns.append((R, points, w, inverse, mixed))
             # Without the turns, which follow the coordinates
             slope = np.einsum("abi,jbi->jai", R, slope)
             slope -= np.einsum("ajki,ki->jai", mixed, w)
@@ -96,9 +96,7 @@ def common_coordinates(
             A = frames_first(unpacked(total))
             change[:, axis] = np.linalg.solve(A, slope.T[..., None])[..., 0].T
         Y += change
-        for R, (_, points), (w, inverse, mixed) in zip(
-            rotations, groups, turns, strict=True
-        ):
+        for R, points, w, inverse, mixed in turns:
             pull = np.einsum("ajki,jai->ki", mixed, _of_group(change, points))
             R[:] = rotated(R, w - np.einsum("kli,li->ki", inverse, pull))
     return np.ascontiguousarray(Y.transpose(2, 1, 0))
