@@ -160,16 +160,17 @@ def fit_table(
             "gradient_norm_": fit.gradient_norm,
             "n_iter_": len(fit.history) - 1,
         }
-        if errors and camera != "affine":
+        # A residual below the noise of the spectrum leaves nothing for groups.
+        n_numbers, square = tracks.totals
+        noise = factorised.noise_level(n_components) * square / n_numbers
+        more = wanted > n_components or fit.misfit > noise
+        if settings.refinement == "consensus" and more:
+            model = consensus(model, table, settings, wanted, free, errors)
+            tracks = JointFrames.from_points(table.rows, table.complete)
+        elif errors and camera != "affine":
             certainty = depth_certainty(model, table.rows, table.weights, settings)
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
-            # A residual below the noise of the spectrum leaves nothing for groups.
-            n_numbers, square = tracks.totals
-            noise = factorised.noise_level(n_components) * square / n_numbers
-            if wanted > n_components or fit.misfit > noise:
-                model = consensus(model, table.rows, settings, wanted, free)
-                tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
         fits = fitted_frames(model, tracks, table.rows)
         del tracks  # as much memory as the table

@@ -43,6 +43,7 @@ from isa_nrsfm._linalg.small_matrices import (
     unpack3,
     unpacked,
 )
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 # Multiplicity of the entries of packed symmetric 3x3 matrices in ``<S, Q>``: those off
 # the diagonal count twice.
@@ -108,9 +109,14 @@ class FrameTracks(NamedTuple):
     weight: NDArray
     energy: NDArray
 
-    def pieces(self, n_frames: int) -> Iterator[tuple[slice, Self]]:
+    @property
+    def n_together(self) -> int:
+        """Frames to work on at a time; with weights each has a Gram matrix."""
+        return BLOCK_FRAMES if self.weights is None else BLOCK_FRAMES // 8
+
+    def pieces(self, n_frames: int = 0) -> Iterator[tuple[slice, Self]]:
         """Yield slices of at most n_frames consecutive frames, and these frames."""
-        total = len(self.weight)
+        total, n_frames = len(self.weight), n_frames or self.n_together
         for start in range(0, total, n_frames):
             frames = slice(start, min(start + n_frames, total))
             yield frames, self if total <= n_frames else of_frames(self, frames)

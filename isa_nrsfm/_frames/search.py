@@ -243,8 +243,7 @@ class FrameSearch:
         Rough cameras may belong to a higher minimum.
         """
         fits = FramePosterior.unknown(len(chosen), initial.shape[1], covariances)
-        # Enough frames to be worth the calls, few enough for the cache
-        length = 2048 if frames.weights is None else 1024
+        length = frames.n_together
         for first in range(0, len(chosen), length):
             block = padded(np.arange(first, min(first + length, len(chosen))))
             products = frame_sums(of_frames(frames, chosen[block]), self.shared)

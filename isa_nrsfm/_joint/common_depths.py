@@ -23,7 +23,10 @@ from isa_nrsfm._linalg.small_matrices import (
     frames_first,
     frames_last,
     inverse3,
+    packed_products,
+    pair_indices,
     procrustes,
+    unpacked,
 )
 
 # Frames and points of a group
@@ -50,45 +53,51 @@ def common_coordinates(
     Y = np.where(unknown, first, 0.0)
     Y[:, :2] += np.nan_to_num(images.transpose(2, 1, 0))
     axes = [axis for axis in range(3) if unknown[:, axis].any()]
-    rotations = [_aligning(_of_group(Y, *group)) for group in groups]
     n_points, _, n_frames = Y.shape
-    precisions = np.empty((len(axes), n_points, n_points, n_frames))
-    diagonal = np.arange(n_points)
+    # Zero in frames that do not show the group, which therefore do not count
+    rotations = [
+        np.isin(np.arange(n_frames), frames) * _aligning(_of_group(Y, points))
+        for frames, points in groups
+    ]
+    # Precisions are packed.
+    first_of, second_of = pair_indices(n_points)
+    places = unpacked(np.arange(len(first_of)))
+    precisions = np.empty((len(axes), len(first_of), n_frames))
     for step in range(STEPS):
         s2 = noise - floor + floor * LAST_SHARE ** (step / (STEPS - 1))
         precisions[:] = 0.0
-        precisions[:, diagonal, diagonal] = WEIGHT_OF_WHOLE / s2
+        precisions[:, np.diagonal(places)] = WEIGHT_OF_WHOLE / s2
         gradient = WEIGHT_OF_WHOLE / s2 * (first - Y)
         turns = []
-        for R, (frames, points) in zip(rotations, groups, strict=True):
-            shapes = np.einsum("jai,abi->jbi", _of_group(Y, frames, points), R)
+        for R, (_, points) in zip(rotations, groups, strict=True):
+            shapes = np.einsum("jai,abi->jbi", _of_group(Y, points), R)
             precision, slope, pulled, inverse, w = _turns(shapes, s2)
             n = len(points)
-            mixed = np.einsum("abi,kjbi->kjai", R, pulled.reshape(3, n, 3, -1))
-            turns.append((w, inverse, mixed))
+            mixed = np.einsum("abi,kjbi->ajki", R, pulled.reshape(3, n, 3, -1))
+            turns.append((R, points, w, inverse, mixed))
             # Without the turns, which follow the coordinates
             slope = np.einsum("abi,jbi->jai", R, slope)
-            slope -= np.einsum("kjai,ki->jai", mixed, w)
-            gradient[np.ix_(points, np.arange(3), frames)] += slope
-            following = np.einsum("kli,ljai->kjai", inverse, mixed)
+            slope -= np.einsum("ajki,ki->jai", mixed, w)
+            gradient[points] += slope
             weights = precision.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+            weights = weights[pair_indices(n)].reshape(-1, 9)
+            own_places = places[np.ix_(points, points)][pair_indices(n)]
             for axis, total in zip(axes, precisions, strict=True):
-                pairs = (R[axis, :, None] * R[axis]).reshape(9, -1)
-                own = (weights.reshape(-1, 9) @ pairs).reshape(n, n, -1)
-                for a, b in zip(mixed[:, :, axis], following[:, :, axis], strict=True):
-                    own -= a[:, None] * b
-                total[np.ix_(points, points, frames)] += own
+                own = weights @ (R[axis, :, None] * R[axis]).reshape(9, -1)
+                following = np.einsum("kli,jli->jki", inverse, mixed[axis])
+                own -= packed_products(mixed[axis], following)
+                total[own_places] += own
         change = np.zeros_like(Y)
         for axis, total in zip(axes, precisions, strict=True):
             free = unknown[:, axis]
-            total[~(free[:, None] & free)] = 0.0
-            total[diagonal, diagonal] += ~free
+            total[~(free[first_of] & free[second_of])] = 0.0
+            total[np.diagonal(places)] += ~free
             slope = np.where(free, gradient[:, axis], 0.0)
-            solved = np.linalg.solve(frames_first(total), slope.T[..., None])
-            change[:, axis] = solved[..., 0].T
+            A = frames_first(unpacked(total))
+            change[:, axis] = np.linalg.solve(A, slope.T[..., None])[..., 0].T
         Y += change
-        for R, group, (w, inverse, mixed) in zip(rotations, groups, turns, strict=True):
-            pull = np.einsum("kjai,jai->ki", mixed, _of_group(change, *group))
+        for R, points, w, inverse, mixed in turns:
+            pull = np.einsum("ajki,jai->ki", mixed, _of_group(change, points))
             R[:] = rotated(R, w - np.einsum("kli,li->ki", inverse, pull))
     return np.ascontiguousarray(Y.transpose(2, 1, 0))
 
@@ -124,21 +133,24 @@ def _principal(shapes: NDArray, s2: float) -> tuple[NDArray, NDArray]:
 
     With eigenvectors U and eigenvalues v above s2 of the covariance, the precision (3n,
     3n) is ``(I - U (1 - s2 / v) U^T) / s2``. The deviations (n, 3, I) are those of the
-    mean from the shapes.
+    mean from the shapes. Shapes of zeros do not count.
     """
-    n, _, n_frames = shapes.shape
-    off = (shapes.mean(axis=2, keepdims=True) - shapes).reshape(3 * n, -1)
+    n, shown = len(shapes), shapes.any(axis=(0, 1))
+    n_frames = np.count_nonzero(shown)
+    mean = shapes.sum(axis=2, keepdims=True) / n_frames
+    off = (shown * mean - shapes).reshape(3 * n, -1)
     values, vectors = np.linalg.eigh(off @ off.T / n_frames)
     kept = values > s2
     U = vectors[:, kept]
-    centring = np.kron(np.eye(n) - 1.0 / n, np.eye(3))
-    precision = (centring - (U * (1.0 - s2 / values[kept])) @ U.T) / s2
+    centring = (np.eye(n) - 1.0 / n)[:, None, :, None] * np.eye(3)[:, None]
+    model = (U * (1.0 - s2 / values[kept])) @ U.T
+    precision = (centring.reshape(model.shape) - model) / s2
     return precision, (precision @ off).reshape(shapes.shape)
 
 
-def _of_group(Y: NDArray, frames: NDArray, points: NDArray) -> NDArray:
-    """Return the centred coordinates (n, 3, n_frames) of a group."""
-    own = Y[np.ix_(points, np.arange(3), frames)]
+def _of_group(Y: NDArray, points: NDArray) -> NDArray:
+    """Return the centred coordinates (n, 3, I) of the points of a group."""
+    own = Y[points]
     return np.asarray(own - own.mean(axis=0))
 
 

@@ -15,9 +15,10 @@ The mean squared difference of the depths of a point in its groups from the resu
 step 4 estimates its squared error: docs/benchmarks/consensus.md.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +38,11 @@ from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
-from isa_nrsfm._joint.uncertainty import inlying_rows
+from isa_nrsfm._joint.uncertainty import depth_certainty, inlying_rows
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._prepare.checks import most_components
+from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
@@ -97,18 +99,20 @@ class Group(NamedTuple):
 
 def consensus(
     model: PosteriorFrames,
-    rows: FrameBlocks,
+    table: ScaledTable,
     settings: FitSettings,
     most: int,
     free: bool,
+    errors: bool,
 ) -> PosteriorFrames:
     """Fit groups of neighbouring points, and return the model that merges them.
 
-    The given model is a joint fit with calibrated cameras, the rows are frames (I, 2,
-    J) of size one, NaN where a point is missing. The result has `most` basis shapes, or
-    if their number is free those that exceed the noise.
+    The given model is a joint fit of the table with calibrated cameras. The result has
+    `most` basis shapes, or if their number is free those that exceed the noise. The
+    errors of the depths of the joint fit are estimated, if wanted, while other
+    processes fit the groups.
     """
-    part, fit, _ = inlying_rows(model, rows, MOST_FRAMES)
+    part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
     shapes = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
     rotations, scales = full_rotations(fit.motion)
@@ -121,11 +125,20 @@ def consensus(
     price = 1.0 / (limits.basis_std**2 * mean_square)
     floor = FLOOR_SHARE * limits.least_noise * mean_square
     scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
-    noise, S, groups, certainty = model.noise_variance, shapes, [], model.certainty
+    noise, S, certainty = model.noise_variance, shapes, model.certainty
+    begun: Any = (), ()
     distances = neighbour_distances(shapes[:, :, chosen])
     # Groups cannot improve a fit whose noise is below their floor.
     if noise >= scene.floor:
-        groups = fitted_groups(scene, distances, len(model.shapes) - 1, settings)
+        begun = group_fits(scene, distances, len(model.shapes) - 1, settings)
+    if errors:
+        certainty = depth_certainty(model, table.rows, table.weights, settings)
+    groups = []
+    for (points, count), result in zip(*begun, strict=True):
+        if settings.on_step is not None:
+            settings.on_step()
+        if result is not None:
+            groups.append(Group(points, count, *result))
     if groups:
         noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
         share = 1.0 - scene.floor / noise
@@ -134,8 +147,8 @@ def consensus(
         noise -= (1.0 - LAST_SHARE) * scene.floor
         weights = interpolation(model.shapes[0], chosen)
         depths = centred(joined[:, 2] @ weights)
-        errors = disagreements(groups, joined[:, 2]) @ weights
-        certainty = certainty.of_consensus(errors, np.mean(depths**2, axis=0))
+        squares = disagreements(groups, joined[:, 2]) @ weights
+        certainty = certainty.of_consensus(squares, np.mean(depths**2, axis=0))
         change = (joined - scene.first) @ weights
         others = np.setdiff1d(np.arange(n_points), chosen)
         off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
@@ -146,7 +159,7 @@ def consensus(
     # Their principal components
     left = 0.0
     if free:
-        possible = most_components(rows.n_frames, n_points, model.camera)
+        possible = most_components(len(table.sizes), n_points, model.camera)
         most, left = min(possible, MOST_COMPONENTS), LEFT * noise
     shapes, alpha, rest = principal_shapes(S, most, left)
     starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
@@ -190,10 +203,10 @@ def disagreements(groups: list[Group], depths: NDArray) -> NDArray:
     return np.divide(squares, weight, out=np.full_like(weight, mean), where=weight > 0)
 
 
-def fitted_groups(
+def group_fits(
     scene: Scene, distances: NDArray, n_components: int, settings: FitSettings
-) -> list[Group]:
-    """Return the fits of all groups."""
+) -> tuple[list[tuple[NDArray, int]], Iterator[Any]]:
+    """Begin to fit all groups; return their `neighbourhoods`, and the fits to come."""
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
     sizes = [size for size in SIZES if size <= largest]
     tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
@@ -204,14 +217,7 @@ def fitted_groups(
         for points, _ in tasks
     )
     run = Parallel(n_jobs=settings.n_jobs, return_as="generator")
-    fits = run(delayed(group_fit)(part, n_components, quiet) for part in parts)
-    groups = []
-    for (points, count), fit in zip(tasks, fits, strict=True):
-        if settings.on_step is not None:
-            settings.on_step()
-        if fit is not None:
-            groups.append(Group(points, count, *fit))
-    return groups
+    return tasks, run(delayed(group_fit)(part, n_components, quiet) for part in parts)
 
 
 def neighbour_distances(shapes: NDArray) -> NDArray:

@@ -232,7 +232,7 @@ class MarginalLikelihood(NamedTuple):
         def over_block(block: FrameTracks, motion: NDArray) -> Terms:
             """Return the sums over pieces whose matrices fit the cache."""
             M, parts = frames_last(motion), []
-            for frames, piece in block.pieces(BLOCK_FRAMES):
+            for frames, piece in block.pieces():
                 M_i = M[:, :, frames]
                 parts.append(_terms(piece, M_i, products, noise, penalty, tiny_noise))
             return _joined(parts)

@@ -28,7 +28,6 @@ from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 from isa_nrsfm._linalg.small_matrices import centred, frames_first, frames_last
 from isa_nrsfm._paper.pipeline import Factorisation
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 # Lower bound of the noise variance, as a share of the mean square of the tracks. It
 # keeps the objective finite for tables without noise.
@@ -209,7 +208,7 @@ class JointProblem:
 
         def reversed_cameras(block: FrameTracks, motion: NDArray) -> Any:
             parts = []
-            for frames, piece in block.pieces(BLOCK_FRAMES):
+            for frames, piece in block.pieces():
                 sums = frame_sums(piece, search.shared)
                 parts.append(search.reversed_cameras(sums, state.noise, motion[frames]))
             return tuple(map(np.concatenate, zip(*parts, strict=True)))

@@ -13,7 +13,7 @@ from sklearn.utils import check_array
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks, read_rows
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES, DaskBlocks, FrameBlocks, read_rows
 from isa_nrsfm._tables.tracks import (
     Layout,
     clean_rows,
@@ -65,7 +65,7 @@ def open_table(
     if not is_read_later(X):
         # Views of the table: each block is copied when it is read.
         rows = clean_rows(table_to_tracks(X, layout).transpose(0, 2, 1), layout, names)
-        blocks = FrameBlocks.of_array(rows, min(length, 2048), n_threads)
+        blocks = FrameBlocks.of_array(rows, min(length, BLOCK_FRAMES), n_threads)
         return blocks.derive(np.ascontiguousarray, kept=False)
     if is_on_dask(X):
         blocks = DaskBlocks.of_chunks(X)

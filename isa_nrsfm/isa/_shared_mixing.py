@@ -298,7 +298,7 @@ def _ascent(
     if min(diagonal.min(), determinant.min()) <= 0:
         return None
     E, residual = np.zeros_like(gradient), gradient
-    direction, least = np.zeros_like(gradient), SOLVED * np.linalg.norm(gradient)
+    direction, least = np.zeros_like(gradient), SOLVED**2 * np.vdot(gradient, gradient)
     product = 1.0
     for _ in range(gradient.size):
         step = (diagonal.T * residual - coupling * residual.T) / determinant
@@ -310,6 +310,6 @@ def _ascent(
             return None
         E = E + product / curvature * direction
         residual = residual - product / curvature * change
-        if np.linalg.norm(residual) <= least:
+        if np.vdot(residual, residual) <= least:
             break
     return E
