@@ -246,7 +246,7 @@ def test_sizes_by_definition():
 def test_distant_points_by_definition(rng):
     rows = rng.normal(size=(10, 2, 15))
     rows[3, :, :4] = np.nan
-    expected = np.zeros((10, 15), dtype=bool)
+    expected = np.isnan(rows[:, 0])
     expected[5, 2] = expected[6, 3] = True
     rows[5, :, 2] += 8 * DISTANT
     rows[6, 1, 3] -= 8 * DISTANT

@@ -27,6 +27,7 @@ from isa_nrsfm._linalg.small_matrices import (
     DIAGONAL,
     ROWS,
     inverse3,
+    lengths,
     packed_products,
     polar,
     unpack3,
@@ -305,8 +306,15 @@ def distances(
     rows: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> NDArray:
     """Return distances (n, J) of points (n, 2, J) from a model, NaN if missing."""
-    images = motion @ compose(shapes[0], shapes[1:], alpha) + position[..., None]
-    return np.linalg.norm(rows - images, axis=1)
+    return lengths(residuals(rows, shapes, motion, alpha) - position[..., None])
+
+
+def residuals(
+    rows: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray
+) -> NDArray:
+    """Return points (n, 2, J) minus their images at position zero."""
+    model = stacked_motion(motion, alpha) @ shapes.reshape(-1, shapes.shape[2])
+    return rows - model.reshape(rows.shape)
 
 
 def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:

@@ -25,10 +25,10 @@ from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._frames.single_frame import SingleSearch
-from isa_nrsfm._linalg.small_matrices import centred, frames_last, padded
+from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
-    distant_points,
+    SETTLED,
     frame_weights,
     lower_medians,
     robust_sizes,
@@ -473,43 +473,45 @@ class PosteriorFrames:
         poor = np.flatnonzero(median > MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
         if len(poor):
             fitted = partial(fitted, starts=self.starts)
-            fit.put(poor, self._reweighted(rows[poor], fitted))
+            fit.put(poor, self._reweighted(rows[poor], fitted, rough=False))
         return fit
 
     def _reweighted(
-        self, rows: NDArray, fitted: Callable[..., FramePosterior]
+        self, rows: NDArray, fitted: Callable[..., FramePosterior], rough: bool = True
     ) -> FramePosterior:
-        """Return the fit of rows (n, 2, J) with a robust loss."""
+        """Return the fit of rows (n, 2, J) with a robust loss, rough on the way."""
+        quick = partial(fitted, covariances=False)
+        sizes, deviation = robust_sizes(rows), np.sqrt(self.noise_variance)
         # First without gross outliers
-        weights = np.where(distant_points(rows), 0.0, 1.0)
-        fit = fitted(rows, weights=weights)
+        weights = frame_weights("linear", lengths(rows), 1.0, sizes)
+        fit = quick(rows, weights=weights)
         # If too few points remain, use the distant ones.
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
         if len(lost):
             weights[lost] = 1.0
-            fit.put(lost, fitted(rows[lost]))
-        sizes = robust_sizes(rows)
-        deviation = np.sqrt(self.noise_variance)
-        changing = padded(np.flatnonzero(np.isfinite(fit.objective)))
+            fit.put(lost, quick(rows[lost]))
         # Then iteratively reweighted, for the frames whose weights still change
+        changing = np.flatnonzero(np.isfinite(fit.objective))
         for _ in range(50):
-            part = rows[changing]
+            part, before = rows[changing], weights[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
-            unsettled = np.abs(new - weights[changing]).max(axis=1) > 1e-4
             weights[changing] = new
-            changing = padded(np.unique(changing[unsettled]))
+            unsettled = np.mean((new - before) ** 2, axis=1) >= SETTLED**2
+            # A point less may determine no camera.
+            unsettled |= ((new > 0) != (before > 0)).any(axis=1)
+            changing, before = changing[unsettled], before[unsettled]
             if not len(changing):
                 break
-            refit = fitted(
-                rows[changing], weights=weights[changing], initial=fit.alpha[changing]
-            )
+            new, alpha = weights[changing], fit.alpha[changing]
+            refit = quick(rows[changing], weights=new, initial=alpha, rough=rough)
             # If the model does not explain a frame, its weights can become so unequal
             # that they determine no camera. Such a frame keeps its fit.
             kept = np.isfinite(refit.objective)
+            weights[changing[~kept]] = before[~kept]
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
-        return fit
+        return fitted(rows, weights=weights, initial=fit.alpha)
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:

@@ -25,11 +25,12 @@ prior. Shapes that fit noise get smaller, and less determined, with each round.
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, compose, distances
+from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, residuals
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.prior import ROUNDS, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
@@ -49,8 +50,13 @@ from isa_nrsfm._joint.starts import (
     with_prior,
 )
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import centred, frames_last
-from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
+from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
+from isa_nrsfm._prepare.robust import (
+    SETTLED,
+    frame_weights,
+    median_noise,
+    robust_sizes,
+)
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
 
@@ -91,23 +97,25 @@ def fit_jointly(
     if sufficient and not table.parts:  # a smaller tolerance is safe
         tol = 0.1**2 * settings.tol
         fit = problem.refined(fit.state, least_noise=least_noise, tol=tol)
-    # Fits of larger samples, and of all frames
+    # Fits of larger samples, and of all frames; for robust losses see `reweighted`
     for larger in problems:
         problem = replace(larger.with_prior(fit.prior), penalty=penalty)
-        state = problem.aligned(fit.state, problem.cameras)
-        fit = problem.refined(state, least_noise=least_noise)
-    # After completed frames, the points that are seen, and robust weights
+        if table.outliers is None:
+            state = problem.aligned(fit.state, problem.cameras)
+            fit = problem.refined(state, least_noise=least_noise)
+    noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
     every_point = table.scaled.complete and table.scaled.weights is None
-    if table.compressed and not (every_point and table.outliers is None):
+    if table.outliers is not None:
+        # This noise variance is corrected for the unknowns of the frames already.
+        problem, fit, noise = reweighted(problem, table, fit, least_noise)
+        n_pose = 0
+    elif table.compressed and not every_point:
+        # After completed frames, the points that are seen, and weights
         shapes = problem.frames.points(fit.state.shapes)
         problem = replace(problem, frames=_visible_frames(table))
         state = fit.state._replace(shapes=shapes)
         fit = problem.refined(state, least_noise=least_noise)
-    noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
-    if table.outliers is not None:
-        # This noise variance is corrected for the unknowns of the frames already.
-        fit, noise = reweighted(problem, table, fit, least_noise)
-        n_pose = 0
+        noise = fit.state.noise
     shapes = problem.frames.points(fit.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
@@ -314,40 +322,45 @@ def widened(problem: JointProblem, fit: JointFit) -> JointFit:
 
 def reweighted(
     problem: JointProblem, table: FactorisedTable, fit: JointFit, least_noise: float
-) -> tuple[JointFit, float]:
+) -> tuple[JointProblem, JointFit, float]:
     """Iterate refinement and weights until the weights agree with the residuals.
 
-    In `fit`, outliers of the table had weight zero, other points weight one. Returns
-    the refinement and the noise variance of a coordinate, from the median of the
-    residuals, corrected for the degrees of freedom.
+    In the fit of the sample, outliers of the table had weight zero, other points weight
+    one. Returns the problem of all frames, the refinement and the noise variance of a
+    coordinate, from the median of the residuals, corrected for the degrees of freedom.
 
     If weights change by 0.5 % at random, the shapes change by about 0.5 % of their
     standard errors (docs/benchmarks/README.md, "Thresholds"). About 2,000 frames
     determine the noise, and nearly the shapes.
     """
-    loss, thorough = problem.settings.loss, problem.thorough
+    loss = problem.settings.loss
+    tol = (1e-2 if problem.thorough else 1.0) * problem.settings.tol
     rows, left_out = table.scaled.rows, table.outliers
     assert left_out is not None
     few = representative_frames(rows, 2000)
     points = rows.take(few)
     weights, sizes = without(points, left_out[few])[1], robust_sizes(points)
-    alpha = problem.likelihood(*fit.state).alpha[few]
-    fit = fit._replace(state=fit.state._replace(motion=fit.state.motion[few]))
+    state = fit.state._replace(shapes=problem.frames.points(fit.state.shapes))
 
-    def refined(weighted: FrameBlocks, fit: JointFit) -> tuple[JointFit, NDArray]:
-        """Return the refinement with weights, and its coefficients."""
-        part = replace(problem, frames=JointFrames.from_weighted(weighted))
-        if fit.prior is None:
-            tol = (1e-2 if thorough else 1.0) * part.settings.tol
-            fit = part.refined(fit.state, least_noise=least_noise, tol=tol)
-        else:
-            fit = widened(part.with_prior(fit.prior), fit)
-        return fit, part.likelihood(*fit.state).alpha
+    def part(weighted: FrameBlocks) -> JointProblem:
+        """Return the problem of frames with weights."""
+        return replace(problem, frames=JointFrames.from_weighted(weighted))
 
+    def refined(problem: JointProblem, fit: JointFit, **limits: Any) -> JointFit:
+        """Return the refinement of a problem."""
+        if fit.prior is not None:
+            return widened(problem.with_prior(fit.prior), fit)
+        limits |= {"least_noise": least_noise, "tol": tol}
+        return problem.refined(fit.state, **limits)
+
+    problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
+    if table.parts:
+        state = problem.aligned(state, problem.cameras)
+    fit = fit._replace(state=state)
     for _ in range(20):
         shapes, motion, _ = fit.state
-        position = _positions((points, weights), motion, alpha, shapes)
-        distance = distances(points, shapes, motion, position, alpha)
+        alpha = problem.likelihood(*fit.state).alpha
+        distance = _distances((points, weights), shapes, motion, alpha)
         # Enough frames for the median of the residuals
         some = slice(None, None, max(distance.size // 150_000, 1))
         state = fit.state._replace(motion=motion[some])
@@ -357,23 +370,22 @@ def reweighted(
         noise = median_noise(typical[np.isfinite(typical)])
         deviation = max(noise, OF_DISTANCES)
         before, weights = weights, frame_weights(loss, distance, deviation, sizes)
-        if np.mean((weights - before) ** 2) < 2.5e-5:
+        if np.mean((weights - before) ** 2) < SETTLED**2:
             break
-        block = points, weights
-        fit, alpha = refined(FrameBlocks.of_blocks([block], [len(few)]), fit)
+        problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
+        fit = refined(problem, fit)
     if len(few) < rows.n_frames:
-        state = problem.aligned(fit.state, problem.cameras)
-        alpha = problem.likelihood(*state).alpha
         weighted = rows.derive(without, left_out)
-        for _ in range(2):
-            shapes, motion, _ = state
-            places = partial(_positions, shapes=shapes)
-            position = weighted.joined(places, motion, alpha)
+        problem = part(weighted)
+        fit = fit._replace(state=problem.aligned(fit.state, problem.cameras))
+        for limits in {"max_iter": 1}, {}:  # one step before the last weights
+            shapes, motion, _ = fit.state
+            alpha = problem.likelihood(*fit.state).alpha
             new = partial(_weighted, shapes=shapes, loss=loss, deviation=deviation)
-            weighted = rows.derive(new, motion, position, alpha)
-            fit, alpha = refined(weighted, fit._replace(state=state))
-            state = fit.state
-    return fit, deviation**2
+            weighted = weighted.derive(new, motion, alpha)
+            problem = part(weighted)
+            fit = refined(problem, fit, **limits)
+    return problem, fit, deviation**2
 
 
 def residual_deviations(
@@ -389,8 +401,8 @@ def residual_deviations(
     (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
     n_pose = 2 + cameras.n_parameters
     deviations = np.empty(weights.shape)
-    # Process frames in slices whose derivatives fit into 32 MB
-    length = max(2**22 // (2 * n_points * (n_pose + n_components)), 1)
+    # Process frames in slices whose derivatives fit into 1 MB
+    length = max(2**17 // (2 * n_points * (n_pose + n_components)), 1)
     for first in range(0, n_frames, length):
         part = slice(first, first + length)
         M, w = motion[part], weights[part, None, None]
@@ -412,22 +424,21 @@ def residual_deviations(
     return deviations
 
 
-def _positions(
-    block: WeightedRows, motion: NDArray, alpha: NDArray, shapes: NDArray
+def _distances(
+    block: WeightedRows, shapes: NDArray, motion: NDArray, alpha: NDArray
 ) -> NDArray:
-    """Return the positions (n, 2) of frames, the weighted means of residuals."""
+    """Return distances (n, J) of frames from a model whose weighted mean is theirs."""
     rows, weights = block
-    stacked = shapes.mT
-    model = compose(stacked[0], stacked[1:], alpha) @ motion.mT
-    rest = np.nan_to_num(rows.mT - model)
-    total = weights.sum(axis=1, keepdims=True)  # zero where no point counts
-    position = np.einsum("ij,ijc->ic", weights, rest)
-    return position / np.where(total > 0, total, 1.0)
+    rest = residuals(rows, shapes, motion, alpha)
+    total = weights.sum(axis=1)[:, None]  # zero where no point counts
+    position = np.einsum("ij,icj->ic", weights, np.nan_to_num(rest))
+    rest -= (position / np.where(total > 0, total, 1.0))[..., None]
+    return lengths(rest)
 
 
 def _weighted(
-    rows: NDArray, *fit: NDArray, shapes: NDArray, loss: str, deviation: float
+    block: WeightedRows, *fit: NDArray, shapes: NDArray, loss: str, deviation: float
 ) -> WeightedRows:
-    """Return frames (n, 2, J) with the weights of their residuals from a fit."""
-    distance = distances(rows, shapes, *fit)
-    return rows, frame_weights(loss, distance, deviation, robust_sizes(rows))
+    """Return frames with the weights of their residuals from a fit."""
+    sizes, distance = robust_sizes(block[0]), _distances(block, shapes, *fit)
+    return block[0], frame_weights(loss, distance, deviation, sizes)

@@ -194,6 +194,11 @@ def energies(rows: NDArray) -> NDArray[np.float64]:
     return np.vecdot(flat, flat)
 
 
+def lengths(rows: NDArray) -> NDArray:
+    """Return the lengths (n, J) of vectors (n, 2, J), faster than by a norm."""
+    return np.sqrt(rows[:, 0] ** 2 + rows[:, 1] ** 2)
+
+
 # BLAS and einsum round the sums of the last frames differently if the number of frames
 # is not a multiple of this.
 LANES = 16
