@@ -92,11 +92,11 @@ def load_data(data_path):
 def one_start(request):
     """Let joint fits have one start, and few steps for the errors of their depths.
 
-    In modules with the name ALL_STARTS they have those of users.
+    The limits that a module names in AS_USERS are those of users.
     """
     limits = {"few_frames": 0, "widths": (), "error_steps": 3}
-    if hasattr(request.module, "ALL_STARTS"):
-        limits = {}
+    for name in getattr(request.module, "AS_USERS", ()):
+        del limits[name]
     quick = AffineNRSfM._limits._replace(**limits)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(AffineNRSfM, "_limits", quick)

@@ -33,7 +33,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
-ALL_STARTS = True
+AS_USERS = ["error_steps"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
 
 

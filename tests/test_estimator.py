@@ -24,7 +24,7 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
-N_FRAMES, N_POINTS, K = 90, 68, 3
+N_FRAMES, N_POINTS, K = 60, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
 TABLE = FACES.data
 ONLY_JOINT = "alpha_std_ noise_variance_ camera_noise_ratio_ reliability_".split()
@@ -469,7 +469,7 @@ def test_single_precision_is_kept():
 
 
 def test_large_tables_in_single_precision_have_the_same_noise():
-    tracks = make_nonrigid_tracks(2000, 250, 1, noise=0.001, random_state=0)
+    tracks = make_nonrigid_tracks(1000, 250, 1, noise=0.001, random_state=0)
     table = tracks.data.astype(np.float32)
     single, double = (estimator(1).fit(X) for X in (table, table.astype(float)))
     assert_allclose(single.noise_variance_, double.noise_variance_, rtol=1e-3)

@@ -49,7 +49,7 @@ from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 from isa_nrsfm.plotting import BasisShapeDisplay
 
-ALL_STARTS = True
+AS_USERS = ["error_steps"]
 
 
 def orthogonal_shapes(seed, n_components=2, n_points=20):
@@ -222,10 +222,10 @@ class TestPosteriorFrames:
         tracks[:, 7] = np.nan
         expected = frames.posterior(tracks.transpose(0, 2, 1))
         for far in [1e3, 1e8, 1e16, 2e153]:
-            tracks[:, 7] = far
-            fitted = frames.posterior(tracks.transpose(0, 2, 1))
-            assert_allclose(fitted.alpha, expected.alpha, atol=1e-6)
-            assert_allclose(fitted.covariance, expected.covariance, atol=1e-6)
+            tracks[:3, 7] = far
+            fitted = frames.posterior(tracks[:3].transpose(0, 2, 1))
+            assert_allclose(fitted.alpha, expected.alpha[:3], atol=1e-6)
+            assert_allclose(fitted.covariance, expected.covariance[:3], atol=1e-6)
 
     @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_points_far_from_the_others_count_where_these_tell_too_little(self, loss):

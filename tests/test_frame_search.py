@@ -30,7 +30,7 @@ from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch, State, scale_of
 from isa_nrsfm._linalg.small_matrices import LANES, unpacked
 from isa_nrsfm._tables.blocks import block_slices
 
-ALL_STARTS = True
+AS_USERS = ["few_frames", "widths"]
 NOISE = 0.02
 CAMERA = pytest.mark.parametrize(
     "camera", ["affine", "weak_perspective", "orthographic"]
