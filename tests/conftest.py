@@ -24,6 +24,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._joint.settings import LIMITS
 
 matplotlib.use("Agg")
+gc.disable()  # while tests are collected, which stay
 
 # The same examples each time
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
@@ -42,8 +43,9 @@ def _data_folder():
 
 
 def pytest_collection_finish():
-    """Look for garbage less often: each search goes through all collected tests."""
-    gc.set_threshold(100_000, 50, 100)
+    """Look for garbage from now on, but not among the collected tests."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -24,7 +24,7 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
-N_FRAMES, N_POINTS, K = 60, 68, 3
+N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
 TABLE = FACES.data
 ONLY_JOINT = "alpha_std_ noise_variance_ camera_noise_ratio_ reliability_".split()

@@ -237,10 +237,10 @@ class TestEdges:
         assert_array_equal(isa.n_iters_, 2)  # one of either iteration
 
     def test_verbose_prints_a_line_for_each_batch(self, capsys):
-        isa = FastISA(n_init=20, random_state=0, verbose=1).fit(few_samples())
+        isa = FastISA(n_init=10, random_state=0, verbose=1).fit(few_samples())
         lines = capsys.readouterr().out.splitlines()
         assert len(lines) == 3
-        assert lines[-1] == f"[FastISA] 20/20 starts, best {isa.log_likelihood_:.6g}"
+        assert lines[-1] == f"[FastISA] 10/10 starts, best {isa.log_likelihood_:.6g}"
 
 
 @pytest.mark.parametrize("energy", [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0, 1e4])
