@@ -83,6 +83,7 @@ def rigid(tracks, mean_shape, basis, camera="affine"):
 
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
 GAPS = pytest.mark.parametrize("missing", [0.0, 0.3])
+EACH_LOSS = pytest.mark.parametrize("loss", slow_after(1, LOSSES[:0:-1]))
 
 
 def least_squares(mean_shape, basis, points, camera):
@@ -183,7 +184,7 @@ class TestPosteriorFrames:
         assert_allclose(fitted.alpha_std**2, variances, rtol=1e-8)
 
     @GAPS
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_weights_of_a_robust_loss_agree_with_the_fit(self, loss, missing):
         frames, tracks = posterior_frames(0, loss)
         tracks = with_gaps(tracks, missing)
@@ -202,7 +203,7 @@ class TestPosteriorFrames:
         assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
 
     @pytest.mark.parametrize(("size", "point"), [(2.0, 0), (20.0, 7)])
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_robust_loss_is_not_drawn_to_an_outlier(self, loss, size, point):
         frames, tracks = posterior_frames(0)
         expected = frames.posterior(tracks.transpose(0, 2, 1))
@@ -216,7 +217,7 @@ class TestPosteriorFrames:
         assert np.median(np.abs(drawn / deviation)) > 3
         assert np.abs(robust / deviation).max() < 2
 
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
         frames, tracks = posterior_frames(0, loss)
         tracks[:, 7] = np.nan
@@ -227,7 +228,7 @@ class TestPosteriorFrames:
             assert_allclose(fitted.alpha, expected.alpha[:3], atol=1e-6)
             assert_allclose(fitted.covariance, expected.covariance[:3], atol=1e-6)
 
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_points_far_from_the_others_count_where_these_tell_too_little(self, loss):
         # Three points near each other, and three far: no camera without the far ones.
         frames, tracks = posterior_frames(0, loss)

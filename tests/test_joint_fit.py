@@ -252,15 +252,14 @@ class TestRobustLoss:
         got = residual_deviations(state, scene.alpha, scene.weights, model)
         assert_allclose(got, expected, rtol=1e-6)
 
-    @pytest.mark.parametrize("loss", slow_after(1, LOSSES[1:]))
+    @pytest.mark.parametrize("loss", slow_after(1, LOSSES[:0:-1]))
     def test_tables_without_noise(self, loss):
         tracks, truth = random_table(deviation=0.0)
         rng = np.random.default_rng(5)
         where = rng.random(tracks.shape[:2]) < 0.05
         moved = tracks.copy()
         moved[where] += 2.0 * rng.normal(size=(where.sum(), 2))
-        model = fitted(moved, kind=QuickNRSfM, loss=loss)
-        assert error_of(model, tracks, truth) < 1e-3
+        assert error_of(fitted(moved, loss=loss), tracks, truth) < 1e-3
 
 
 class TestDegenerate:
