@@ -93,7 +93,6 @@ VARIANTS = [
     {"scale_frames": False},
     {"layout": "planar"},
     {"isa": PooledFastICA(n_init=3), "independence": "coefficients"},
-    {"loss": "huber"},
     {"camera": "weak_perspective"},
     {"camera": "orthographic"},
     {"camera": "weak_perspective", "refinement": None},
@@ -104,6 +103,7 @@ VARIANTS = [
     {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
 ]
 SLOW_VARIANTS = [
+    {"loss": "huber"},
     {"n_components": 6},
     {"refinement": "alternating", "scale_frames": False},
     {"refinement": None, "block_recovery": "irls"},

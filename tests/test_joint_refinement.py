@@ -104,7 +104,7 @@ def test_max_iter_cuts_the_history_short(max_iter):
 
 
 class TestOptimum:
-    @KINDS
+    @pytest.mark.parametrize("kind", slow_after(1, ["complete", "weighted"]))
     @pytest.mark.parametrize("size", slow_after(1, [0.2, 0.0]))
     def test_is_the_same_from_other_starts(self, kind, size):
         scene, expected = optimum(kind)
