@@ -185,7 +185,7 @@ class TestFitted:
         # Each shape agrees with the sum of all.
         assert (np.tensordot(other.shapes_, other.mean_shape_, 2) >= 0).all()
 
-    @deterministic
+    @pytest.mark.parametrize("method", slow_after(1, list(METHODS)[:2]))
     def test_signs_agree_for_a_camera_that_turns_slowly(self, method):
         turns = np.outer(np.radians(8.0) * np.arange(60), [0.1, 0.9, 0.3])
         cameras = Rotation.from_rotvec(turns).as_matrix()[:, :2]

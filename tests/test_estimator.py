@@ -4,6 +4,7 @@ import inspect
 import warnings
 from copy import deepcopy
 from functools import cache
+from itertools import product
 
 import joblib
 import numpy as np
@@ -808,8 +809,10 @@ def calibrated(camera, refinement="joint"):
         return model.fit(truth.data), truth
 
 
-@pytest.mark.parametrize("refinement", ["joint", "alternating"])
-@pytest.mark.parametrize("camera", CALIBRATED)
+@pytest.mark.parametrize(
+    ("camera", "refinement"),
+    slow_after(3, product(CALIBRATED, ["joint", "alternating"])),
+)
 def test_images_are_those_of_scaled_rotations(camera, refinement):
     model, truth = calibrated(camera, refinement)
     S, R, s = model.reconstruct(truth.data), model.rotations_, model.scales_
@@ -844,7 +847,9 @@ def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
 
 @pytest.mark.parametrize(
     ("camera", "refinement"),
-    [*((each, "joint") for each in ("affine", *CALIBRATED)), ("affine", "alternating")],
+    slow_after(
+        3, [*product([*CALIBRATED, "affine"], ["joint"]), ("affine", "alternating")]
+    ),
 )
 def test_mirror_images_fit_as_well(camera, refinement):
     model, truth = calibrated(camera, refinement)

@@ -430,7 +430,7 @@ def test_robust_losses_cost_little_without_outliers(loss):
 
 @pytest.mark.parametrize(
     ("seed", "scale_frames", "missing"),
-    [(0, True, 0.0), (1, True, 0.3), (0, False, 0.3), (1, False, 0.0)],
+    slow_after(2, [(0, True, 0.0), (0, False, 0.3), (1, True, 0.3), (1, False, 0.0)]),
 )
 def test_noise_variance(seed, scale_frames, missing):
     options = {"missing": missing, "camera": "orthographic"}

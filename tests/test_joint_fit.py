@@ -100,7 +100,8 @@ class TestStarts:
     def test_make_no_difference_where_there_is_one_optimum(self):
         tracks, truth = random_table(n_frames=40, n_points=30)
         models = [
-            fitted(tracks, kind=QuickNRSfM, isa=isa) for isa in (None, FastISA(n_init=1))
+            fitted(tracks, kind=QuickNRSfM, isa=isa)
+            for isa in (None, FastISA(n_init=1))
         ]
         ends = [model.objective_history_[-1] for model in models]
         assert np.ptp(ends) < 0.05 * len(tracks)

@@ -93,6 +93,7 @@ def counted(scene):
 
 
 KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
+ONE_KIND = pytest.mark.parametrize("kind", slow_after(1, ["complete", "weighted"]))
 
 
 @pytest.mark.parametrize("max_iter", [0, 4])
@@ -104,7 +105,7 @@ def test_max_iter_cuts_the_history_short(max_iter):
 
 
 class TestOptimum:
-    @pytest.mark.parametrize("kind", slow_after(1, ["complete", "weighted"]))
+    @ONE_KIND
     @pytest.mark.parametrize("size", slow_after(1, [0.2, 0.0]))
     def test_is_the_same_from_other_starts(self, kind, size):
         scene, expected = optimum(kind)
@@ -161,7 +162,7 @@ class TestTolerance:
         assert small[-2:].all()
         assert not (small[:-2] & small[1:-1]).any()
 
-    @KINDS
+    @ONE_KIND
     def test_of_zero_ends_where_rounding_errors_are_left(self, kind):
         scene, best = optimum(kind)
         result = refined(scene, best.state, tol=0.0, max_iter=5000)

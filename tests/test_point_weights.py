@@ -245,6 +245,7 @@ class TestMethods:
         message = "point_weight needs the table; give it to decompose"
         refused(message, model.reconstruct, decomposed, point_weight=weights)
 
+    @pytest.mark.slow
     def test_smoothed_coefficients_are_those_of_weighted_frames(self, rng):
         """Frames with noise of ten times the deviation have the weight 1/100."""
         scene, alpha = waving_scene(100, N_POINTS, [0.1, 0.07])

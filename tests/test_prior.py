@@ -136,7 +136,7 @@ def test_widths_of_zero_give_the_shapes_of_the_prior(frontal, adapt):
     assert_allclose(shapes, prior.shapes, atol=1e-6)
 
 
-@BOTH
+@pytest.mark.parametrize("adapt", slow_after(1, ADAPTED[::-1]))
 def test_first_widths_make_no_difference(frontal, adapt):
     ends = []
     for widths in ((0.01, 0.003), (0.2, 0.03)):
@@ -356,7 +356,7 @@ def test_searches_pipelines_and_copies(turned, frontal, tmp_path):
     assert np.isfinite(search.cv_results_["mean_test_score"]).all()
     assert search.best_estimator_.prior_std_.shape == (2,)
     refused("prior", AffineNRSfMCV((1, 2), estimator=clone(model)).fit, X)
-    searched = AffineNRSfMCV([2], estimator=clone(prior)).fit(turned.X)
+    searched = AffineNRSfMCV([2], estimator=clone(prior), cv=2).fit(turned.X)
     of_search = fitted(X, searched)
     assert_array_equal(of_search.alpha_, model.alpha_)
     save_model(of_search, tmp_path / "model.npz")

@@ -34,7 +34,7 @@ def joint():
 
 def alternating():
     """Return an estimator of the other strategy and refinement."""
-    return AffineNRSfM(n_components=2, isa=FastISA(n_init=2), refinement="alternating")
+    return AffineNRSfM(n_components=2, isa=FastISA(n_init=1), refinement="alternating")
 
 
 def search(refinement):
