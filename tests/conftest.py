@@ -24,6 +24,9 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._joint.settings import LIMITS
 
 matplotlib.use("Agg")
+gc.disable()  # while tests are collected, which stay
+# Joint fits have one start, and few steps for the errors of their depths.
+AffineNRSfM._limits = LIMITS._replace(few_frames=0, widths=(), error_steps=3)
 
 # The same examples each time
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
@@ -42,8 +45,9 @@ def _data_folder():
 
 
 def pytest_collection_finish():
-    """Look for garbage less often: each search goes through all collected tests."""
-    gc.set_threshold(100_000, 50, 100)
+    """Look for garbage from now on, but not among the collected tests."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter):
@@ -89,22 +93,17 @@ def load_data(data_path):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_start(request):
-    """Let joint fits have one start, and few steps for the errors of their depths.
-
-    In modules with the name ALL_STARTS they have those of users.
-    """
-    limits = {"few_frames": 0, "widths": (), "error_steps": 3}
-    if hasattr(request.module, "ALL_STARTS"):
-        limits = {}
-    quick = AffineNRSfM._limits._replace(**limits)
+def as_users(request):
+    """Let joint fits have those limits of users that a module names in AS_USERS."""
+    names = getattr(request.module, "AS_USERS", ())
+    limits = {name: getattr(LIMITS, name) for name in names}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(AffineNRSfM, "_limits", quick)
+        patch.setattr(AffineNRSfM, "_limits", AffineNRSfM._limits._replace(**limits))
         yield
 
 
 @pytest.fixture(autouse=True)
-def all_starts(request, one_start, monkeypatch):
+def all_starts(request, as_users, monkeypatch):
     """Let joint fits of slow tests have all starts, as those of users."""
     if request.node.get_closest_marker("slow"):
         monkeypatch.setattr(AffineNRSfM, "_limits", LIMITS)

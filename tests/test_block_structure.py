@@ -243,9 +243,9 @@ class TestRefinement:
             assert_allclose(slopes / 2e-5, 0, atol=1e-6 * energy.max())
 
     def test_best_of_the_starts_is_taken(self, scene):
-        starts = random_starts(0, 3, 12)
+        starts = random_starts(0, 3, 6)
         together = explained(scene, refined(scene, starts)[0])
-        alone = (refined(scene, starts[:, s : s + 1])[0] for s in range(12))
+        alone = (refined(scene, starts[:, s : s + 1])[0] for s in range(6))
         single = [explained(scene, E) for E in alone]
         # Trial steps are few, so the best start may be missed, but not by much.
         assert np.all(together >= 0.99 * np.max(single, axis=0))

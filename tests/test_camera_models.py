@@ -383,7 +383,7 @@ class TestMinimum:
             scale = np.linalg.norm(M) / np.sqrt(2)
             found = value(scene, i, M, noise)
             ends = []
-            for _ in range(4):
+            for _ in range(3):
                 start = scale * Rotation.random(None, rng).as_matrix()[:2]
                 result = minimize(
                     lambda step, i=i, start=start: value(

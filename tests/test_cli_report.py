@@ -24,7 +24,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses
 
 N = 120
-HOSTILE = '<script>alert("x")</script>&"{{content}}'
+HOSTILE = '<script>alert("x")</script>&"{{content}}$0_$50k'
 EXPECTED = Path(__file__).with_name("expected") / "report.txt"
 
 
@@ -324,14 +324,14 @@ UNREFINED = "--no-figures --refinement none --isa fast --n-init 1".split()
 
 @pytest.mark.parametrize("groups", slow_after(1, [True, False]))
 def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
-    table, path = table_of(), tmp_path / "table.csv"
+    table, path = table_of()[::2], tmp_path / "table.csv"
     table.to_csv(path, index=False)
     options = ["-k", "1-3", *UNREFINED]
     found = fits(path, *options, *["--group", "person"] * groups)
     assert len(found.err.splitlines()) == 3
     search = AffineNRSfMCV(
         [1, 2, 3], estimator=ESTIMATOR, cv=GroupKFold(3) if groups else 3
-    ).fit(X, groups=table["person"] if groups else None)
+    ).fit(X[::2], groups=table["person"] if groups else None)
     parts = [-search.cv_results_[f"split{i}_test_score"] for i in range(3)]
     report, of_parts = found.report["choice"], np.transpose(parts)
     for name, values in (

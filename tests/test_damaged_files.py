@@ -303,12 +303,12 @@ def tried(format, numbers, folder):
 QUICK = [n for n in FORMATS if "-" not in n] + ["deeplabcut-table", "mediapipe-sizes"]
 WIDE = ["mediapipe-pixels", "mediapipe-sizes", "pyfeat-mp", "pyfeat-v2"]
 OTHERS = [(n, range(6)) for n in FORMATS if n not in QUICK]
-OTHERS += [(n, range(3, 80 if n in WIDE else 250)) for n in FORMATS]
+OTHERS += [(n, range(2, 80 if n in WIDE else 250)) for n in FORMATS]
 
 
 @pytest.mark.parametrize(
     ("format", "numbers"),
-    slow_after(len(QUICK), [(n, range(3)) for n in QUICK] + OTHERS),
+    slow_after(len(QUICK), [(n, range(2)) for n in QUICK] + OTHERS),
 )
 def test_damaged_files_are_read_or_refused(format, numbers, tmp_path):
     for folder in ("first", "corpus"):

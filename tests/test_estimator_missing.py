@@ -22,12 +22,14 @@ from isa_nrsfm.metrics import affine_shape_error
 K = 2
 REFINEMENTS = ["joint", "alternating", None]
 VARIANTS = [{"refinement": refinement} for refinement in REFINEMENTS]
-VARIANTS += [{"loss": loss} for loss in ["huber", "cauchy"]]
+VARIANTS += [{"loss": loss} for loss in ["cauchy", "huber"]]
+
+EACH_LOSS = pytest.mark.parametrize("loss", slow_after(1, ["cauchy", "huber"]))
 
 
 def scene(seed=0, **params):
     """Return a synthetic table with 2 percent noise and its truth."""
-    params = {"n_frames": 90, "n_points": 30, "noise": 0.02} | params
+    params = {"n_frames": 60, "n_points": 30, "noise": 0.02} | params
     return make_nonrigid_tracks(n_components=K, random_state=seed, **params)
 
 
@@ -54,7 +56,7 @@ def complete_model():
     return estimator().fit(COMPLETE.data)
 
 
-@pytest.fixture(scope="module", params=VARIANTS, ids=str)
+@pytest.fixture(scope="module", params=slow_after(4, VARIANTS), ids=str)
 def variant(request):
     """Return a model of the table with missing points."""
     return estimator(**request.param).fit(HOLED.data)
@@ -76,7 +78,7 @@ def gross_scene(seed, size=0.0):
 # --- frames by themselves -----------------------------------------------------------
 
 
-def frames_with_outliers(n_frames=24):
+def frames_with_outliers(n_frames=12):
     """Return a table of little noise, and frames of it of which many points are wrong.
 
     There the loss has many minima, and rounding errors would decide between them.
@@ -96,9 +98,9 @@ def frames_with_outliers(n_frames=24):
     slow_after(
         1,
         [
-            ("huber", "affine"),
-            ("linear", "affine"),
             ("cauchy", "affine"),
+            ("linear", "affine"),
+            ("huber", "affine"),
             ("linear", "weak_perspective"),
             ("cauchy", "weak_perspective"),
             ("huber", "orthographic"),
@@ -112,14 +114,14 @@ def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     model = AffineNRSfM(1, loss=loss, camera=camera, random_state=0).fit(X)
     together = model.transform(Y)
     assert_array_equal(model.transform(Y[::-1])[::-1], together)
-    for start, stop in ((0, 2), (3, 8), (5, 22)):
+    for start, stop in ((0, 2), (3, 8)):
         assert_array_equal(model.transform(Y[start:stop]), together[start:stop])
     # Alone but for the last step, the change to the public shapes.
     alone = np.concatenate([model.transform(row[None]) for row in Y[:6]])
     assert_allclose(alone, together[:6], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@EACH_LOSS
 def test_frames_that_the_model_does_not_explain_have_finite_fits(loss):
     """Without noise, the weights of their points fall until no camera is left."""
     X = make_nonrigid_tracks(7, 7, 1, random_state=14).data.copy()
@@ -148,7 +150,7 @@ def test_coefficients_of_the_points_that_are_seen_are_canonical(refinement, came
 
 # --- rows that show nothing ---------------------------------------------------------
 
-EMPTY = np.isin(np.arange(90), [0, 17, 18, 60, 89])
+EMPTY = np.isin(np.arange(60), [0, 17, 18, 40, 59])
 
 
 def with_empty_rows(table):
@@ -159,7 +161,7 @@ def with_empty_rows(table):
 @cache
 def fitted_with_empty_rows(**params):
     """Return the model of a table with rows of NaN, which are warned of."""
-    message = r"5 of 90 rows \(first: row 0\)"
+    message = r"5 of 60 rows \(first: row 0\)"
     with pytest.warns(UserWarning, match=message) as found:
         fitted = estimator(**params).fit(with_empty_rows(HOLED.data))
     assert found[0].filename == __file__
@@ -218,7 +220,7 @@ def without(frames, points):
     return tracks.reshape(len(tracks), -1)
 
 
-ALL_FRAMES, ALL_POINTS = np.arange(90), np.arange(30)
+ALL_FRAMES, ALL_POINTS = np.arange(60), np.arange(30)
 BAD = {
     "a point nowhere": (
         without(ALL_FRAMES, [7]),
@@ -226,13 +228,13 @@ BAD = {
     ),
     "points in too few frames": (
         without(ALL_FRAMES[4:], [11, 12]),
-        r"at least 5 frames; .* 2 of 30 points \(first: point 11, in 4 of 90 frames",
+        r"at least 5 frames; .* 2 of 30 points \(first: point 11, in 4 of 60 frames",
     ),
     "a frame with too few points": (
         without([5], ALL_POINTS[3:]),
-        r"fewer than 4 points are visible in 1 of 90 frames \(first: row 5, with 3\)",
+        r"fewer than 4 points are visible in 1 of 60 frames \(first: row 5, with 3\)",
     ),
-    "nothing": (without(ALL_FRAMES, ALL_POINTS), "no point is visible: all 90 rows"),
+    "nothing": (without(ALL_FRAMES, ALL_POINTS), "no point is visible: all 60 rows"),
 }
 
 
@@ -245,20 +247,20 @@ def test_tables_that_show_too_little_are_refused(name, refinement):
 
 @pytest.mark.parametrize(
     ("spoilt", "message"),
-    [(np.nan, "row 5, with 3"), (0.1, r"equal in 1 of 90 frames .* row 5\)")],
+    [(np.nan, "row 5, with 3"), (0.1, r"equal in 1 of 60 frames .* row 5\)")],
 )
 def test_rows_are_counted_from_the_first_one_where_some_show_nothing(spoilt, message):
     tracks = COMPLETE.tracks.copy()
     tracks[[1, 2]] = np.nan
     tracks[5, 3 if np.isnan(spoilt) else 0 :] = spoilt
-    refused(message, estimator().fit, tracks.reshape(90, -1))
+    refused(message, estimator().fit, tracks.reshape(60, -1))
 
 
 def test_rows_that_show_nothing_are_no_frames():
     few = r"at least 7 frames \(rows\), the table has n_samples=6"
     with (
         pytest.raises(ValueError, match=few),
-        pytest.warns(UserWarning, match="84 of 90"),
+        pytest.warns(UserWarning, match="54 of 60"),
     ):
         estimator().fit(without(ALL_FRAMES[6:], ALL_POINTS))
 
@@ -266,7 +268,7 @@ def test_rows_that_show_nothing_are_no_frames():
 def test_missing_points_of_dataframes_are_named():
     pandas = pytest.importorskip("pandas")
     table = pandas.DataFrame(without(ALL_FRAMES, [7]), columns=COMPLETE.feature_names)
-    refused(r"point 7 \(x_7, y_7\), in 0 of 90", estimator().fit, table)
+    refused(r"point 7 \(x_7, y_7\), in 0 of 60", estimator().fit, table)
 
 
 # --- methods ------------------------------------------------------------------------
@@ -292,7 +294,7 @@ def test_the_fitted_table_has_its_coefficients_to_the_bit(variant, scale_frames)
 
 
 def test_rows_do_not_depend_on_each_other(variant):
-    new = np.vstack([HOLED.data[:6], COMPLETE.data[:6], HOLED.data[60:66]])
+    new = np.vstack([HOLED.data[:4], COMPLETE.data[:2], HOLED.data[40:42]])
     new[2, 4:] = np.nan
     together = variant.decompose(new)
     backwards = variant.decompose(new[::-1])
@@ -404,7 +406,7 @@ def with_outliers(made, seed, share=0.05, size=1.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "size"), [(0, 5.0), (0, 1.0), (1, 1.0)])
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@EACH_LOSS
 def test_robust_losses_withstand_outliers(loss, seed, size):
     # The influence of outliers is bounded by "huber", but not small.
     *_, expected = gross_scene(seed)
@@ -414,7 +416,7 @@ def test_robust_losses_withstand_outliers(loss, seed, size):
     assert linear > 2 * expected
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@EACH_LOSS
 def test_robust_losses_cost_little_without_outliers(loss):
     made, X, linear, expected = gross_scene(0)
     robust = estimator(loss=loss).fit(X)
@@ -428,7 +430,7 @@ def test_robust_losses_cost_little_without_outliers(loss):
 
 @pytest.mark.parametrize(
     ("seed", "scale_frames", "missing"),
-    [(0, True, 0.0), (1, True, 0.3), (0, False, 0.3), (1, False, 0.0)],
+    slow_after(2, [(0, True, 0.0), (0, False, 0.3), (1, True, 0.3), (1, False, 0.0)]),
 )
 def test_noise_variance(seed, scale_frames, missing):
     options = {"missing": missing, "camera": "orthographic"}
@@ -443,9 +445,9 @@ def test_noise_variance(seed, scale_frames, missing):
 
 def test_frames_that_show_less_are_known_less_well():
     tracks = COMPLETE.tracks.copy()
-    tracks[:45, ::2] = np.nan
-    fitted = estimator().fit(tracks.reshape(90, -1))
-    few, many = fitted.alpha_std_[:45], fitted.alpha_std_[45:]
+    tracks[:30, ::2] = np.nan
+    fitted = estimator().fit(tracks.reshape(60, -1))
+    few, many = fitted.alpha_std_[:30], fitted.alpha_std_[30:]
     assert np.all(np.median(few, axis=0) > 1.2 * np.median(many, axis=0))
 
 

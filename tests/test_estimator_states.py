@@ -358,7 +358,7 @@ def test_a_refusal_that_is_interrupted_leaves_nothing(kind):
         assert not [name for name in vars(model) if name.endswith("_")]
 
 
-FEW = settings(max_examples=4, stateful_step_count=4)
+FEW = settings(max_examples=3, stateful_step_count=4)
 MANY = settings(max_examples=40, stateful_step_count=10)
 
 

@@ -49,7 +49,7 @@ from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 from isa_nrsfm.plotting import BasisShapeDisplay
 
-ALL_STARTS = True
+AS_USERS = ["error_steps"]
 
 
 def orthogonal_shapes(seed, n_components=2, n_points=20):
@@ -83,6 +83,7 @@ def rigid(tracks, mean_shape, basis, camera="affine"):
 
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
 GAPS = pytest.mark.parametrize("missing", [0.0, 0.3])
+EACH_LOSS = pytest.mark.parametrize("loss", slow_after(1, LOSSES[:0:-1]))
 
 
 def least_squares(mean_shape, basis, points, camera):
@@ -183,7 +184,7 @@ class TestPosteriorFrames:
         assert_allclose(fitted.alpha_std**2, variances, rtol=1e-8)
 
     @GAPS
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_weights_of_a_robust_loss_agree_with_the_fit(self, loss, missing):
         frames, tracks = posterior_frames(0, loss)
         tracks = with_gaps(tracks, missing)
@@ -200,7 +201,7 @@ class TestPosteriorFrames:
         assert_allclose(again.alpha, fitted.alpha, atol=1e-3)
 
     @pytest.mark.parametrize(("size", "point"), [(2.0, 0), (20.0, 7)])
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_robust_loss_is_not_drawn_to_an_outlier(self, loss, size, point):
         frames, tracks = posterior_frames(0)
         expected = frames.posterior(tracks.transpose(0, 2, 1))
@@ -214,18 +215,18 @@ class TestPosteriorFrames:
         assert np.median(np.abs(drawn / deviation)) > 3
         assert np.abs(robust / deviation).max() < 2
 
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
         frames, tracks = posterior_frames(0, loss)
         tracks[:, 7] = np.nan
         expected = frames.posterior(tracks.transpose(0, 2, 1))
         for far in [1e3, 1e8, 1e16, 2e153]:
-            tracks[:, 7] = far
-            fitted = frames.posterior(tracks.transpose(0, 2, 1))
-            assert_allclose(fitted.alpha, expected.alpha, atol=1e-6)
-            assert_allclose(fitted.covariance, expected.covariance, atol=1e-6)
+            tracks[:3, 7] = far
+            fitted = frames.posterior(tracks[:3].transpose(0, 2, 1))
+            assert_allclose(fitted.alpha, expected.alpha[:3], atol=1e-6)
+            assert_allclose(fitted.covariance, expected.covariance[:3], atol=1e-6)
 
-    @pytest.mark.parametrize("loss", LOSSES[1:])
+    @EACH_LOSS
     def test_points_far_from_the_others_count_where_these_tell_too_little(self, loss):
         # Three points near each other, and three far: no camera without the far ones.
         frames, tracks = posterior_frames(0, loss)

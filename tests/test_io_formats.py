@@ -139,10 +139,11 @@ def test_shares_of_the_image_become_pixels(tmp_path):
     landmarks = read_landmarks(path, image_size=files.IMAGE_SIZE)
     assert_allclose(tracks_of(landmarks), MESH)
     assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
+    few = files.write_mesh(tmp_path / "b.csv", TRACKS)
     for size in (640, (640, 0), (640, 480, 3), ("a", "b"), (np.nan, 480)):
         message = "image_size must be a width and a height"
-        refused(message, read_landmarks, path, image_size=size)
-    pixels = files.write_mesh(tmp_path / "b.csv", MESH, shares=False)
+        refused(message, read_landmarks, few, "mediapipe", image_size=size)
+    pixels = files.write_mesh(tmp_path / "c.csv", MESH, shares=False)
     refused("these are in pixels", read_landmarks, pixels, image_size=files.IMAGE_SIZE)
 
 

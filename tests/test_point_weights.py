@@ -28,7 +28,9 @@ from isa_nrsfm.metrics import affine_shape_error
 # Of the start, which the joint refinement does not say.
 pytestmark = start_may_not_converge
 
-CAMERAS = pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+CAMERAS = pytest.mark.parametrize(
+    "camera", slow_after(1, ["weak_perspective", "affine"])
+)
 N_FRAMES, N_POINTS, K = 60, 20, 2
 
 
@@ -227,7 +229,7 @@ class TestMethods:
         weights = np.ones((N_FRAMES, N_POINTS))
         weights[np.random.default_rng(1).random(weights.shape) < 0.1] = 0.0
         holed = np.where(np.repeat(weights, 2, axis=1) > 0, X, np.nan)
-        few = {"max_iter": 5, "tol": 0.0}
+        few = {"max_iter": 2, "tol": 0.0}
         for call in (
             model.rotation_covariance,
             model.reconstruct,
@@ -243,13 +245,14 @@ class TestMethods:
         message = "point_weight needs the table; give it to decompose"
         refused(message, model.reconstruct, decomposed, point_weight=weights)
 
+    @pytest.mark.slow
     def test_smoothed_coefficients_are_those_of_weighted_frames(self, rng):
         """Frames with noise of ten times the deviation have the weight 1/100."""
-        scene, alpha = waving_scene(150, N_POINTS, [0.1, 0.07])
+        scene, alpha = waving_scene(100, N_POINTS, [0.1, 0.07])
         tracks = scene.tracks
-        deviation = np.where(rng.random(150) < 0.3, 0.2, 0.02) * tracks.std()
+        deviation = np.where(rng.random(100) < 0.3, 0.2, 0.02) * tracks.std()
         tracks += deviation[:, None, None] * rng.normal(size=tracks.shape)
-        X = tracks.reshape(150, -1)
+        X = tracks.reshape(100, -1)
         weights = np.tile((deviation.min() / deviation) ** 2, (N_POINTS, 1)).T
         model = estimator(scale_frames=False).fit(X, point_weight=weights)
         truth = np.linalg.lstsq(model.alpha_, alpha)[0]

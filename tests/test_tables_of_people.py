@@ -250,18 +250,6 @@ def test_words_for_missing_are_missing(asked, word, suffix):
     refused(message, asked, columns, "--group", "mood", suffix=suffix)
 
 
-def test_dollar_signs_are_shown_as_they_are(tmp_path, capsys):
-    path, name = tmp_path / "table.csv", "$0_$50k"
-    write_landmarks(path)
-    table = pd.read_csv(path)
-    table[name] = np.resize(["$0_$50k", "$50k_$", "$"], len(table))
-    table.to_csv(path, index=False)
-    assert fit(path, tmp_path / "out", 0, "--label", name) == 0
-    assert "was not drawn" not in capsys.readouterr().err
-    for figure in ("label_1.png", "label_1_shapes.png"):
-        assert (tmp_path / "out" / figure).exists()
-
-
 def test_texts_of_tables_are_no_mathematics():
     plt = pytest.importorskip("matplotlib.pyplot")
     from isa_nrsfm.plotting import CoefficientsDisplay

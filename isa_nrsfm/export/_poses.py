@@ -162,7 +162,7 @@ def pose_function(
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.export import pose_function
     >>> options = {"camera": "weak_perspective", "random_state": 0}
-    >>> faces = make_face_tracks(40, n_components=1, **options)
+    >>> faces = make_face_tracks(20, n_components=1, **options)
     >>> model = AffineNRSfM(1, **options)
     >>> poses = pose_function(model.fit(faces.data))
     >>> for row in faces.data[:2]:
@@ -247,11 +247,11 @@ def point_distances(
     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.export import point_distances
     >>> options = {"camera": "weak_perspective", "random_state": 0}
-    >>> faces = make_face_tracks(40, n_components=1, **options)
+    >>> faces = make_face_tracks(20, n_components=1, **options)
     >>> model = AffineNRSfM(1, **options)
     >>> model = model.fit(faces.data)
     >>> point_distances(model, [(48, 54), (62, 66)]).shape  # of the mouth
-    (40, 2)
+    (20, 2)
     """
     if camera is None:
         raise ValueError("distances need calibrated cameras; got camera=None")
