@@ -41,7 +41,7 @@ from isa_nrsfm._joint.uncertainty import (
     shown_frames,
 )
 from isa_nrsfm._parameters.choices import LOSSES
-from isa_nrsfm._prepare.robust import SETTLED, WEIGHTS, distant_points
+from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses, write_viewer
@@ -195,10 +195,12 @@ class TestPosteriorFrames:
         again = fit_posterior(
             tracks, frames.shapes, NOISE**2, weights=weights, initial=fitted.alpha
         )
+        # The fit ends when its weights change by less than 1e-4. Entries of cameras can
+        # change by more where points are missing.
         apart = distances(tracks.transpose(0, 2, 1), frames.shapes, *again[:3])
         new = np.nan_to_num(WEIGHTS[loss](apart / NOISE))
-        assert np.mean((new - weights) ** 2, axis=1).max() < SETTLED**2
-        assert_allclose(again.alpha, fitted.alpha, atol=1e-3)
+        assert_allclose(new, weights, rtol=0, atol=1e-4)
+        assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
 
     @pytest.mark.parametrize(("size", "point"), [(2.0, 0), (20.0, 7)])
     @EACH_LOSS

@@ -20,7 +20,7 @@ FITS["consensus"]["refinement"] = "consensus"
 NUMBERS = {
     "calibrated": [1.057758573e-3, 9.198214961e-4, -1.141188059e-3, 0.7730915423],
     "missing": [9.801392716e-4, 7.506639066e-4, -1.357330301e-3, 0.7643345523],
-    "robust": [1.00872888e-2, 1.3717964162e-2, -4.8105264824e-2, 0.8685667515],
+    "robust": [1.008728888e-2, 1.3811690536e-2, -4.7697967684e-2, 0.86855225228],
     "consensus": [1.435656244e-2, 1.113716499e-3, -1.970364542e-3, 0.7743476784],
 }
 # Uncertainty of depths, their mean deviation, and mean variances of rotations.

@@ -28,7 +28,6 @@ from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
-    SETTLED,
     frame_weights,
     lower_medians,
     robust_sizes,
@@ -473,13 +472,13 @@ class PosteriorFrames:
         poor = np.flatnonzero(median > MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
         if len(poor):
             fitted = partial(fitted, starts=self.starts)
-            fit.put(poor, self._reweighted(rows[poor], fitted, rough=False))
+            fit.put(poor, self._reweighted(rows[poor], fitted))
         return fit
 
     def _reweighted(
-        self, rows: NDArray, fitted: Callable[..., FramePosterior], rough: bool = True
+        self, rows: NDArray, fitted: Callable[..., FramePosterior]
     ) -> FramePosterior:
-        """Return the fit of rows (n, 2, J) with a robust loss, rough on the way."""
+        """Return the fit of rows (n, 2, J) with a robust loss."""
         quick = partial(fitted, covariances=False)
         sizes, deviation = robust_sizes(rows), np.sqrt(self.noise_variance)
         # First without gross outliers
@@ -496,15 +495,12 @@ class PosteriorFrames:
             part, before = rows[changing], weights[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
-            weights[changing] = new
-            unsettled = np.mean((new - before) ** 2, axis=1) >= SETTLED**2
-            # A point less may determine no camera.
-            unsettled |= ((new > 0) != (before > 0)).any(axis=1)
-            changing, before = changing[unsettled], before[unsettled]
+            unsettled = np.abs(new - before).max(axis=1) > 1e-4
+            changing, before, new = (x[unsettled] for x in (changing, before, new))
             if not len(changing):
                 break
-            new, alpha = weights[changing], fit.alpha[changing]
-            refit = quick(rows[changing], weights=new, initial=alpha, rough=rough)
+            weights[changing], alpha = new, fit.alpha[changing]
+            refit = quick(rows[changing], weights=new, initial=alpha)
             # If the model does not explain a frame, its weights can become so unequal
             # that they determine no camera. Such a frame keeps its fit.
             kept = np.isfinite(refit.objective)

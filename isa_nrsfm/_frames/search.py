@@ -153,8 +153,8 @@ class FrameSearch:
         *,
         weights: NDArray | None = None,
         initial: NDArray | None = None,
+        starts: NDArray | None = None,
         covariances: bool = True,
-        **how: Any,
     ) -> FramePosterior:
         """Fit rows (I, 2, J), NaN where a point is missing, as `fit` does.
 
@@ -176,8 +176,8 @@ class FrameSearch:
                     frame_tracks(rows[frames], own),
                     noise[frames],
                     initial=None if initial is None else initial[frames],
+                    starts=starts,
                     covariances=covariances,
-                    **how,
                 )
                 fits.put(frames, fit)
         return fits

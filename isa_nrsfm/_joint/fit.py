@@ -51,12 +51,7 @@ from isa_nrsfm._joint.starts import (
 )
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
-from isa_nrsfm._prepare.robust import (
-    SETTLED,
-    frame_weights,
-    median_noise,
-    robust_sizes,
-)
+from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
 
@@ -370,7 +365,7 @@ def reweighted(
         noise = median_noise(typical[np.isfinite(typical)])
         deviation = max(noise, OF_DISTANCES)
         before, weights = weights, frame_weights(loss, distance, deviation, sizes)
-        if np.mean((weights - before) ** 2) < SETTLED**2:
+        if np.mean((weights - before) ** 2) < 2.5e-5:
             break
         problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
         fit = refined(problem, fit)

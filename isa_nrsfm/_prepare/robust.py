@@ -38,8 +38,6 @@ MEDIAN_DISTANCE = np.sqrt(2 * np.log(2))
 # A point does not belong to its frame if it is farther from the spatial median than
 # this many sizes of the frame.
 DISTANT = 6.0
-# Weights are settled if they change by less (RMS): docs/benchmarks/README.md.
-SETTLED = 0.005
 
 
 def frame_weights(

@@ -128,7 +128,10 @@ def diagnose(
     distance = None
     if table is not None:
         if table.n_frames != len(sizes):
-            raise ValueError(f"X must have the {len(sizes)} rows of the fitted table")
+            raise ValueError(
+                f"diagnostics needs the fitted table, which has {len(sizes)} rows; got "
+                f"X with {table.n_frames}"
+            )
         fit = estimator.motion_, estimator.translation_, estimator.alpha_
         distance = table.joined(estimator._model.distances, *fit, *weights)
     fitted = np.isfinite(sizes)
