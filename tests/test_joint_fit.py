@@ -262,6 +262,17 @@ class TestRobustLoss:
         moved[where] += 2.0 * rng.normal(size=(where.sum(), 2))
         assert error_of(fitted(moved, loss=loss), tracks, truth) < 1e-3
 
+    def test_tables_of_more_frames_than_settle_the_weights(self):
+        # 2,000 frames do, also of tables that are too small for a sample.
+        table = make_nonrigid_tracks(2100, 12, 1, noise=0.02, random_state=0).data
+        few, model = (
+            AffineNRSfM(1, loss="cauchy", random_state=0).fit(table[:n_frames])
+            for n_frames in (2000, 2100)
+        )
+        assert model.noise_variance_ == pytest.approx(few.noise_variance_, rel=0.02)
+        assert_allclose(model.mean_shape_, few.mean_shape_, rtol=0, atol=0.02)
+        assert_allclose(model.alpha_, model.transform(table), rtol=0, atol=1e-8)
+
 
 class TestDegenerate:
     @CALIBRATED

@@ -349,8 +349,10 @@ def reweighted(
         return problem.refined(fit.state, **limits)
 
     problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
-    if table.parts:
+    if table.parts:  # of a sample with other frames
         state = problem.aligned(state, problem.cameras)
+    else:
+        state = state._replace(motion=state.motion[few])
     fit = fit._replace(state=state)
     for _ in range(20):
         shapes, motion, _ = fit.state
