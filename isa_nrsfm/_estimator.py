@@ -561,8 +561,9 @@ default="affine"
             if auto:
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
                     table = scaled_table(source, weights, 1, settings)
-                numbers = supported_components(table, isa, settings, progress)
-                n_components, most = numbers
+                n_components, most = supported_components(
+                    table, isa, settings, progress
+                )
             table = scaled_table(source, weights, n_components, settings)
             fit = fit_table(
                 table, n_components, isa, settings, progress, start, auto, errors

@@ -82,7 +82,6 @@ from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import of_all_rows
 
-AUTO_STAGE = "number of basis shapes"
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
 PERSPECTIVE_STAGE = "perspective"
@@ -95,7 +94,7 @@ def stages_of(estimator: Any) -> list[str]:
     stages = ["table", "factorisation"]
     if estimator.prior is None:
         if estimator.n_components == "auto" and estimator.camera != "perspective":
-            stages.insert(0, AUTO_STAGE)
+            stages.insert(0, "number of basis shapes")
         stages += ["independent subspaces", "block structure and refinement"]
     if estimator.refinement in JOINT_REFINEMENTS:
         stages.append(JOINT_STAGE)
@@ -160,11 +159,13 @@ def fit_table(
             "gradient_norm_": fit.gradient_norm,
             "n_iter_": len(fit.history) - 1,
         }
-        # A residual below the noise of the spectrum leaves nothing for groups.
-        n_numbers, square = tracks.totals
-        noise = factorised.noise_level(n_components) * square / n_numbers
-        more = wanted > n_components or fit.misfit > noise
-        if settings.refinement == "consensus" and more:
+        grouped = settings.refinement == "consensus"
+        if grouped and wanted == n_components:
+            # A residual below the noise of the spectrum leaves nothing for groups.
+            n_numbers, square = tracks.totals
+            noise = factorised.noise_level(n_components) * square / n_numbers
+            grouped = fit.misfit > noise
+        if grouped:
             model = consensus(model, table, settings, wanted, free, errors)
             tracks = JointFrames.from_points(table.rows, table.complete)
         elif errors and camera != "affine":
@@ -233,7 +234,7 @@ def supported_components(
     if consensus and settings.loss != "linear":
         model, *_ = fit_table(table, supported, isa, settings, quiet, free=True)
         supported = len(model.basis)
-    progress(AUTO_STAGE)
+    progress("number of basis shapes")
     return supported, most
 
 

@@ -150,8 +150,13 @@ def spherical_sources(seed, n_samples, n_subspaces, size=3):
 
 def likelihood_of(tracks, weights, penalty, block_frames=2048):
     """Return the objective of the joint fit for tracks (n_frames, n_points, 2)."""
-    pieces = frame_tracks(tracks.transpose(0, 2, 1), weights).pieces(block_frames)
-    blocks = [block for _, block in pieces]
+    blocks = [
+        frame_tracks(
+            tracks[first : first + block_frames].transpose(0, 2, 1),
+            None if weights is None else weights[first : first + block_frames],
+        )
+        for first in range(0, len(tracks), block_frames)
+    ]
     lengths = [len(block.weight) for block in blocks]
     frames = JointFrames(FrameBlocks.of_blocks(blocks, lengths))
     return MarginalLikelihood(frames, penalty)

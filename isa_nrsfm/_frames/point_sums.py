@@ -114,12 +114,12 @@ class FrameTracks(NamedTuple):
         """Frames to work on at a time; with weights each has a Gram matrix."""
         return BLOCK_FRAMES if self.weights is None else BLOCK_FRAMES // 8
 
-    def pieces(self, n_frames: int = 0) -> Iterator[tuple[slice, Self]]:
-        """Yield slices of at most n_frames consecutive frames, and these frames."""
-        total, n_frames = len(self.weight), n_frames or self.n_together
-        for start in range(0, total, n_frames):
-            frames = slice(start, min(start + n_frames, total))
-            yield frames, self if total <= n_frames else of_frames(self, frames)
+    def pieces(self) -> Iterator[tuple[slice, Self]]:
+        """Yield slices of at most `n_together` consecutive frames, and these frames."""
+        total, length = len(self.weight), self.n_together
+        for start in range(0, total, length):
+            frames = slice(start, min(start + length, total))
+            yield frames, self if total <= length else of_frames(self, frames)
 
 
 class FrameSums(NamedTuple):

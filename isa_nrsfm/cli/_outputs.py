@@ -18,7 +18,6 @@ from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import frames_of
-from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
@@ -168,9 +167,7 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
 
 def fitted_table(model: AffineNRSfM) -> NDArray:
     """Return the table of the model, in the frames that it was fitted to."""
-    blocks = FrameBlocks.of_array(model.alpha_, BLOCK_FRAMES)
-    cameras = model.motion_, model.translation_
-    return np.asarray(blocks.joined(model.inverse_transform, *cameras))
+    return model.inverse_transform(model.alpha_, model.motion_, model.translation_)
 
 
 def read_model(args: Namespace) -> AffineNRSfM:

@@ -16,7 +16,6 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
 from isa_nrsfm._prepare.coordinates import UNSURE, warn_of_places
-from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
@@ -148,8 +147,7 @@ def read_frames(
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
-    blocks = FrameBlocks.of_array(cleaned, BLOCK_FRAMES)
-    report = blocks.joined(lambda block: centred_frames(block)[1])
+    _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     usable = slice(None) if report.usable.all() else report.usable

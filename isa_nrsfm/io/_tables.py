@@ -30,8 +30,6 @@ from isa_nrsfm.skeletons._column_names import (
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
-# Rows that are looked at; headers of DeepLabCut have four.
-N_FIRST = 5
 # Numbers with a decimal comma, and with commas between thousands.
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
@@ -407,7 +405,7 @@ def header_names(path: Path) -> list[str]:
 
 
 def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
-    """Yield the first `N_FIRST` non-empty rows of a text file, and a few others.
+    """Yield the first five non-empty rows of a text file, and a few others.
 
     Raise if one has not as many cells as the first, if none follows it, or at a null
     character, as files in UTF-16 without a mark have. pandas would pad or cut the
@@ -423,7 +421,8 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
             nonlocal n_lines
             n_lines += 1
             full = line.count(separator) + 1 == n_columns
-            return n_rows < N_FIRST or not full or '"' in line or "\0" in line
+            # Headers of DeepLabCut have four rows.
+            return n_rows < 5 or not full or '"' in line or "\0" in line
 
         for row in csv.reader(filter(unusual, file), delimiter=separator):
             if "\0" in "".join(row):
