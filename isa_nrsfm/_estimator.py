@@ -87,17 +87,18 @@ class AffineNRSfM(
 
         (mean_shape_ + tensordot(alpha_[i], basis_, 1)) @ motion_[i].T + translation_[i]
 
+    and with calibrated cameras by further directions that are not reported.
+
     Parameters
     ----------
     n_components : int or "auto", default=3
-        K, the number of basis shapes. K needs at least 3K + 4 points and
-        ``ceil(8 (K + 2) / 5)`` frames. Calibrated cameras allow up to 2J - 7 basis
-        shapes of J points, if there are enough frames (joint refinement only): for 17
-        points 27 instead of 4. "auto" fits twelve basis shapes, or as many as the table
-        allows, and keeps the relevant and reliable ones (joint refinement only). With
-        ``refinement="consensus"`` the joint fit has at most twelve, and the result has
-        K principal components of the merged shapes; "auto" keeps those that exceed the
-        noise, at most 60.
+        K, the number of coefficients that are reported. With affine cameras the fit has
+        K basis shapes, which needs at least 3K + 4 points and ``ceil(8 (K + 2) / 5)``
+        frames. With calibrated cameras and the joint refinement the fit has all
+        directions of deformation that the table supports, and K does not change
+        cameras, depths, `reconstruct`, `reproject` and `score`; K is at most 2J - 7 for
+        J points. "auto" reports the directions that the table determines, at most
+        twelve (joint refinement and consensus only).
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
@@ -118,9 +119,8 @@ class AffineNRSfM(
         result and recovers the true shapes as far as the images determine them.
         "consensus" continues from there, with calibrated cameras: it fits overlapping
         groups of neighbouring points, with rotations of their own, and finds the
-        depths that they have in common. Bodies become more accurate by a third to two
-        thirds, and a fit takes 5 to 30 times as long. Set ``n_components="auto"`` or
-        about 60 with it.
+        depths that they have in common. Bodies become more accurate, and a fit takes
+        5 to 30 times as long.
         "alternating" is the paper's alternating least squares for basis shapes and
         coefficients, with fixed rigid cameras.
     camera : {"affine", "weak_perspective", "orthographic", "perspective"}, \
@@ -203,7 +203,7 @@ default="affine"
     Attributes
     ----------
     n_components_ : int
-        K, the number of basis shapes.
+        K, the number of coefficients.
     mean_shape_ : ndarray of shape (n_points, 3)
         Mean shape B_0, centred and white: the mean of ``b b^T`` over the points is the
         identity (of rank two for flat objects). With weak-perspective cameras only the
@@ -258,7 +258,7 @@ default="affine"
         visible points, scaled as in the fit.
     rank_floor_ : float
         Lowest inverse SNR of any model of rank 3K + 3, with missing points filled in;
-        zero where K exceeds the bound of affine cameras. K is that of the joint fit.
+        zero where K exceeds the bound of affine cameras.
     noise_variance_ : float
         Noise variance of a coordinate. If frames are scaled, it is that of frames of
         size one (joint refinement only, as are the next four).
@@ -276,8 +276,9 @@ default="affine"
         Norm of the gradient of this objective at the end, in the metric of its
         curvature, divided by the root of the number of coordinates.
     energy_share_ : ndarray of shape (n_components,)
-        Share of each basis shape in the energy of the deformations in the images,
-        ``sum_i ||alpha_ik M_i B_k||_F^2``, frames scaled as in the fit.
+        Share of each basis shape in the energy of all deformations in the images,
+        ``sum_i ||alpha_ik M_i B_k||_F^2``, frames scaled as in the fit. Directions that
+        are not reported have the rest.
     mode_covariance_ : ndarray of shape (3 * n_components, 3 * n_components)
         Covariance over the images of the 3K independent directions, 3x3 blocks in
         the order of `basis_`; after the joint refinement ``(1 / 2I) sum_i (alpha_i
@@ -375,6 +376,7 @@ default="affine"
     _model: TableModel
     _frame_sizes: NDArray
     _limits: ClassVar[Limits] = LIMITS  # others: `limited`
+    _whole: ClassVar[bool] = True  # whether joint fits have all directions of a shape
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
@@ -550,31 +552,22 @@ default="affine"
             self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
         )
         prior, n_components = settings.prior, self.n_components
-        n_components = n_components if prior is None else len(prior.basis)
-        auto, most = n_components == "auto", None
+        n_components = n_components if prior is None else prior.n_components
+        auto = n_components == "auto"
         if self.camera == "perspective":
             point, f = self.principal_point, self.focal_length
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
             fit = fit_perspective(images, number, f, start, errors)
         else:
-            if auto:
+            if auto and self.camera == "affine":
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
                     table = scaled_table(source, weights, 1, settings)
-                n_components, most = supported_components(
-                    table, isa, settings, progress
-                )
-            table = scaled_table(source, weights, n_components, settings)
-            fit = fit_table(
-                table, n_components, isa, settings, progress, start, auto, errors
-            )
+                n_components = supported_components(table, isa, settings, progress)
+            number = 1 if n_components == "auto" else n_components
+            table = scaled_table(source, weights, number, settings)
+            fit = fit_table(table, number, isa, settings, progress, start, auto, errors)
         model, frames, converged, fitted = fit
-        # A consensus has more components.
-        if auto and self.refinement == "joint" and len(model.basis) == most:
-            warn_caller(
-                f"all {most} basis shapes that were tried are relevant: try a larger "
-                "n_components, if the table allows it"
-            )
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
@@ -583,13 +576,16 @@ default="affine"
             )
         attributes: dict[str, Any] = fitted | {
             "_model": model,
-            "_n_features_out": len(model.basis),
-            "n_components_": len(model.basis),
+            "_n_features_out": model.n_components,
+            "n_components_": model.n_components,
             "camera_": self.camera,
             "frames_scaled_": bool(settings.scale_frames),
         }
         if self.keep_frames:
-            for name, part in keep(frames._asdict()).items():
+            K = model.n_components
+            alpha, deviation = frames.alpha[:, :K], frames.alpha_std[:, :K]
+            reported = frames._replace(alpha=alpha, alpha_std=deviation)
+            for name, part in keep(reported._asdict()).items():
                 attributes[f"{name}_"] = source.as_collected(part)
             if not settings.joint:
                 del attributes["alpha_std_"]
@@ -639,6 +635,7 @@ default="affine"
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),
             silent_isa=joint and self.isa is None,
+            whole=self._whole,
             limits=self._limits,
         )
         if self.camera == "orthographic":  # one scale
@@ -708,7 +705,8 @@ default="affine"
         """
         table, weights = self._opened(X, point_weight)
         coefficients = partial(self._model.decompose, deviations=False)
-        return table.collect(coefficients, *weights).alpha
+        K = self._model.n_components
+        return table.collect(coefficients, *weights).alpha[:, :K]
 
     def decompose(self, X: Any, *, point_weight: Any = None) -> Decomposition:
         """
@@ -728,7 +726,7 @@ default="affine"
             alpha_std (n_frames, n_components).
         """
         table, weights = self._opened(X, point_weight)
-        return table.collect(self._model.decompose, *weights)
+        return table.collect(self._model.reported, *weights)
 
     def smooth(
         self,
@@ -801,10 +799,12 @@ default="affine"
         result = smooth(
             alone, frames.gauge, camera, time, groups, max_gap, max_iter, tol, dtype
         )
-        if self._model.pinhole is None:
-            return result
-        in_table = table.joined(self._model.in_table_cameras, *result.decomposition)
-        return result._replace(decomposition=in_table)
+        fit, K = result.decomposition, self._model.n_components
+        if self._model.pinhole is not None:
+            fit = table.joined(self._model.in_table_cameras, *fit)
+        alpha, deviation = fit.alpha[:, :K], fit.alpha_std[:, :K]
+        fit = fit._replace(alpha=alpha, alpha_std=deviation)
+        return result._replace(alpha=alpha, alpha_std=deviation, decomposition=fit)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """

@@ -53,7 +53,7 @@ from isa_nrsfm._gauge import (
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames
-from isa_nrsfm._joint.problem import FactorisedTable, JointState
+from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
@@ -81,6 +81,7 @@ from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm.isa import PooledFastICA
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
@@ -93,7 +94,7 @@ def stages_of(estimator: Any) -> list[str]:
     """Return the names of the stages of a fit, in order."""
     stages = ["table", "factorisation"]
     if estimator.prior is None:
-        if estimator.n_components == "auto" and estimator.camera != "perspective":
+        if estimator.n_components == "auto" and estimator.camera == "affine":
             stages.insert(0, "number of basis shapes")
         stages += ["independent subspaces", "block structure and refinement"]
     if estimator.refinement in JOINT_REFINEMENTS:
@@ -126,8 +127,12 @@ def fit_table(
     without visible points; convergence; and the other attributes of `AffineNRSfM`.
     """
     camera, wanted = settings.camera, n_components
-    if settings.refinement == "consensus":
-        n_components = min(wanted, MOST_FIRST)
+    # Calibrated cameras: the fit does not depend on the number of coefficients.
+    whole = settings.joint and camera != "affine"
+    whole = whole and settings.whole and settings.prior is None
+    if whole:
+        possible = most_components(len(table.sizes), table.n_points, camera)
+        n_components = min(MOST_FIRST, possible)
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
@@ -138,10 +143,16 @@ def fit_table(
     if start is not None:
         given = _started(table, start, n_components)
     if given is None:
-        isa = clone(isa)
+        isa, factors = clone(isa), factorised.factors
         shapes, covariance, n_iter, converged = run_paper_pipeline(
-            factorised.factors, n_components, isa, settings, progress
+            factors.leading(3 * wanted), wanted, isa, settings, progress
         )
+        if whole:  # started with a fixed number of basis shapes
+            plain, silent = PooledFastICA(random_state=0), NoProgress()
+            settings = settings._replace(silent_isa=True)
+            shapes, *_ = run_paper_pipeline(
+                factors, n_components, plain, settings, silent
+            )
     else:
         isa, shapes = None, given.shapes
     # 5. Refinement, gauge and frames
@@ -150,7 +161,7 @@ def fit_table(
         fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
         (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
         settings = settings._replace(shape_prior=fit.prior)
-        gauge = FrameMap.identity(n_components)
+        gauge = FrameMap.identity(len(shapes) - 1)
         model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
         progress(JOINT_STAGE)
         attributes = {
@@ -159,23 +170,37 @@ def fit_table(
             "gradient_norm_": fit.gradient_norm,
             "n_iter_": len(fit.history) - 1,
         }
-        grouped = settings.refinement == "consensus"
-        if grouped and wanted == n_components:
+        if free and fit.widths is not None:
+            wanted = min(fit.widths.n_relevant, MOST_FIRST)
+        grouped, widths = settings.refinement == "consensus", fit.widths
+        if grouped:
             # A residual below the noise of the spectrum leaves nothing for groups.
             n_numbers, square = tracks.totals
-            noise = factorised.noise_level(n_components) * square / n_numbers
+            noise = factorised.noise_level(len(shapes) - 1) * square / n_numbers
+            if widths is not None:  # whose noise is that of the other coordinates
+                noise *= n_numbers / widths.freedom(n_numbers, len(table.sizes), camera)
             grouped = fit.misfit > noise
         if grouped:
-            model = consensus(model, table, settings, wanted, free, errors)
+            model, widths = consensus(model, table, settings, errors), None
             tracks = JointFrames.from_points(table.rows, table.complete)
         elif errors and camera != "affine":
-            certainty = depth_certainty(model, table.rows, table.weights, settings)
+            certainty = depth_certainty(
+                model, table.rows, table.weights, settings, widths
+            )
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             progress(CONSENSUS_STAGE)
+        if (n_more := wanted + 1 - len(model.shapes)) > 0:
+            # Coefficients beyond the directions that a table supports are zero.
+            shapes = np.pad(model.shapes, ((0, n_more), (0, 0), (0, 0)))
+            starts = np.pad(model.starts, ((0, 0), (0, n_more)))
+            model = replace(model, shapes=shapes, starts=starts)
+            widths = None if widths is None else widths.padded(n_more)
         fits = fitted_frames(model, tracks, table.rows)
         del tracks  # as much memory as the table
-        fitted, frames, measures = _joint_frames(table, model, fits, settings)
+        fitted, frames, measures = _joint_frames(
+            table, model, fits, settings, wanted, widths
+        )
         if fit.prior is not None:
             attributes["prior_std_"] = np.array(fit.prior.widths)
         if errors and camera != "affine":
@@ -183,7 +208,7 @@ def fit_table(
         converged = fit.converged
         # Down-weighted outliers, for example, look like basis shapes at first.
         supported = max(n_reliable(measures["reliability_"]), 1)
-        if free and settings.refinement == "joint" and supported < n_components:
+        if free and not whole and supported < n_components:
             quiet = NoProgress()
             return fit_table(
                 table, supported, isa, settings, quiet, start, free, errors
@@ -216,26 +241,16 @@ def supported_components(
     isa: Any,
     settings: FitSettings,
     progress: FitProgress | NoProgress,
-) -> tuple[int, int]:
-    """Return the number of relevant basis shapes of a table, and how many were tried.
-
-    Those are at most twelve.
-    """
-    consensus = settings.refinement == "consensus"
-    settings = settings._replace(refinement="joint")
+) -> int:
+    """Return the number of relevant basis shapes of affine cameras, at most twelve."""
     possible = most_components(len(table.sizes), table.n_points, settings.camera)
     most = min(MOST_FIRST, possible)
     quiet = NoProgress()
     factorised = _factorised(table, most, settings, quiet)
     factors = factorised.factors
     shapes, *_ = run_paper_pipeline(factors, most, clone(isa), settings, quiet)
-    supported = count_components(factorised, shapes, settings)
-    # Down-weighted outliers look like basis shapes of the joint fit of a consensus.
-    if consensus and settings.loss != "linear":
-        model, *_ = fit_table(table, supported, isa, settings, quiet, free=True)
-        supported = len(model.basis)
     progress("number of basis shapes")
-    return supported, most
+    return count_components(factorised, shapes, settings)
 
 
 def _factorised(
@@ -289,7 +304,7 @@ def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointS
     """
     frames, unit = model.frames, (model.unit or 1.0) / (table.unit or 1.0)
     assert isinstance(frames, PosteriorFrames)
-    n_more = n_components + 1 - len(frames.shapes)
+    n_more = max(n_components + 1 - len(frames.shapes), 0)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance
     if n_more:
         rows = table.rows.take(spread(np.arange(table.rows.n_frames), 200))
@@ -314,7 +329,8 @@ def _paper_frames(
 
     def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
         frames = RigidFrames(mean_shape, basis, s.camera)
-        return TableModel(frames, mean_shape, basis, s.layout, table.unit)
+        K = len(basis)
+        return TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
     def frames_for(mean_shape: NDArray, basis: NDArray) -> Any:
@@ -330,9 +346,18 @@ def _paper_frames(
 
 
 def _joint_frames(
-    table: ScaledTable, model: PosteriorFrames, fits: FrameFits, s: FitSettings
+    table: ScaledTable,
+    model: PosteriorFrames,
+    fits: FrameFits,
+    s: FitSettings,
+    n_components: int,
+    widths: Widths | None,
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return model, frames and attributes of fits in the independent gauge."""
+    """Return model, frames and attributes of fits in the independent gauge.
+
+    n_components: number of coefficients that are reported. widths: of a fit of all
+    directions.
+    """
     posteriors, motion, alpha, covariance, _ = fits
     unknown = np.isnan(motion).any(axis=(1, 2))
     if unknown.any():
@@ -347,19 +372,25 @@ def _joint_frames(
     unit = table.unit if s.camera == "orthographic" else None
     if prior is None:
         mean_shape, basis, gauge = independent_gauge(
-            model.shapes, motion, alpha, s.independence, s.camera, unit
+            model.shapes, motion, alpha, s.independence, s.camera, unit, n_components
         )
     else:
         gauge = prior.gauge
         mean_shape, basis = gauge.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share, slices = weight / table.n_points, posteriors.slices
-    information = shape_information(motion, alpha, covariance, share, slices)
+    prior_moments = covariance
+    if widths is not None:  # as in `MarginalLikelihood`
+        penalty = model.noise_variance / (widths.variances * len(motion))
+        prior_moments = covariance + np.diag(penalty)
+    information = shape_information(motion, alpha, prior_moments, share, slices)
     if prior is None:
         uncertainty = np.linalg.pinv(information, hermitian=True)
     else:
         uncertainty = prior.inverse(information[None], noise)[0]
-    certainty = frame_certainty(model, fits, table.n_seen, weight, prior)
+    known = prior or widths
+    unknowns = float(model.shapes.size) if known is None else known.n_determined
+    certainty = frame_certainty(model, fits, table.n_seen, weight, unknowns)
     certainty = certainty._replace(weighted=table.weights is not None)
     model = replace(model, gauge=gauge, certainty=certainty)
     last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
@@ -375,12 +406,15 @@ def _joint_frames(
         model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
     attributes = {
-        "mode_covariance_": square * mode_covariance(cameras, frames.alpha),
+        "mode_covariance_": square
+        * mode_covariance(cameras, frames.alpha[:, :n_components]),
         "noise_variance_": square * noise,
-        "reliability_": reliabilities(alpha, covariance, sum(moments), sum(noises)),
+        "reliability_": reliabilities(alpha, covariance, sum(moments), sum(noises))[
+            :n_components
+        ],
     }
     frames = frames._replace(translation=frames.translation + table.translation)
-    fitted = TableModel(model, mean_shape, basis, s.layout, table.unit)
+    fitted = TableModel(model, mean_shape, basis, n_components, s.layout, table.unit)
     return fitted, frames, attributes
 
 
@@ -392,7 +426,8 @@ def _measures(
     settings: FitSettings,
 ) -> dict[str, Any]:
     """Return the attributes that describe any fit, by name."""
-    mean_shape, basis = model.mean_shape, model.basis
+    mean_shape, basis, K = model.mean_shape, model.basis, model.n_components
+    values = factorised.singular_values
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, basis, frames.alpha)
     position = (frames.translation - table.translation) / table.sizes[:, None]
@@ -401,10 +436,10 @@ def _measures(
     reference = mean_camera(frames, table.sizes, settings.camera)
     return {
         "mean_shape_": mean_shape,
-        "basis_": basis,
-        "rank_floor_": factorised.rest_share,
-        "singular_values_": (table.unit or 1.0) * factorised.singular_values,
-        "energy_share_": energy / (energy.sum() or 1.0),
+        "basis_": basis[:K],
+        "rank_floor_": factorised.rest_share(3 * K + 3),
+        "singular_values_": (table.unit or 1.0) * values[: 3 * K + 3],
+        "energy_share_": energy[:K] / (energy.sum() or 1.0),
         "inverse_snr_": error,
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
@@ -423,8 +458,9 @@ def mirror_image(
     model: TableModel, frames: Decomposition, attributes: dict[str, Any]
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return the mirror image in depth of a fit."""
-    model, signs = model.mirrored(), np.tile(MIRROR, len(model.basis))
-    shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis}
+    K = model.n_components
+    model, signs = model.mirrored(), np.tile(MIRROR, K)
+    shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis[:K]}
     covariance = attributes.get("mode_covariance_", 0.0) * np.outer(signs, signs)
     attributes = attributes | shapes | {"mode_covariance_": covariance}
     return model, frames._replace(motion=frames.motion * MIRROR), attributes

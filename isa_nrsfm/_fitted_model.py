@@ -49,7 +49,8 @@ class TableModel(NamedTuple):
     """Model of a frame, shapes and layout: all that is needed to fit a new table.
 
     Methods take rows (n, 2, n_points) of a table and return NaN for frames with too few
-    visible points. The mean shape (J, 3) and the basis (K, J, 3) are in the gauge.
+    visible points. The mean shape (J, 3) and the basis (D, J, 3) are in the gauge. The
+    first n_components coefficients are reported; shapes and images are of all.
     `unit` is the common size of all frames, or None if each frame has its own. With a
     pinhole the rows are perspective images, and frames those of weak-perspective ones.
     """
@@ -57,6 +58,7 @@ class TableModel(NamedTuple):
     frames: RigidFrames | PosteriorFrames
     mean_shape: NDArray
     basis: NDArray
+    n_components: int
     layout: Layout
     unit: float | None
     pinhole: Pinhole | None = None
@@ -76,6 +78,12 @@ class TableModel(NamedTuple):
         fit = self.in_virtual_cameras(rows, weights, deviations)
         fit = self.in_table_cameras(rows, *fit)
         return Decomposition(*(part.astype(dtype) for part in fit))
+
+    def reported(self, *args: Any, **options: Any) -> Decomposition:
+        """Return `decompose` with the coefficients that are reported."""
+        fit, K = self.decompose(*args, **options), self.n_components
+        alpha, deviation = fit.alpha[:, :K], fit.alpha_std[:, :K]
+        return fit._replace(alpha=alpha, alpha_std=deviation)
 
     def in_virtual_cameras(
         self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
@@ -216,11 +224,10 @@ class TableModel(NamedTuple):
         A metric of space makes them Euclidean. `scaled` multiplies each by the scale of
         its camera, as orthographic cameras need.
         """
+        basis = self.basis[: fit.alpha.shape[1]]
         if metric is None:
-            return compose(self.mean_shape, self.basis, fit.alpha)
-        frames = euclidean_frames(
-            metric, fit.motion, fit.alpha, self.mean_shape, self.basis
-        )
+            return compose(self.mean_shape, basis, fit.alpha)
+        frames = euclidean_frames(metric, fit.motion, fit.alpha, self.mean_shape, basis)
         sizes = frames.scales[:, None, None] if scaled else 1.0
         return (sizes * frames.shapes).astype(fit.alpha.dtype, copy=False)
 

@@ -74,7 +74,12 @@ def euclidean_space(
 
 
 def canonical_gauge(
-    mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray, space: NDArray
+    mean_shape: NDArray,
+    basis: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    space: NDArray,
+    n_components: int | None = None,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return the canonical shapes among those that fit equally well, in a space (3, 3).
 
@@ -87,7 +92,9 @@ def canonical_gauge(
     index in the given basis and its factor (K,), zero for those without motion.
     """
     energy = image_energies(motion, basis, alpha)
-    order = np.argsort(-energy, kind="stable")
+    # The leading n_components stay before the others.
+    further = np.arange(len(energy)) >= (n_components or len(energy))
+    order = np.lexsort((-energy, further))
     rigid = image_energies(motion, mean_shape[None], np.ones((len(motion), 1)))
     # Basis shapes with less energy are rounding errors.
     moving = energy > OF_RANKS**2 * rigid
@@ -172,13 +179,15 @@ def independent_gauge(
     independence: str | None,
     camera: str = "affine",
     unit: float | None = None,
+    n_components: int | None = None,
 ) -> tuple[NDArray, NDArray, FrameMap]:
     """Return mean shape and independent basis of a fit, and the map of frames to it.
 
     Shapes (K + 1, 3, J) are centred. Cameras (I, 2, 3) belong to frames of size one.
     "shapes" makes basis shapes independent over the points, "coefficients" makes
-    coefficients independent over the frames. None takes the principal axes. `unit` is
-    the size in `euclidean_space`.
+    coefficients independent over the frames. None takes the principal axes. These are
+    the mixings of the leading n_components principal axes; further ones follow as they
+    are. `unit` is the size in `euclidean_space`.
     """
     # The shifts u and v, then the affinity of space.
     shift, motion, alpha = _centred(shapes, motion, alpha, camera)
@@ -188,17 +197,21 @@ def independent_gauge(
     if camera != "affine":
         space = euclidean_space(shapes[0].T, motion, unit)
     # The mixing of the basis shapes, then their order, scale and signs.
-    mixing: NDArray
-    if independence == "shapes":
-        mixing = shared_mixing(white)
-    elif independence == "coefficients":
-        mixing = np.linalg.inv(independent_coefficients(alpha)).T
-    else:
+    mixing = np.eye(len(white))
+    K = len(white) if n_components is None else n_components
+    if independence is None or K < len(white):
         mixing = _principal_axes(white, alpha)
+        white = np.tensordot(mixing, white, 1)
+    unmixing = np.linalg.inv(mixing).T
+    if independence == "shapes":
+        mixing[:K] = shared_mixing(white[:K]) @ mixing[:K]
+    elif independence == "coefficients":
+        inverse = independent_coefficients((alpha @ unmixing.T)[:, :K])
+        mixing[:K] = np.linalg.inv(inverse).T @ mixing[:K]
     basis = np.tensordot(mixing, shapes[1:], 1).mT
     unmixing = np.linalg.inv(mixing).T
     mean_shape, basis, order, factors = canonical_gauge(
-        shapes[0].T, basis, motion, alpha @ unmixing.T, space
+        shapes[0].T, basis, motion, alpha @ unmixing.T, space, K
     )
     # Coefficients (1, alpha_i) change by the inverse transpose of the mixing of shapes.
     scale = np.divide(1.0, factors, where=factors != 0, out=np.zeros_like(factors))

@@ -115,7 +115,7 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
             f"the prior has {len(model.mean_shape)} points, the table {n_points}. Give "
             "the table the points of the prior, in the same order"
         )
-    if n_components not in ("auto", K := len(model.basis)):
+    if n_components not in ("auto", K := model.n_components):
         raise ValueError(
             f"n_components must be that of the prior, {K}, or 'auto', which takes it; "
             f"got {n_components}"

@@ -99,7 +99,7 @@ class PerspectiveFit(NamedTuple):
     @property
     def n_components(self) -> int:
         """Number of basis shapes."""
-        return len(self.model.basis)
+        return self.model.n_components
 
     @property
     def for_depths(self) -> list[tuple[TableModel, Decomposition]]:
@@ -181,12 +181,13 @@ class PerspectiveTable(NamedTuple):
         isa, settings = self.isa, self.settings
         if not last:
             tol = ROUGH * settings.tol
-            settings = settings._replace(independence=None, tol=tol)
+            # All directions of a shape would explain the perspective.
+            settings = settings._replace(independence=None, tol=tol, whole=False)
         options["free"] = n_components is None
         options.setdefault("progress", NoProgress())
         if n_components is None:
             table = self.straight(pinhole, 1, before)
-            n_components, _ = supported_components(table, isa, settings, NoProgress())
+            n_components = supported_components(table, isa, settings, NoProgress())
             if before is not None and n_components == before.n_components:
                 return before
         table = self.straight(pinhole, n_components, before)

@@ -52,6 +52,7 @@ class StartedNRSfM(AffineNRSfM):
     """A fit that starts from another one, without warnings and errors of depths."""
 
     start: TableModel | None = None
+    _whole = False  # held-out points compare numbers of basis shapes
 
     def __sklearn_clone__(self) -> Self:
         """Return a copy with the same start."""

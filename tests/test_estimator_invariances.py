@@ -44,7 +44,7 @@ def estimator(params, scale_frames=True):
 def faces(load_data, name):
     """Return the tracks of complete frames, a subset of a real table or synthetic."""
     if name == "synthetic":
-        return make_face_tracks(120, n_components=4, random_state=0).tracks
+        return make_face_tracks(120, n_components=4, random_state=1).tracks
     tracks = load_data(name)["W2d"].astype(float)
     tracks = tracks[~np.isnan(tracks).any(axis=(1, 2))]
     return tracks[:: len(tracks) // 200]

@@ -1,7 +1,6 @@
 """Starts of the joint fit, the choice between them, and the number of shapes."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 from scenes import random_scene as random_model, with_gaps
 
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._joint.fit import _first_fit, relevant_components
+from isa_nrsfm._joint.fit import _first_fit
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState
+from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState, Widths
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
     affine_start,
@@ -23,6 +22,12 @@ from isa_nrsfm._joint.starts import (
     likely_basis,
     mixed_cameras,
     rigid_start,
+)
+from isa_nrsfm._joint.whole import (
+    determined,
+    extended,
+    n_directions,
+    whole_distribution,
 )
 from isa_nrsfm._paper.pipeline import Factorisation, factorise
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -269,23 +274,15 @@ def random_problem(kind="complete", n_frames=30, **options):
     return problem, JointState(shapes, scene.motion, NOISE**2)
 
 
-def counted(problem, state, threshold=None):
-    """Return the number of relevant shapes, by another threshold of shares."""
-    settings = problem.settings
-    if threshold is not None:
-        limits = settings.limits._replace(determined=threshold)
-        settings = settings._replace(limits=limits)
-    return relevant_components(replace(problem, settings=settings), state)
-
-
 def mean_images(state):
     """Return the mean over frames of the products <M B_k, M B_l>."""
     images = [(M @ state.shapes[1:]).reshape(3, -1) for M in state.motion]
     return np.mean([image @ image.T for image in images], axis=0)
 
 
-def shares_and_variances(problem, state, penalty):
-    """Return g_k and v_k after a round from prior variances 1 / (n_frames penalty)."""
+def shares_and_variances(problem, state, v):
+    """Return g_k and the next v_k after a round from prior variances v_k."""
+    penalty = 1 / (len(state.motion) * v)
     curvature = MarginalLikelihood(problem.frames, penalty)(*state).shape_curvature
     C = np.mean([M.T @ M for M in state.motion], axis=0)
     traces = np.zeros(3)
@@ -294,51 +291,68 @@ def shares_and_variances(problem, state, penalty):
         for k in range(3):
             of_shape = slice(3 * k + 3, 3 * k + 6)
             traces[k] += np.trace(C @ covariance[of_shape, of_shape])
-    v = 1 / (len(state.motion) * penalty)
     g = 1 - traces / (3 * FEW_POINTS * v)
     return g, np.diag(mean_images(state)) / (3 * FEW_POINTS * g)
 
 
-class TestRelevantComponents:
+class TestWholeDistribution:
+    """All directions of a shape, and their variances."""
+
     @pytest.mark.parametrize("kind", ["complete", "missing", "directions"])
-    def test_rounds_by_their_definition(self, kind, monkeypatch):
+    def test_rounds_by_their_definition(self, kind):
         problem, state = random_problem(kind)
-        rounds = []
+        reached, widths = determined(problem, state, None)
+        # Another basis of the same shapes, whose images are orthogonal
+        assert_allclose(reached.shapes[0], state.shapes[0])
+        before = np.linalg.pinv(state.shapes[1:].reshape(3, -1))
+        mixing = reached.shapes[1:].reshape(3, -1) @ before
+        assert_allclose(mixing @ mixing.T, np.eye(3), atol=1e-10)
+        energies = np.linalg.eigvalsh(mean_images(state))[::-1]
+        assert_allclose(mean_images(reached), np.diag(energies), atol=1e-9)
+        v = energies / (3 * FEW_POINTS)
+        for _ in range(2):
+            shares, v = shares_and_variances(problem, reached, v)
+            assert_allclose(widths.shares, shares, rtol=1e-6)
+            assert_allclose(widths.variances, v, rtol=1e-6)
+            assert widths.n_determined == pytest.approx(36 * (1 + shares.sum()))
+            reached, widths = determined(problem, reached, widths)
 
-        def held(problem, state, **options):
-            rounds.append((problem.penalty, state))
-            return SimpleNamespace(state=state)
+    def test_noise_has_the_coordinates_that_are_left(self):
+        problem, state = random_problem()
+        widths = Widths(np.full(3, 0.1), np.array([1.0, 0.5, 0.0]), 36)
+        plain = replace(problem, penalty=1 / (0.1 * 30)).likelihood(*state)
+        found = replace(problem, widths=widths).likelihood(*state)
+        n_unknowns = 30 * (2 + 6) + 36 * 2.5  # affine cameras
+        change = n_unknowns * np.log(state.noise)
+        assert found.value == pytest.approx(plain.value - change)
+        slope = plain.noise_gradient - n_unknowns
+        assert found.noise_gradient == pytest.approx(slope)
+        assert_allclose(found.shape_gradient, plain.shape_gradient)
 
-        monkeypatch.setattr(JointProblem, "refined", held)
-        counted(problem, state)
-        assert_allclose(rounds[0][0], np.full(3, problem.penalty))
-        assert len(rounds) == 3
-        prices = [penalty for penalty, _ in rounds[1:]] + [None]
-        for (penalty, reached), following in zip(rounds, prices, strict=True):
-            # Another basis of the same shapes, whose images are orthogonal
-            assert_allclose(reached.shapes[0], state.shapes[0])
-            before = np.linalg.pinv(state.shapes[1:].reshape(3, -1))
-            mixing = reached.shapes[1:].reshape(3, -1) @ before
-            assert_allclose(mixing @ mixing.T, np.eye(3), atol=1e-10)
-            energies = np.linalg.eigvalsh(mean_images(state))[::-1]
-            assert_allclose(mean_images(reached), np.diag(energies), atol=1e-9)
-            shares, variances = shares_and_variances(problem, reached, penalty)
-            if following is not None:
-                expected = 1 / (variances * len(state.motion))
-                assert_allclose(following, expected, rtol=1e-6)
-        for n, threshold in enumerate(np.sort(shares)[::-1]):
-            assert 0.0 < threshold < 1.0
-            assert counted(problem, state, threshold + 1e-6) == n
-            assert counted(problem, state, threshold - 1e-6) == n + 1
-
-    def test_true_shapes_are_and_those_of_noise_are_not(self):
+    def test_directions_of_noise_are_left_out(self):
         problem, state = random_problem(n_frames=60, n_components=2)
         spare = 0.05 * np.random.default_rng(1).normal(size=(2, 3, FEW_POINTS))
         spare -= spare.mean(axis=2, keepdims=True)
         shapes = np.concatenate([state.shapes, spare])
-        assert counted(problem, state._replace(shapes=shapes)) == 2
+        fit = problem.refined(state._replace(shapes=shapes), max_iter=5)
+        fit, widths = whole_distribution(problem, fit)
+        assert widths.n_relevant == 2
+        assert fit.state.noise == pytest.approx(NOISE**2, rel=0.1)
 
     def test_of_a_rigid_object(self):
         problem, state = random_problem()
         rigid = np.array([1.0, 0.0, 0.0, 0.0])[:, None, None]
-        assert counted(problem, state._replace(shapes=rigid * state.shapes)) == 0
+        still = state._replace(shapes=rigid * state.shapes)
+        _, widths = determined(problem, still, None)
+        assert widths.n_relevant == 1  # at least one
+        assert not (widths.shares > 0.5).any()
+
+    def test_all_directions_have_no_noise_without_the_correction(self):
+        """The likelihood alone explains each frame by enough directions."""
+        problem, state = random_problem(n_frames=120)
+        fit = problem.refined(state, max_iter=5)
+        n = n_directions(problem, FEW_POINTS, few=False)
+        assert n == 12  # half of 2,880 coordinates, less 8 a frame, over 36, less one
+        wide = extended(problem, fit, n, 20)
+        found, _ = whole_distribution(problem, wide)
+        assert found.state.noise > 0.5 * NOISE**2

@@ -82,7 +82,7 @@ def test_level(missing):
     rng, decided = np.random.default_rng(0), 0
     shape = rng.normal(size=(25, 3))
     shape -= shape.mean(axis=0)
-    model = TableModel(None, shape, np.empty((0, 25, 3)), "interleaved", None)
+    model = TableModel(None, shape, np.empty((0, 25, 3)), 0, "interleaved", None)
     for _ in range(300):
         waves = np.arange(200)[:, None] * rng.uniform(0.02, 0.09, 2)
         angles = 0.5 * np.sin(waves + rng.uniform(0, 2 * np.pi, 2))

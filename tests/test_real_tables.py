@@ -18,14 +18,19 @@ FITS = {
 FITS["consensus"]["refinement"] = "consensus"
 # Noise variance, inverse SNR, score, mean magnitude of the coefficients.
 NUMBERS = {
-    "calibrated": [1.057758573e-3, 9.198214961e-4, -1.141188059e-3, 0.7730915423],
-    "missing": [9.801392716e-4, 7.506639066e-4, -1.357330301e-3, 0.7643345523],
-    "robust": [1.008728888e-2, 1.3811690536e-2, -4.7697967684e-2, 0.86855225228],
-    "consensus": [1.435656244e-2, 1.113716499e-3, -1.970364542e-3, 0.7743476784],
+    "calibrated": [
+        9.82141578431e-5,
+        4.09114894721e-5,
+        -8.52537204161e-5,
+        0.7871160403342,
+    ],
+    "missing": [9.8014415521e-4, 7.506636e-4, -1.3573254476e-3, 0.7643343],
+    "robust": [1.0087041038e-2, 1.3811690536e-2, -4.7697797559e-2, 0.86855225228],
+    "consensus": [1.37804489414e-3, 5.24606714e-5, -3.85614310934e-4, 0.7825026361],
 }
 # Uncertainty of depths, their mean deviation, and mean variances of rotations.
-STATED_ERRORS = [0.0958206819, 0.0764673873, 6.55198901e-4, 8.53082804e-4]
-STATED_ERRORS.append(4.42218653e-4)
+STATED_ERRORS = [0.0901224982959, 0.0709470342830, 7.23285071469e-4, 4.80560457841e-4]
+STATED_ERRORS.append(4.54009475765e-4)
 # Relative RMS errors of the shapes, a little above what is reached.
 ERRORS = {"calibrated": 0.045, "missing": 0.044, "consensus": 0.054}
 

@@ -134,7 +134,9 @@ def test_attributes(column, refinement):
             continue
         if refinement != "joint" and name == "mode_covariance_":  # in other axes
             values, name = [np.linalg.eigvalsh(value) for value in values], "energies"
-        assert_changed(*values, name.removesuffix("_"), word)
+        # A gradient near zero has the rounding errors of the terms that cancel.
+        tolerance = 1e-5 if name == "gradient_norm_" else 1e-7
+        assert_changed(*values, name.removesuffix("_"), word, tolerance)
 
 
 def results(model, X):

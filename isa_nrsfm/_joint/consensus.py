@@ -101,16 +101,13 @@ def consensus(
     model: PosteriorFrames,
     table: ScaledTable,
     settings: FitSettings,
-    most: int,
-    free: bool,
     errors: bool,
 ) -> PosteriorFrames:
     """Fit groups of neighbouring points, and return the model that merges them.
 
     The given model is a joint fit of the table with calibrated cameras. The result has
-    `most` basis shapes, or if their number is free those that exceed the noise. The
-    errors of the depths of the joint fit are estimated, if wanted, while other
-    processes fit the groups.
+    all principal components that exceed the noise. The errors of the depths of the
+    joint fit are estimated, if wanted, while other processes fit the groups.
     """
     part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
@@ -130,7 +127,8 @@ def consensus(
     distances = neighbour_distances(shapes[:, :, chosen])
     # Groups cannot improve a fit whose noise is below their floor.
     if noise >= scene.floor:
-        begun = group_fits(scene, distances, len(model.shapes) - 1, settings)
+        n_components = min(len(model.shapes) - 1, MOST_FIRST)
+        begun = group_fits(scene, distances, n_components, settings)
     if errors:
         certainty = depth_certainty(model, table.rows, table.weights, settings)
     groups = []
@@ -157,11 +155,9 @@ def consensus(
         S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
         S = aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S
     # Their principal components
-    left = 0.0
-    if free:
-        possible = most_components(len(table.sizes), n_points, model.camera)
-        most, left = min(possible, MOST_COMPONENTS), LEFT * noise
-    shapes, alpha, rest = principal_shapes(S, most, left)
+    possible = most_components(len(table.sizes), n_points, model.camera)
+    most = min(possible, MOST_COMPONENTS)
+    shapes, alpha, rest = principal_shapes(S, most, LEFT * noise)
     starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
     model = replace(model, shapes=shapes, noise_variance=noise + rest)
     return replace(model, starts=starts, gauge=gauge, certainty=certainty)

@@ -9,17 +9,6 @@
    of the spectrum. Then the fit is repeated without floor and prior.
 
 For large tables, the first steps use a sample and the last ones all frames.
-
-The number of basis shapes that a table determines: the images of the 3J coordinates of
-each basis shape have a prior variance v_k, which is estimated (automatic relevance
-determination: MacKay, "Bayesian interpolation", 1992; Bishop, "Bayesian PCA", 1999).
-With the posterior covariance ``cov B_k``, the coefficients' moments held fixed, and ``C
-= mean_i M_i^T M_i`` the iteration is
-
-    g_k = 1 - tr(C cov B_k) / (3J v_k),   v_k <- mean_i ||M_i B_k||^2 / (3J g_k).
-
-g_k is the share of the 3J numbers of B_k that the table determines rather than the
-prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
 from collections.abc import Iterator
@@ -39,6 +28,7 @@ from isa_nrsfm._joint.problem import (
     JointFit,
     JointProblem,
     JointState,
+    Widths,
     regular,
 )
 from isa_nrsfm._joint.settings import FitSettings
@@ -46,13 +36,23 @@ from isa_nrsfm._joint.starts import (
     FIXED_STEPS,
     affine_start,
     best_starts,
-    camera_moments,
     with_prior,
+)
+from isa_nrsfm._joint.whole import (
+    LEAST_NOISE,
+    extended,
+    n_directions,
+    relevant,
+    whole_distribution,
 )
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
+
+# Numbers of basis shapes of the fits that are compared, and most steps of each with
+# all directions: docs/benchmarks/README.md, "Thresholds".
+FIRST_COMPONENTS, FREE_STEPS = (3, 12), 40
 
 
 def fit_jointly(
@@ -69,37 +69,62 @@ def fit_jointly(
     are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
     of freedom.
     """
+    every_point = table.scaled.complete and table.scaled.weights is None
     problems = _problems(table, paper_shapes, settings)
     first = next(problems)
+    whole = first.cameras.calibrated and settings.whole and settings.prior is None
     # Fit of the sample (of all frames if it is the table), and judgement of the model
-    if start is None:
-        fit, start = _first_fit(first, table, paper_shapes)
-    else:
+    if start is not None:
         shapes = first.frames.coordinates(start.shapes)
         start = first.aligned(start._replace(shapes=shapes), first.cameras)
         # The widths of a prior change its first fit.
         rough = {} if settings.prior is None else {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, first.cameras, **rough)
-    ratio = fit.camera_noise_ratio
-    if fit.prior is None:
-        fit, least_noise, sufficient = judged(first, table, fit, start)
+    elif whole:
+        fit = _likeliest_fit(first, table, paper_shapes)
     else:
-        least_noise, sufficient = settings.limits.least_noise, False
-        if table.outliers is None:  # with them the widths follow the weights
-            fit = widened(first, fit)
-    penalty = 0.0 if sufficient else first.penalty
-    problem = replace(first.with_prior(fit.prior), penalty=penalty)
+        fit, start = _first_fit(first, table, paper_shapes)
+    ratio, penalty = fit.camera_noise_ratio, first.penalty
+    least_noise, sufficient = settings.limits.least_noise, False
+    widths: Widths | None = None
+    if whole:
+        few = bool(table.parts) or not every_point or table.outliers is not None
+        n = n_directions(first, paper_shapes.shape[2], few)
+        fit = extended(first, fit, n, FREE_STEPS)
+        fit, widths = whole_distribution(first, fit)
+        # Directions that explain the table up to rounding leave no noise.
+        if table.explained_by(len(widths.variances), LEAST_NOISE):
+            least_noise = NOISE_FLOOR
+            fit, widths = relevant(fit, widths)
+            fit = unregularised(first, fit.state)
+        else:
+            least_noise = LEAST_NOISE
+            problem = replace(first, widths=widths)
+            fit = problem.refined(fit.state, least_noise=least_noise, tol=settings.tol)
+    elif fit.prior is None:
+        assert start is not None
+        fit, least_noise, sufficient = judged(first, table, fit, start)
+        penalty = 0.0 if sufficient else first.penalty
+    elif table.outliers is None:  # with them the widths follow the weights
+        fit = widened(first, fit)
+
+    def of_all(larger: JointProblem) -> JointProblem:
+        """Return a problem with the priors of the fit of the sample."""
+        if widths is not None:
+            return replace(larger, widths=widths)
+        return replace(larger.with_prior(fit.prior), penalty=penalty)
+
+    problem = of_all(first)
     if sufficient and not table.parts:  # a smaller tolerance is safe
         tol = 0.1**2 * settings.tol
         fit = problem.refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames; for robust losses see `reweighted`
     for larger in problems:
-        problem = replace(larger.with_prior(fit.prior), penalty=penalty)
+        problem = of_all(larger)
         if table.outliers is None:
             state = problem.aligned(fit.state, problem.cameras)
             fit = problem.refined(state, least_noise=least_noise)
     noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
-    every_point = table.scaled.complete and table.scaled.weights is None
     if table.outliers is not None:
         # This noise variance is corrected for the unknowns of the frames already.
         problem, fit, noise = reweighted(problem, table, fit, least_noise)
@@ -116,10 +141,33 @@ def fit_jointly(
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
     if table.parts:
         state = state._replace(motion=state.motion[table.parts[0]])
-    noise *= _freedom_correction(table.scaled.n_seen, shapes.shape, n_pose, fit.prior)
+    if widths is None:
+        n_seen, prior = table.scaled.n_seen, fit.prior
+        noise *= _freedom_correction(n_seen, shapes.shape, n_pose, prior)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
-    fit = fit._replace(state=end, camera_noise_ratio=ratio)
+    fit = fit._replace(state=end, camera_noise_ratio=ratio, widths=widths)
     return fit, problem.frames, first.likelihood(*state).alpha
+
+
+def _likeliest_fit(
+    problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray
+) -> JointFit:
+    """Return the fit of few basis shapes from which all directions fit best."""
+    n_points = paper_shapes.shape[2]
+    n = n_directions(problem, n_points, few=True)
+    most = min(len(paper_shapes) - 1, n)
+    numbers = sorted({min(k, most) for k in FIRST_COMPONENTS})
+    fits = [_first_fit(problem, table, paper_shapes[: k + 1])[0] for k in numbers]
+    best = min((extended(problem, fit, n, FREE_STEPS) for fit in fits), key=_end)
+    # The noise variances of both camera models, each for its degrees of freedom, of the
+    # fewest basis shapes: more of them explain what wrong cameras leave.
+    size, n_seen = fits[0].state.shapes.shape, table.scaled.n_seen
+    own, affine = (
+        _freedom_correction(n_seen, size, 2 + c.n_parameters, None)
+        for c in (problem.cameras, CAMERAS["affine"])
+    )
+    ratio = max(fits[0].camera_noise_ratio * own / affine, 1.0)
+    return best._replace(camera_noise_ratio=ratio)
 
 
 def count_components(
@@ -131,46 +179,7 @@ def count_components(
     """
     problem = next(_problems(table, paper_shapes, settings))
     fit, _ = _first_fit(problem, table, paper_shapes)
-    return max(relevant_components(problem, fit.state), 1)
-
-
-def relevant_components(problem: JointProblem, state: JointState) -> int:
-    """Return the number of relevant basis shapes of a fit with more of them."""
-    n_points = problem.frames.points(state.shapes).shape[2]
-    n_numbers, n_frames = 3 * n_points, problem.frames.n_frames
-    penalty = np.full(len(state.shapes) - 1, problem.penalty)
-    determined = np.ones(len(penalty))
-    for _ in range(3):
-        part = replace(problem, penalty=penalty)
-        # Basis shapes whose images are orthogonal on average
-        axes = np.linalg.eigh(_image_moments(state)[1])[1][:, ::-1]
-        basis = np.tensordot(axes.T, state.shapes[1:], 1)
-        shapes = np.concatenate([state.shapes[:1], basis])
-        start = state._replace(shapes=shapes)
-        state = part.refined(start, max_iter=30, tol=part.settings.tol).state
-        C, images = _image_moments(state)
-        energy = np.diagonal(images)
-        if not energy.any():
-            return 0  # nothing deforms
-        # Posterior covariance of each point: half the Hessian is curvature / s2.
-        curvature = part.likelihood(*state).shape_curvature
-        covariance = state.noise * np.linalg.inv(regular(curvature))
-        # If all weights are one, one matrix is valid for all points.
-        total = covariance.sum(axis=0) * (n_points / len(covariance))
-        total = total.reshape(len(shapes), 3, len(shapes), 3)
-        uncertain = np.einsum("ab,kakb->k", C, total)[1:]
-        # g_k and v_k, with penalty = 1 / (v_k n_frames)
-        determined = 1.0 - uncertain * penalty * n_frames / n_numbers
-        determined = np.maximum(determined, 1e-9)
-        variance = np.maximum(energy / (n_numbers * determined), 1e-9 * energy.max())
-        penalty = 1.0 / (variance * n_frames)
-    return int(np.sum(determined > problem.settings.limits.determined))
-
-
-def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
-    """Return ``C = mean_i M_i^T M_i`` and the moments ``mean_i <M_i B_k, M_i B_l>``."""
-    C, basis = camera_moments(state.motion), state.shapes[1:]
-    return C, np.einsum("ab,kaj,lbj->kl", C, basis, basis, optimize=True)
+    return whole_distribution(problem, fit)[1].n_relevant
 
 
 def _problems(

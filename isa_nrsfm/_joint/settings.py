@@ -56,10 +56,6 @@ class Limits(NamedTuple):
     compared_tol: float = 0.5
     # Frames with more points are represented by directions.
     many_points: int = 200
-    # Threshold of a relevant basis shape, the share of its numbers that the table
-    # determines. On artificial tables with 2 % noise true shapes have 0.998 and more,
-    # others 0.83 and less.
-    determined: float = 0.95
     # Largest number of steps of a fit that estimates errors of depths. 30 steps
     # understate those of undetermined depths.
     error_steps: int = 100
@@ -76,6 +72,7 @@ class FitSettings(NamedTuple):
     mirror_certainty: that of the prior.
     silent_isa: whether a strategy that only starts the joint fit may end early.
     on_step: called before each step of the joint fit.
+    whole: whether fits of calibrated cameras have all directions of a shape.
     """
 
     refinement: str | None = "joint"
@@ -97,6 +94,7 @@ class FitSettings(NamedTuple):
     silent_isa: bool = True
     limits: Limits = LIMITS
     on_step: Callable[[], None] | None = None
+    whole: bool = True
 
     @property
     def joint(self) -> bool:

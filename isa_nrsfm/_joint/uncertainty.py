@@ -40,8 +40,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._joint.problem import JointState, refine_joint
+from isa_nrsfm._joint.problem import JointState, Widths, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
@@ -60,7 +59,7 @@ N_GROUPS = 5
 TOL = 1e-3
 # Largest numbers of frames and points of the fits. With 100 frames one deviation
 # changed from 12 to 19 %. Points are assigned to groups in cubic time.
-MOST_FRAMES, MOST_POINTS = 200, 200
+MOST_FRAMES, MOST_POINTS, MOST_DIRECTIONS = 200, 200, 24
 # Floor of the noise variance of the fits, as a share of the mean square. Without noise,
 # surplus basis shapes leave the depth undetermined, and fits stay near their start.
 # Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
@@ -142,21 +141,20 @@ def frame_certainty(
     fits: FrameFits,
     n_seen: NDArray,
     weight: NDArray,
-    prior: ShapePrior | None,
+    unknowns: float,
 ) -> DepthCertainty:
     """Return the certainty with that of the residuals of frames.
 
-    n_seen (n,): numbers of seen points. weight (n,): sums of their weights. Camera,
+    n_seen (n,): numbers of seen points. weight (n,): sums of their weights. unknowns:
+    number of coordinates that determine the shapes. Camera,
     position and coefficients fit a part of the coordinates of a frame. All other
-    coordinates determine the 3 J unknowns of each shape, whose errors in an image are
+    coordinates determine the shapes, whose errors in an image are
     proportional to the leverage of the frame. The noise variance neglects that the
     coefficients fit noise, too, but not with a robust loss, nor at its floor.
     """
     *_, alpha, covariance, residual = fits
     certainty, mean = frames.certainty, float(leverages(alpha).mean())
-    unknowns, numbers = float(frames.shapes.size), 2.0 * n_seen.sum()
-    if prior is not None:
-        unknowns = prior.n_determined
+    numbers = 2.0 * n_seen.sum()
     n_own = 2 + CAMERAS[frames.camera].n_parameters + np.trace(1 - covariance)
     left = max(numbers - len(alpha) * n_own, 0.1 * numbers)
     noise = frames.noise_variance
@@ -253,15 +251,20 @@ def depth_certainty(
     rows: FrameBlocks,
     weights: NDArray | None,
     settings: FitSettings,
+    widths: Widths | None = None,
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
-    Weights (I, J) are numbers of observations; without them each is one.
+    Weights (I, J) are numbers of observations; without them each is one. widths: of a
+    fit of all directions.
     """
     limits = settings.limits
     part, fit, w = inlying_rows(frames, rows, MOST_FRAMES, weights)
     n_points = frames.shapes.shape[2]
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
+    # Directions are sorted by their size, and as many as these frames determine.
+    most = MOST_DIRECTIONS if settings.shape_prior is None else len(frames.shapes)
+    directions, directions_of_fits = slice(most + 1), slice(most)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     groups = neighbours(mean_shape)
     parts = [groups != group for group in range(N_GROUPS)]
@@ -271,7 +274,7 @@ def depth_certainty(
     if known.sum() < 2:
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
-    shapes, motion = frames.shapes[:, :, points], fit.motion[known]
+    shapes, motion = frames.shapes[directions][:, :, points], fit.motion[known]
     tracks, camera = part[known], CAMERAS[frames.camera]
     prior, extents = settings.shape_prior, EXTENT_WEIGHT
     if prior is not None:  # which does not let depths grow
@@ -290,8 +293,14 @@ def depth_certainty(
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
-        penalty = part.basis_penalty(limits.basis_std)
-        likelihood = MarginalLikelihood(part, penalty, extents)
+        penalty: Any = part.basis_penalty(limits.basis_std)
+        unknowns = 0.0
+        if widths is not None:
+            penalty = 1.0 / (widths.variances[directions_of_fits] * len(rows))
+            unknowns = (2 + camera.n_parameters) * len(rows)
+            shares = widths.shares[directions_of_fits]
+            unknowns += 3 * rows.shape[2] * (1.0 + shares.sum())
+        likelihood = MarginalLikelihood(part, penalty, extents, None, unknowns)
         if prior is not None:
             likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)

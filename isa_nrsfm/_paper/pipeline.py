@@ -63,6 +63,10 @@ class Factorisation(NamedTuple):
     motion: NDArray
     signals: NDArray
 
+    def leading(self, n: int) -> "Factorisation":
+        """Return the factorisation with at most n signals."""
+        return self._replace(motion=self.motion[:, :n], signals=self.signals[:n])
+
 
 def factorise(
     W: NDArray,

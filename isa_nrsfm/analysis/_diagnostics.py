@@ -3,6 +3,7 @@
 import html
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -132,8 +133,9 @@ def diagnose(
                 f"diagnostics needs the fitted table, which has {len(sizes)} rows; got "
                 f"X with {table.n_frames}"
             )
-        fit = estimator.motion_, estimator.translation_, estimator.alpha_
-        distance = table.joined(estimator._model.distances, *fit, *weights)
+        model = estimator._model  # with the directions that are not reported
+        fit = table.joined(partial(model.decompose, deviations=False), *weights)[:3]
+        distance = table.joined(model.distances, *fit, *weights)
     fitted = np.isfinite(sizes)
     motion = np.asarray(estimator.motion_)[fitted] / sizes[fitted, None, None]
     coefficients = np.asarray(estimator.alpha_, dtype=np.float64)

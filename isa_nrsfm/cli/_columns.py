@@ -14,7 +14,6 @@ from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
 from isa_nrsfm.cli._options import DEFAULTS
-from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import as_numbers, read_times, video_times
@@ -206,7 +205,7 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray
     """
     from sklearn.decomposition import PCA  # not needed without labels
 
-    table = np.where(X.isna(), fitted_table(estimator), X)
+    table = np.where(X.isna(), estimator.reproject(X), X)
     aligned = analysis.AlignedFrames().fit_transform(table)
     n_shapes = len(estimator.basis_)
     most = min(3 * n_shapes + 3, *aligned.shape)

@@ -117,7 +117,7 @@ def fit_table(
                     X, return_std=True, **frames.weighting
                 )[1]
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
-            explained = _outputs.fitted_table(estimator)
+            explained = estimator.reproject(X, **frames.weighting)
             energy, error, _ = frame_energies(X, explained, estimator.layout)
             snr = error / energy
             choice = None if search is None else choice_report(search, X)

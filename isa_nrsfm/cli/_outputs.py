@@ -54,7 +54,7 @@ RESULTS = {
 class Fit(NamedTuple):
     """A fit to write and draw: model, frames, choice of K, smoothing, lines.
 
-    ``explained`` is the `fitted_table`, and ``inverse_snr`` (n_frames,) that of frames.
+    ``explained`` is the table of the model, ``inverse_snr`` (n_frames,) that of frames.
     """
 
     estimator: AffineNRSfM
@@ -163,11 +163,6 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
     shown |= {"X": X, **frames.weighting, **drawn}
     export.write_viewer(estimator, folder / "viewer.html", **shown)
     save_model(estimator, folder / "model.npz")
-
-
-def fitted_table(model: AffineNRSfM) -> NDArray:
-    """Return the table of the model, in the frames that it was fitted to."""
-    return model.inverse_transform(model.alpha_, model.motion_, model.translation_)
 
 
 def read_model(args: Namespace) -> AffineNRSfM:

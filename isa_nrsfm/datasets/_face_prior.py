@@ -81,7 +81,7 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     share, n_features = stored["energy_share"][:K], 2 * len(mean_shape)
     model = AffineNRSfM(K, camera="weak_perspective")
     model.__dict__ |= {
-        "_model": TableModel(frames, mean_shape, basis, "interleaved", None),
+        "_model": TableModel(frames, mean_shape, basis, K, "interleaved", None),
         "_n_features_out": K,
         "n_components_": K,
         "n_features_in_": n_features,

@@ -233,7 +233,8 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     estimator._model = TableModel(
         _frame_model(entries),
         estimator.mean_shape_,
-        estimator.basis_,
+        _all_directions(entries, estimator.basis_),
+        len(estimator.basis_),
         entries["layout"],
         entries["unit"],
         _pinhole(entries),
@@ -256,6 +257,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
     if missing := [name for name in NEEDED if values.get(name) is None]:
         raise ValueError(f"it lacks attributes: {', '.join(missing)}")
     K, P = (*np.shape(values["basis_"]), 0, 0)[:2]
+    D = K + len(values.get("further_basis", ()))
     N = (*np.shape(values.get("sizes", ())), 0)[0]
     single = "noise_variance unit n_features_in_ n_iter_ inverse_snr_ leverage".split()
     single += "noise_variance_ rank_floor_ camera_noise_ratio_ gradient_norm_".split()
@@ -263,12 +265,13 @@ def _check_shapes(values: dict[str, Any]) -> None:
     shapes: tuple[tuple[tuple[int | None, ...], list[str]], ...] = (
         ((K, P, 3), ["basis_", "basis"]),
         ((P, 3), ["mean_shape_", "mean_shape"]),
-        ((K + 1, 3, P), ["shapes"]),
+        ((D + 1, 3, P), ["shapes"]),
+        ((D - K, P, 3), ["further_basis"]),
         ((K,), ["energy_share_", "reliability_"]),
-        ((None, K), ["coefficient_starts"]),
-        ((K + 1, K + 1), ["mixing"]),
+        ((None, D), ["coefficient_starts"]),
+        ((D + 1, D + 1), ["mixing"]),
         ((3 * K, 3 * K), ["mode_covariance_"]),
-        ((min(3 * K + 3, P - 1),), ["singular_values_"]),
+        ((None,), ["singular_values_"]),
         ((P,), ["depth_variances"]),
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
@@ -332,6 +335,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         **entries,
         "loss": frames.loss,
         "shapes": frames.shapes,
+        "further_basis": model.basis[model.n_components :],
         "noise_variance": frames.noise_variance,
         "coefficient_starts": frames.starts,
         "mixing": frames.gauge.mixing,
@@ -345,6 +349,11 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "image_errors": np.array(frames.certainty.images),
         "weighted": frames.certainty.weighted,
     }
+
+
+def _all_directions(entries: dict[str, Any], basis: Any) -> Any:
+    """Return the basis of all directions of a shape, reported or not."""
+    return np.concatenate([basis, entries.get("further_basis", basis[:0])])
 
 
 def _pinhole(entries: dict[str, Any]) -> Pinhole | None:

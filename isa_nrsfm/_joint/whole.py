@@ -1,0 +1,145 @@
+"""The whole distribution of a shape: all its directions, by their evidence.
+
+A shape has 3J - 7 directions of deformation. With calibrated cameras the joint fit has
+as many of them as frames and time allow, whatever number of coefficients is reported:
+deformation that a fit lacks would distort cameras and depths.
+
+The images of the 3J numbers of each direction have a prior variance v_k, which follows
+from the table (automatic relevance determination: MacKay, "Bayesian interpolation",
+1992; Bishop, "Bayesian PCA", 1999). With the posterior covariance ``cov B_k``, the
+coefficients' moments held fixed, and ``C = mean_i M_i^T M_i`` the iteration is
+
+    g_k = 1 - tr(C cov B_k) / (3J v_k),   v_k <- mean_i ||M_i B_k||^2 / (3J g_k).
+
+g_k is the share of the 3J numbers of B_k that the table determines rather than the
+prior. Directions that fit noise get smaller, and less determined, with each round.
+
+The noise variance s2 follows in the same way. Of the N coordinates ``n = sum_i (2 + p)
++ 3J (1 + sum_k g_k)`` determine positions, the p parameters of each camera, and the
+shapes. The objective has ``(N - n) log s2`` in place of ``N log s2``: otherwise s2
+vanishes as soon as there are enough directions to explain a frame by them.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._joint.problem import (
+    JointFit,
+    JointProblem,
+    JointState,
+    Widths,
+    regular,
+)
+from isa_nrsfm._joint.starts import camera_moments
+from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._linalg.small_matrices import centred
+
+# All of these: docs/benchmarks/README.md, "Thresholds".
+# Largest number of directions: of small complete tables, and of others, where each
+# frame or point has matrices of its own.
+MOST_DIRECTIONS, FEW_DIRECTIONS = 60, 24
+# Sizes of further directions at first, as a share of that of the mean shape.
+FIRST_SIZE = 0.03
+# Noise variance of the first fit of all directions, as a share of the mean square: the
+# floor of large motion, at which fits from different starts are compared.
+FIRST_NOISE = 1e-3
+# Floor of the noise variance, for tables without noise
+LEAST_NOISE = 1e-5
+# Directions with a smaller share of determined numbers are left out.
+LEAST_SHARE = 0.02
+
+
+def n_directions(problem: JointProblem, n_points: int, few: bool) -> int:
+    """Return the number of directions of a joint fit.
+
+    At least half of the coordinates have to be left for the noise.
+    """
+    most = FEW_DIRECTIONS if few else MOST_DIRECTIONS
+    n_pose = (2 + problem.cameras.n_parameters) * problem.frames.n_frames
+    n_shapes = (problem.frames.totals[0] / 2 - n_pose) / (3 * n_points)
+    return max(min(3 * n_points - 7, most, int(n_shapes) - 1), 1)
+
+
+def extended(problem: JointProblem, fit: JointFit, n: int, steps: int) -> JointFit:
+    """Return the fit of n directions with the first noise, from one with less."""
+    state = fit.state
+    n_more = n + 1 - len(state.shapes)
+    if n_more > 0:
+        _, _, n_points = state.shapes.shape
+        more = np.random.RandomState(0).standard_normal((n_more, 3, n_points))
+        if problem.frames.directions is None:
+            more = centred(more)
+        size = FIRST_SIZE * np.linalg.norm(state.shapes[0])
+        more *= size / np.linalg.norm(more, axis=(1, 2))[:, None, None]
+        state = state._replace(shapes=np.concatenate([state.shapes, more]))
+    free = replace(problem, penalty=0.0, widths=None)
+    tol = problem.settings.tol
+    return free.refined(state, least_noise=FIRST_NOISE, max_iter=steps, tol=tol)
+
+
+def whole_distribution(problem: JointProblem, fit: JointFit) -> tuple[JointFit, Widths]:
+    """Return the fit with the variances of its directions and the noise, and these."""
+    state, widths, n_now = fit.state, None, np.inf
+    tol = problem.settings.tol
+    for _ in range(10):
+        state, widths = determined(problem, state, widths)
+        part = replace(problem, widths=widths)
+        fit = part.refined(state, least_noise=LEAST_NOISE, max_iter=30, tol=tol)
+        state = fit.state
+        before, n_now = n_now, widths.shares.sum()
+        if abs(n_now - before) < 0.02 * n_now + 0.1:
+            break
+    assert widths is not None
+    return fit, widths
+
+
+def determined(
+    problem: JointProblem, state: JointState, widths: Widths | None
+) -> tuple[JointState, Widths]:
+    """Return a state along its principal directions, and their prior variances."""
+    n_numbers = 3 * problem.frames.points(state.shapes).shape[2]
+    # Basis shapes whose images are orthogonal on average
+    C, images = image_moments(state)
+    energy, axes = np.linalg.eigh(images)
+    energy, axes = np.maximum(energy[::-1], 0.0), axes[:, ::-1]
+    basis = np.tensordot(axes.T, state.shapes[1:], 1)
+    state = state._replace(shapes=np.concatenate([state.shapes[:1], basis]))
+    least = 1e-9 * max(energy.max(), OF_DISTANCES * problem.mean_square) / n_numbers
+    variances = np.maximum(energy / n_numbers, least)
+    if widths is not None:  # of the same directions, nearly in the same order
+        variances = widths.variances[: len(energy)]
+    # Posterior covariance of each point: half the Hessian is curvature / s2.
+    every = Widths(variances, np.ones(len(energy)), n_numbers)
+    part = replace(problem, widths=every)
+    curvature = part.likelihood(*state).shape_curvature
+    covariance = state.noise * np.linalg.inv(regular(curvature))
+    # If all weights are one, one matrix is valid for all points.
+    total = covariance.sum(axis=0) * (n_numbers / 3 / len(covariance))
+    total = total.reshape(len(basis) + 1, 3, len(basis) + 1, 3)
+    uncertain = np.einsum("ab,kakb->k", C, total)[1:]
+    shares = np.clip(1.0 - uncertain / (variances * n_numbers), 1e-9, 1.0)
+    variances = np.maximum(energy / (n_numbers * shares), least)
+    # The large noise of the first round hides directions.
+    kept = (shares > LEAST_SHARE) | (widths is None)
+    kept[0] = True
+    shapes = state.shapes[np.append(True, kept)]
+    widths = Widths(variances[kept], shares[kept], n_numbers)
+    return state._replace(shapes=shapes), widths
+
+
+def relevant(fit: JointFit, widths: Widths) -> tuple[JointFit, Widths]:
+    """Return a fit with only the directions that the table determines."""
+    kept = np.arange(len(widths.shares)) < widths.n_relevant
+    shapes = fit.state.shapes[np.append(True, kept)]
+    widths = widths._replace(
+        variances=widths.variances[kept], shares=widths.shares[kept]
+    )
+    return fit._replace(state=fit.state._replace(shapes=shapes)), widths
+
+
+def image_moments(state: JointState) -> tuple[NDArray, NDArray]:
+    """Return ``C = mean_i M_i^T M_i`` and the moments ``mean_i <M_i B_k, M_i B_l>``."""
+    C, basis = camera_moments(state.motion), state.shapes[1:]
+    return C, np.einsum("ab,kaj,lbj->kl", C, basis, basis, optimize=True)
