@@ -116,12 +116,12 @@ def fit_table(
     free: bool = False,
     errors: bool = False,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
-    """Fit a table with K basis shapes and a clone of the strategy `isa`.
+    """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
     The joint fit starts from the model of a similar table, if `start` is given, instead
-    of the paper's result. `free`: K falls until all directions of the coefficients
-    are reliable; the consensus keeps all components that exceed the noise, instead of
-    K. `errors`: estimate the errors of the depths.
+    of the paper's result. `free`: K is the number of directions that the table
+    determines, or with affine cameras falls until all directions of the coefficients
+    are reliable. `errors`: estimate the errors of the depths.
 
     Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
     without visible points; convergence; and the other attributes of `AffineNRSfM`.

@@ -64,7 +64,7 @@ FREE_STEPS, MOST_STEPS = 30, 300
 MOST_FRAMES, MOST_POINTS = 500, 100
 # Mean square that free numbers of components leave, as a share of the noise variance
 LEFT = 0.01
-# Largest number of basis shapes of the joint fit, and of the consensus if it is free
+# Largest number of basis shapes of first fits, and of the consensus
 MOST_FIRST, MOST_COMPONENTS = 12, 60
 
 

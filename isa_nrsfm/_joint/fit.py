@@ -64,7 +64,8 @@ def fit_jointly(
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
     The shapes and the noise of a given start replace the paper's shapes (K + 1, 3, J).
-    With a prior there is no judgement.
+    Calibrated cameras have all directions of a shape (`whole`). With them and with a
+    prior there is no judgement.
     Returns the fit, the fitted frames, and alpha (n_chosen, K) of the sample. Shapes
     are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
     of freedom.
