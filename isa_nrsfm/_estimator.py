@@ -582,9 +582,7 @@ default="affine"
             "frames_scaled_": bool(settings.scale_frames),
         }
         if self.keep_frames:
-            K = model.n_components
-            alpha, deviation = frames.alpha[:, :K], frames.alpha_std[:, :K]
-            reported = frames._replace(alpha=alpha, alpha_std=deviation)
+            reported = frames.leading(model.n_components)
             for name, part in keep(reported._asdict()).items():
                 attributes[f"{name}_"] = source.as_collected(part)
             if not settings.joint:
@@ -802,9 +800,10 @@ default="affine"
         fit, K = result.decomposition, self._model.n_components
         if self._model.pinhole is not None:
             fit = table.joined(self._model.in_table_cameras, *fit)
-        alpha, deviation = fit.alpha[:, :K], fit.alpha_std[:, :K]
-        fit = fit._replace(alpha=alpha, alpha_std=deviation)
-        return result._replace(alpha=alpha, alpha_std=deviation, decomposition=fit)
+        fit = fit.leading(K)
+        return result._replace(
+            alpha=fit.alpha, alpha_std=fit.alpha_std, decomposition=fit
+        )
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """

@@ -178,7 +178,8 @@ def fit_table(
             n_numbers, square = tracks.totals
             noise = factorised.noise_level(len(shapes) - 1) * square / n_numbers
             if widths is not None:  # whose noise is that of the other coordinates
-                noise *= n_numbers / widths.freedom(n_numbers, len(table.sizes), camera)
+                n_unknowns = widths.n_unknowns(len(table.sizes), camera)
+                noise *= n_numbers / (n_numbers - n_unknowns)
             grouped = fit.misfit > noise
         if grouped:
             model, widths = consensus(model, table, settings, errors), None

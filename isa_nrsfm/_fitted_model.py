@@ -81,9 +81,7 @@ class TableModel(NamedTuple):
 
     def reported(self, *args: Any, **options: Any) -> Decomposition:
         """Return `decompose` with the coefficients that are reported."""
-        fit, K = self.decompose(*args, **options), self.n_components
-        alpha, deviation = fit.alpha[:, :K], fit.alpha_std[:, :K]
-        return fit._replace(alpha=alpha, alpha_std=deviation)
+        return self.decompose(*args, **options).leading(self.n_components)
 
     def in_virtual_cameras(
         self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False

@@ -117,7 +117,7 @@ class TestStarts:
 
 
 @pytest.mark.parametrize(("n_components", "n_points"), [(1, 20), (2, 20), (1, 7)])
-def test_noise_level_and_missing_share_of_the_spectrum(n_components, n_points):
+def test_noise_level_of_the_spectrum(n_components, n_points):
     # Rows of points that are centred have one singular value less.
     squares = np.random.default_rng(0).exponential(size=n_points - 1)
     squares, rank = np.sort(squares)[::-1], 3 * n_components + 3
@@ -126,8 +126,6 @@ def test_noise_level_and_missing_share_of_the_spectrum(n_components, n_points):
     table = FactorisedTable(scaled, None, None, kept, rest, W, [], None)
     others = squares[rank:].mean() / squares.mean() if n_points > 7 else 0.0
     assert table.noise_level(n_components) == pytest.approx(others)
-    missing = squares[n_components + 3 :].sum() / squares.sum()
-    assert table.missing_share(n_components) == pytest.approx(missing)
 
 
 class TestCameras:

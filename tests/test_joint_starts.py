@@ -353,6 +353,6 @@ class TestWholeDistribution:
         fit = problem.refined(state, max_iter=5)
         n = n_directions(problem, FEW_POINTS, few=False)
         assert n == 12  # half of 2,880 coordinates, less 8 a frame, over 36, less one
-        wide = extended(problem, fit, n, 20)
+        wide = extended(problem, fit, n)
         found, _ = whole_distribution(problem, wide)
         assert found.state.noise > 0.5 * NOISE**2

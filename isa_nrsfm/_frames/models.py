@@ -144,6 +144,22 @@ class Decomposition(NamedTuple):
     alpha: NDArray
     alpha_std: NDArray
 
+    def leading(self, n: int) -> "Decomposition":
+        """Return the fits with only the first coefficients.
+
+        Parameters
+        ----------
+        n : int
+            Number of coefficients that are kept.
+
+        Returns
+        -------
+        Decomposition
+            Fits with alpha and alpha_std of shape (n_frames, n).
+        """
+        alpha, deviation = self.alpha[:, :n], self.alpha_std[:, :n]
+        return self._replace(alpha=alpha, alpha_std=deviation)
+
 
 class FrameMap(NamedTuple):
     """Map of cameras and coefficients of frames to other, equally good shapes.

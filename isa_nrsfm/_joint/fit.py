@@ -39,10 +39,10 @@ from isa_nrsfm._joint.starts import (
     with_prior,
 )
 from isa_nrsfm._joint.whole import (
+    FEW_DIRECTIONS,
     LEAST_NOISE,
     extended,
     n_directions,
-    relevant,
     whole_distribution,
 )
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
@@ -50,9 +50,9 @@ from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 
-# Numbers of basis shapes of the fits that are compared, and most steps of each with
-# all directions: docs/benchmarks/README.md, "Thresholds".
-FIRST_COMPONENTS, FREE_STEPS = (3, 12), 40
+# Numbers of basis shapes of the fits that are compared: docs/benchmarks/README.md,
+# "Thresholds".
+FIRST_COMPONENTS = 3, 12
 
 
 def fit_jointly(
@@ -90,14 +90,17 @@ def fit_jointly(
     widths: Widths | None = None
     if whole:
         few = bool(table.parts) or not every_point or table.outliers is not None
-        n = n_directions(first, paper_shapes.shape[2], few)
-        fit = extended(first, fit, n, FREE_STEPS)
-        fit, widths = whole_distribution(first, fit)
+        most = n_directions(first, paper_shapes.shape[2], few)
+        n = min(most, FEW_DIRECTIONS)
+        fit, widths = whole_distribution(first, extended(first, fit, n))
+        if len(widths.variances) == n < most:  # the table supports all of them
+            fit, widths = whole_distribution(first, extended(first, fit, most))
         # Directions that explain the table up to rounding leave no noise.
         if table.explained_by(len(widths.variances), LEAST_NOISE):
             least_noise = NOISE_FLOOR
-            fit, widths = relevant(fit, widths)
-            fit = unregularised(first, fit.state)
+            shapes = fit.state.shapes[: 1 + widths.n_relevant]
+            fit = unregularised(first, fit.state._replace(shapes=shapes))
+            widths = widths.of_points(paper_shapes.shape[2], len(shapes) - 1)
         else:
             least_noise = LEAST_NOISE
             problem = replace(first, widths=widths)
@@ -154,12 +157,15 @@ def _likeliest_fit(
     problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray
 ) -> JointFit:
     """Return the fit of few basis shapes from which all directions fit best."""
-    n_points = paper_shapes.shape[2]
-    n = n_directions(problem, n_points, few=True)
+    n = n_directions(problem, paper_shapes.shape[2], few=True)
     most = min(len(paper_shapes) - 1, n)
-    numbers = sorted({min(k, most) for k in FIRST_COMPONENTS})
-    fits = [_first_fit(problem, table, paper_shapes[: k + 1])[0] for k in numbers]
-    best = min((extended(problem, fit, n, FREE_STEPS) for fit in fits), key=_end)
+    few, *more = sorted({min(k, most) for k in FIRST_COMPONENTS})
+    rough, cameras = {"tol": problem.settings.tol}, problem.cameras
+    fits = [_first_fit(problem, table, paper_shapes[: few + 1], **rough)[0]]
+    for k in more:
+        paper = paper_shapes[: k + 1]
+        fits.append(_calibrated_fit(problem, table, paper, cameras, **rough)[0])
+    best = min((extended(problem, fit, n) for fit in fits), key=_end)
     # The noise variances of both camera models, each for its degrees of freedom, of the
     # fewest basis shapes: more of them explain what wrong cameras leave.
     size, n_seen = fits[0].state.shapes.shape, table.scaled.n_seen
@@ -208,14 +214,15 @@ def _visible_frames(table: FactorisedTable) -> JointFrames:
 
 
 def _first_fit(
-    problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray
+    problem: JointProblem,
+    table: FactorisedTable,
+    paper_shapes: NDArray,
+    **limits: Any,
 ) -> tuple[JointFit, JointState]:
     """Return the fit of the sample, with its noise ratio, and one of its starts."""
-    # Calibrated cameras, from the best starts
     cameras, affine = problem.cameras, CAMERAS["affine"]
     calibrated = cameras if cameras.calibrated else CAMERAS["weak_perspective"]
-    starts = best_starts(problem, table, paper_shapes, calibrated)
-    fit = min(map(partial(problem.unreversed, cameras=calibrated), starts), key=_end)
+    fit, start = _calibrated_fit(problem, table, paper_shapes, calibrated, **limits)
     # Affine cameras, from the calibrated fit and from the paper's result
     rigid = affine_start(problem, table.W, paper_shapes)
     # Some steps without the prior: with the large noise of a start it would make basis
@@ -233,8 +240,21 @@ def _first_fit(
     other = min(map(partial(refined, max_iter=max_iter), states), key=_end)
     ratio = fit.misfit / min(other.misfit, fit.misfit)
     if cameras.calibrated:
-        return fit._replace(camera_noise_ratio=ratio), starts[0]
+        return fit._replace(camera_noise_ratio=ratio), start
     return other._replace(camera_noise_ratio=ratio), rigid
+
+
+def _calibrated_fit(
+    problem: JointProblem,
+    table: FactorisedTable,
+    paper_shapes: NDArray,
+    cameras: CameraModel,
+    **limits: Any,
+) -> tuple[JointFit, JointState]:
+    """Return the fit of calibrated cameras from the best starts, and the best start."""
+    starts = best_starts(problem, table, paper_shapes, cameras)
+    refined = partial(problem.unreversed, cameras=cameras, **limits)
+    return min(map(refined, starts), key=_end), starts[0]
 
 
 def _end(fit: JointFit) -> float:
@@ -252,15 +272,12 @@ def judged(
     floor and prior, from its result and from its start. The result lacks deformation
     below the floor.
 
-    Otherwise cameras or depths explain the missing deformation. Calibrated cameras are
-    fitted again, with a noise floor as high as that deformation; orthographic ones only
-    if their noise is at the lower floor.
+    Otherwise the fit keeps them: missing deformation would distort cameras and depths.
     """
     limits, mean_square = problem.settings.limits, problem.mean_square
-    cameras, least_noise = problem.cameras, limits.least_noise
-    n_components = len(start.shapes) - 1
-    noise_level = table.noise_level(n_components)
+    least_noise = limits.least_noise
     # A spectrum of only 3K + 3 singular values has no noise.
+    noise_level = table.noise_level(len(start.shapes) - 1)
     threshold = max(limits.right * noise_level, 1e-10) * mean_square
     at_floor = fit.state.noise < (1 + 1e-3) * least_noise * mean_square
     # Sufficient: without floor and prior
@@ -269,12 +286,6 @@ def judged(
             released = unregularised(problem, state)
             if released.state.noise < threshold:
                 return released, NOISE_FLOOR, True
-    # Not sufficient: with a floor as high as the missing deformation
-    follows = cameras.scaled or at_floor
-    if cameras.calibrated and follows and noise_level > 0:
-        missing = limits.cut_off * table.missing_share(n_components)
-        least_noise = np.clip(missing, least_noise, limits.most_noise)
-        fit = problem.unreversed(fit.state, cameras, least_noise=least_noise)
     return fit, least_noise, False
 
 

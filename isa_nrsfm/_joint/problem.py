@@ -33,10 +33,9 @@ from isa_nrsfm._prepare.scaling import ScaledTable
 # keeps the objective finite for tables without noise.
 NOISE_FLOOR = 1e-11
 
-# Least share of the numbers of a direction that a table determines, if it is
-# relevant. On artificial tables with 2 % noise true shapes have 0.998 and more, others
-# 0.83 and less.
-RELEVANT = 0.95
+# Least share of the numbers of a direction that a table determines, if it is relevant:
+# docs/benchmarks/README.md, "Thresholds".
+RELEVANT = 0.99
 
 # Steps, changes of the gradient, and their inner products.
 Memory = deque[tuple[NDArray, NDArray, float]]
@@ -95,14 +94,6 @@ class FactorisedTable(NamedTuple):
         known = 3 * n_directions + 3 < np.mean(self.scaled.n_seen) - 1
         return known and self.noise_level(n_directions) < 2.0 * noise
 
-    def missing_share(self, n_components: int) -> float:
-        """Return the share of the energy beyond the K + 3 largest singular values.
-
-        For motion capture, it is about the share of the shapes outside the best K basis
-        shapes.
-        """
-        return self.rest_share(n_components + 3)
-
 
 class JointState(NamedTuple):
     """Shapes (n_shapes, 3, J), cameras (I, 2, 3) and noise variance of a coordinate."""
@@ -123,6 +114,11 @@ class Widths(NamedTuple):
     shares: NDArray
     n_numbers: int
 
+    def of_points(self, n_points: int, n_directions: int) -> "Widths":
+        """Return the widths of the first directions of some of the points."""
+        kept = slice(n_directions)
+        return Widths(self.variances[kept], self.shares[kept], 3 * n_points)
+
     def padded(self, n_more: int) -> "Widths":
         """Return the widths with further directions, of which nothing is known."""
         variances = np.pad(self.variances, (0, n_more), constant_values=OF_DIFFERENCES)
@@ -137,12 +133,17 @@ class Widths(NamedTuple):
     @property
     def n_determined(self) -> float:
         """Number of coordinates of all shapes that the table determines."""
-        return float(self.n_numbers * (1.0 + self.shares.sum()))
+        return self.n_numbers * (1.0 + float(self.shares.sum()))
 
-    def freedom(self, n_numbers: float, n_frames: int, camera: str) -> float:
-        """Return the number of coordinates of some frames that determine the noise."""
-        n_pose = 2 + CAMERAS[camera].n_parameters
-        return n_numbers - n_pose * n_frames - self.n_determined
+    def n_unknowns(self, n_frames: int, camera: str) -> float:
+        """Return the number of coordinates that determine cameras and shapes."""
+        return (2 + CAMERAS[camera].n_parameters) * n_frames + self.n_determined
+
+    def likelihood(self, frames: JointFrames, camera: str) -> MarginalLikelihood:
+        """Return the objective of some frames, without other priors."""
+        penalty = 1.0 / (self.variances * frames.n_frames)
+        unknowns = self.n_unknowns(frames.n_frames, camera)
+        return MarginalLikelihood(frames, penalty, n_unknowns=unknowns)
 
 
 class JointFit(NamedTuple):
@@ -206,13 +207,10 @@ class JointProblem:
     @cached_property
     def likelihood(self) -> MarginalLikelihood:
         """The objective."""
-        prior = self.settings.shape_prior
-        penalty, unknowns, n_frames = self.penalty, 0.0, self.frames.n_frames
         if self.widths is not None:
-            penalty = 1.0 / (self.widths.variances * n_frames)
-            n_seen, camera = self.frames.totals[0], self.cameras.name
-            unknowns = n_seen - self.widths.freedom(n_seen, n_frames, camera)
-        return MarginalLikelihood(self.frames, penalty, 0.0, prior, unknowns)
+            return self.widths.likelihood(self.frames, self.cameras.name)
+        prior = self.settings.shape_prior
+        return MarginalLikelihood(self.frames, self.penalty, prior=prior)
 
     def aligned(self, state: JointState, cameras: CameraModel) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes."""

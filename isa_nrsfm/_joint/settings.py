@@ -41,11 +41,6 @@ class Limits(NamedTuple):
     # level of the spectrum. The ratio is 0.8 to 1.0 for artificial tables with the true
     # K or more, 1.3 to 1.8 with fewer basis shapes, 1.9 and more for motion capture.
     right: float = 1.4
-    # Floor of the noise variance for calibrated cameras and too few basis shapes: a
-    # multiple of the share of energy beyond K + 3 singular values, and its upper bound,
-    # because large motion adds to the spectrum
-    cut_off: float = 3.0
-    most_noise: float = 5e-4
     # Largest number of frames of a small table, with several minima. In large tables
     # all starts lead to the same minimum.
     few_frames: int = 2000

@@ -59,7 +59,7 @@ N_GROUPS = 5
 TOL = 1e-3
 # Largest numbers of frames and points of the fits. With 100 frames one deviation
 # changed from 12 to 19 %. Points are assigned to groups in cubic time.
-MOST_FRAMES, MOST_POINTS, MOST_DIRECTIONS = 200, 200, 24
+MOST_FRAMES, MOST_POINTS, MOST_DIRECTIONS = 200, 200, 16
 # Floor of the noise variance of the fits, as a share of the mean square. Without noise,
 # surplus basis shapes leave the depth undetermined, and fits stay near their start.
 # Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
@@ -264,7 +264,6 @@ def depth_certainty(
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     # Directions are sorted by their size, and as many as these frames determine.
     most = MOST_DIRECTIONS if settings.shape_prior is None else len(frames.shapes)
-    directions, directions_of_fits = slice(most + 1), slice(most)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     groups = neighbours(mean_shape)
     parts = [groups != group for group in range(N_GROUPS)]
@@ -274,7 +273,7 @@ def depth_certainty(
     if known.sum() < 2:
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(known, points)]
-    shapes, motion = frames.shapes[directions][:, :, points], fit.motion[known]
+    shapes, motion = frames.shapes[: most + 1, :, points], fit.motion[known]
     tracks, camera = part[known], CAMERAS[frames.camera]
     prior, extents = settings.shape_prior, EXTENT_WEIGHT
     if prior is not None:  # which does not let depths grow
@@ -293,16 +292,15 @@ def depth_certainty(
         counts = None if w is None else w[:, kept]
         part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
         n_numbers, energy = part.totals
-        penalty: Any = part.basis_penalty(limits.basis_std)
-        unknowns = 0.0
-        if widths is not None:
-            penalty = 1.0 / (widths.variances[directions_of_fits] * len(rows))
-            unknowns = (2 + camera.n_parameters) * len(rows)
-            shares = widths.shares[directions_of_fits]
-            unknowns += 3 * rows.shape[2] * (1.0 + shares.sum())
-        likelihood = MarginalLikelihood(part, penalty, extents, None, unknowns)
         if prior is not None:
             likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
+        elif widths is not None:
+            own = widths.of_points(rows.shape[2], most)
+            likelihood = own.likelihood(part, frames.camera)
+        else:
+            penalty = part.basis_penalty(limits.basis_std)
+            likelihood = MarginalLikelihood(part, penalty)
+        likelihood = likelihood._replace(extent_weight=extents)
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         least = min(noise * n_numbers / energy, limits.least_noise)
         if start is None:

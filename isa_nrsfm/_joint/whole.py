@@ -62,7 +62,7 @@ def n_directions(problem: JointProblem, n_points: int, few: bool) -> int:
     return max(min(3 * n_points - 7, most, int(n_shapes) - 1), 1)
 
 
-def extended(problem: JointProblem, fit: JointFit, n: int, steps: int) -> JointFit:
+def extended(problem: JointProblem, fit: JointFit, n: int) -> JointFit:
     """Return the fit of n directions with the first noise, from one with less."""
     state = fit.state
     n_more = n + 1 - len(state.shapes)
@@ -76,7 +76,7 @@ def extended(problem: JointProblem, fit: JointFit, n: int, steps: int) -> JointF
         state = state._replace(shapes=np.concatenate([state.shapes, more]))
     free = replace(problem, penalty=0.0, widths=None)
     tol = problem.settings.tol
-    return free.refined(state, least_noise=FIRST_NOISE, max_iter=steps, tol=tol)
+    return free.refined(state, least_noise=FIRST_NOISE, max_iter=40, tol=tol)
 
 
 def whole_distribution(problem: JointProblem, fit: JointFit) -> tuple[JointFit, Widths]:
@@ -127,16 +127,6 @@ def determined(
     shapes = state.shapes[np.append(True, kept)]
     widths = Widths(variances[kept], shares[kept], n_numbers)
     return state._replace(shapes=shapes), widths
-
-
-def relevant(fit: JointFit, widths: Widths) -> tuple[JointFit, Widths]:
-    """Return a fit with only the directions that the table determines."""
-    kept = np.arange(len(widths.shares)) < widths.n_relevant
-    shapes = fit.state.shapes[np.append(True, kept)]
-    widths = widths._replace(
-        variances=widths.variances[kept], shares=widths.shares[kept]
-    )
-    return fit._replace(state=fit.state._replace(shapes=shapes)), widths
 
 
 def image_moments(state: JointState) -> tuple[NDArray, NDArray]:
