@@ -67,6 +67,8 @@ MOST_FRAMES, MOST_POINTS, MOST_DIRECTIONS = 200, 200, 16
 LEAST_NOISE = 1e-6
 # Factor of the depths of a fit that hardly turns: docs/depth.md, "How it is estimated".
 FAR = 1000.0
+# Number of frames whose likelihoods tell it apart: docs/depth.md, "How it is estimated".
+FAR_FRAMES = 4
 
 
 # Result of `fitted_frames`.
@@ -319,7 +321,7 @@ def depth_certainty(
     deformation = 0.0
     if prior is None:
         *_, far_value = refit(every, far_state(whole, camera))
-        deformation = float(np.exp(-max(far_value - value, 0.0)))
+        deformation = float(np.exp(-FAR_FRAMES * max(far_value - value, 0.0)))
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept in parts:
         _, turned, z, _ = refit(kept)
