@@ -375,10 +375,8 @@ def studies(options):
         for K in (9, 40):
             prior = load_face_prior(K)
             show(f"transform, face prior, K={K}", [prior.transform(X) for X in tables])
-            for adapt in ("mean", "shapes"):
-                model = AffineNRSfM(K, prior=prior, adapt=adapt, **calibrated)
-                both = [model.fit_transform(X) for X in tables]
-                show(f"face prior, {adapt}, K={K}", both)
+            model = AffineNRSfM(K, prior=prior, **calibrated)
+            show(f"face prior, K={K}", [model.fit_transform(X) for X in tables])
 
 
 def views_of(rotations):

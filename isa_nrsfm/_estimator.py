@@ -139,12 +139,11 @@ default="affine"
         Point of the image on the axis of perspective cameras, which need it: half of
         the image's width and height, if nothing else is known.
     prior : AffineNRSfM, default=None
-        A fitted model of the same points, with calibrated cameras, that is adapted to
-        the table: frontal photos and few frames alone do not determine depths.
+        A fitted model of the same points, with calibrated cameras, for frontal photos
+        and few frames, which alone do not determine depths. The fit has its basis
+        shapes, and the mean shape of the table, in the pose and size of the model's.
         `isa_nrsfm.datasets.load_face_prior` is one of faces. `n_components` is its K,
         or "auto". `isa` and `independence` have no effect.
-    adapt : {"mean", "shapes"}, default="mean"
-        Shapes that may differ from the prior's: only the mean shape, or all.
     independence : {"shapes", "coefficients", None}, default="shapes"
         Criterion for the basis of the joint refinement. The likelihood does not depend
         on the mixing of the basis shapes. "shapes" makes them independent of each other
@@ -250,9 +249,8 @@ default="affine"
     focal_length_std_ : float
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
-    prior_std_ : ndarray of shape (2,)
-        Standard deviations of the mean shape and of the basis shapes from those of the
-        prior, in sizes of frames. The prior also fixes scales and signs.
+    prior_std_ : float
+        Standard deviation of the mean shape from that of the prior, in sizes of frames.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -344,7 +342,7 @@ default="affine"
     basis_: NDArray
     alpha_: NDArray
     alpha_std_: NDArray
-    prior_std_: NDArray
+    prior_std_: float
     motion_: NDArray
     translation_: NDArray
     rotations_: NDArray
@@ -389,7 +387,6 @@ default="affine"
         "focal_length": [None, Interval(Real, 0, None, closed="neither"), "array-like"],
         "principal_point": [None, "array-like"],
         "prior": [None, HasMethods(["fit", "get_params"])],
-        "adapt": [StrOptions(set(choices.ADAPTED))],
         "independence": [StrOptions(set(choices.INDEPENDENCE)), None],
         "loss": [StrOptions(set(choices.LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],
@@ -416,7 +413,6 @@ default="affine"
         focal_length: Any = None,
         principal_point: Any = None,
         prior: Any = None,
-        adapt: choices.Adapted = "mean",
         independence: choices.Independence | None = "shapes",
         loss: choices.Loss = "linear",
         layout: Layout = "interleaved",
@@ -439,7 +435,6 @@ default="affine"
         self.focal_length = focal_length
         self.principal_point = principal_point
         self.prior = prior
-        self.adapt = adapt
         self.independence = independence
         self.loss = loss
         self.layout = layout
@@ -1169,7 +1164,7 @@ default="affine"
         if point_weight is not None:
             table, weights = weighted_rows(table, point_weight)
         if judged and joint and not (reset or is_on_dask(X)):
-            warn_if_foreign(self._model, table, *weights)
+            warn_if_foreign(self, table, *weights)
         return table, weights
 
 

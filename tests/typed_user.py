@@ -58,7 +58,6 @@ def of_misspelt_values() -> None:
     AffineNRSfM(refinement="paper")  # type: ignore[arg-type]
     AffineNRSfM(loss="squared")  # type: ignore[arg-type]
     AffineNRSfM(independence="frames")  # type: ignore[arg-type]
-    AffineNRSfM(adapt="all")  # type: ignore[arg-type]
     AffineNRSfM(block_recovery="qr")  # type: ignore[arg-type]
 
 

@@ -376,11 +376,15 @@ class _Iterate:
         half = self.state.noise / 2
         shapes, steps, noise = self.split(vector)
         by_shapes, by_cameras = self.metric
+        if self.prior is not None:
+            shapes = self.prior.projected(shapes)
         stacked = shapes.reshape(-1, shapes.shape[-1])
         if len(by_shapes) == 1:
             stacked = by_shapes[0] @ stacked
         else:
             stacked = (by_shapes @ stacked.T[:, :, None])[:, :, 0].T
+        if self.prior is not None:
+            stacked = self.prior.projected(stacked.reshape(shapes.shape))
         steps = self.cameras.product(by_cameras, steps)
         return _stacked(half * stacked, half * steps, noise / self.n_seen)
 

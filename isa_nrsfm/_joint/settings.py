@@ -84,7 +84,6 @@ class FitSettings(NamedTuple):
     names: NDArray | None = None
     prior: Any = None
     mirror_certainty: float = np.nan
-    adapt: str = "mean"
     shape_prior: ShapePrior | None = None
     silent_isa: bool = True
     limits: Limits = LIMITS

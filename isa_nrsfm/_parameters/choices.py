@@ -9,8 +9,6 @@ BlockRecovery = Literal["generalized_eigen", "eigen", "irls"]
 Refinement = Literal["joint", "consensus", "alternating"]
 CalibratedCamera = Literal["weak_perspective", "orthographic"]
 Camera = Literal["affine", CalibratedCamera, "perspective"]
-# Shapes that move away from those of a prior: the mean shape, or all.
-Adapted = Literal["mean", "shapes"]
 Independence = Literal["shapes", "coefficients"]
 Loss = Literal["linear", "huber", "cauchy"]
 
@@ -20,7 +18,6 @@ REFINEMENTS: tuple[Refinement, ...] = get_args(Refinement)
 JOINT_REFINEMENTS = ("joint", "consensus")
 CALIBRATED_CAMERAS: tuple[CalibratedCamera, ...] = get_args(CalibratedCamera)
 CAMERA_NAMES: tuple[Camera, ...] = get_args(Camera)
-ADAPTED: tuple[Adapted, ...] = get_args(Adapted)
 INDEPENDENCE: tuple[Independence, ...] = get_args(Independence)
 LOSSES: tuple[Loss, ...] = get_args(Loss)
 # Sets of points in the files of OpenPose.

@@ -17,7 +17,7 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
 
     Frontal photos do not determine depths. With this prior they need not: it knows how
     deep faces are, and how people and expressions differ. Coefficients of all tables
-    that are fitted with it, and ``adapt="mean"``, can be compared.
+    that are fitted with it can be compared.
 
     Parameters
     ----------

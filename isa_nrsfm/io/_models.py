@@ -59,6 +59,8 @@ FINITE = (
     *("n_iter_", "energy_share_", "mode_covariance_", "singular_values_"),
 )
 POSITIVE = ("noise_variance", "noise_variance_", "unit", "depth_variances", "leverage")
+# Parameters of older files, which a fitted model does not need.
+REMOVED = ("adapt", "density", "fun")
 # Attributes that the model of a frame implies.
 IMPLIED = ("n_components_", "camera_", "frames_scaled_")
 
@@ -221,6 +223,8 @@ def _digest(header: dict[str, Any], arrays: Arrays) -> str:
 def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     """Return the fitted estimator of a model file."""
     estimator = with_parts(AffineNRSfM, header, arrays)
+    if np.ndim(vars(estimator).get("prior_std_")):  # of older files
+        estimator.prior_std_ = estimator.prior_std_[0]
     stored = header["frames"].items()
     entries = {name: unpacked(value, arrays) for name, value in stored}
     for name, choices in (("camera", CAMERAS), ("layout", LAYOUTS), ("loss", LOSSES)):
@@ -261,7 +265,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
     N = (*np.shape(values.get("sizes", ())), 0)[0]
     single = "noise_variance unit n_features_in_ n_iter_ inverse_snr_ leverage".split()
     single += "noise_variance_ rank_floor_ camera_noise_ratio_ gradient_norm_".split()
-    single += "depth_uncertainty_ focal_length_std_".split()
+    single += "depth_uncertainty_ focal_length_std_ prior_std_".split()
     shapes: tuple[tuple[tuple[int | None, ...], list[str]], ...] = (
         ((K, P, 3), ["basis_", "basis"]),
         ((P, 3), ["mean_shape_", "mean_shape"]),
@@ -275,7 +279,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((P,), ["depth_variances"]),
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
-        ((2,), ["reference_translation_", "prior_std_"]),
+        ((2,), ["reference_translation_"]),
         ((2,), ["certainty", "image_errors"]),
         ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
@@ -477,8 +481,8 @@ def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     """Return an object with the parameters and attributes of `packed_parts`."""
     stored = parts["parameters"].items()
     parameters = {name: unpacked(value, arrays) for name, value in stored}
-    # Of older files. Parameters that are newer than the file have their defaults.
-    parameters = {n: v for n, v in parameters.items() if n not in ("density", "fun")}
+    # Parameters that are newer than the file have their defaults.
+    parameters = {n: v for n, v in parameters.items() if n not in REMOVED}
     defaults = kind().get_params(deep=False)
     check_names({**defaults, **parameters}, defaults, "parameters")
     created = kind(**parameters)
