@@ -249,8 +249,9 @@ default="affine"
     focal_length_std_ : float
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
-    prior_std_ : float
-        Standard deviation of the mean shape from that of the prior, in sizes of frames.
+    prior_std_ : ndarray of shape (2,)
+        Standard deviations of mean shape and basis shapes from those of the prior, in
+        sizes of frames. The basis is that of the prior: the second is zero.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -342,7 +343,7 @@ default="affine"
     basis_: NDArray
     alpha_: NDArray
     alpha_std_: NDArray
-    prior_std_: float
+    prior_std_: NDArray
     motion_: NDArray
     translation_: NDArray
     rotations_: NDArray

@@ -203,7 +203,7 @@ def fit_table(
             table, model, fits, settings, wanted, widths
         )
         if fit.prior is not None:
-            attributes["prior_std_"] = fit.prior.width
+            attributes["prior_std_"] = np.array([fit.prior.width, 0.0])
         if errors and camera != "affine":
             attributes["depth_uncertainty_"] = fitted.frames.certainty.total
         converged = fit.converged

@@ -193,9 +193,9 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     model, alone = found.model, AffineNRSfM(**options, prior=prior)
     assert_array_equal(model.alpha_, alone.fit(X).alpha_)
     assert_array_equal(model.prior.basis_, prior.basis_)
-    assert found.report["prior"] == {"name": str(path), "std": model.prior_std_}
+    assert found.report["prior"] == {"name": str(path), "std": [*model.prior_std_]}
     text = " ".join(found.out.split())
-    width = f"{100 * model.prior_std_:.2g} % of the size"
+    width = f"{100 * model.prior_std_[0]:.2g} % of the size"
     assert f"prior {path}: the mean shape differs by {width}" in text
     assert "studies with the same prior can be compared" in text
     assert "Choice" not in text

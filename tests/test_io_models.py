@@ -321,8 +321,6 @@ def test_files_that_do_not_fit_together_are_refused(change, message, rewritten):
 
 def test_what_older_files_have_is_read(rewritten):
     assert load_model(rewritten(with_entry("shapes", "parameters", "adapt")))
-    width = with_entry({"tuple": [0.1, 0.0]}, "attributes", "prior_std_")
-    assert load_model(rewritten(width)).prior_std_ == 0.1
 
 
 def test_any_change_is_found_by_the_digest(model, path):

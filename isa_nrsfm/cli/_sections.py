@@ -307,7 +307,7 @@ def _fit(report: dict[str, Any]) -> Section:
 def _prior(prior: dict[str, Any]) -> str:
     """Return how far the shapes are from those of the prior, and what that means."""
     return (
-        f"prior {prior['name']}: the mean shape differs by {100 * prior['std']:.2g} "
+        f"prior {prior['name']}: the mean shape differs by {100 * prior['std'][0]:.2g} "
         "% of the size of the object from that of the prior (standard deviation of a "
         "coordinate). Coefficients are those of the prior, so that studies with the "
         "same prior can be compared."

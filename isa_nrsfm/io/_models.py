@@ -223,8 +223,6 @@ def _digest(header: dict[str, Any], arrays: Arrays) -> str:
 def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     """Return the fitted estimator of a model file."""
     estimator = with_parts(AffineNRSfM, header, arrays)
-    if np.ndim(vars(estimator).get("prior_std_")):  # of older files
-        estimator.prior_std_ = estimator.prior_std_[0]
     stored = header["frames"].items()
     entries = {name: unpacked(value, arrays) for name, value in stored}
     for name, choices in (("camera", CAMERAS), ("layout", LAYOUTS), ("loss", LOSSES)):
@@ -265,7 +263,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
     N = (*np.shape(values.get("sizes", ())), 0)[0]
     single = "noise_variance unit n_features_in_ n_iter_ inverse_snr_ leverage".split()
     single += "noise_variance_ rank_floor_ camera_noise_ratio_ gradient_norm_".split()
-    single += "depth_uncertainty_ focal_length_std_ prior_std_".split()
+    single += "depth_uncertainty_ focal_length_std_".split()
     shapes: tuple[tuple[tuple[int | None, ...], list[str]], ...] = (
         ((K, P, 3), ["basis_", "basis"]),
         ((P, 3), ["mean_shape_", "mean_shape"]),
@@ -279,7 +277,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((P,), ["depth_variances"]),
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
-        ((2,), ["reference_translation_"]),
+        ((2,), ["reference_translation_", "prior_std_"]),
         ((2,), ["certainty", "image_errors"]),
         ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
