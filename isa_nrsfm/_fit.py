@@ -55,7 +55,7 @@ from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._joint.starts import extended_shapes, rigid_start
+from isa_nrsfm._joint.starts import extended_shapes, lifted_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
     FrameFits,
     depth_certainty,
@@ -81,7 +81,6 @@ from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import of_all_rows
-from isa_nrsfm.isa import PooledFastICA
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
@@ -147,12 +146,10 @@ def fit_table(
         shapes, covariance, n_iter, converged = run_paper_pipeline(
             factors.leading(3 * wanted), wanted, isa, settings, progress
         )
-        if whole:  # started with a fixed number of basis shapes
-            plain, silent = PooledFastICA(random_state=0), NoProgress()
-            settings = settings._replace(silent_isa=True)
-            shapes, *_ = run_paper_pipeline(
-                factors, n_components, plain, settings, silent
-            )
+        if whole:  # the start has a fixed number of basis shapes
+            rigid = factors.rigid_motion.reshape(-1, 2, 3)
+            images = factorised.W.reshape(len(rigid), 2, -1)
+            shapes = lifted_shapes(images, rigid, n_components)
     else:
         isa, shapes = None, given.shapes
     # 5. Refinement, gauge and frames
