@@ -1,7 +1,7 @@
 """
 Print what fits of real photos know of the camera that took them.
 
-Run ``python -m benchmarks.real [muct rafd] [--seeds N]``: about ten minutes of one
+Run ``python -m benchmarks.real [muct rafd] [--seeds N]``: five and ten minutes of one
 core. Cameras took the photos of a moment at the same time, so that turns of the cameras
 and shapes are known, and the numbers of these photos should be the same. No fit is told
 which photos belong together.
@@ -35,6 +35,7 @@ RAFD = Case("RaFD", "rafd_106", 9)
 # Points of MUCT without the jaw, and of RaFD; those of iBUG-68 among the latter.
 MUCT_INNER, RAFD_INNER = slice(15, 68), slice(33, 104)
 RAFD_68 = [*range(0, 33, 2), *range(33, 52), *range(52, 64), *range(84, 104)]
+REMOVED = ", `remove_pose`"
 PEOPLE = {"0, 3, 6, ...": 3, "0, 2, 4, ...": 2}
 # Views of RaFD that are learnt and predicted: left, front and right are 0, 1 and 2.
 PREDICTED = {
@@ -94,15 +95,16 @@ def muct(options):
         X, moment = np.vstack(views[chosen]), np.repeat(moments[chosen], 5)
         known = np.isin(moment, truth["moment"])
         shapes = truth["S3d"][np.searchsorted(truth["moment"], moment[known])]
-        for K in (3, 6, 9, "auto"):
+        options = {"independence": None, "random_state": seed}
+        for K, removed in (*product((3, 6, 9, "auto"), [False]), (9, True)):
             model = AffineNRSfM(
-                K, camera="weak_perspective", independence=None, random_state=seed
+                K, camera="weak_perspective", remove_pose=removed, **options
             )
             with warnings.catch_warnings(action="ignore"):  # of depths
                 alpha, found = model.fit_transform(X), model.reconstruct(X)[known]
             pairs = (mean_shape[None], model.mean_shape_[None]), (shapes, found)
             errors = [mean_shape_error_3d(*p, convention="frame") for p in pairs]
-            cells = [people, str(K), f"{errors[0]:.3f}", f"{errors[1]:.3f}"]
+            cells = [people, f"{K}{REMOVED * removed}", *map("{:.3f}".format, errors)]
             cells += [shown(turns(model.rotations_, 5, 0), 1)]
             cells += [f"{model.depth_uncertainty_:.2f}", *of_camera(alpha, moment)]
             rows.append(cells)
@@ -140,8 +142,11 @@ def rafd(options):
         calibrated = {"camera": "weak_perspective", "random_state": seed}
         prior = FunctionTransformer(load_face_prior(9).transform)
         methods = {"face prior, transform, K = 9": (as_68, prior)}
-        for K in (9, 18):
-            methods[f"own fit, K = {K}"] = inner, AffineNRSfM(K, **calibrated)
+        for K, removed in product((9, 18), (False, True)):
+            fit = AffineNRSfM(K, remove_pose=removed, **calibrated)
+            methods[f"own fit, K = {K}{REMOVED * removed}"] = inner, fit
+        fit = AffineNRSfM(9, prior=load_face_prior(9), remove_pose=True, **calibrated)
+        methods[f"face prior, fit, K = 9{REMOVED}"] = as_68, fit
         for n in (9, 18, 30):
             pca = make_pipeline(AlignedFrames(), PCA(n, random_state=seed))
             methods[f"PCA of aligned points, {n}"] = inner, pca

@@ -145,6 +145,11 @@ class Decomposition(NamedTuple):
     alpha_std: NDArray
 
 
+def leading(fit: Decomposition, n: int) -> Decomposition:
+    """Return frames with their first n coefficients."""
+    return fit._replace(alpha=fit.alpha[:, :n], alpha_std=fit.alpha_std[:, :n])
+
+
 class FrameMap(NamedTuple):
     """Map of cameras and coefficients of frames to other, equally good shapes.
 
