@@ -25,10 +25,11 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
-from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
-from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
+from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
+from isa_nrsfm._frames.pose import pose_effect
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._other_tables import checked_prior, warn_if_foreign
 from isa_nrsfm._parameters import choices
@@ -103,8 +104,7 @@ class AffineNRSfM(
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
         result is only the start of the joint refinement. A clone is fitted. Its
-        `random_state`, `n_jobs` and `verbose` are inherited from this estimator unless
-        set.
+        `random_state`, `n_jobs` and `verbose` are those of this estimator unless set.
     block_recovery : {"generalized_eigen", "eigen", "irls"}, default=\
 "generalized_eigen"
         Method for the 3x3 matrix of each subspace that brings its motion to the rigid
@@ -156,6 +156,11 @@ default="affine"
         1.5 standard deviations of the noise. "cauchy" reduces it gradually, to one half
         at 2.5 standard deviations. With both, points beyond six sizes of their frame
         have weight zero, and both need the joint refinement.
+    remove_pose : bool, default=False
+        Whether `alpha_`, `transform` and `smooth` return the directions of what s and
+        s^2 do not predict, with s the sine of the yaw of calibrated cameras. It removes
+        what points that slide over the surface add in turned views, if objects move
+        alike in all views. Coefficients of `decompose` are still those of the shapes.
     layout : {"interleaved", "planar"}, default="interleaved"
         Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=True
@@ -182,8 +187,7 @@ default="affine"
     frames_folder : str, path-like or None, default=None
         Folder for the kept arrays. Each fit makes a new folder within it, with files
         ``alpha.npy`` and so on, and never removes others. The attributes are memory
-        maps of these files; ``alpha_.filename`` is the path. None keeps the arrays in
-        memory.
+        maps of these files; ``alpha_.filename`` is the path. None keeps them in memory.
     working_memory : float or None, default=None
         Largest memory of a block, in megabytes, of a table that is not in memory (a
         memory map or a table of `isa_nrsfm.io.open_table`). None is scikit-learn's
@@ -216,6 +220,8 @@ default="affine"
     alpha_ : ndarray of shape (n_frames, n_components)
         Coefficients of the frames, scaled to unit variance; signs chosen so that the
         skewness is non-negative. Their mean is zero after the joint refinement.
+    pose_effect_ : ndarray of shape (3, n_components)
+        With `remove_pose`: factors of 1, s and s^2 in what is subtracted, of mean zero.
     alpha_std_ : ndarray of shape (n_frames, n_components)
         Posterior standard deviations of `alpha_`, with the errors of the shapes (joint
         refinement only). They assume independent noise: they are too small where basis
@@ -266,8 +272,7 @@ default="affine"
         with affine ones, from the frames of the first steps; see `diagnostics`.
     reliability_ : ndarray of shape (n_components,)
         Shares of the variance of the coefficients that are signal, not uncertainty of
-        coefficients or shapes, along uncorrelated directions, decreasing. Zero for
-        noise.
+        coefficients or shapes, along uncorrelated directions, decreasing.
     objective_history_ : ndarray of shape (`n_iter_` + 1,)
         Minus twice the log posterior, up to a constant, before the last refinement and
         after each of its steps; it never rises.
@@ -342,6 +347,7 @@ default="affine"
     mean_shape_: NDArray
     basis_: NDArray
     alpha_: NDArray
+    pose_effect_: NDArray
     alpha_std_: NDArray
     prior_std_: NDArray
     motion_: NDArray
@@ -390,6 +396,7 @@ default="affine"
         "prior": [None, HasMethods(["fit", "get_params"])],
         "independence": [StrOptions(set(choices.INDEPENDENCE)), None],
         "loss": [StrOptions(set(choices.LOSSES))],
+        "remove_pose": ["boolean"],
         "layout": [StrOptions(set(LAYOUTS))],
         "scale_frames": ["boolean"],
         "hidden_points": ["boolean"],
@@ -416,6 +423,7 @@ default="affine"
         prior: Any = None,
         independence: choices.Independence | None = "shapes",
         loss: choices.Loss = "linear",
+        remove_pose: bool = False,
         layout: Layout = "interleaved",
         scale_frames: bool = True,
         hidden_points: bool = True,
@@ -438,6 +446,7 @@ default="affine"
         self.prior = prior
         self.independence = independence
         self.loss = loss
+        self.remove_pose = remove_pose
         self.layout = layout
         self.scale_frames = scale_frames
         self.hidden_points = hidden_points
@@ -554,7 +563,7 @@ default="affine"
             point, f = self.principal_point, self.focal_length
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
-            fit = fit_perspective(images, number, f, start, errors)
+            fit = fit_perspective(images, number, f, start, errors, self.remove_pose)
         else:
             if auto and self.camera == "affine":
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
@@ -562,7 +571,8 @@ default="affine"
                 n_components = supported_components(table, isa, settings, progress)
             number = 1 if n_components == "auto" else n_components
             table = scaled_table(source, weights, number, settings)
-            fit = fit_table(table, number, isa, settings, progress, start, auto, errors)
+            known = start, auto, errors, self.remove_pose
+            fit = fit_table(table, number, isa, settings, progress, *known)
         model, frames, converged, fitted = fit
         if not converged:
             warn_caller(
@@ -577,8 +587,12 @@ default="affine"
             "camera_": self.camera,
             "frames_scaled_": bool(settings.scale_frames),
         }
+        reported = leading(frames, model.n_components)
+        if self.remove_pose:
+            opened.pose_effect_ = pose_effect(frames.motion, reported.alpha)
+            left = reported.alpha - removed_part(opened, frames.motion)
+            reported = reported._replace(alpha=left)
         if self.keep_frames:
-            reported = frames.leading(model.n_components)
             for name, part in keep(reported._asdict()).items():
                 attributes[f"{name}_"] = source.as_collected(part)
             if not settings.joint:
@@ -694,13 +708,15 @@ default="affine"
         Returns
         -------
         ndarray of shape (n_frames, n_components)
-            Coefficients; `alpha_` for the fitted table. NaN for rows with too few
-            visible points.
+            Coefficients; `alpha_` for the fitted table. NaN for rows of too few points.
         """
         table, weights = self._opened(X, point_weight)
-        coefficients = partial(self._model.decompose, deviations=False)
-        K = self._model.n_components
-        return table.collect(coefficients, *weights).alpha[:, :K]
+
+        def coefficients(rows: NDArray, weights: NDArray | None = None) -> NDArray:
+            fit = self._model.reported(rows, weights, deviations=False)
+            return fit.alpha - removed_part(self, fit.motion)
+
+        return table.collect(coefficients, *weights)
 
     def decompose(self, X: Any, *, point_weight: Any = None) -> Decomposition:
         """
@@ -717,7 +733,7 @@ default="affine"
         -------
         Decomposition
             Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
-            alpha_std (n_frames, n_components).
+            alpha_std (n_frames, n_components), also with `remove_pose` of the shapes.
         """
         table, weights = self._opened(X, point_weight)
         return table.collect(self._model.reported, *weights)
@@ -744,8 +760,7 @@ default="affine"
         Parameters
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one. The rows of each group are in
-            temporal order.
+            A table with the points of the fitted one, each group in temporal order.
         point_weight : array-like of shape (n_frames, n_points), default=None
             Weights of the points, as in `fit`.
         time : array-like of shape (n_frames,), default=None
@@ -793,13 +808,12 @@ default="affine"
         result = smooth(
             alone, frames.gauge, camera, time, groups, max_gap, max_iter, tol, dtype
         )
-        fit, K = result.decomposition, self._model.n_components
+        fit = result.decomposition
         if self._model.pinhole is not None:
             fit = table.joined(self._model.in_table_cameras, *fit)
-        fit = fit.leading(K)
-        return result._replace(
-            alpha=fit.alpha, alpha_std=fit.alpha_std, decomposition=fit
-        )
+        fit = leading(fit, self._model.n_components)
+        left = fit.alpha - removed_part(self, fit.motion)
+        return result._replace(alpha=left, alpha_std=fit.alpha_std, decomposition=fit)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """
@@ -954,7 +968,7 @@ default="affine"
         -------
         ndarray of shape (n_shapes, n_points, 3)
             ``S_i = mean_shape_ + sum_k alpha_ik basis_[k]``, NaN for rows with NaN. For
-            the coefficients of frames it is the same as `reconstruct`.
+            the coefficients of `decompose` it is the same as `reconstruct`.
 
         Raises
         ------
@@ -997,6 +1011,7 @@ default="affine"
         factors = dict.fromkeys(shapes_and_cameras, signs)
         factors["rotations_"] = np.outer(signs, signs)
         of_modes = np.tile(signs, len(self.basis_))
+        factors["pose_effect_"] = np.array([[1.0], [-1.0], [1.0]])
         factors["mode_covariance_"] = np.outer(of_modes, of_modes)
         for name, factor in factors.items():
             if hasattr(self, name):
@@ -1037,8 +1052,7 @@ default="affine"
         motion : array-like of shape (n_frames, 2, 3) or (2, 3), default=None
             Cameras; None is `reference_motion_`, the mean view of the fitted table.
         translation : array-like of shape (n_frames, 2) or (2,), default=None
-            Positions; None is `reference_translation_`, the mean centroid of the
-            fitted table.
+            Positions; None is `reference_translation_`, the mean centroid of the fit.
 
         Returns
         -------
@@ -1180,14 +1194,3 @@ def check_class(estimator: object, where: str) -> None:
         raise ValueError(
             f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
         )
-
-
-def sees_perspective(estimator: AffineNRSfM) -> bool:
-    """Return whether perspective decides between the mirror images in depth."""
-    pinhole = estimator._model.pinhole
-    return pinhole is not None and pinhole.near
-
-
-def frames_of(estimator: AffineNRSfM) -> Any:
-    """Return the fitted model of single frames."""
-    return estimator._model.frames

@@ -114,13 +114,15 @@ def fit_table(
     start: TableModel | None = None,
     free: bool = False,
     errors: bool = False,
+    remove_pose: bool = False,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
     The joint fit starts from the model of a similar table, if `start` is given, instead
     of the paper's result. `free`: K is the number of directions that the table
     determines, or with affine cameras falls until all directions of the coefficients
-    are reliable. `errors`: estimate the errors of the depths.
+    are reliable. `errors`: estimate the errors of the depths. `remove_pose`: report the
+    directions of the part of the coefficients that the pose does not predict.
 
     Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
     without visible points; convergence; and the other attributes of `AffineNRSfM`.
@@ -197,7 +199,7 @@ def fit_table(
         fits = fitted_frames(model, tracks, table.rows)
         del tracks  # as much memory as the table
         fitted, frames, measures = _joint_frames(
-            table, model, fits, settings, wanted, widths
+            table, model, fits, settings, wanted, widths, remove_pose
         )
         if fit.prior is not None:
             attributes["prior_std_"] = np.array([fit.prior.width, 0.0])
@@ -207,10 +209,8 @@ def fit_table(
         # Down-weighted outliers, for example, look like basis shapes at first.
         supported = max(n_reliable(measures["reliability_"]), 1)
         if free and not whole and supported < n_components:
-            quiet = NoProgress()
-            return fit_table(
-                table, supported, isa, settings, quiet, start, free, errors
-            )
+            known = NoProgress(), start, free, errors, remove_pose
+            return fit_table(table, supported, isa, settings, *known)
     else:
         fitted, frames, measures = _paper_frames(
             table, factorised.factors, shapes, covariance, settings
@@ -350,6 +350,7 @@ def _joint_frames(
     s: FitSettings,
     n_components: int,
     widths: Widths | None,
+    remove_pose: bool,
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of fits in the independent gauge.
 
@@ -369,9 +370,8 @@ def _joint_frames(
     prior, noise = s.shape_prior, model.noise_variance
     unit = table.unit if s.camera == "orthographic" else None
     if prior is None:
-        mean_shape, basis, gauge = independent_gauge(
-            model.shapes, motion, alpha, s.independence, s.camera, unit, n_components
-        )
+        kind = s.independence, s.camera, unit, n_components, remove_pose
+        mean_shape, basis, gauge = independent_gauge(model.shapes, motion, alpha, *kind)
     else:
         gauge = prior.gauge
         mean_shape, basis = gauge.public(model.shapes)

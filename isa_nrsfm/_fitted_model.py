@@ -18,8 +18,10 @@ from isa_nrsfm._frames.models import (
     LinearisedFrames,
     PosteriorFrames,
     RigidFrames,
+    leading,
 )
 from isa_nrsfm._frames.pinhole import Pinhole, zoomed
+from isa_nrsfm._frames.pose import pose_part
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
@@ -81,7 +83,7 @@ class TableModel(NamedTuple):
 
     def reported(self, *args: Any, **options: Any) -> Decomposition:
         """Return `decompose` with the coefficients that are reported."""
-        return self.decompose(*args, **options).leading(self.n_components)
+        return leading(self.decompose(*args, **options), self.n_components)
 
     def in_virtual_cameras(
         self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
@@ -366,6 +368,23 @@ class TableModel(NamedTuple):
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes, weights
+
+
+def frames_of(estimator: Any) -> Any:
+    """Return the fitted model of single frames of an estimator."""
+    return estimator._model.frames
+
+
+def sees_perspective(estimator: Any) -> bool:
+    """Return whether perspective decides between the mirror images in depth."""
+    pinhole = estimator._model.pinhole
+    return pinhole is not None and pinhole.near
+
+
+def removed_part(estimator: Any, motion: Any) -> Any:
+    """Return the part (n, K) of coefficients that `remove_pose` removes, or zero."""
+    effect = getattr(estimator, "pose_effect_", None)
+    return 0.0 if effect is None else pose_part(np.asarray(motion), effect)
 
 
 def _camera_leverage(mean_shape: NDArray, seen: NDArray) -> NDArray:

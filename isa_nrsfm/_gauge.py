@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import mean_view, stacked_motion
 from isa_nrsfm._frames.models import Decomposition, FrameMap
+from isa_nrsfm._frames.pose import pose_effect, pose_part
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
 from isa_nrsfm._linalg.small_matrices import orientations, polar
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
@@ -180,6 +181,7 @@ def independent_gauge(
     camera: str = "affine",
     unit: float | None = None,
     n_components: int | None = None,
+    remove_pose: bool = False,
 ) -> tuple[NDArray, NDArray, FrameMap]:
     """Return mean shape and independent basis of a fit, and the map of frames to it.
 
@@ -187,7 +189,8 @@ def independent_gauge(
     "shapes" makes basis shapes independent over the points, "coefficients" makes
     coefficients independent over the frames. None takes the principal axes. These are
     the mixings of the leading n_components principal axes; further ones follow as they
-    are. `unit` is the size in `euclidean_space`.
+    are. `unit` is the size in `euclidean_space`. `remove_pose`: the axes are those of
+    what calibrated cameras do not predict of the coefficients.
     """
     # The shifts u and v, then the affinity of space.
     shift, motion, alpha = _centred(shapes, motion, alpha, camera)
@@ -196,11 +199,16 @@ def independent_gauge(
     white = shapes[1:].mT @ space.T
     if camera != "affine":
         space = euclidean_space(shapes[0].T, motion, unit)
+    if remove_pose:
+        cameras = motion @ np.linalg.inv(space)
+        alpha = alpha - pose_part(cameras, pose_effect(cameras, alpha))
     # The mixing of the basis shapes, then their order, scale and signs.
     mixing = np.eye(len(white))
     K = len(white) if n_components is None else n_components
     if independence is None or K < len(white):
-        mixing = _principal_axes(white, alpha)
+        # With calibrated cameras in true proportions: whitened, depths of flat objects
+        # would count many times.
+        mixing = _principal_axes(shapes[1:].mT @ space.T, alpha)
         white = np.tensordot(mixing, white, 1)
     unmixing = np.linalg.inv(mixing).T
     if independence == "shapes":

@@ -319,6 +319,7 @@ def fit_perspective(
     given: Any,
     start: TableModel | None = None,
     errors: bool = False,
+    remove_pose: bool = False,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
     """Fit perspective images as `fit_table` fits weak-perspective ones.
 
@@ -357,7 +358,7 @@ def fit_perspective(
             best = table.settled(best.pinhole, best.n_components, best)[0]
     # The last fit, with warnings and errors of depths
     before = None if why else best
-    options = {"start": best.model, "errors": errors}
+    options = {"start": best.model, "errors": errors, "remove_pose": remove_pose}
     fit = table.fit(best.pinhole, best.n_components, before, last=True, **options)
     model, _, converged, attributes, *_ = fit
     f = best.pinhole.focal_length

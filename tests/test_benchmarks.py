@@ -14,13 +14,13 @@ from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
 import benchmarks.__main__ as command
-from benchmarks import _fits, _paper, questions
+from benchmarks import _fits, _paper, questions, real
 from benchmarks._methods import METHODS, Found
 from benchmarks._results import cell, read, section_of
 from benchmarks._run import rounded, run_isolated
 from benchmarks._sets import SETS, Table
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.metrics import inverse_snr
+from isa_nrsfm.metrics import inverse_snr, mean_shape_error_3d
 
 # Tables of few points: that FastICA does not converge makes no difference here.
 pytestmark = may_not_converge
@@ -138,6 +138,28 @@ def test_views_are_told_by_the_turn_from_the_front():
         assert found == [[0], [0, 1]]
         assert np.flatnonzero(views["turned"]).tolist() == [2, 3]
         assert {np.argmax(views["left"]), np.argmax(views["right"])} == {2, 3}
+
+
+def test_turns_and_shares_of_cameras(rng):
+    turn = Rotation.from_rotvec([[0, 0, 0], [0, 0.3, 0], [0.1, 0, 0]]).as_matrix()
+    pose = Rotation.from_rotvec(rng.normal(size=(20, 3))).as_matrix()
+    rotations = (turn @ pose[:, None]).reshape(-1, 3, 3)
+    degrees = np.degrees([0.3, 0.1])
+    np.testing.assert_allclose(real.turns(rotations, 3, 0), degrees)
+    steps = np.array([[0, 0], [0, 3], [0, 6]])
+    alpha = rng.normal(size=(20, 1, 2)) + steps
+    first, second = real.camera_share(alpha.reshape(-1, 2), 3)
+    assert first == pytest.approx(0.0)
+    assert second == pytest.approx(6 / alpha[..., 1].var())
+
+
+def test_common_shape_does_not_depend_on_size_and_rotation(rng):
+    shape = rng.normal(size=(20, 3))
+    shapes = [(i + 1) * shape @ random_rotation(i, 3) + i for i in range(4)]
+    error = mean_shape_error_3d(
+        [shape], [real.common_shape(shapes)], convention="frame"
+    )
+    assert error == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.subprocess

@@ -490,7 +490,7 @@ class TestAdvice:
     def test_a_prior_determines_the_number_of_basis_shapes(self):
         few = facts(reliability=np.array([0.9, 0.8, 0.0]))
         assert "at most n_components=2" in advice(few)[0]
-        assert advice(few._replace(prior=True, pose="the outline")) == ()
+        assert advice(few._replace(prior=True, pose="the yaw")) == ("the yaw",)
 
 
 # --- what a notebook shows of a model ------------------------------------------------

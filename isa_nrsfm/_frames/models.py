@@ -144,21 +144,10 @@ class Decomposition(NamedTuple):
     alpha: NDArray
     alpha_std: NDArray
 
-    def leading(self, n: int) -> "Decomposition":
-        """Return the fits with only the first coefficients.
 
-        Parameters
-        ----------
-        n : int
-            Number of coefficients that are kept.
-
-        Returns
-        -------
-        Decomposition
-            Fits with alpha and alpha_std of shape (n_frames, n).
-        """
-        alpha, deviation = self.alpha[:, :n], self.alpha_std[:, :n]
-        return self._replace(alpha=alpha, alpha_std=deviation)
+def leading(fit: Decomposition, n: int) -> Decomposition:
+    """Return frames with their first n coefficients."""
+    return fit._replace(alpha=fit.alpha[:, :n], alpha_std=fit.alpha_std[:, :n])
 
 
 class FrameMap(NamedTuple):

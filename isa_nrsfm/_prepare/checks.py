@@ -297,6 +297,11 @@ def check_camera(model: Any) -> None:
             "groups of points with affine cameras have no common unit. Set "
             "camera='weak_perspective' or camera='orthographic'"
         )
+    if model.remove_pose and camera == "affine":
+        raise ValueError(
+            "remove_pose needs calibrated cameras, which have a yaw. Set "
+            "camera='weak_perspective' or camera='orthographic', or remove_pose=False"
+        )
     if camera != "perspective":
         for name in ("focal_length", "principal_point"):
             if getattr(model, name) is not None:

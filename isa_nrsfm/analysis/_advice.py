@@ -164,8 +164,7 @@ def _messages(facts: Facts) -> Iterator[str]:
     if facts.few and n_supported == n_components:
         what = "Look for wrong landmarks in the frames with the largest coefficients"
         yield f"{facts.few}. {what}"
-    if not facts.prior:  # which has all points
-        yield facts.pose
+    yield facts.pose
 
 
 def depth_advice(facts: Facts) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.texts import aligned, first_items, percent
+from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -69,8 +70,10 @@ class Diagnostics(NamedTuple):
     pose_share : ndarray of shape (n_components,)
         Share of the variance of each coefficient that the pose predicts: R^2 of a
         linear regression on the rotation, for each fifth of the rows fitted to the
-        others. Zero or negative if there is no relation. NaN with fewer than 20 frames,
-        or if the rotations are not determined.
+        others. Zero or negative if there is no relation, also in small tables. It does
+        not depend on the scale of the depths. NaN with fewer than 20 frames.
+    pose_removed : ndarray of shape (n_components,)
+        Share of the variance of each coefficient that `remove_pose` has removed.
     outlier_share : float
         Share of the points of a table with gross residuals, more than 8 robust standard
         deviations. NaN without a table.
@@ -91,6 +94,7 @@ class Diagnostics(NamedTuple):
     camera_noise_ratio: float
     camera_meaning: str
     pose_share: NDArray
+    pose_removed: NDArray
     outlier_share: float
     outliers: NDArray
     messages: tuple[str, ...] = ()
@@ -105,6 +109,9 @@ class Diagnostics(NamedTuple):
         for frames, share in zip(self.effective_frames, self.pose_share, strict=True):
             known = "" if math.isnan(share) else percent(max(share, 0.0))
             rows.append([f"alpha_{len(rows)}", f"{frames:.1f}", known])
+        if self.pose_removed.any():
+            for row, share in zip(rows, ["removed", *self.pose_removed], strict=True):
+                row.append(share if isinstance(share, str) else percent(share))
         lines = [
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
@@ -138,8 +145,9 @@ def diagnose(
         distance = table.joined(model.distances, *fit, *weights)
     fitted = np.isfinite(sizes)
     motion = np.asarray(estimator.motion_)[fitted] / sizes[fitted, None, None]
-    coefficients = np.asarray(estimator.alpha_, dtype=np.float64)
-    alpha = coefficients[fitted]
+    left = np.asarray(estimator.alpha_, dtype=np.float64)
+    coefficients = left + removed_part(estimator, estimator.motion_)
+    alpha, left = coefficients[fitted], left[fitted]
     mean_shape = estimator.mean_shape_.astype(np.float64)
     basis = estimator.basis_.astype(np.float64)
     images = motion.reshape(-1, 3)
@@ -154,9 +162,8 @@ def diagnose(
     floats = np.finfo(float)
     known = np.maximum(known, max(floats.eps * known[0], floats.tiny))
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
-    share = pose_share(motion, alpha)
-    if not frames.certainty.determined:  # neither are the poses
-        share[:] = np.nan
+    share, variance = pose_share(motion, left), alpha.var(axis=0)
+    removed = variance - left.var(axis=0)
     found = Diagnostics(
         np.linalg.svd(images, compute_uv=False) / np.sqrt(len(images)),
         float(np.sqrt(deformation / np.sum(mean_shape**2))),
@@ -167,6 +174,7 @@ def diagnose(
         ratio,
         camera_meaning(ratio),
         share,
+        np.divide(removed, variance, where=variance > 0, out=np.zeros_like(variance)),
         *gross_residuals(distance),
     )
     names = names_of_points(estimator)
@@ -178,7 +186,7 @@ def diagnose(
         outlier_share=found.outlier_share,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
-        pose=_of_pose(found, mean_shape, basis, layout),
+        pose=_of_pose(found, mean_shape, basis, layout, estimator),
     )
     return found._replace(messages=advice(facts))
 
@@ -239,11 +247,15 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
 
 
 def _of_pose(
-    found: Diagnostics, mean_shape: NDArray, basis: NDArray, layout: Skeleton | None
+    found: Diagnostics,
+    mean_shape: NDArray,
+    basis: NDArray,
+    layout: Skeleton | None,
+    model: Any,
 ) -> str:
-    """Describe coefficients of faces that the pose predicts; empty if none."""
+    """Describe coefficients that the pose predicts; empty if there are none."""
     large = np.flatnonzero(found.pose_share > MOST_POSE)
-    if layout is None or not layout.contour or not len(large):
+    if not len(large):
         return ""
     shown = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
     text = f"the pose predicts {first_items(shown, 5)}"
@@ -251,6 +263,18 @@ def _of_pose(
     rest = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
     if 2 * np.sum(rest**2) < np.sum(shape**2):
         return f"{text}: they stretch the whole shape. Make sure that {SAME_UNIT}"
+    if model.remove_pose:
+        return (
+            f"{text}, beyond what remove_pose has removed. Compare coefficients of "
+            "similar views only"
+        )
+    if layout is None or not layout.contour or model.prior is not None:
+        calibrated = "calibrated cameras and " * (model.camera_ == "affine")
+        return (
+            f"{text}: points slide over the surface as the view changes, or the object "
+            f"moves otherwise in other views. If it moves alike in all views, use "
+            f"{calibrated}--remove-pose (in Python remove_pose=True)"
+        )
     return (
         f"{text}: {len(layout.contour)} points "
         f"of {layout.name} follow the visible outline, which slides over the "

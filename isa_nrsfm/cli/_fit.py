@@ -234,6 +234,7 @@ def _fitted(
         isa=isa,
         scale_frames=not args.no_scale_frames,
         hidden_points=not args.no_hidden_points,
+        remove_pose=args.remove_pose,
         **given,
     )
     search, X, groups = None, frames.X, frames.groups

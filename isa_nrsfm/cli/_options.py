@@ -247,6 +247,8 @@ HELP = {
     "independence": "joint refinement: independent basis shapes, or independent "
     "coefficients",
     "loss": "joint refinement: all but linear limit the influence of outliers",
+    "remove_pose": "calibrated cameras: coefficients minus what the yaw of the cameras "
+    "predicts, if points slide over the surface and people move alike in all views",
     "no_scale_frames": "weight frames by their size in the image, as orthographic "
     "cameras always do",
     "no_hidden_points": "missing points are not hidden by the object: they do not "
@@ -334,8 +336,8 @@ coefficients. The results replace those of an earlier run in the output folder."
             "method": (
                 *("n_components", "camera", "focal_length", "principal_point"),
                 *("prior", "isa", "n_init", "block_recovery"),
-                *("refinement", "independence", "loss", "no_scale_frames"),
-                *("no_hidden_points", "random_state", "n_jobs"),
+                *("refinement", "independence", "loss", "remove_pose"),
+                *("no_scale_frames", "no_hidden_points", "random_state", "n_jobs"),
             ),
         },
     ),

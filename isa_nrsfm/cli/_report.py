@@ -10,7 +10,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import percent
-from isa_nrsfm._estimator import frames_of, sees_perspective
+from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._advice import advice, camera_meaning, facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli._outputs import Fit
@@ -112,6 +112,7 @@ def model_report(
             "row_of_max": X.index[alpha.argmax(axis=0)],
             "effective_frames": None if found is None else found.effective_frames,
             "pose_share": None if found is None else found.pose_share,
+            "pose_removed": None if found is None else found.pose_removed,
         }
     )
     return {

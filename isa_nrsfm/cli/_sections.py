@@ -396,6 +396,13 @@ def _alpha(model: dict[str, Any]) -> Section:
     ]
     if is_posed:
         parts.append("pose: variance that yaw, pitch and roll predict, cross-validated")
+    if model["parameters"]["remove_pose"]:
+        most = max(coefficients, key=lambda row: row["pose_removed"] or 0.0)
+        share = f"{100 * (most['pose_removed'] or 0.0):.0f} % of {most['name']}"
+        parts.append(
+            f"--remove-pose: what yaw predicts was removed, up to {share}. It assumes "
+            "that the objects move alike in all views"
+        )
     correlations = np.triu(np.nan_to_num(np.array(model["correlations"], float)), 1)
     if correlations.any():
         place = np.unravel_index(abs(correlations).argmax(), correlations.shape)

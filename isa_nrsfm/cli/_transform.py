@@ -9,6 +9,7 @@ import numpy as np
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._outputs import (
     read_model,
@@ -56,6 +57,7 @@ def run(args: Namespace, warned: list[str]) -> str:
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting
             )[1]
+        alpha = alpha - removed_part(estimator, motion)
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)

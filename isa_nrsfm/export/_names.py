@@ -7,6 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm.skeletons._column_names import checked_names
 
@@ -35,7 +36,7 @@ def frames_of_table(
     None is the fitted table.
     """
     if X is None:
-        return model.motion_, model.alpha_
+        return model.motion_, model.alpha_ + removed_part(model, model.motion_)
     if not isinstance(X, Decomposition):
         X = model.decompose(X, point_weight=point_weight)
     return X.motion, X.alpha

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._estimator import frames_of
+from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.calibration import angle_deviations, view_angles

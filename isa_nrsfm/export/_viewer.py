@@ -18,7 +18,7 @@ from sklearn.utils import check_array
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._estimator import frames_of, sees_perspective
+from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
@@ -166,7 +166,7 @@ def write_viewer(
     # The first and the last row are among those shown.
     rows = np.linspace(0, max(n_rows - 1, 0), min(n_rows, n_frames)).astype(np.intp)
     if X is None or not len(rows):
-        motion, alpha = model.motion_[rows], model.alpha_[rows]
+        motion, alpha = (part[rows] for part in frames_of_table(model, None))
     else:
         weights = None if point_weight is None else taken_rows(point_weight, rows)
         motion, alpha = frames_of_table(model, taken_rows(X, rows), weights)

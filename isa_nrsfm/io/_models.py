@@ -57,6 +57,7 @@ FINITE = (
     *("mean_shape_", "basis_", "mean_shape", "basis", "shapes", "mixing", "space"),
     *("coefficient_starts", "reference_motion_", "reference_translation_"),
     *("n_iter_", "energy_share_", "mode_covariance_", "singular_values_"),
+    "pose_effect_",
 )
 POSITIVE = ("noise_variance", "noise_variance_", "unit", "depth_variances", "leverage")
 # Parameters of older files, which a fitted model does not need.
@@ -282,6 +283,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_", "focal_length_"]),
+        ((3, K), ["pose_effect_"]),
         ((N, 2, 3), ["motion_"]),
         ((N, 2), ["translation_"]),
         ((N, K), ["alpha_", "alpha_std_"]),

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import pdist, squareform
 
-from isa_nrsfm._estimator import frames_of
+from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm.calibration import _metric, canonical_pose
 from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
 from isa_nrsfm.skeletons import Skeleton, find_skeleton

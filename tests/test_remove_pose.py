@@ -1,0 +1,195 @@
+"""Coefficients without what the yaw of the cameras predicts."""
+
+import re
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from refusals import refused
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._fitted_model import removed_part
+from isa_nrsfm._frames.pose import pose_effect
+from isa_nrsfm.analysis._diagnostics import pose_share
+from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.export import point_distances
+from isa_nrsfm.io import load_model, save_model
+
+CALIBRATED = {"camera": "weak_perspective", "random_state": 0}
+
+
+def faces(n_frames=120, seed=0):
+    """Return a table of faces, and coefficients that its points do not follow.
+
+    They move along the first basis shape by the coefficient, and slide by the yaw.
+    """
+    options = {"noise": 0.01, "camera": "weak_perspective", "random_state": seed}
+    true = make_face_tracks(n_frames, n_components=2, **options)
+    yaw = true.motion[:, 0, 2] / np.linalg.norm(true.motion[:, 0], axis=1)
+    tracks = true.tracks + 4.0 * yaw[:, None, None] * (true.basis[0] @ true.motion.mT)
+    return tracks[:, 17:].reshape(n_frames, -1), true.alpha
+
+
+def sine_of_yaw(model):
+    """Return the part along x of the line of sight of the fitted cameras."""
+    return model.rotations_[:, 2, 0]
+
+
+@pytest.fixture(scope="module")
+def table():
+    return faces()[0]
+
+
+@pytest.fixture(scope="module")
+def plain(table):
+    return AffineNRSfM(2, **CALIBRATED).fit(table)
+
+
+@pytest.fixture(scope="module")
+def model(table):
+    return AffineNRSfM(2, remove_pose=True, **CALIBRATED).fit(table)
+
+
+def test_what_is_left_has_no_relation_to_the_yaw(model, plain, table):
+    s = sine_of_yaw(model)
+    terms = np.stack([np.ones_like(s), s, s**2], axis=1)
+    left = np.linalg.lstsq(terms, model.alpha_)[0]
+    assert_allclose(left, 0.0, atol=1e-6)  # also the mean
+    assert_allclose(model.alpha_.std(axis=0), 1.0, atol=1e-6)
+    before = model.alpha_ + terms @ model.pose_effect_
+    assert_allclose(before, model.decompose(table).alpha, atol=1e-4)
+    # The true coefficients, without the yaw that was added.
+    true = faces()[1]
+    found = [
+        np.abs(np.corrcoef(each.alpha_.T, true.T)[:-2, -2:]).max(axis=0)
+        for each in (model, plain)
+    ]
+    assert found[0].min() > 0.95
+    assert found[1].min() < 0.75
+
+
+def test_shapes_cameras_and_score_do_not_change(model, plain, table):
+    fit = model.decompose(table)
+    for name in ("mean_shape_", "motion_", "translation_"):
+        assert_allclose(getattr(model, name), getattr(plain, name), atol=1e-8)
+    assert_allclose(model.reconstruct(table), plain.reconstruct(table), atol=1e-4)
+    assert_allclose(model.reproject(table), plain.reproject(table), atol=1e-2)
+    assert model.score(table) == pytest.approx(plain.score(table), rel=1e-4)
+    np.testing.assert_array_equal(model.reconstruct(fit), model.shapes(fit.alpha))
+    known, alone = (
+        point_distances(model, [(0, 4)], X, unit=(19, 28)) for X in (fit, None)
+    )
+    assert_allclose(alone, known, atol=1e-4)
+
+
+def test_new_frames_lose_what_the_fit_has_found(model):
+    new, _ = faces(40, seed=5)
+    fit = model.decompose(new)
+    rows = fit.motion / np.linalg.norm(fit.motion, axis=2, keepdims=True)
+    s = np.cross(rows[:, 0], rows[:, 1])[:, 0]
+    part = model.pose_effect_.T @ [np.ones_like(s), s, s**2]
+    found = model.transform(new)
+    assert_allclose(found, fit.alpha - part.T, atol=1e-8)
+    assert_allclose(found[7:8], model.transform(new[7:8]), atol=1e-9)
+    assert pose_share(fit.motion, fit.alpha).max() > 0.5
+    assert pose_share(fit.motion, found).max() < 0.3
+    new[3] = np.nan
+    assert np.isnan(model.transform(new)[3]).all()
+
+
+def test_all_results_have_the_same_coefficients(model, table, tmp_path):
+    alpha = model.alpha_
+    assert_allclose(model.transform(table), alpha, atol=1e-5)
+    save_model(model, tmp_path / "model.npz")
+    loaded = load_model(tmp_path / "model.npz")
+    others = [model.mirrored(), loaded, loaded.mirrored()]
+    for other in others:
+        assert_allclose(other.transform(table), model.transform(table), atol=1e-9)
+    smooth = model.smooth(table)  # photos in any order: as they are
+    assert_allclose(smooth.alpha, model.transform(table), atol=1e-9)
+    fit = model.decompose(table)
+    assert_allclose(smooth.decomposition.alpha, fit.alpha, atol=1e-9)
+    forgetful = AffineNRSfM(2, remove_pose=True, keep_frames=False, **CALIBRATED)
+    assert_allclose(forgetful.fit_transform(table), alpha, atol=1e-5)
+    single = AffineNRSfM(2, remove_pose=True, **CALIBRATED).fit(table.astype("f4"))
+    assert single.alpha_.dtype == single.transform(table.astype("f4")).dtype == "f4"
+    # A new fit without the option forgets it.
+    assert not hasattr(single.set_params(remove_pose=False).fit(table), "pose_effect_")
+
+
+def test_a_prior_keeps_its_origin(plain):
+    new, _ = faces(30, seed=5)
+    means = [
+        AffineNRSfM("auto", prior=plain, remove_pose=removed, **CALIBRATED)
+        .fit_transform(new)
+        .mean(axis=0)
+        for removed in (False, True)
+    ]
+    assert np.abs(means[0]).max() > 0.05
+    assert_allclose(means[0], means[1], atol=1e-9)
+
+
+def test_needs_calibrated_cameras(table):
+    refused(
+        "remove_pose needs calibrated cameras, .* camera='weak_perspective'",
+        AffineNRSfM(2, remove_pose=True).fit,
+        table,
+    )
+
+
+def test_diagnostics_say_what_was_removed_and_what_is_left(model, plain):
+    before, after = plain.diagnostics(), model.diagnostics()
+    assert before.pose_share.max() > 0.3
+    assert not before.pose_removed.any()
+    message = "the pose predicts .* alike in all views, use --remove-pose"
+    assert re.search(message, before.messages[-1])
+    assert after.pose_share.max() < 0.3
+    assert after.messages == ()
+    before = model.alpha_ + removed_part(model, model.motion_)
+    share = 1 - model.alpha_.var(axis=0) / before.var(axis=0)
+    assert_allclose(after.pose_removed, share, atol=1e-9)
+    assert "removed" in repr(after)
+    assert "removed" not in repr(before)
+
+
+@pytest.mark.parametrize("n_frames", [20, 40, 100])
+def test_pose_share_of_unrelated_coefficients_is_not_above_zero(n_frames, rng):
+    turns = Rotation.from_rotvec(0.4 * rng.normal(size=(n_frames, 3))).as_matrix()
+    share = pose_share(turns[:, :2], rng.normal(size=(n_frames, 200)))
+    assert share.mean() < 0
+    assert np.mean(share > 0.3) < 0.01
+
+
+def test_effect_is_that_of_known_frames(rng):
+    R = Rotation.from_rotvec(0.4 * rng.normal(size=(30, 3))).as_matrix()
+    alpha = 2.0 + np.outer(3 * R[:, 2, 0] - R[:, 2, 0] ** 2, [1.0, 0.0])
+    alpha[4] = np.nan
+    effect = pose_effect(R[:, :2], alpha)
+    assert_allclose(effect[1:], [[3.0, 0.0], [-1.0, 0.0]], atol=1e-12)
+
+
+def test_command_line_removes_it_in_fit_and_transform(table, plain, tmp_path, capsys):
+    path, out = tmp_path / "table.csv", tmp_path / "out"
+    np.savetxt(
+        path,
+        table,
+        delimiter=",",
+        header=",".join(f"{c}{j}" for j in range(51) for c in "xy"),
+        comments="",
+    )
+    given = [str(path), "-k", "2", "--remove-pose", "--no-figures", "-o", str(out)]
+    assert main(["fit", *given]) == 0
+    text = capsys.readouterr().out
+    assert re.search(
+        "--remove-pose: what yaw predicts was removed, up to .. % of", text
+    )
+    new = tmp_path / "new.csv"
+    assert main(["transform", str(out / "model.npz"), str(path), "-o", str(new)]) == 0
+    files = out / "alpha.csv", new
+    fitted, again = (np.genfromtxt(f, delimiter=",", names=True) for f in files)
+    for k in (1, 2):
+        assert_allclose(fitted[f"alpha_{k}"], again[f"alpha_{k}"], atol=1e-4)
+    s = sine_of_yaw(load_model(out / "model.npz"))
+    assert abs(np.corrcoef(s, fitted["alpha_1"])[0, 1]) < 1e-4
