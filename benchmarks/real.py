@@ -129,45 +129,60 @@ def rafd(options):
     people, without labels. Labels are learnt from one view. Five folds of people, means
     of both directions.
     """
-    arrays = load_arrays(RAFD)
+    arrays, rows = load_arrays(RAFD), []
     if arrays is None:
         return
+    for seed in range(options.seeds):
+        points, y, person = in_views(arrays)
+        for name, (X, steps) in methods_of(points, seed).items():
+            scores, angles = predicted(X, steps, y, person)
+            right = [f"{100 * value:.0f}" for value in scores.values()]
+            rows.append([name, *right, shown(angles, 0)])
+            print(*rows[-1], sep="; ", flush=True)
+    print(table(["numbers", *PREDICTED, "turns of the cameras (45)"], rows))
+
+
+def in_views(arrays):
+    """Return points (n, 106, 2), expressions and people of RaFD, view by view."""
     keys = ("camera", "emotion", "person")
     order = np.lexsort([arrays[key] for key in keys])
     points, y, person = (arrays[key][order] for key in ("W2d", "emotion", "person"))
-    views, points = np.arange(len(y)) % 3, points.astype(float)
+    return points.astype(float), y, person
+
+
+def methods_of(points, seed):
+    """Return the table and the transformer of each kind of numbers, by name."""
     inner, as_68 = as_table(points[:, RAFD_INNER]), as_table(points[:, RAFD_68])
-    rows = []
-    for seed in range(options.seeds):
-        calibrated = {"camera": "weak_perspective", "random_state": seed}
-        prior = FunctionTransformer(load_face_prior(9).transform)
-        methods = {"face prior, transform, K = 9": (as_68, prior)}
-        for K, removed in product((9, 18), (False, True)):
-            fit = AffineNRSfM(K, remove_pose=removed, **calibrated)
-            methods[f"own fit, K = {K}{REMOVED * removed}"] = inner, fit
-        fit = AffineNRSfM(9, prior=load_face_prior(9), remove_pose=True, **calibrated)
-        methods[f"face prior, fit, K = 9{REMOVED}"] = as_68, fit
-        for n in (9, 18, 30):
-            pca = make_pipeline(AlignedFrames(), PCA(n, random_state=seed))
-            methods[f"PCA of aligned points, {n}"] = inner, pca
-        for name, (X, steps) in methods.items():
-            scores, angles = {kind: [] for kind in PREDICTED}, []
-            folds = GroupKFold(5, shuffle=True, random_state=0).split(X, y, person)
-            for learn, test in folds:
-                with warnings.catch_warnings(action="ignore"):  # of depths, other faces
-                    Z, others = steps.fit_transform(X[learn]), steps.transform(X[test])
-                if hasattr(steps, "rotations_"):
-                    angles.append(turns(steps.rotations_, 3, 1))
-                for kind, pairs in PREDICTED.items():
-                    for one, other in pairs:
-                        a, b = views[learn] == one, views[test] == other
-                        model = LinearDiscriminantAnalysis().fit(Z[a], y[learn][a])
-                        scores[kind].append(model.score(others[b], y[test][b]))
-            right = [f"{100 * np.mean(values):.0f}" for values in scores.values()]
-            turned = shown(np.mean(angles, axis=0), 0) if angles else ""
-            rows.append([name, *right, turned])
-            print(*rows[-1], sep="; ", flush=True)
-    print(table(["numbers", *PREDICTED, "turns of the cameras (45)"], rows))
+    calibrated = {"camera": "weak_perspective", "random_state": seed}
+    prior = FunctionTransformer(load_face_prior(9).transform)
+    methods = {"face prior, transform, K = 9": (as_68, prior)}
+    for K, removed in product((9, 18), (False, True)):
+        fit = AffineNRSfM(K, remove_pose=removed, **calibrated)
+        methods[f"own fit, K = {K}{REMOVED * removed}"] = inner, fit
+    fit = AffineNRSfM(9, prior=load_face_prior(9), remove_pose=True, **calibrated)
+    methods[f"face prior, fit, K = 9{REMOVED}"] = as_68, fit
+    for n in (9, 18, 30):
+        pca = make_pipeline(AlignedFrames(), PCA(n, random_state=seed))
+        methods[f"PCA of aligned points, {n}"] = inner, pca
+    return methods
+
+
+def predicted(X, steps, y, person):
+    """Return shares of right predictions by views, and the turns of the cameras."""
+    scores, angles, views = {kind: [] for kind in PREDICTED}, [], np.arange(len(y)) % 3
+    folds = GroupKFold(5, shuffle=True, random_state=0).split(X, y, person)
+    for learn, test in folds:
+        with warnings.catch_warnings(action="ignore"):  # of depths, other faces
+            Z, others = steps.fit_transform(X[learn]), steps.transform(X[test])
+        if hasattr(steps, "rotations_"):
+            angles.append(turns(steps.rotations_, 3, 1))
+        for kind, pairs in PREDICTED.items():
+            for one, other in pairs:
+                a, b = views[learn] == one, views[test] == other
+                model = LinearDiscriminantAnalysis().fit(Z[a], y[learn][a])
+                scores[kind].append(model.score(others[b], y[test][b]))
+    means = {kind: float(np.mean(values)) for kind, values in scores.items()}
+    return means, np.mean(angles, axis=0) if angles else []
 
 
 SECTIONS = {"muct": muct, "rafd": rafd}

@@ -67,7 +67,7 @@ MOST_FRAMES, MOST_POINTS, MOST_DIRECTIONS = 200, 200, 16
 LEAST_NOISE = 1e-6
 # Factor of the depths of a fit that hardly turns: docs/depth.md, "How it is estimated".
 FAR = 1000.0
-# Number of frames whose likelihoods tell it apart: docs/depth.md, "How it is estimated".
+# Number of frames whose likelihoods tell it apart: see the same page.
 FAR_FRAMES = 4
 
 
