@@ -219,7 +219,9 @@ default="affine"
         one standard deviation of `alpha_`; zero without motion in the table.
     alpha_ : ndarray of shape (n_frames, n_components)
         Coefficients of the frames, scaled to unit variance; signs chosen so that the
-        skewness is non-negative. Their mean is zero after the joint refinement.
+        skewness is non-negative. Their mean is zero after the joint refinement. Their
+        rows are no points of a space with distances, as columns depend on each other.
+        With ``independence=None`` they are: all directions have the prior N(0, I).
     pose_effect_ : ndarray of shape (3, n_components)
         With `remove_pose`: factors of 1, s and s^2 in what is subtracted, of mean zero.
     alpha_std_ : ndarray of shape (n_frames, n_components)
@@ -781,8 +783,7 @@ default="affine"
         Returns
         -------
         SmoothedCoefficients
-            Named tuple of alpha, alpha_std (n_frames, n_components), time_scales and
-            decomposition.
+            Named tuple of alpha, alpha_std, time_scales and decomposition.
 
         Raises
         ------
@@ -1088,8 +1089,7 @@ default="affine"
         y : None
             Ignored.
         point_weight : array-like of shape (n_frames, n_points), default=None
-            Weights of the points, as in `fit`. They also multiply the terms of the
-            sums.
+            Weights of the points, as in `fit`, and of the terms of the sums.
 
         Returns
         -------

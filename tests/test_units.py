@@ -39,6 +39,7 @@ OF_WHITE_SIGNALS = {"mode_covariance_": "unit^2"}
 NO_NUMBERS = {"isa_", "feature_names_in_", "camera_", "frames_scaled_"}
 # In words below the table
 OF_PERSPECTIVE = {"positions_", "focal_length_", "focal_length_std_", "prior_std_"}
+OF_PERSPECTIVE |= {"pose_effect_"}
 FIGURES = ("camera_singular_values", "deformation_amplitude", "effective_frames")
 FIGURES += ("weak_deviations", "pose_share")
 # Results that turn with the images.
