@@ -69,24 +69,21 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
 
 def adapting_errors(
     estimator: Any, rows: NDArray, *weights: NDArray
-) -> tuple[float, float]:
+) -> tuple[float, ...]:
     """Return the inverse SNR of held-out points of every other row (n, 2, J).
 
     Without and with adapting the model to the rows between them.
     """
     layout, pinhole = estimator._model.layout, estimator._model.pinhole
-    given = {"n_components": "auto", "refinement": "joint", "prior": estimator}
-    given |= {"layout": layout, "frames_folder": None}
-    if pinhole is not None:
-        given["focal_length"] = pinhole.focal_length
-    adapted = clone(estimator).set_params(**given)
+    given = {"layout": layout, "focal_length": pinhole and pinhole.focal_length}
+    given |= {"n_components": "auto", "refinement": "joint", "prior": estimator}
+    adapted = clone(estimator).set_params(**given, frames_folder=None)
     of_points = weights[0][::2] if weights else None
     with warnings.catch_warnings(action="ignore"):
         adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)
     others = [each[1::2] for each in (rows, *weights)]
     parts = [each._model.held_out(*others)[0] for each in (estimator, adapted)]
-    before, after = (float(noise / signal) for noise, signal in parts)
-    return before, after
+    return tuple(float(noise / signal) for noise, signal in parts)
 
 
 def far_points(distance: NDArray, frames: Any) -> float:

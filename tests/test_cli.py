@@ -212,14 +212,32 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     assert "--prior needs one number of basis shapes" in fails(*again, "-k", "1-2")
 
 
+def test_faces_whose_table_does_not_determine_depths(fits, fails, tmp_path, load_data):
+    photos = load_data("muct_68")["W2d"][1::7]
+    names = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
+    X = pd.DataFrame(np.nan_to_num(photos).reshape(len(photos), -1), columns=names)
+    found = fits(saved(X, tmp_path), "--no-figures")
+    missing, by_itself = found.err.split("warning: ")[1:]
+    n_rows = np.isnan(photos).any(axis=(1, 2)).sum()
+    assert f"points at (0, 0), in {n_rows} rows, are missing" in missing
+    assert "--prior face --n-components 9, because the layout" in by_itself
+    assert found.report["prior"]["name"] == "face"
+    assert found.report["table"]["missing_values"] == [0]
+    order = np.random.default_rng(0).permutation(68)
+    other = X.to_numpy().reshape(-1, 68, 2)[:, order].reshape(X.shape)
+    path = saved(pd.DataFrame(other, columns=names), tmp_path)
+    message = fails("fit", path, "-o", tmp_path / "new", "--prior", "face")
+    assert "--prior face has no points of this table" in message
+
+
 @pytest.mark.slow
 def test_the_face_prior_that_a_warning_names(fits, tmp_path):
     X = make_face_tracks(60, n_components=2, random_state=0).shapes[..., :2] - 500
     table = saved(pd.DataFrame(X.reshape(60, -1), columns=LANDMARKS), tmp_path)
-    given = [table, "--camera", "weak_perspective", "-k", 3, "--no-figures"]
+    given = [table, "--prior", "none", "-k", 3, "--no-figures"]
     (remedy,) = re.findall(r"68 points of faces, use (.*?)\. ", fits(*given).err)
-    assert remedy == "--prior face-68 --n-components auto"
-    found = fits(*given, "--force", *remedy.split())
+    assert remedy == "--prior face --n-components auto"
+    found = fits(table, "--no-figures", "--force", *remedy.split())
     assert len(found.model.basis_) == 40
     assert "mirror image in depth: the one of the prior" in " ".join(found.out.split())
 

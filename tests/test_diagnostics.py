@@ -370,6 +370,7 @@ UNKNOWN = {
     "parts": DepthCertainty(0.9, 1e-6),
     None: DepthCertainty(0.1, 1e-6),
 }
+OF_FACE = {"certainty": UNKNOWN["parts"], "layout": "ibug-68"}
 
 
 BENT = 'they bend the shapes. Use loss="cauchy", or correct them'
@@ -406,11 +407,15 @@ class TestAdvice:
                 'objects turn, then use prior=model, n_components="auto". If',
             ),
             (
-                {"certainty": UNKNOWN["parts"], "n_points": 68, "auto": True},
-                "68 points of faces, use prior=isa_nrsfm.datasets.load_face_prior(). I",
+                OF_FACE | {"auto": True},
+                "68 points of faces, use prior=isa_nrsfm.datasets.load_face_prior(",
             ),
             (
-                {"certainty": UNKNOWN["parts"], "n_points": 68, "prior": True},
+                OF_FACE | {"layout": "wflw-98"},  # of which there is none
+                'Use refinement="consensus", n_components="auto". If',
+            ),
+            (
+                OF_FACE | {"prior": True},
                 "Fit more frames, best of objects that turn further",
             ),
             (
@@ -469,13 +474,16 @@ class TestAdvice:
                 fit._ready(X, given)
             except ValueError:  # there is no such fit
                 continue
-            known = {"n_points": n_points, "prior": bool(other), "auto": K == "auto"}
+            layout = "" if n_points == 16 else "xm2vts-68"
+            known = {"layout": layout, "prior": bool(other), "auto": K == "auto"}
             known |= {"camera": camera, "consensus": refinement == "consensus"}
             certainty = UNKNOWN[depth]._replace(weighted=extra == "weights")
             known |= {"certainty": certainty, "noise_ratio": ratio}
             for wrong in ({}, {"outlier_share": 0.01, "outliers": "wrong points"}):
                 for sentence in ". ".join(advice(facts(**known | wrong))).split(". "):
-                    parameters = re.findall(r'(\w+)=("\w+"|[\w.]+\(\)|\w+)', sentence)
+                    parameters = re.findall(
+                        r'(\w+)=("\w+"|[\w.]+\([^)]*\)|\w+)', sentence
+                    )
                     values = {name: eval(value, names) for name, value in parameters}
                     clone(fit).set_params(**values)._ready(X, given)
                     n_tried += len(values) > 0

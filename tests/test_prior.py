@@ -22,6 +22,7 @@ from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm._estimator import limited
+from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._joint.fit import widened
 from isa_nrsfm._joint.likelihood import JointFrames
@@ -29,10 +30,12 @@ from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._other_tables import prior_start
+from isa_nrsfm._parameters.choices import FACE_PRIORS
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
+from isa_nrsfm.skeletons import find_skeleton, get_skeleton
 
 # For errors of depths
 Thorough = limited(LIMITS._replace(few_frames=0, widths=()))
@@ -309,9 +312,47 @@ def test_the_face_prior_shows_faces_as_images_do():
     assert nose[2] < eyes[:, 2].min()  # depths away from the viewer
     assert prior.mirror_certainty_ == 1
     refused("must be <= 40", load_face_prior, 41)
+    refused(
+        "the layouts are ibug-68, .*; got 'wflw-98'", load_face_prior, layout="wflw-98"
+    )
     with pytest.raises(TypeError, match="n_components must be an instance of int"):
         load_face_prior(2.0)
     refused("The face prior has no frames", prior.diagnostics)
+
+
+@pytest.mark.parametrize("layout", FACE_PRIORS)
+def test_face_priors_of_all_layouts(layout):
+    prior, skeleton = load_face_prior(9, layout=layout), get_skeleton(layout)
+    shape = prior.mean_shape_
+    assert find_skeleton(len(shape), shape=shape[:, :2]) == skeleton
+    mirrored = shape[[*skeleton.right]] * (-1, 1, 1) - shape[[*skeleton.left]]
+    assert np.sqrt(np.mean(mirrored**2)) < 0.06
+    assert np.sqrt(np.mean(shape**2)) == pytest.approx(1)
+    # Faces of the prior, from 20 degrees to both sides
+    rng = np.random.default_rng(0)
+    alpha, yaws = rng.normal(size=(40, 9)), 20 * rng.uniform(-1, 1, 40)
+    R = Rotation.from_euler("y", yaws[:, None], degrees=True).as_matrix()
+    X = (prior.shapes(alpha) @ R.mT)[..., :2] + 0.01 * rng.normal(
+        size=(40, len(shape), 2)
+    )
+    fit = prior.decompose(100 * X.reshape(40, -1))
+    found = np.degrees(np.arctan2(fit.motion[:, 0, 2], fit.motion[:, 0, 0]))
+    assert_allclose(found, yaws, atol=4)
+
+
+def test_the_prior_of_real_photos_from_five_cameras(load_data):
+    views, photos = load_data("muct_views"), load_data("muct_68")
+    order = np.lexsort([photos[name] for name in ("camera", "lighting", "subjects")])
+    X = photos["W2d"][order, 15:].reshape(len(order), -1)
+    prior = load_face_prior(9, layout="xm2vts-53")
+    for model in (prior, fitted(X[::3], prior, n_components=9)):
+        R = full_rotations(model.decompose(X).motion)[0].reshape(-1, 5, 3, 3)
+        turned = Rotation.from_matrix(R[:, 0] @ R[:, 2].mT).magnitude()
+        assert np.degrees(np.median(turned)) == pytest.approx(23.9, abs=2)
+        truth = views["S3d"].mean(axis=0, keepdims=True)
+        found = model.reconstruct(X).mean(axis=0, keepdims=True)
+        signs = (1, 1, np.sign(np.linalg.det(truth[0].T @ found[0])))
+        assert mean_shape_error_3d(truth, found * signs, convention="frame") < 0.06
 
 
 # --- refusals -------------------------------------------------------------------------

@@ -309,8 +309,14 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
     hidden[:, :8] = False  # these are seen in all rows
     tracks[hidden] = code
     n_rows, n_points = hidden.any(axis=1).sum(), hidden.sum()
-    option = f"--missing-value={code:g}" if code else "--zeros-missing"
+    option = f"--missing-value={code:g}"
     points, (warning,) = tracks_read(tracks)
+    if not code:  # far from all other points, which are not
+        told = f"{n_points:,} points at (0, 0), in {n_rows} rows, are missing: "
+        assert warning.startswith(told)
+        np.testing.assert_array_equal(np.isnan(points[:, ::2]), hidden)
+        assert len(tracks_read(tracks - [480, 0] * ~hidden[..., None])[1]) == 1
+        return
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
     assert re.match(rf"{shown} \({n_points} in all\)", warning)

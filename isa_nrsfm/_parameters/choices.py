@@ -30,3 +30,7 @@ SKELETON_NAMES = tuple(
     "mediapipe-face-468 mediapipe-face-478 hand-21 coco-17 h36m-17 body-25 "
     "mediapipe-pose-33 coco-wholebody-133".split()
 )
+# Layouts with a face prior, and their points in its file.
+FACE_PRIORS = {"ibug-68": range(68), "ibug-51": range(17, 68)}
+FACE_PRIORS |= {"xm2vts-68": range(68, 136), "xm2vts-53": range(83, 136)}
+FACE_PRIORS |= {"muct-76": range(68, 144), "muct-61": range(83, 144)}

@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import n_reliable
+from isa_nrsfm._parameters.choices import FACE_PRIORS
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
+from isa_nrsfm.skeletons import Skeleton, find_skeleton
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Entries of V_k with a larger standard deviation count as not determined.
 LARGEST_DEVIATION = 0.1
@@ -57,8 +60,8 @@ class Facts(NamedTuple):
         those that the pose predicts; empty if there are none.
     perspective : str
         Message if perspective explains the table better, otherwise empty.
-    n_points, prior : int, bool
-        Number of points, and whether a fitted model was the prior.
+    layout, prior : str, bool
+        The layout of the points, if known, and whether a fitted model was the prior.
     """
 
     camera: str
@@ -74,7 +77,7 @@ class Facts(NamedTuple):
     few: str = ""
     pose: str = ""
     perspective: str = ""
-    n_points: int = 0
+    layout: str = ""
     prior: bool = False
 
     @property
@@ -114,8 +117,15 @@ def facts_of(model: Any, **found: Any) -> Facts:
     frames, ratio = model._model.frames, getattr(model, "camera_noise_ratio_", np.nan)
     consensus, auto = model.refinement == "consensus", model.n_components == "auto"
     known = frames.certainty, model.reliability_, ratio
-    found |= {"n_points": len(model.mean_shape_), "prior": model.prior is not None}
+    layout = getattr(layout_of(model), "name", "")
+    found |= {"layout": layout, "prior": model.prior is not None}
     return Facts(model.camera_, frames.loss, consensus, auto, *known, **found)
+
+
+def layout_of(model: Any) -> Skeleton | None:
+    """Return the layout of the points of a model, by their names or mean image."""
+    names, image = names_of_points(model), model.mean_shape_ @ model.reference_motion_.T
+    return find_skeleton(len(names), names, shape=image)
 
 
 def advice(facts: Facts) -> tuple[str, ...]:
@@ -183,10 +193,12 @@ def depth_advice(facts: Facts) -> str:
     given += ', refinement="joint"' * facts.consensus
     grouped = facts.camera != "perspective" and not certainty.weighted
     if facts.prior:
-        remedy = "fit more frames, best of objects that turn further"
-    elif facts.n_points == 68 and facts.camera != "orthographic":
-        face = f"prior=isa_nrsfm.datasets.load_face_prior(){given}"
-        remedy = f"if these are the 68 points of faces, use {face}"
+        remedy = "fit more frames, best of objects that turn further, "
+        remedy += "or use a prior with fewer basis shapes"
+    elif (layout := facts.layout) in FACE_PRIORS and facts.camera != "orthographic":
+        face = f'prior=isa_nrsfm.datasets.load_face_prior(layout="{layout}"){given}'
+        n_points = len(FACE_PRIORS[layout])
+        remedy = f"if these are the {n_points} points of faces, use {face}"
     elif turned:
         remedy = f"fit a table in which the objects turn, then use prior=model{given}"
     elif most < len(facts.reliability):

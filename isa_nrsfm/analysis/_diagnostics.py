@@ -23,8 +23,9 @@ from isa_nrsfm.analysis._advice import (
     camera_meaning,
     facts_of,
     gross_residuals,
+    layout_of,
 )
-from isa_nrsfm.skeletons import Skeleton, find_skeleton
+from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
@@ -177,9 +178,7 @@ def diagnose(
         np.divide(removed, variance, where=variance > 0, out=np.zeros_like(variance)),
         *gross_residuals(distance),
     )
-    names = names_of_points(estimator)
-    image = mean_shape @ estimator.reference_motion_.T
-    layout = find_skeleton(len(names), names, shape=image)
+    names, layout = names_of_points(estimator), layout_of(estimator)
     facts = facts_of(
         estimator,
         deviation=found.weak_deviations[-1],

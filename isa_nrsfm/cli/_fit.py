@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import time
+import warnings
 from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,12 +12,15 @@ from typing import Any
 
 import numpy as np
 from joblib import parallel_config
+from sklearn.base import clone
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
 from isa_nrsfm._compat import pandas as pd, whole_files
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._estimator import frames_of
+from isa_nrsfm._parameters.choices import FACE_PRIORS as LAYOUTS, JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._prepare.coordinates import TOLD
 from isa_nrsfm._selection import standard_errors
@@ -25,10 +29,16 @@ from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import figures_of, write_figures
-from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, NONE, flag_of
+from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, FACE_PRIORS, NONE, flag_of
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
+from isa_nrsfm.cli._reading import (
+    Frames,
+    drawing,
+    drawing_files,
+    face_layout,
+    read_frames,
+)
 from isa_nrsfm.cli._report import model_report, perspective_report, table_report
 from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.datasets import load_face_prior
@@ -39,6 +49,8 @@ from isa_nrsfm.metrics._reprojection import frame_energies
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
+# Components of the face prior of tables that do not determine depths by themselves.
+FACE_COMPONENTS = 9
 # Options that are parameters of the same name; none stands for None.
 _PARAMETERS = (
     *("block_recovery", "refinement", "camera", "focal_length", "independence"),
@@ -64,6 +76,15 @@ def fit_table(
     _check_options(args)
     folder, clock = Path(args.output), {"": args.since}
     frames = read_frames(args, table=table)
+    if prior in FACE_PRIORS:
+        layout = face_layout(args, frames)
+        if layout is None:
+            raise ValueError(
+                f"--prior {prior} has no points of this table, whose layout is "
+                f"not one of {', '.join(LAYOUTS)}. Name it with --skeleton, "
+                "or give --prior the model.npz of a table in which the objects turn"
+            )
+        args.prior = load_face_prior(len(args.prior.basis_), layout=layout)
     frames.points.attrs[TOLD] = True
     X = frames.X
     if X.empty:
@@ -84,7 +105,7 @@ def fit_table(
         inputs.append(args.table)
     else:
         results = results | {Path(args.table).name: "the table"}
-    if prior not in (None, FACE_PRIOR):
+    if prior not in (None, NONE, *FACE_PRIORS):
         inputs.append(prior)
     with whole_files.folder_for_writing(folder):
         files = [*results, *figures, _outputs.REPORT]
@@ -123,8 +144,8 @@ def fit_table(
             choice = None if search is None else choice_report(search, X)
             fit = Fit(estimator, frames, choice, smooth, drawn, explained, snr)
             _outputs.write_results(new, fit, unit, **shown)
-            if prior is not None:
-                answers["prior"] = {"name": prior, "std": estimator.prior_std_}
+            if (std := getattr(estimator, "prior_std_", None)) is not None:
+                answers["prior"] = {"name": prior or FACE_PRIOR, "std": std}
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
@@ -157,10 +178,11 @@ def fit_table(
 
 def _load_prior(args: Namespace) -> None:
     """Load the prior, and set the options that it determines unless they are given."""
-    n_components = 3
-    if args.prior is not None:
-        face = args.prior == FACE_PRIOR
-        args.prior = load_face_prior() if face else load_model(args.prior)
+    n_components, auto = 3, args.n_components in (None, (AUTO,))
+    args.face_components = FACE_COMPONENTS if auto else args.n_components[0]
+    if args.prior not in (None, NONE):
+        face, K = args.prior in FACE_PRIORS, None if auto else args.n_components[0]
+        args.prior = load_face_prior(K) if face else load_model(args.prior)
         n_components = len(args.prior.basis_)
         if args.n_components == (AUTO,):
             args.n_components = None
@@ -194,7 +216,7 @@ def _check_options(args: Namespace) -> None:
         "prior": "a fit has those of the prior",
     }
     for name, why in one.items():
-        if getattr(args, name) is not None and len(args.n_components) > 1:
+        if getattr(args, name) not in (None, NONE) and len(args.n_components) > 1:
             raise ValueError(
                 f"{flag_of(name)} needs one number of basis shapes, because {why}; "
                 "give it with --n-components, or auto"
@@ -258,7 +280,12 @@ def _fitted(
         clock["choose"] = time.perf_counter() - search.refit_time_
     else:
         # For `shown_progress`; the model that is written does not have it.
-        estimator.set_params(verbose=2).fit(X, **frames.weighting)
+        with warnings.catch_warnings(record=True) as told:
+            estimator.set_params(verbose=2).fit(X, **frames.weighting)
+        with_prior = _with_face_prior(args, estimator, frames)
+        for each in told if with_prior is None else ():
+            warnings.warn(each.message, stacklevel=1)
+        estimator = with_prior or estimator
     diagnostics = None
     if args.refinement in JOINT_REFINEMENTS:
         diagnostics = estimator.diagnostics(X, **frames.weighting)
@@ -271,6 +298,36 @@ def _fitted(
     estimator.set_params(verbose=0)
     clock["fit"] = time.perf_counter()
     return estimator, search, diagnostics, perspective
+
+
+def _with_face_prior(
+    args: Namespace, estimator: AffineNRSfM, frames: Frames
+) -> AffineNRSfM | None:
+    """Return a fit with the face prior, if that and nothing else determines depths."""
+    certainty = frames_of(estimator).certainty if args.refinement == "joint" else None
+    plain = args.prior is None and estimator.camera_ == "weak_perspective"
+    layout = face_layout(args, frames) if plain else None
+    if layout is None or certainty is None or certainty.determined:
+        return None
+    show_stage("fit with the face prior")
+    prior = load_face_prior(args.face_components, layout=layout)
+    with_prior = clone(estimator).set_params(n_components="auto", prior=prior)
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            with_prior.fit(frames.X, **frames.weighting)
+            with_prior.set_params(n_components=len(prior.basis_))
+        except ValueError:  # other points
+            return None
+    if not frames_of(with_prior).certainty.determined:
+        return None
+    warn_caller(
+        "the table by itself does not determine the depth of the shapes (expected "
+        f"error {100 * certainty.total:.0f} % of the depth): they are fitted with the "
+        f"face prior, as with --prior {FACE_PRIOR} --n-components "
+        f"{len(prior.basis_)}, because the layout of the points is {layout}. "
+        f"--prior {NONE} fits the table by itself"
+    )
+    return with_prior
 
 
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:

@@ -76,7 +76,7 @@ def _with_options(text: str, args: Namespace) -> str:
             f"{PROGRAM} fit TABLE {model}",
         ),
         (r"prior=model", model),
-        (r"prior=[\w.]+\(\)", f"--prior {FACE_PRIOR}"),
+        (r"prior=[\w.]+\([^)]*\)", f"--prior {FACE_PRIOR}"),
     ):
         text = re.sub(way, option.replace("\\", r"\\"), text)
     for name in filter(partial(hasattr, args), _PARAMETERS):

@@ -21,8 +21,8 @@ AUTO = "auto"
 NONE = "none"
 # Configuration files of DeepLabCut.
 CONFIGURATIONS = (".yaml", ".yml")
-# The prior of the package.
-FACE_PRIOR = "face-68"
+# The prior of the package, and another name of it.
+FACE_PRIOR, FACE_PRIORS = "face", ("face", "face-68")
 # What export writes, and the suffixes of the files.
 SUFFIXES = {
     "viewer": (".html", ".htm"),
@@ -234,8 +234,9 @@ HELP = {
     "principal_point X Y": "of perspective cameras: the point of the image on the axis "
     "of the camera, in pixels (default: the middle of the images)",
     "prior MODEL": "a fitted model of a table in which the objects turn, such as "
-    f"model.npz, or {FACE_PRIOR} for faces with 68 points: with it frontal photos and "
-    "few frames have true depths",
+    f"model.npz, or {FACE_PRIOR} for faces: with it frontal photos and few frames have "
+    f"true depths. Its layouts are {', '.join(choices.FACE_PRIORS)}; tables of these "
+    f"that do not determine depths have it by default. {NONE}: no prior",
     "export.camera": "camera model for a model with affine cameras; none exports "
     "affine shapes, whose angles and depth are not true (default: weak_perspective)",
     "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
@@ -321,7 +322,7 @@ _COMMANDS: dict[str, tuple[str, str, str, dict[str, tuple]]] = {
 examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
   isa-nrsfm fit body.csv -k auto --output results
-  isa-nrsfm fit photos.csv --prior face-68 --output results
+  isa-nrsfm fit photos.csv --prior face --output results
   isa-nrsfm fit webcam.csv --image-size 1280x720 --output results
 
 Cells of missing points are empty. Rows with too few points are counted and have empty

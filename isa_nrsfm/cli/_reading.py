@@ -14,8 +14,8 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._parameters.choices import SKELETON_NAMES
-from isa_nrsfm._prepare.coordinates import UNSURE, warn_of_places
+from isa_nrsfm._parameters.choices import FACE_PRIORS, SKELETON_NAMES
+from isa_nrsfm._prepare.coordinates import UNSURE, CoordinateWarning, warn_of_places
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     FrameReport,
@@ -142,6 +142,14 @@ def read_frames(
         confidence = sure[list(columns.x)].to_numpy(np.float64)
     if args.min_confidence is not None:
         tracks[confidence < args.min_confidence] = np.nan
+    if (zeros := zeros_far_away(tracks)).any():
+        tracks[zeros] = np.nan
+        args.missing_value = sorted({*args.missing_value, 0.0})
+        warn_caller(
+            f"{zeros.sum():,} points at (0, 0), in {zeros.any(axis=1).sum():,} rows, "
+            "are missing: no other point is near (0, 0)",
+            CoordinateWarning,
+        )
     cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[shown]
     tracks, confidence, weighting = cleaned.mT, confidence[shown], {}
     if args.weights is not None:
@@ -370,6 +378,32 @@ def _layout(
     images = centred[extended] / report.size[extended, None, None]
     shape = images.mean(axis=0).T if extended.any() else None
     return skeletons.find_skeleton(len(names), names, shape=shape)
+
+
+def zeros_far_away(tracks: NDArray) -> NDArray:
+    """Return which points (n_frames, n_points) at (0, 0) are missing.
+
+    They are there exactly, in at least three frames, and all other points are farther
+    away than they are spread (root mean square distance from their centroid).
+    """
+    zeros = (tracks == 0).all(axis=2)
+    # The origin of the coordinates is one point in all frames.
+    zeros &= (~zeros & ~np.isnan(tracks[..., 0])).any(axis=0)
+    if zeros.any(axis=1).sum() > 2:
+        others = tracks[~zeros]
+        spread = np.sqrt(np.nanvar(others, axis=0).sum())
+        if np.nanmin(np.linalg.norm(others, axis=1)) > spread:
+            return zeros
+    return np.zeros_like(zeros)
+
+
+def face_layout(args: Namespace, frames: Frames) -> str | None:
+    """Return the name of the layout of a table, if there is a face prior of it."""
+    layout, columns = frames.skeleton, frames.columns
+    if layout is None:
+        table = frames.X.set_axis(columns.interleaved, axis=1)
+        layout = _layout(args, table, columns, None)
+    return layout.name if layout is not None and layout.name in FACE_PRIORS else None
 
 
 def _given_layout(skeleton: str, names: Sequence[str]) -> Skeleton:

@@ -1,5 +1,6 @@
 """The face prior: a fitted model of faces for tables that do not determine depths."""
 
+from collections.abc import Sequence
 from importlib.resources import files
 from numbers import Integral
 
@@ -9,20 +10,26 @@ from sklearn.utils import check_scalar
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import DepthCertainty, FrameMap, PosteriorFrames
+from isa_nrsfm._parameters.choices import FACE_PRIORS
 
 
-def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
+def load_face_prior(
+    n_components: int | None = None, *, layout: str = "ibug-68"
+) -> AffineNRSfM:
     """
-    Return a model of faces, to be the prior of tables with 68 landmarks (iBUG-68).
+    Return a model of faces, to be the prior of tables with landmarks of faces.
 
     Frontal photos do not determine depths. With this prior they need not: it knows how
     deep faces are, and how people and expressions differ. Coefficients of all tables
-    that are fitted with it can be compared.
+    of a layout that are fitted with it can be compared.
 
     Parameters
     ----------
     n_components : int, default=None
         K, the number of principal components of the shapes, at most 40. None is 40.
+    layout : {"ibug-68", "ibug-51", "xm2vts-68", "xm2vts-53", "muct-76", "muct-61"}, \
+default="ibug-68"
+        The points, by the name of their layout in `isa_nrsfm.skeletons.SKELETONS`.
 
     Returns
     -------
@@ -34,7 +41,8 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     Raises
     ------
     ValueError, TypeError
-        If `n_components` is not a whole number between 1 and 40.
+        If `n_components` is not a whole number between 1 and 40, or there is no prior
+        of the layout.
 
     Notes
     -----
@@ -42,8 +50,10 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     physically-based face attributes", CVPR 2020), copyright 2020 USC Institute for
     Creative Technologies, MIT licence: 100 people with 25 expressions each, drawn from
     its identities and expressions. They are artificial and no random sample of mankind.
-    The points of the jaw are interpolated on its mesh where annotators of photos click.
-    ``benchmarks/face_prior.py`` makes the file.
+    Its landmarks are the inner points of iBUG-68. All other points are interpolated on
+    its mesh, where annotators of photos click. The basis shapes are the principal
+    components for iBUG-68, also for other layouts. ``benchmarks/face_prior.py`` makes
+    the file.
 
     Examples
     --------
@@ -54,28 +64,49 @@ def load_face_prior(n_components: int | None = None) -> AffineNRSfM:
     (40, 68, 3)
     >>> model = AffineNRSfM("auto", camera="weak_perspective", prior=prior)
     """
+    if layout not in FACE_PRIORS:
+        raise ValueError(f"the layouts are {', '.join(FACE_PRIORS)}; got {layout!r}")
+    return model_of_points(FACE_PRIORS[layout], n_components)
+
+
+def model_of_points(
+    points: Sequence[int], n_components: int | None = None
+) -> AffineNRSfM:
+    """Return the model of some of the points in the file."""
     path = files("isa_nrsfm.datasets") / "face_prior.npz"
     with path.open("rb") as file, np.load(file) as arrays:
         stored = {name: arrays[name].astype(np.float64) for name in arrays.files}
-    most = len(stored["basis"])
+    most = len(stored["shapes"]) - 1
     K = most if n_components is None else n_components
     check_scalar(K, "n_components", Integral, min_val=1, max_val=most)
-    mean_shape, basis = stored["mean_shape"], stored["basis"][:K]
+    C, every = stored["moments"], stored["shapes"]
+    some, ibug = (
+        B - B.mean(axis=1, keepdims=True)
+        for B in (every[:, points], every[:, FACE_PRIORS["ibug-68"]])
+    )
+    # Frames of these points have size one, and their mean shape: those of iBUG-68 have
+    # in the file.
+    square, square_in_file = (
+        np.einsum("ab,kja,kjb->", C, B, B) / B.shape[1] for B in (some, ibug)
+    )
+    share, size = square / square_in_file, np.sqrt(np.mean(some[0] ** 2))
+    C, shapes = C * size**2 / share, some / size
+    mean_shape, basis = shapes[0], shapes[1 : K + 1]
     noise, inverse_snr, rank_floor, *certain = stored["numbers"].tolist()
     # Components that are left out become noise of the two coordinates of an image.
-    C, others = stored["moments"], stored["basis"][K:]
+    others = shapes[K + 1 :]
     left = np.einsum("ab,kja,kjb->", C, others, others) / (2 * len(mean_shape))
     total, residual, constant, slope = certain
     certainty = DepthCertainty(
         total,
         0.0,
         stored["turns"],
-        stored["points"],
-        residual=residual + 2.0 * left,
+        stored["points"][points] / share,
+        residual=residual / share + 2.0 * left,
         images=(constant, slope),
     )
-    noise, camera = noise + left, "weak_perspective"
-    shapes = np.ascontiguousarray(np.concatenate([mean_shape[None], basis]).mT)
+    noise, camera = noise / share + left, "weak_perspective"
+    shapes = np.ascontiguousarray(shapes[: K + 1].mT)
     gauge, starts = FrameMap.identity(K), np.zeros((0, K))
     frames = PosteriorFrames(shapes, noise, starts, "linear", gauge, camera, certainty)
     share, n_features = stored["energy_share"][:K], 2 * len(mean_shape)
