@@ -19,7 +19,7 @@ from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __vers
 from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._estimator import frames_of
+from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm._parameters.choices import FACE_PRIORS as LAYOUTS, JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._prepare.coordinates import TOLD
