@@ -217,10 +217,11 @@ def test_faces_whose_table_does_not_determine_depths(fits, fails, tmp_path, load
     names = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
     X = pd.DataFrame(np.nan_to_num(photos).reshape(len(photos), -1), columns=names)
     found = fits(saved(X, tmp_path), "--no-figures")
-    missing, by_itself = found.err.split("warning: ")[1:]
+    missing, by_itself, pose = found.err.split("warning: ")[1:]
     n_rows = np.isnan(photos).any(axis=(1, 2)).sum()
     assert f"points at (0, 0), in {n_rows} rows, are missing" in missing
     assert "--prior face --n-components 9, because the layout" in by_itself
+    assert "use --remove-pose" in pose
     assert found.report["prior"]["name"] == "face"
     assert found.report["table"]["missing_values"] == [0]
     order = np.random.default_rng(0).permutation(68)

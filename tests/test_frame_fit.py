@@ -502,7 +502,7 @@ class TestFrontalFaces:
         assert frontal[1].depth_uncertainty_ > 0.2
         found = frontal[1].diagnostics()
         (message,) = found.messages
-        assert "prior=isa_nrsfm.datasets.load_face_prior()" in message
+        assert "prior=isa_nrsfm.datasets.load_face_prior(layout=" in message
         assert found.depth_uncertainty == frontal[1].depth_uncertainty_
 
     def test_angles_are_withheld(self, frontal):
