@@ -49,7 +49,8 @@ from isa_nrsfm.metrics._reprojection import frame_energies
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
-# Components of the face prior of tables that do not determine depths by themselves.
+# Components of the face prior of tables that do not determine depths by themselves:
+# docs/depth.md has figures of nine and of forty.
 FACE_COMPONENTS = 9
 # Options that are parameters of the same name; none stands for None.
 _PARAMETERS = (
