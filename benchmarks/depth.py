@@ -94,6 +94,35 @@ def sheet(n_frames, seed):
     return np.concatenate([flat, z[:, :, None]], axis=2)
 
 
+def bird(n_frames, seed):
+    """Return shapes (n_frames, 12, 3) of a bird: x ahead, y down, z aside."""
+    rng = np.random.default_rng(seed)
+    phase = np.cumsum(rng.uniform(0.3, 0.8, n_frames))
+    trunk = np.zeros((n_frames, 4, 3))
+    trunk[:, :, 0] = -1.2, -0.4, 0.4, 1.2
+    parts = [trunk]
+    for side in (-1, 1):
+        wing = np.zeros((n_frames, 4, 3))
+        for point, span in enumerate((0.5, 1.0, 1.6, 2.2)):
+            angle = 0.9 * np.sin(phase - 0.5 * (span >= 1))
+            wing[:, point, 0] = 0.1 * span * np.sin(phase)
+            wing[:, point, 1] = -span * np.sin(angle)
+            wing[:, point, 2] = side * span * np.cos(angle)
+        parts.append(wing)
+    return np.concatenate(parts, axis=1)
+
+
+def fish(n_frames, seed):
+    """Return shapes (n_frames, 22, 3) of a fish from above, along which a wave runs."""
+    rng = np.random.default_rng(seed)
+    phase = np.cumsum(rng.uniform(0.2, 0.6, n_frames))[:, None]
+    along = np.linspace(0, 1, 12)
+    wave = 0.25 * along**1.5 * np.sin(2 * np.pi * along - phase)
+    middle = np.stack([np.broadcast_to(1 - 2 * along, wave.shape), wave, 0 * wave], 2)
+    fins = [middle[:, 3:8] + (0.0, 0.0, height) for height in (0.35, -0.3)]
+    return np.concatenate([middle, *fins], axis=1)
+
+
 def flat_hand(n_frames, seed):
     """Return shapes (n_frames, 21, 3) of hands whose fingers move in one plane."""
     hands = np.random.default_rng(seed).integers(2**31)
@@ -121,6 +150,8 @@ OBJECTS = {
     "animals from the side": (animal, 4),
     "flat hands": (flat_hand, 4),
     "sheets": (sheet, 2),
+    "birds from above": (bird, 3),
+    "fish from above": (fish, 3),
     **{
         file: (partial(captured, file=file), 8)
         for file in ("cmu_body", "rat_23", "fly_legs_30")

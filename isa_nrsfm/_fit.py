@@ -181,11 +181,11 @@ def fit_table(
                 noise *= n_numbers / (n_numbers - n_unknowns)
             grouped = fit.misfit > noise
         if grouped:
-            model, widths = consensus(model, table, settings, errors), None
+            model, widths = consensus(model, table, settings, errors, fit), None
             tracks = JointFrames.from_points(table.rows, table.complete)
         elif errors and camera != "affine":
             certainty = depth_certainty(
-                model, table.rows, table.weights, settings, widths
+                model, table.rows, table.weights, settings, widths, fit.rivals
             )
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":

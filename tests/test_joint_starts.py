@@ -1,5 +1,6 @@
 """Starts of the joint fit, the choice between them, and the number of shapes."""
 
+import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,8 +10,12 @@ from frame_parts import assert_calibrated
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_scene as random_model, with_gaps
+from scipy.spatial.transform import Rotation
 
+from benchmarks.depth import bird, depth_error, seen
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.models import LARGEST_SHARE
 from isa_nrsfm._joint.fit import _first_fit
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState, Widths
@@ -22,9 +27,11 @@ from isa_nrsfm._joint.starts import (
     likely_basis,
     mixed_cameras,
     rigid_start,
+    steadied,
 )
 from isa_nrsfm._joint.whole import (
     determined,
+    evidence,
     extended,
     n_directions,
     whole_distribution,
@@ -356,3 +363,42 @@ class TestWholeDistribution:
         wide = extended(problem, fit, n)
         found, _ = whole_distribution(problem, wide)
         assert found.state.noise > 0.5 * NOISE**2
+
+
+def test_steadied_cameras_turn_about_one_axis_less():
+    """Lines of sight stay in one plane; nothing changes along the axis."""
+    views = Rotation.from_rotvec(np.linspace([-1.5, 0.1, 0], [1.5, -0.1, 0.3], 9))
+    motion = views.as_matrix()[:, :2]
+    still = steadied(motion)
+    assert_calibrated(still, "orthographic")
+    sight = np.cross(still[:, 0], still[:, 1])
+    spread = np.linalg.svd(sight, compute_uv=False)
+    assert spread[2] < 1e-12
+    assert spread[1] < 0.3 < np.linalg.svd(np.cross(*motion.swapaxes(0, 1)))[1][1]
+
+
+def test_evidence_does_not_know_the_axes_of_the_object():
+    """It is the same for turned shapes with cameras turned back."""
+    problem, state = random_problem(camera="weak_perspective")
+    settings = problem.settings._replace(camera="weak_perspective")
+    problem = replace(problem, settings=settings)
+    fit, widths = whole_distribution(problem, problem.refined(state, max_iter=5))
+    shapes, motion, noise = fit.state
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
+    turned = fit._replace(state=JointState(turn @ shapes, motion @ turn.T, noise))
+    for own in (widths, None):
+        there, back = (evidence(problem, each, own) for each in (turned, fit))
+        assert_allclose(there, back, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_beating_wings_are_no_rolling_bird(seed, monkeypatch):
+    """Depths are right or withheld, for a bird from above that turns by 3 degrees."""
+    monkeypatch.setattr(AffineNRSfM, "_limits", LIMITS)
+    X, points, _ = seen(bird(140, seed), 3, seed)
+    model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    with warnings.catch_warnings(action="ignore"):
+        model.fit(X)
+    _, error = depth_error(model, X, points)
+    stated = model.depth_uncertainty_
+    assert stated > LARGEST_SHARE or error < min(3 * stated, 0.3)

@@ -82,12 +82,18 @@ class DepthCertainty(NamedTuple):
         """Whether the table determines depths and rotations; True if not estimated."""
         return not self.total > LARGEST_SHARE
 
-    def of_consensus(self, errors: NDArray, depths: NDArray) -> "DepthCertainty":
+    def of_consensus(
+        self, errors: NDArray, depths: NDArray, nearer: float
+    ) -> "DepthCertainty":
         """Return that of a consensus with mean squares of errors and depths (J,).
 
         Groups cannot tell turning from deformation better than all points together.
+        Errors that groups share are those of the joint fit, times `nearer`: the mean
+        square distance of the groups from the consensus over that from the joint fit.
         """
-        points = errors + self.deformation * depths
+        own = 0.0 if self.points is None else self.points
+        shared = np.maximum(own - self.deformation * depths, 0.0)
+        points = np.maximum(errors, nearer * shared) + self.deformation * depths
         total = float(np.sqrt(points.sum() / depths.sum()))
         return self._replace(total=total, points=points, leverage=1.0)
 

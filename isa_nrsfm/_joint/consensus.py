@@ -35,7 +35,7 @@ from isa_nrsfm._joint.common_depths import (
     common_coordinates,
 )
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.problem import JointState, refine_joint
+from isa_nrsfm._joint.problem import JointFit, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._joint.uncertainty import depth_certainty, inlying_rows
@@ -102,6 +102,7 @@ def consensus(
     table: ScaledTable,
     settings: FitSettings,
     errors: bool,
+    joint: JointFit,
 ) -> PosteriorFrames:
     """Fit groups of neighbouring points, and return the model that merges them.
 
@@ -130,7 +131,9 @@ def consensus(
         n_components = min(len(model.shapes) - 1, MOST_FIRST)
         begun = group_fits(scene, distances, n_components, settings)
     if errors:
-        certainty = depth_certainty(model, table.rows, table.weights, settings)
+        certainty = depth_certainty(
+            model, table.rows, table.weights, settings, joint.widths, joint.rivals
+        )
     groups = []
     for (points, count), result in zip(*begun, strict=True):
         if settings.on_step is not None:
@@ -145,8 +148,11 @@ def consensus(
         noise -= (1.0 - LAST_SHARE) * scene.floor
         weights = interpolation(model.shapes[0], chosen)
         depths = centred(joined[:, 2] @ weights)
-        squares = disagreements(groups, joined[:, 2]) @ weights
-        certainty = certainty.of_consensus(squares, np.mean(depths**2, axis=0))
+        squares = disagreements(groups, joined[:, 2])
+        # Groups start from one fit and share a part of its errors.
+        nearer = squares.sum() / disagreements(groups, scene.first[:, 2]).sum()
+        squares, depths = squares @ weights, np.mean(depths**2, axis=0)
+        certainty = certainty.of_consensus(squares, depths, min(nearer, 1.0))
         change = (joined - scene.first) @ weights
         others = np.setdiff1d(np.arange(n_points), chosen)
         off = (1.0 - share) * np.nan_to_num(part - first[:, :2])

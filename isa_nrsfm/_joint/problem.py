@@ -37,6 +37,10 @@ NOISE_FLOOR = 1e-11
 # docs/benchmarks/README.md, "Thresholds".
 RELEVANT = 0.99
 
+# Number of frames whose likelihoods tell two explanations of a table apart:
+# docs/depth.md, "How it is estimated".
+FAR_FRAMES = 4
+
 # Steps, changes of the gradient, and their inner products.
 Memory = deque[tuple[NDArray, NDArray, float]]
 
@@ -157,6 +161,7 @@ class JointFit(NamedTuple):
     posterior means of the coefficients. camera_noise_ratio: noise variance with
     calibrated cameras divided by that with affine ones, for the sample of
     `fit_jointly`. NaN with given starts. prior: with the widths of the fit, if any.
+    rivals: `rival_depths` of less evident fits.
     """
 
     state: JointState
@@ -167,6 +172,7 @@ class JointFit(NamedTuple):
     camera_noise_ratio: float = np.nan
     prior: ShapePrior | None = None
     widths: Widths | None = None
+    rivals: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,16 +234,18 @@ class JointProblem:
     ) -> JointFit:
         """Refine a state jointly, within the limits of the settings or other ones."""
         cameras, settings = cameras or self.cameras, self.settings
-        free = cameras.name == "affine" or settings.shape_prior is not None
-        extents = 0.0 if free else EXTENT_WEIGHT
         given = {
             "least_noise": settings.limits.least_noise,
             "max_iter": settings.max_iter,
             "tol": settings.tol * (0.1 if self.thorough else 1.0),
             "on_step": settings.on_step,
         }
-        likelihood = self.likelihood._replace(extent_weight=extents)
-        return refine_joint(likelihood, state, cameras, **given | limits)
+        return refine_joint(self.objective(cameras), state, cameras, **given | limits)
+
+    def objective(self, cameras: CameraModel) -> MarginalLikelihood:
+        """Return the objective with the prior of the extents, if it is needed."""
+        free = cameras.name == "affine" or self.settings.shape_prior is not None
+        return self.likelihood._replace(extent_weight=0.0 if free else EXTENT_WEIGHT)
 
     def unreversed(
         self, state: JointState, cameras: CameraModel, **limits: Any

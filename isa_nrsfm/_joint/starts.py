@@ -12,10 +12,12 @@ from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import (
     AffineCameras,
     CameraModel,
+    full_rotations,
     nearest_calibrated,
     rigid_cameras,
 )
@@ -109,12 +111,27 @@ def extended_shapes(
     return np.concatenate([shapes, more / np.sqrt(len(rows))])
 
 
+def steadied(motion: NDArray) -> NDArray:
+    """Return calibrated cameras (I, 2, 3) without the turning about the main axis.
+
+    The axis is the one that is most nearly perpendicular to all lines of sight. These
+    are turned about it into one plane that contains it.
+    """
+    views = full_rotations(motion)[0][:, 2]
+    frame = np.linalg.eigh(views.T @ views)[1][:, ::-1]  # the axis is the last column
+    frame[:, 2] *= np.linalg.det(frame)
+    across = views @ frame
+    angle = np.arctan2(across[:, 1], across[:, 0])
+    turn = Rotation.from_rotvec(np.outer(angle, frame[:, 2]))
+    return motion @ turn.as_matrix()
+
+
 def affine_start(problem: JointProblem, W: NDArray, paper: NDArray) -> JointState:
     """Return the paper's result, rigid cameras and scaled basis shapes, as a start."""
     shapes = problem.frames.coordinates(paper)
     W = problem.frames.coordinates(W)
     rows, motion = W.reshape(len(W) // 2, 2, -1), rigid_cameras(W, shapes[0].T)
-    return _first_state(problem, rows, motion, _scaled(rows, motion, shapes))
+    return first_state(problem, rows, motion, _scaled(rows, motion, shapes))
 
 
 def best_starts(
@@ -136,7 +153,7 @@ def best_starts(
         """Refine shapes, or lifted ones, with fixed cameras, and add the trial."""
         if shapes is None:
             shapes = lifted_shapes(seen, motion[few], n_components)
-        state = _first_state(part, seen, motion[few], shapes)
+        state = first_state(part, seen, motion[few], shapes)
         fit = part.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
         trials.append((fit.history[-1], fit.state, motion))
 
@@ -168,7 +185,7 @@ def best_starts(
     return [with_prior(problem, state) for _, state in freed[:3]]
 
 
-def _first_state(
+def first_state(
     problem: JointProblem, rows: NDArray, motion: NDArray, shapes: NDArray
 ) -> JointState:
     """Return a state whose noise is a tenth of the residual of the mean shape."""

@@ -40,7 +40,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.problem import JointState, Widths, refine_joint
+from isa_nrsfm._joint.problem import FAR_FRAMES, JointState, Widths, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
@@ -67,8 +67,6 @@ MOST_FRAMES, MOST_POINTS, MOST_DIRECTIONS = 200, 200, 16
 LEAST_NOISE = 1e-6
 # Factor of the depths of a fit that hardly turns: docs/depth.md, "How it is estimated".
 FAR = 1000.0
-# Number of frames whose likelihoods tell it apart: see the same page.
-FAR_FRAMES = 4
 
 
 # Result of `fitted_frames`.
@@ -254,11 +252,12 @@ def depth_certainty(
     weights: NDArray | None,
     settings: FitSettings,
     widths: Widths | None = None,
+    rivals: float = 0.0,
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
     Weights (I, J) are numbers of observations; without them each is one. widths: of a
-    fit of all directions.
+    fit of all directions. rivals: as of `JointFit`.
     """
     limits = settings.limits
     part, fit, w = inlying_rows(frames, rows, MOST_FRAMES, weights)
@@ -318,10 +317,10 @@ def depth_certainty(
 
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extents=extents)
-    deformation = 0.0
+    deformation = rivals
     if prior is None:
         *_, far_value = refit(every, far_state(whole, camera))
-        deformation = float(np.exp(-FAR_FRAMES * max(far_value - value, 0.0)))
+        deformation += float(np.exp(-FAR_FRAMES * max(far_value - value, 0.0)))
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept in parts:
         _, turned, z, _ = refit(kept)

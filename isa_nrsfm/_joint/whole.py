@@ -25,7 +25,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.camera_models import (
+    CalibratedCameras,
+    full_rotations,
+    line_of_sight,
+)
 from isa_nrsfm._joint.problem import (
+    FAR_FRAMES,
     JointFit,
     JointProblem,
     JointState,
@@ -34,7 +40,7 @@ from isa_nrsfm._joint.problem import (
 )
 from isa_nrsfm._joint.starts import camera_moments
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._linalg.small_matrices import centred, frames_last, unpacked
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Largest number of directions: of small complete tables, and of others, where each
@@ -133,3 +139,60 @@ def image_moments(state: JointState) -> tuple[NDArray, NDArray]:
     """Return ``C = mean_i M_i^T M_i`` and the moments ``mean_i <M_i B_k, M_i B_l>``."""
     C, basis = camera_moments(state.motion), state.shapes[1:]
     return C, np.einsum("ab,kaj,lbj->kl", C, basis, basis, optimize=True)
+
+
+def evidence(problem: JointProblem, fit: JointFit, widths: Widths | None) -> float:
+    """Return -2 log evidence of a fit for each frame, up to a constant.
+
+    The objective has all coefficients integrated out, but takes cameras and shapes as
+    known. Laplace's method integrates them out (MacKay, 1992): with the Hessians C_i of
+    the cameras, the covariance V of the lines of sight in the object, and the Hessian A
+    of the shapes, for n frames, ::
+
+        F / n + mean_i log det C_i + log det V + (log det A + 3J sum_k log v_k) / n.
+
+    A is that along axes in which ``mean_i M_i^T M_i`` is the identity, as for v_k. So
+    turning has a price, as deforming has. det V is that along the two axes of
+    largest spread. Without widths the shapes have no prior and do not count.
+    """
+    part = replace(problem, penalty=0.0, widths=widths)
+    shapes, motion, noise = fit.state
+    cameras = problem.cameras
+    assert isinstance(cameras, CalibratedCameras)
+    terms = part.objective(cameras)(*fit.state)
+    turns = unpacked(cameras.curvature(frames_last(motion), terms.motion_curvature))
+    price = np.linalg.slogdet(np.moveaxis(turns, 2, 0) / noise)[1].mean()
+    views = full_rotations(motion)[0][:, 2]
+    spread = np.linalg.eigvalsh(np.cov(views.T))[1:]
+    price += np.log(np.maximum(spread, OF_DISTANCES)).sum()
+    if widths is not None:
+        known = np.linalg.slogdet(regular(terms.shape_curvature) / noise)[1].mean()
+        known -= len(shapes) * np.linalg.slogdet(camera_moments(motion))[1]
+        known = known / 3 + np.log(widths.variances).sum()
+        price += widths.n_numbers * known / len(motion)
+    return float(terms.value / len(motion) + price)
+
+
+def rival_depths(problem: JointProblem, fits: list[tuple[float, JointFit]]) -> float:
+    """Return the mean squared difference of the depths of fits from those of the first.
+
+    Relative to the mean square, each with its probability ``exp(-m (e - e_0))`` by the
+    evidence e of m = `FAR_FRAMES` frames, and mirrored if that is nearer.
+    """
+    (best, first), *others = fits
+    z, total = depths_of(problem, first), 0.0
+    for value, fit in others:
+        other = depths_of(problem, fit)
+        other *= np.copysign(1.0, np.sum(other * z))
+        square = np.sum((other - z) ** 2) / np.sum(z**2)
+        total += np.exp(-FAR_FRAMES * (value - best)) * square
+    return float(total)
+
+
+def depths_of(problem: JointProblem, fit: JointFit) -> NDArray:
+    """Return the centred depths (I, J) of a fit of all directions."""
+    (shapes, motion, _), part = fit.state, replace(problem, widths=fit.widths)
+    alpha = part.likelihood(*fit.state).alpha
+    shapes = problem.frames.points(shapes)
+    z = np.einsum("ia,kaj->ikj", line_of_sight(motion), shapes)
+    return centred(z[:, 0] + np.einsum("ik,ikj->ij", alpha, z[:, 1:]))
