@@ -34,6 +34,7 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
+from isa_nrsfm.io._other_shapes import frames_of
 from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import (
@@ -43,7 +44,7 @@ from isa_nrsfm.skeletons._column_names import (
 )
 
 # Options of some formats.
-_OF_FORMATS = ("image_size", "columns", "individuals", "part")
+_OF_FORMATS = ("image_size", "columns", "individuals", "row_per_point", "part")
 INNER, WITHOUT = "inner", "without:"
 # The columns of the size of an image, in pixels, by format.
 _SIZES = {"coco": ("width", "height"), "pyfeat": ("FrameWidth", "FrameHeight")}
@@ -114,12 +115,13 @@ def read_frames(
             sure = found.confidence.set_axis(x, axis=1)
     elif table is None:
         table = individuals_as_rows(read_table(args.table), args.individuals)
-        if args.columns is not None:
-            chosen = find_landmark_columns(table.columns, args.columns)
+        table, names = frames_of(table, args.columns, args.row_per_point)
+        if names is not None:
+            chosen = find_landmark_columns(table.columns, names)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
     else:
-        columns = chosen or find_landmark_columns(table.columns, table=table)
+        columns = chosen or find_landmark_columns(table.columns)
     table, sure, not_used = _with_confidences(args, table, columns, sure)
     kept, left_out = _rows_to_keep(args, table)
     if estimator is not None and chosen is not None:
@@ -321,7 +323,7 @@ def _columns_of_model(
     fitted = getattr(estimator, "feature_names_in_", None)
     n_points = len(estimator.mean_shape_)
     if fitted is None:
-        found = chosen or find_landmark_columns(table.columns, table=table)
+        found = chosen or find_landmark_columns(table.columns)
         if len(found.points) != n_points:
             raise ValueError(
                 f"the model has {n_points} points, the table has {len(found.points)} "

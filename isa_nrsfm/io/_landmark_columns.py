@@ -7,11 +7,12 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
+from fnmatch import fnmatchcase
 from itertools import chain
 from typing import Any, NamedTuple
 
-from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm.skeletons._column_names import (
     individuals_in,
     parse_coordinate,
@@ -27,11 +28,18 @@ CONFIDENCES = (
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
 
-# Columns that name points, and frames or people, in tables with a row for each point.
-_POINT = "point|landmark|joint|marker|node|part(?!ic)"
-_FRAME = (
-    "frame|time|image|video|file|session|trial|person|people|participant|subject|"
-    "patient|animal|track|face|hand"
+# Words of columns with x and y that are no points, and of the same points once more: in
+# another unit, filtered, or their velocities.
+_NO_POINT = re.compile(
+    "(?i)(?<![a-z])(?:gyro|gyroscope|accel|accelerometer|acceleration|magnetometer|imu|"
+    "gaze|fixation|cursor|pointer|joystick|rotation|rot|euler|angle|angular|orientation|"
+    "quaternion|translation|velocity|speed|b?box|roi|crop|centroid|cent(?:er|re)_?of_?mass"
+    "|com|cog|stimulus)(?![a-z])|^(?:mouse|target|center|centre|origin|head_?pose)$"
+)
+_COPY = re.compile(
+    "(?i)world|pixels?|px|norm|normali[sz]ed|raw|filt|filtered|filter|smooth|smoothed|"
+    "interp|interpolated|vel|velocity|speed|acc|acceleration|[cm]?m|rel|relative|abs|"
+    "absolute|image|img|[23]d|pred|predicted|gt|true|truth|orig|original|corrected"
 )
 
 
@@ -58,14 +66,13 @@ class LandmarkColumns(NamedTuple):
 def find_landmark_columns(
     names: Iterable[Hashable],
     columns: str | Sequence[str] | None = None,
-    table: "pd.DataFrame | None" = None,
 ) -> LandmarkColumns:
     """
     Find the landmark columns among the columns of a table.
 
     `columns` are patterns of the x and the y columns in turn, such as ``"x_#,y_#"``.
-    Several pairs are put one after the other. Without it, the table must have exactly
-    one set of landmarks of at least `MIN_POINTS` points. Numbered points are in the
+    Several pairs are put one after the other; a pattern after ``-`` leaves columns out, one after ``+`` all others.
+    Without it, the table must have exactly one set of landmarks of at least `MIN_POINTS` points. Numbered points are in the
     order of their numbers, others in that of their x columns.
 
     >>> from isa_nrsfm.io._landmark_columns import find_landmark_columns
@@ -75,23 +82,30 @@ def find_landmark_columns(
     """
     names = list(names)
     if columns is not None:
-        listed = columns.split(",") if isinstance(columns, str) else list(columns)
-        patterns = [pattern.strip() for pattern in listed]
+        listed = split_patterns(columns)
+        patterns = [pattern for pattern in listed if pattern[:1] not in "-+"]
         if not patterns or len(patterns) % 2 or not all(patterns):
             raise ValueError(
                 "columns must name x and y columns in turn, such as 'x_#,y_#'; "
                 f"got {columns!r}"
             )
+        for pattern in (pattern for pattern in listed if pattern[:1] in "-+"):
+            chosen = [fnmatchcase(str(name).strip(), pattern[1:]) for name in names]
+            names = [n for n, c in zip(names, chosen, strict=True) if c == (pattern[0] == "+")]
         given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
         return _select(names if given else without_boxes(names), patterns)
-    names = without_boxes(names)
+    all_names, names = without_boxes(names), only_points(names)
+    if others := [str(name) for name in all_names if name not in names]:
+        warn_caller(
+            f"the columns {first_items(others)} are no points by their names, and are "
+            "left out. If they are, choose with columns (command line: --columns), such "
+            f"as {next(iter(landmark_sets(all_names)))!r}"
+        )
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
+    _refuse_copies(names)
     _refuse_individuals(names, candidates or sets)
     if not candidates:
-        x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
-        if x and y:
-            raise ValueError(_pivoted(names, [x[0], y[0]], table))
         if any(isinstance(name, tuple) for name in names):
             raise ValueError(
                 "the names of the columns have several levels: join them to names such "
@@ -103,7 +117,9 @@ def find_landmark_columns(
         raise ValueError(
             "no landmark columns such as x0, y0, x1, y1 or nose_x, nose_y were found"
             f"{small}; {_first_columns(names)}. If they have other names, give columns "
-            f"(command line: --columns), such as {_likely_pattern(names)!r}"
+            f"(command line: --columns), such as {_likely_pattern(names)!r}; if there "
+            "is a row for each point, give row_per_point (command line: "
+            "--row-per-point), such as 'frame,landmark'"
         )
     if len(candidates) > 1:
         raise ValueError(_several_found(names, candidates))
@@ -117,37 +133,53 @@ def find_landmark_columns(
     return _select(names, pattern.split(","))
 
 
-def _pivoted(
-    names: Sequence[Hashable], values: list[Hashable], table: "pd.DataFrame | None"
-) -> str:
-    """Return how a table with a row for each point gets one for each frame."""
-    told = (
-        "the table has one row for each point, with columns x and y; one row for each "
-        "frame is needed. Columns must tell frames and points apart"
-    )
-    aside = {"x", "y", "z", "", *CONFIDENCES}
-    keys = [name for name in names if str(name).strip().lower() not in aside]
-    points = [name for name in keys if re.search(_POINT, str(name), re.IGNORECASE)]
-    last = [name for name in keys if not re.search(_FRAME, str(name), re.IGNORECASE)]
-    if not keys:
-        return f"{told}: add columns frame and point with their numbers"
-    several = table is not None and table.duplicated(keys).any()
-    points = points or ([] if several else last[-1:])
-    frames = [name for name in keys if name not in points]
-    counted = "table[{!r}] = table.groupby({}).cumcount(), and "
-    if not points:
-        points = ["point"]
-        counted = counted.format("point", keys)
-    elif not frames or several:
-        frames.append("individual" if frames else "frame")
-        counted = counted.format(frames[-1], keys)
-    else:
-        counted = ""
+def split_patterns(columns: str | Sequence[str] | None) -> list[str]:
+    """Return the patterns or names of columns that are given."""
+    listed = columns.split(",") if isinstance(columns, str) else columns or []
+    return [pattern.strip() for pattern in listed]
+
+
+def only_points(names: Iterable[Hashable]) -> list[Hashable]:
+    """Leave out corners of boxes, and columns with x and y that are no points.
+
+    These are so called, and most others are not.
+    """
+    names = without_boxes(list(names))
+    of_points = {n: c[1] for n in names if (c := parse_coordinate(n)) is not None}
+    others = {name for name, point in of_points.items() if _NO_POINT.search(point)}
+    few = 2 * len(others) < len(of_points)
+    return [name for name in names if name not in others] if few else names
+
+
+def _refuse_copies(names: Sequence[Hashable]) -> None:
+    """Raise if most points are there once more, with a further word in their names."""
+    texts = [name.strip() for name, axis, _ in _coordinates(names) if axis == 0]
+    parts = {t: re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", t) for t in texts}
+    keys = {" ".join(each).lower(): text for text, each in parts.items()}
+    pairs: dict[str, list[tuple[str, str]]] = {}
+    for text, each in parts.items():
+        for i, word in enumerate(each):
+            other = keys.get(" ".join([*each[:i], *each[i + 1 :]]).lower())
+            if other is not None and not word.isdigit():
+                pairs.setdefault(word.lower(), []).append((other, text))
+    plain = len(texts) - sum(map(len, pairs.values()))
+    for found in pairs.values():
+        if len(found) >= max(MIN_POINTS, 0.8 * plain):
+            point, copy = found[0]
+            place = next(i for i, letter in enumerate(copy) if point[i : i + 1] != letter)
+            word = copy[place : place + len(copy) - len(point)]
+            ways = {word: f"+*{word}*", f"no {word}": f"-*{word}*"}
+            raise ValueError(_copies(names, f"{point!r} and {copy!r}", ways))
+
+
+def _copies(names: Sequence[Hashable], which: str, ways: dict[str, str]) -> str:
+    """Return the question which of points that are there twice are to be read."""
+    every = ",".join(landmark_sets(names))
+    chosen = "; ".join(f"'{every},{way}' for {word!r}" for word, way in ways.items())
     return (
-        f"{told}. In pandas: {counted}"
-        f"wide = table.pivot(index={frames}, columns={points[0]!r}, values={values}), "
-        "and wide.columns = "
-        "[f'{axis}_{j}' for axis, j in wide.columns], and wide = wide.reset_index()"
+        f"the points are probably there more than once, such as {which}, in another "
+        f"unit or filtered. Choose with columns (command line: --columns): {chosen}; "
+        f"{every!r} if all are points of one body"
     )
 
 
@@ -191,7 +223,7 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
         or not any(
             other_size == size
             and "#" in other[0]
-            and _regular_expression(patterns[0]).fullmatch(other[0])
+            and regular_expression(patterns[0]).fullmatch(other[0])
             for other, other_size in sizes.items()
         )
     }
@@ -229,6 +261,10 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     x = list(dict.fromkeys(chain.from_iterable(lists)))
     if not (who := individuals_in(x, MIN_POINTS)):
         return
+    if any(map(_COPY.fullmatch, who)):
+        found = [re.search(rf"[ _.\-]*{re.escape(w)}[ _.\-]*", "\n".join(x)) for w in who]
+        ways = {w: f"+*{each[0]}*" for w, each in zip(who, found, strict=True) if each}
+        raise ValueError(_copies(names, " and ".join(who), ways))
     largest = max(sets, key=sets.__getitem__)
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
@@ -285,7 +321,7 @@ def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, st
     exact = [name for name in texts if name.strip() == pattern]
     if len(exact) == 1:
         return {(): exact[0]}
-    expression = _regular_expression(pattern)
+    expression = regular_expression(pattern)
     wildcards = re.findall("[#*]", pattern)
     found: dict[tuple, str] = {}
     for name in texts:
@@ -306,7 +342,7 @@ def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, st
     return found
 
 
-def _regular_expression(pattern: str) -> re.Pattern[str]:
+def regular_expression(pattern: str) -> re.Pattern[str]:
     """Translate a pattern into a regular expression with a group for each wildcard."""
     wildcards = {"#": r"(\d+)", "*": "(.+)"}
     parts = re.split(r"([#*])", pattern)
@@ -347,7 +383,12 @@ def _coordinates(names: Iterable[Hashable]) -> list[tuple[str, int, tuple]]:
 
 def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str:
     """List the sets of landmarks of a table, and how to choose one."""
-    listed = []
+    listed, example = [], max(candidates, key=lambda pattern: candidates[pattern])
+    whole = regular_expression(example.split(",")[0])
+    inside = [p for p in candidates if "#" in p and whole.fullmatch(p.split(",")[0])]
+    # Numbered points beside others, such as their centroid
+    if inside and candidates[example] > sum(candidates[p] for p in inside):
+        example = max(inside, key=lambda pattern: candidates[pattern])
     for pattern, n_points in candidates.items():
         x = list(_columns_matching(names, pattern.split(",")[0]).values())
         count = f"{n_points} points" + (", with a z each" if _z_of(names, x) else "")
@@ -355,7 +396,7 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
     return (
         "the table has more than one set of landmark columns: "
         f"{'; '.join(listed)}. Choose with columns (command line: --columns), "
-        f"such as {max(candidates, key=lambda pattern: candidates[pattern])!r}"
+        f"such as {example!r}"
     )
 
 

@@ -1,0 +1,294 @@
+"""Tables of other shapes: a row for each point or coordinate, a point in each cell.
+
+They become tables with a row for each frame, and two columns for each point.
+"""
+
+import re
+from collections.abc import Hashable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
+from isa_nrsfm.io._landmark_columns import (
+    CONFIDENCES,
+    MIN_POINTS,
+    landmark_sets,
+    only_points,
+    regular_expression,
+    split_patterns,
+)
+from isa_nrsfm.skeletons._column_names import parse_coordinate
+
+# Columns that name points, and frames or who is shown.
+_POINT = re.compile(r"(?i)point|landmark|joint|marker|node|part(?!ic)")
+_FRAME = re.compile(
+    "(?i)frame|time|image|video|file|session|trial|person|people|participant|subject|"
+    "patient|animal|individual|track|face|hand"
+)
+_IMAGE = re.compile(rf"(?i)\s*(?:{FRAME}|{IMAGE_NAME})\s*")
+_VALUE = re.compile("(?i)value|position|coord|pos$")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan")
+# Cells of numbers, with brackets, separators, and the names of axes.
+_NUMBERS = re.compile(rf"(?:{_NUMBER.pattern}|[\s,;:|()\[\]{{}}'\"=xyzXYZ])+")
+_INNERMOST = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
+
+
+def frames_of(
+    frame: "pd.DataFrame",
+    columns: str | Sequence[str] | None = None,
+    row_per_point: str | Sequence[str] | None = None,
+) -> tuple["pd.DataFrame", str | Sequence[str] | None]:
+    """Return a table with a row for each frame, and what chooses the columns of points.
+
+    Tables that have one are returned as they are.
+    """
+    names, patterns = list(frame.columns), split_patterns(columns)
+    pair = patterns if len(patterns) == 2 and {*patterns} <= {*names} else None
+    if row_per_point is None and pair is None:
+        sizes = landmark_sets(only_points(names)).values()
+        first = regular_expression(patterns[0]) if patterns else None
+        is_wide = max(sizes, default=0) >= MIN_POINTS
+        if first is not None:
+            is_wide = any(first.fullmatch(str(name).strip()) for name in names)
+        if is_wide:
+            return frame, columns
+    found: tuple[pd.DataFrame, list[str] | None] | None
+    found = None if row_per_point or pair else _cells_apart(frame)
+    if found is None:
+        found = _points_apart(_axes_apart(frame), pair, row_per_point)
+    if found is None:
+        return frame, columns
+    table, points = found
+    return table, columns if patterns and not pair else points
+
+
+def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | None:
+    """Return a table whose cells hold points with a column for each coordinate."""
+    found: dict[Hashable, Any] = {}
+    for name in frame.select_dtypes(["object", "string"]):
+        cells = frame[name].dropna().astype(str)
+        if len(cells) and cells.map(_NUMBERS.fullmatch).notna().all():
+            first = cells.iloc[0]
+            numbers, inner = cells.map(_NUMBER.findall), _INNERMOST.search(first)
+            n_all = len(numbers.iloc[0])
+            n_each = len(_NUMBER.findall(inner[1])) if inner else n_all
+            if n_all > 1 and (numbers.map(len) == n_all).all():
+                n_each = n_each if 1 < n_each < 5 else 2
+                values = pd.DataFrame(numbers.tolist(), cells.index).reindex(frame.index)
+                found[name] = values.to_numpy(float), n_each
+            elif n_all >= 2 * MIN_POINTS:
+                raise ValueError(
+                    f"the cells of the column {name!r} hold several numbers, {n_all} in "
+                    "the first, and other numbers of them in others: all need the same"
+                )
+    points = {name: v[:, :2] for name, (v, _) in found.items() if v.shape[1] in (2, 3)}
+    lists = {n: v for n, (v, _) in found.items() if v.shape[1] >= MIN_POINTS}
+    pairs = axis_pairs(lists)
+    if len(points) >= MIN_POINTS:
+        tracks, labels, used = np.stack([*points.values()], 1), [*points], [*points]
+    elif len(pairs) == 1:
+        tracks, used = np.stack([lists[name] for name in pairs[0]], 2), [*pairs[0]]
+        labels = range(tracks.shape[1])
+    elif len(lists) == 1 and not pairs:
+        (name,), ((values, n_each),) = lists, [found[name] for name in lists]
+        if values.shape[1] % n_each or values.shape[1] < n_each * MIN_POINTS:
+            return None
+        tracks, used = values.reshape(len(values), -1, n_each)[..., :2], [name]
+        labels = range(tracks.shape[1])
+    else:
+        return None
+    warn_caller(
+        f"the cells of {first_items(map(repr, used))} hold several numbers: they are "
+        f"read as x and y of {tracks.shape[1]} points"
+    )
+    points_of = _names(labels, "xy")
+    values = pd.DataFrame(tracks.reshape(len(frame), -1), frame.index, points_of)
+    return pd.concat([frame.drop(columns=used), values], axis=1), points_of
+
+
+def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
+    """Return a table with a row for each coordinate with columns x and y instead."""
+    for name in frame.select_dtypes(["object", "string"]):
+        texts = frame[name].astype(str).str.strip()
+        axes, known = texts.str.lower(), {}
+        coordinates = {text: parse_coordinate(text) for text in texts.unique()}
+        if all(coordinates.values()) and len(coordinates) >= 2 * MIN_POINTS:
+            known = {name: texts.map({t: c[1] for t, c in coordinates.items() if c})}
+            axes = texts.map({t: "xyz"[c[0]] for t, c in coordinates.items() if c})
+        if not {"x", "y"} <= {*axes} <= {"x", "y", "z", *CONFIDENCES}:
+            continue
+        rest = frame.drop(columns=name).assign(**known)
+        keys = [n for n in rest if 1 < rest[n].nunique() < len(rest) / 2 or n in known]
+        others = [n for n in rest if n not in keys and n not in CONFIDENCES]
+        value = ([n for n in rest if _VALUE.search(str(n))] or others)[-1]
+        keys = [n for n in keys if n not in (value, *CONFIDENCES)]
+        table = rest[axes == "x"].rename(columns={value: "x"})
+        for axis in {*axes} - {"x"}:
+            part = rest[axes == axis][[*keys, value]].rename(columns={value: axis})
+            table = table.merge(part, how="left", on=keys, validate="one_to_one")
+        return table
+    return frame
+
+
+def axis_pairs(names: Iterable[Hashable]) -> list[tuple[Hashable, Hashable]]:
+    """Return the pairs of names that differ in one letter, x and y.
+
+    >>> from isa_nrsfm.io._other_shapes import axis_pairs
+    >>> axis_pairs(["frame", "pos_x", "pos_y", "X [px]", "Y [px]"])
+    [('pos_x', 'pos_y'), ('X [px]', 'Y [px]')]
+    """
+    texts = {str(name).strip(): name for name in names}
+    places = [(t, i) for t in texts for i, letter in enumerate(t) if letter in "xX"]
+    pairs = [(t, t[:i] + chr(ord(t[i]) + 1) + t[i + 1 :]) for t, i in places]
+    return [(texts[x], texts[y]) for x, y in pairs if y in texts]
+
+
+def _points_apart(
+    frame: "pd.DataFrame", pair: Sequence[str] | None, given: str | Sequence[str] | None
+) -> tuple["pd.DataFrame", list[str] | None] | None:
+    """Return a table with a row for each frame in place of one for each point."""
+    frame = frame.rename(columns=lambda name: str(name).strip())
+    names = list(frame)
+    pairs = [tuple(pair)] if pair else axis_pairs(only_points(names))
+    pairs = pairs or axis_pairs(names)  # x and y beside width and height
+    plain = [each for each in pairs if "".join(each).lower() == "xy"]
+    if not pairs:
+        return None
+    x, y = (plain or pairs)[0]
+    place = next(i for i, (a, b) in enumerate(zip(x, y, strict=True)) if a != b)
+    z = x[:place] + chr(ord(x[place]) + 2) * (not pair) + x[place + 1 :]
+    values = {"x": x, "y": y} | ({"z": z} if z in names else {})
+    words = {name.lower(): name for name in names if len(name) > 1}
+    values |= {word: words[word] for word in CONFIDENCES if word in words}
+    keys = [n for n in names if n not in values.values() and frame[n].nunique() > 1]
+    found = _keys_of(frame, keys) if given is None else _keys_as_given(frame, given)
+    if found is None:
+        return None
+    if len(pairs) > 1 and not plain:
+        listed = " or ".join(repr(",".join(each)) for each in pairs)
+        raise ValueError(
+            "the table has a row for each point, and more than one pair of coordinates. "
+            f"Choose with columns (command line: --columns), {listed}"
+        )
+    frame, by_frame, by_point = found
+    row = np.zeros(len(frame), int)
+    if by_frame:
+        row += frame.groupby(by_frame, sort=False, dropna=False).ngroup().to_numpy()
+    texts = frame[by_point].astype(str).apply(lambda column: column.str.strip())
+    texts = texts.agg("_".join, axis=1) if len(by_point) > 1 else texts[by_point[0]]
+    point, labels = pd.factorize(texts)
+    numbers = pd.to_numeric(pd.Series(labels), errors="coerce")
+    if (numbers % 1 == 0).all():
+        order = np.argsort(numbers.to_numpy(), kind="stable")
+        point, labels = np.argsort(order)[point], numbers.astype(int)[order].tolist()
+    if (twice := pd.DataFrame({"row": row, "point": point}).duplicated()).any():
+        raise ValueError(
+            f"the table has several rows for the point {texts[twice].iloc[0]!r} of one "
+            "frame: name all columns that tell frames apart with row_per_point (command "
+            "line: --row-per-point)"
+        )
+    parts: dict[str, Any] = {}
+    for axis, name in values.items():
+        numbers = pd.to_numeric(frame[name], errors="coerce")
+        are_numbers = numbers.notna().equals(frame[name].notna())
+        shape, dtype = (row.max() + 1, len(labels)), float if are_numbers else object
+        wide = np.full(shape, np.nan, dtype)
+        wide[row, point] = numbers if are_numbers else frame[name]
+        parts |= zip(_names(labels, [axis]), wide.T, strict=True)
+    first = np.unique(row, return_index=True)[1]
+    others = [name for name in frame if name not in {*values.values(), *by_point}]
+    codes = {name: pd.factorize(frame[name])[0] for name in others}
+    of_frame = [n for n, code in codes.items() if (code[first][row] == code).all()]
+    left = [name for name in others if name not in of_frame]
+    told = f"; left out, as they differ between its points: {first_items(left)}"
+    if given is None or left:
+        option = ",".join([*by_frame, "+".join(by_point)])
+        warn_caller(
+            f"the table has a row for each point: {', '.join(by_frame) or 'nothing'} "
+            f"tells {len(first)} frames apart, {', '.join(by_point)} {len(labels)} "
+            f"points (row_per_point={option!r}; command line: --row-per-point "
+            f"{option}){told * bool(left)}"
+        )
+    kept = frame[of_frame].iloc[first].reset_index(drop=True)
+    points = _names(labels, "xy") if len(by_point) < 2 else None
+    return pd.concat([kept, pd.DataFrame(parts)], axis=1), points
+
+
+def _names(labels: Iterable[Any], axes: Iterable[str]) -> list[str]:
+    """Return the names of columns of points, such as x_0, or nose_x."""
+    pairs = [(str(label).strip(), axis) for label in labels for axis in axes]
+    return [f"{a}_{j}" if j.isdigit() else f"{j}_{a}" for j, a in pairs]
+
+
+def _keys_as_given(
+    frame: "pd.DataFrame", given: str | Sequence[str]
+) -> tuple["pd.DataFrame", list[str], list[str]]:
+    """Return a table, and the columns that tell its frames and points apart, as given.
+
+    One that is not there is counted among the rows that the others do not tell apart.
+    """
+    listed = given.split(",") if isinstance(given, str) else list(given)
+    *by_frame, point = [name.strip() for name in listed]
+    keys = [*by_frame, *point.split("+")]
+    known = [name for name in keys if name in frame]
+    absent = [name for name in keys if name not in frame]
+    if len(absent) > 1 or not known:
+        raise ValueError(
+            "row_per_point must name the columns that tell frames apart, and then that "
+            f"of the points, such as 'frame,landmark'; the table has no {absent}"
+        )
+    counts = {name: frame.groupby(known, dropna=False).cumcount() for name in absent}
+    return frame.assign(**counts), by_frame, point.split("+")
+
+
+def _keys_of(
+    frame: "pd.DataFrame", keys: list[str]
+) -> tuple["pd.DataFrame", list[str], list[str]] | None:
+    """Return a table, and the fewest columns that tell its frames and points apart.
+
+    None if it has no row for each point.
+    """
+    codes = pd.DataFrame({name: pd.factorize(frame[name])[0] for name in keys})
+    sizes, is_frame = codes.nunique(), {n: bool(_FRAME.search(n)) for n in keys}
+
+    def count(names: list[str]) -> int:
+        return len(codes[names].drop_duplicates()) if names else 1
+
+    named = [name for name in keys if _POINT.search(name)]
+    for point in dict.fromkeys([*named, *[n for n in keys[::-1] if not is_frame[n]]]):
+        by_frame, by_point = [name for name in keys if name != point], [point]
+        if count(keys) < len(frame):
+            break
+        for name in sorted(by_frame, key=lambda n: (is_frame[n], -sizes[n])):
+            fewer = [other for other in by_frame if other != name]
+            if count([*fewer, point]) == len(frame):
+                by_frame = fewer
+        if not by_frame and any(is_frame.values()):
+            continue  # the points of all frames have numbers of their own
+        # Parts, such as hands and face, have other points; people have the same.
+        for name in sorted(by_frame, key=lambda n: -sizes[n])[1:]:
+            few = sizes[point] < MIN_POINTS
+            if not is_frame[name] and (
+                few or count([name, point]) < 0.75 * sizes[name] * sizes[point]
+            ):
+                by_frame.remove(name)
+                by_point.insert(0, name)
+        n_points = count(by_point)
+        if n_points >= MIN_POINTS and len(frame) > 0.4 * n_points * count(by_frame):
+            return frame, by_frame, by_point
+    # What no column tells apart is counted, if there is the same number of each.
+    by = [name for name in keys if sizes[name] <= len(frame) / 2]
+    counted = "point" if not named else "individual" if len(by) > 1 else "frame"
+    alike = codes.groupby(by).size() if by else pd.Series([1])
+    least = MIN_POINTS if counted == "point" else 2
+    if alike.nunique() > 1 or alike.iloc[0] < least:
+        return None
+    if counted == "point" and not any(map(_IMAGE.fullmatch, by)):
+        return None
+    table = frame.assign(**{counted: frame.groupby(by, dropna=False).cumcount()})
+    if counted == "point":
+        return table, by, ["point"]
+    return table, [*(name for name in by if name != named[0]), counted], named[:1]
