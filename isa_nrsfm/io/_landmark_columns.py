@@ -95,12 +95,6 @@ def find_landmark_columns(
         given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
         return _select(names if given else without_boxes(names), patterns)
     all_names, names = without_boxes(names), only_points(names)
-    if others := [str(name) for name in all_names if name not in names]:
-        warn_caller(
-            f"the columns {first_items(others)} are no points by their names, and are "
-            "left out. If they are, choose with columns (command line: --columns), such "
-            f"as {next(iter(landmark_sets(all_names)))!r}"
-        )
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
     _refuse_copies(names)
@@ -116,10 +110,10 @@ def find_landmark_columns(
         small = f" (fewer than {MIN_POINTS} points: {small})" if small else ""
         raise ValueError(
             "no landmark columns such as x0, y0, x1, y1 or nose_x, nose_y were found"
-            f"{small}; {_first_columns(names)}. If they have other names, give columns "
-            f"(command line: --columns), such as {_likely_pattern(names)!r}; if there "
-            "is a row for each point, give row_per_point (command line: "
-            "--row-per-point), such as 'frame,landmark'"
+            f"{small}; {_first_columns(names)}. If there is a row for each point, give "
+            "row_per_point (command line: --row-per-point). If they have other names, "
+            "give columns (command line: --columns), such as "
+            f"{_likely_pattern(names)!r}"
         )
     if len(candidates) > 1:
         raise ValueError(_several_found(names, candidates))
@@ -130,7 +124,15 @@ def find_landmark_columns(
             f"the columns '{axis}', '{axis}.1', ... come from a header that repeats "
             "the same names: give every point a name of its own, such as x0, y0, x1, y1"
         )
-    return _select(names, pattern.split(","))
+    patterns, others = pattern.split(","), {*all_names}.difference(names)
+    of_set = [n for n in others if any(_matches(n, each) for each in patterns)]
+    if of_set:
+        warn_caller(
+            f"the columns {first_items(sorted(of_set))} are no points by their names, "
+            "and are left out. If they are, give columns (command line: --columns), "
+            f"such as {pattern!r}"
+        )
+    return _select(names, patterns)
 
 
 def split_patterns(columns: str | Sequence[str] | None) -> list[str]:
@@ -154,7 +156,7 @@ def only_points(names: Iterable[Hashable]) -> list[Hashable]:
 def _refuse_copies(names: Sequence[Hashable]) -> None:
     """Raise if most points are there once more, with a further word in their names."""
     texts = [name.strip() for name, axis, _ in _coordinates(names) if axis == 0]
-    parts = {t: re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", t) for t in texts}
+    parts = {t: re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", t) for t in texts}
     keys = {" ".join(each).lower(): text for text, each in parts.items()}
     pairs: dict[str, list[tuple[str, str]]] = {}
     for text, each in parts.items():
@@ -163,18 +165,23 @@ def _refuse_copies(names: Sequence[Hashable]) -> None:
             if other is not None and not word.isdigit():
                 pairs.setdefault(word.lower(), []).append((other, text))
     plain = len(texts) - sum(map(len, pairs.values()))
-    for found in pairs.values():
-        if len(found) >= max(MIN_POINTS, 0.8 * plain):
-            point, copy = found[0]
-            place = next(i for i, letter in enumerate(copy) if point[i : i + 1] != letter)
+    least = max(MIN_POINTS, 0.8 * plain)
+    copies = [found[0] for found in pairs.values() if len(found) >= least]
+    if copies:
+        ways = {}
+        for point, copy in copies:
+            same = [a == b for a, b in zip(f"{point}\n", copy, strict=False)]
+            place = same.index(False)
             word = copy[place : place + len(copy) - len(point)]
-            ways = {word: f"+*{word}*", f"no {word}": f"-*{word}*"}
-            raise ValueError(_copies(names, f"{point!r} and {copy!r}", ways))
+            ways[word] = f"+*{word}*"
+        first = {"the others": ",".join(f"-*{word}*" for word in ways)}
+        which = " and ".join(map(repr, copies[0]))
+        raise ValueError(_copies(names, which, first | ways))
 
 
 def _copies(names: Sequence[Hashable], which: str, ways: dict[str, str]) -> str:
     """Return the question which of points that are there twice are to be read."""
-    every = ",".join(landmark_sets(names))
+    every = _all_sets(names)
     chosen = "; ".join(f"'{every},{way}' for {word!r}" for word, way in ways.items())
     return (
         f"the points are probably there more than once, such as {which}, in another "
@@ -183,18 +190,39 @@ def _copies(names: Sequence[Hashable], which: str, ways: dict[str, str]) -> str:
     )
 
 
+def _all_sets(names: Iterable[Hashable]) -> str:
+    """Return patterns of all coordinates, each in one of them."""
+    x = {pattern.partition(",")[0]: pattern for pattern in landmark_sets(names)}
+    whole = [regular_expression(one) for one in x if "*" in one]
+    return ",".join(
+        pattern
+        for one, pattern in x.items()
+        if "*" in one or not any(each.fullmatch(one) for each in whole)
+    )
+
+
+def axis_pairs(names: Iterable[Hashable]) -> list[tuple[str, str, int]]:
+    """Return pairs of names that differ in one letter, x and y, and its place.
+
+    >>> from isa_nrsfm.io._landmark_columns import axis_pairs
+    >>> axis_pairs(["frame", "pos_x", "pos_y", "X [px]", "Y [px]"])
+    [('pos_x', 'pos_y', 4), ('X [px]', 'Y [px]', 0)]
+    """
+    texts = [str(name).strip() for name in names]
+    places = ((t, i) for t in texts for i, letter in enumerate(t) if letter in "xX")
+    pairs = [(t, t[:i] + chr(ord(t[i]) + 1) + t[i + 1 :], i) for t, i in places]
+    known = {*texts}
+    return [pair for pair in pairs if pair[1] in known]
+
+
 def _likely_pattern(names: Iterable[Hashable]) -> str:
     """Return the pattern of most names that differ in the letters x and y alone."""
-    texts = [str(name).strip() for name in names]
     found: Counter[str] = Counter()
-    places = [(text, i) for text in texts for i in range(len(text))]
-    for text, place in places:
-        before, letter, after = text[:place], text[place], text[place + 1 :]
-        if letter not in "xX" or f"{before}{chr(ord(letter) + 1)}{after}" not in texts:
-            continue
+    for x, y, i in axis_pairs(names):
+        before, after = x[:i], x[i + 1 :]
         numbered = [re.sub(r"\d+", "#", part) for part in (before, after)]
         for one, other in (numbered, ("*" if before else "", after), (before, "*")):
-            found[f"{one}{letter}{other},{one}{chr(ord(letter) + 1)}{other}"] += 1
+            found[f"{one}{x[i]}{other},{one}{y[i]}{other}"] += 1
     likely = ((pattern, n) for pattern, n in found.items() if pattern.count(",") == 1)
     pattern, size = max(likely, key=lambda each: each[1], default=("", 0))
     return pattern if size >= MIN_POINTS else "px_#,py_#"
@@ -340,6 +368,11 @@ def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, st
     if not found:
         raise ValueError(f"no column matches {pattern!r}; {_first_columns(names)}")
     return found
+
+
+def _matches(name: Hashable, pattern: str) -> bool:
+    """Return whether a name has the form of a pattern."""
+    return regular_expression(pattern).fullmatch(str(name).strip()) is not None
 
 
 def regular_expression(pattern: str) -> re.Pattern[str]:

@@ -15,6 +15,7 @@ from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
 from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
     MIN_POINTS,
+    axis_pairs,
     landmark_sets,
     only_points,
     regular_expression,
@@ -46,6 +47,8 @@ def frames_of(
     Tables that have one are returned as they are.
     """
     names, patterns = list(frame.columns), split_patterns(columns)
+    if not all(isinstance(name, str) for name in names):
+        return frame, columns
     pair = patterns if len(patterns) == 2 and {*patterns} <= {*names} else None
     if row_per_point is None and pair is None:
         sizes = landmark_sets(only_points(names)).values()
@@ -86,7 +89,7 @@ def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | No
                 )
     points = {name: v[:, :2] for name, (v, _) in found.items() if v.shape[1] in (2, 3)}
     lists = {n: v for n, (v, _) in found.items() if v.shape[1] >= MIN_POINTS}
-    pairs = axis_pairs(lists)
+    pairs = [each[:2] for each in axis_pairs(lists)]
     if len(points) >= MIN_POINTS:
         tracks, labels, used = np.stack([*points.values()], 1), [*points], [*points]
     elif len(pairs) == 1:
@@ -133,33 +136,19 @@ def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
     return frame
 
 
-def axis_pairs(names: Iterable[Hashable]) -> list[tuple[Hashable, Hashable]]:
-    """Return the pairs of names that differ in one letter, x and y.
-
-    >>> from isa_nrsfm.io._other_shapes import axis_pairs
-    >>> axis_pairs(["frame", "pos_x", "pos_y", "X [px]", "Y [px]"])
-    [('pos_x', 'pos_y'), ('X [px]', 'Y [px]')]
-    """
-    texts = {str(name).strip(): name for name in names}
-    places = [(t, i) for t in texts for i, letter in enumerate(t) if letter in "xX"]
-    pairs = [(t, t[:i] + chr(ord(t[i]) + 1) + t[i + 1 :]) for t, i in places]
-    return [(texts[x], texts[y]) for x, y in pairs if y in texts]
-
-
 def _points_apart(
     frame: "pd.DataFrame", pair: Sequence[str] | None, given: str | Sequence[str] | None
 ) -> tuple["pd.DataFrame", list[str] | None] | None:
     """Return a table with a row for each frame in place of one for each point."""
     frame = frame.rename(columns=lambda name: str(name).strip())
     names = list(frame)
-    pairs = [tuple(pair)] if pair else axis_pairs(only_points(names))
-    pairs = pairs or axis_pairs(names)  # x and y beside width and height
-    plain = [each for each in pairs if "".join(each).lower() == "xy"]
-    if not pairs:
+    pairs = axis_pairs(only_points(names)) or axis_pairs(names)  # beside width, height
+    pairs = [(*pair, -1)] if pair else pairs
+    plain = [each for each in pairs if "".join(each[:2]).lower() == "xy"]
+    if not 0 < len(pairs) < MIN_POINTS:
         return None
-    x, y = (plain or pairs)[0]
-    place = next(i for i, (a, b) in enumerate(zip(x, y, strict=True)) if a != b)
-    z = x[:place] + chr(ord(x[place]) + 2) * (not pair) + x[place + 1 :]
+    x, y, place = (plain or pairs)[0]
+    z = f"{x[:place]}{'z' if x[place] == 'x' else 'Z'}{x[place + 1 :]}"
     values = {"x": x, "y": y} | ({"z": z} if z in names else {})
     words = {name.lower(): name for name in names if len(name) > 1}
     values |= {word: words[word] for word in CONFIDENCES if word in words}
@@ -168,7 +157,7 @@ def _points_apart(
     if found is None:
         return None
     if len(pairs) > 1 and not plain:
-        listed = " or ".join(repr(",".join(each)) for each in pairs)
+        listed = " or ".join(repr(f"{x},{y}") for x, y, _ in pairs)
         raise ValueError(
             "the table has a row for each point, and more than one pair of coordinates. "
             f"Choose with columns (command line: --columns), {listed}"
@@ -258,11 +247,12 @@ def _keys_of(
         return len(codes[names].drop_duplicates()) if names else 1
 
     named = [name for name in keys if _POINT.search(name)]
+    image = next(filter(_IMAGE.fullmatch, keys), None)
     for point in dict.fromkeys([*named, *[n for n in keys[::-1] if not is_frame[n]]]):
         by_frame, by_point = [name for name in keys if name != point], [point]
         if count(keys) < len(frame):
             break
-        for name in sorted(by_frame, key=lambda n: (is_frame[n], -sizes[n])):
+        for name in sorted(by_frame, key=lambda n: (is_frame[n], -sizes[n], n == image)):
             fewer = [other for other in by_frame if other != name]
             if count([*fewer, point]) == len(frame):
                 by_frame = fewer
@@ -286,7 +276,7 @@ def _keys_of(
     least = MIN_POINTS if counted == "point" else 2
     if alike.nunique() > 1 or alike.iloc[0] < least:
         return None
-    if counted == "point" and not any(map(_IMAGE.fullmatch, by)):
+    if counted == "point" and image not in by:
         return None
     table = frame.assign(**{counted: frame.groupby(by, dropna=False).cumcount()})
     if counted == "point":
