@@ -99,7 +99,7 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
     That is the standard deviation with n or n - 1, smallest and largest value, largest
     magnitude, or median and quartiles.
     """
-    X = tracks.reshape(len(tracks), -1)
+    X = tracks.reshape(len(tracks), 2 * tracks.shape[1])
     X = X[:, np.isfinite(X).sum(axis=0) > max(len(X) / 2, 9)].astype(np.float64)
     largest = np.nanmax(np.abs(X), initial=0.0)
     if X.shape[1] < 2 or not largest:
@@ -136,7 +136,9 @@ def warn_of_still_points(tracks: NDArray, describe: Callable[[int], str] = str) 
     still, moving = np.split(order, n_still[apart][-1:])
     shown = tracks[:, known[moving]]
     shown = shown[np.isfinite(shown[..., 0]).any(axis=1)]
-    if _spread(np.nanmean(shown, axis=1, keepdims=True))[0] < 0.5 * np.median(spread[moving]):
+    if _spread(np.nanmean(shown, axis=1, keepdims=True))[0] < 0.5 * np.median(
+        spread[moving]
+    ):
         return
     listed = first_items(map(describe, sorted(known[still].tolist())))
     warn_caller(

@@ -268,6 +268,7 @@ def find_format(path: str | os.PathLike[str]) -> str:
             f"{found.name}: {found.expected}, in {_listed(found.suffixes)}"
             for found in (*possible, FORMATS[TABLE])
         )
+        + ". Rename tables of separated values to .csv"
     )
 
 

@@ -91,7 +91,11 @@ def find_landmark_columns(
             )
         for pattern in (pattern for pattern in listed if pattern[:1] in "-+"):
             chosen = [fnmatchcase(str(name).strip(), pattern[1:]) for name in names]
-            names = [n for n, c in zip(names, chosen, strict=True) if c == (pattern[0] == "+")]
+            names = [
+                n
+                for n, c in zip(names, chosen, strict=True)
+                if c == (pattern[0] == "+")
+            ]
         given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
         return _select(names if given else without_boxes(names), patterns)
     all_names, names = without_boxes(names), only_points(names)
@@ -290,7 +294,9 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     if not (who := individuals_in(x, MIN_POINTS)):
         return
     if any(map(_COPY.fullmatch, who)):
-        found = [re.search(rf"[ _.\-]*{re.escape(w)}[ _.\-]*", "\n".join(x)) for w in who]
+        found = [
+            re.search(rf"[ _.\-]*{re.escape(w)}[ _.\-]*", "\n".join(x)) for w in who
+        ]
         ways = {w: f"+*{each[0]}*" for w, each in zip(who, found, strict=True) if each}
         raise ValueError(_copies(names, " and ".join(who), ways))
     largest = max(sets, key=sets.__getitem__)

@@ -80,7 +80,9 @@ def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | No
             n_each = len(_NUMBER.findall(inner[1])) if inner else n_all
             if n_all > 1 and (numbers.map(len) == n_all).all():
                 n_each = n_each if 1 < n_each < 5 else 2
-                values = pd.DataFrame(numbers.tolist(), cells.index).reindex(frame.index)
+                values = pd.DataFrame(numbers.tolist(), cells.index).reindex(
+                    frame.index
+                )
                 found[name] = values.to_numpy(float), n_each
             elif n_all >= 2 * MIN_POINTS:
                 raise ValueError(
@@ -252,7 +254,9 @@ def _keys_of(
         by_frame, by_point = [name for name in keys if name != point], [point]
         if count(keys) < len(frame):
             break
-        for name in sorted(by_frame, key=lambda n: (is_frame[n], -sizes[n], n == image)):
+        for name in sorted(
+            by_frame, key=lambda n: (is_frame[n], -sizes[n], n == image)
+        ):
             fewer = [other for other in by_frame if other != name]
             if count([*fewer, point]) == len(frame):
                 by_frame = fewer
