@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from fnmatch import fnmatchcase
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
@@ -64,16 +64,16 @@ class LandmarkColumns(NamedTuple):
 
 
 def find_landmark_columns(
-    names: Iterable[Hashable],
-    columns: str | Sequence[str] | None = None,
+    names: Iterable[Hashable], columns: str | Sequence[str] | None = None
 ) -> LandmarkColumns:
     """
     Find the landmark columns among the columns of a table.
 
     `columns` are patterns of the x and the y columns in turn, such as ``"x_#,y_#"``.
-    Several pairs are put one after the other; a pattern after ``-`` leaves columns out, one after ``+`` all others.
-    Without it, the table must have exactly one set of landmarks of at least `MIN_POINTS` points. Numbered points are in the
-    order of their numbers, others in that of their x columns.
+    Several pairs are put one after the other; a pattern after ``-`` leaves columns
+    out, one after ``+`` all others. Without it, the table must have exactly one set of
+    landmarks of at least `MIN_POINTS` points. Numbered points are in the order of their
+    numbers, others in that of their x columns.
 
     >>> from isa_nrsfm.io._landmark_columns import find_landmark_columns
     >>> names = ["file"] + [f"{a}_{j}" for a in "xy" for j in range(8)]
@@ -83,19 +83,15 @@ def find_landmark_columns(
     names = list(names)
     if columns is not None:
         listed = split_patterns(columns)
-        patterns = [pattern for pattern in listed if pattern[:1] not in "-+"]
+        patterns = [pattern for pattern in listed if pattern[:1] not in ("-", "+")]
         if not patterns or len(patterns) % 2 or not all(patterns):
             raise ValueError(
                 "columns must name x and y columns in turn, such as 'x_#,y_#'; "
                 f"got {columns!r}"
             )
-        for pattern in (pattern for pattern in listed if pattern[:1] in "-+"):
-            chosen = [fnmatchcase(str(name).strip(), pattern[1:]) for name in names]
-            names = [
-                n
-                for n, c in zip(names, chosen, strict=True)
-                if c == (pattern[0] == "+")
-            ]
+        for sign, pattern in ((p[0], p[1:]) for p in listed if p not in patterns):
+            chosen = {n for n in names if fnmatchcase(str(n).strip(), pattern)}
+            names = [name for name in names if (name in chosen) == (sign == "+")]
         given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
         return _select(names if given else without_boxes(names), patterns)
     all_names, names = without_boxes(names), only_points(names)
@@ -129,7 +125,7 @@ def find_landmark_columns(
             "the same names: give every point a name of its own, such as x0, y0, x1, y1"
         )
     patterns, others = pattern.split(","), {*all_names}.difference(names)
-    of_set = [n for n in others if any(_matches(n, each) for each in patterns)]
+    of_set = [n for n in others if any(matches(n, each) for each in patterns)]
     if of_set:
         warn_caller(
             f"the columns {first_items(sorted(of_set))} are no points by their names, "
@@ -171,26 +167,26 @@ def _refuse_copies(names: Sequence[Hashable]) -> None:
     plain = len(texts) - sum(map(len, pairs.values()))
     least = max(MIN_POINTS, 0.8 * plain)
     copies = [found[0] for found in pairs.values() if len(found) >= least]
+    words = []
+    for point, copy in copies:
+        same = [a == b for a, b in zip(f"{point}\n", copy, strict=False)].index(False)
+        words.append(copy[same : same + len(copy) - len(point)])
     if copies:
-        ways = {}
-        for point, copy in copies:
-            same = [a == b for a, b in zip(f"{point}\n", copy, strict=False)]
-            place = same.index(False)
-            word = copy[place : place + len(copy) - len(point)]
-            ways[word] = f"+*{word}*"
-        first = {"the others": ",".join(f"-*{word}*" for word in ways)}
-        which = " and ".join(map(repr, copies[0]))
-        raise ValueError(_copies(names, which, first | ways))
+        others = ",".join(f"-*{word}*" for word in words)
+        _ask_which(names, " and ".join(copies[0]), [*words], [others])
 
 
-def _copies(names: Sequence[Hashable], which: str, ways: dict[str, str]) -> str:
-    """Return the question which of points that are there twice are to be read."""
+def _ask_which(
+    names: Sequence[Hashable], which: str, words: list[str], further: Sequence[str] = ()
+) -> NoReturn:
+    """Raise the question which of points that are there twice are to be read."""
     every = _all_sets(names)
-    chosen = "; ".join(f"'{every},{way}' for {word!r}" for word, way in ways.items())
-    return (
+    ways = [*further, *(f"+*{word}*" for word in words)]
+    raise ValueError(
         f"the points are probably there more than once, such as {which}, in another "
-        f"unit or filtered. Choose with columns (command line: --columns): {chosen}; "
-        f"{every!r} if all are points of one body"
+        "unit or filtered. Choose with columns (command line: --columns): "
+        f"{', '.join(repr(f'{every},{way}') for way in ways)}; or {every!r} if all are "
+        "points of one body"
     )
 
 
@@ -295,10 +291,11 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
         return
     if any(map(_COPY.fullmatch, who)):
         found = [
-            re.search(rf"[ _.\-]*{re.escape(w)}[ _.\-]*", "\n".join(x)) for w in who
+            re.search(rf"[ _.\-]*{re.escape(w)}[ _.\-]*", " ".join(x)) for w in who
         ]
-        ways = {w: f"+*{each[0]}*" for w, each in zip(who, found, strict=True) if each}
-        raise ValueError(_copies(names, " and ".join(who), ways))
+        _ask_which(
+            names, " and ".join(who), [each[0].strip(" ") for each in found if each]
+        )
     largest = max(sets, key=sets.__getitem__)
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
@@ -376,7 +373,7 @@ def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, st
     return found
 
 
-def _matches(name: Hashable, pattern: str) -> bool:
+def matches(name: Hashable, pattern: str) -> bool:
     """Return whether a name has the form of a pattern."""
     return regular_expression(pattern).fullmatch(str(name).strip()) is not None
 

@@ -4,10 +4,11 @@ They become tables with a row for each frame, and two columns for each point.
 """
 
 import re
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
@@ -17,8 +18,8 @@ from isa_nrsfm.io._landmark_columns import (
     MIN_POINTS,
     axis_pairs,
     landmark_sets,
+    matches,
     only_points,
-    regular_expression,
     split_patterns,
 )
 from isa_nrsfm.skeletons._column_names import parse_coordinate
@@ -33,8 +34,10 @@ _IMAGE = re.compile(rf"(?i)\s*(?:{FRAME}|{IMAGE_NAME})\s*")
 _VALUE = re.compile("(?i)value|position|coord|pos$")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan")
 # Cells of numbers, with brackets, separators, and the names of axes.
-_NUMBERS = re.compile(rf"(?:{_NUMBER.pattern}|[\s,;:|()\[\]{{}}'\"=xyzXYZ])+")
+_NUMBERS = re.compile(r"[\d\s.,;:|()\[\]{}'\"=+\-eExyzXYZna]+")
 _INNERMOST = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
+# A table, and the names of its columns that tell frames and points apart.
+Keys = tuple["pd.DataFrame", list[str], list[str]]
 
 
 def frames_of(
@@ -50,68 +53,58 @@ def frames_of(
     if not all(isinstance(name, str) for name in names):
         return frame, columns
     pair = patterns if len(patterns) == 2 and {*patterns} <= {*names} else None
+    found: tuple[pd.DataFrame, list[str] | None] | None = None
     if row_per_point is None and pair is None:
-        sizes = landmark_sets(only_points(names)).values()
-        first = regular_expression(patterns[0]) if patterns else None
-        is_wide = max(sizes, default=0) >= MIN_POINTS
-        if first is not None:
-            is_wide = any(first.fullmatch(str(name).strip()) for name in names)
-        if is_wide:
+        sets = landmark_sets(only_points(names))
+        if patterns:
+            sets = {name: MIN_POINTS for name in names if matches(name, patterns[0])}
+        if max(sets.values(), default=0) >= MIN_POINTS:
             return frame, columns
-    found: tuple[pd.DataFrame, list[str] | None] | None
-    found = None if row_per_point or pair else _cells_apart(frame)
-    if found is None:
-        found = _points_apart(_axes_apart(frame), pair, row_per_point)
+        found = _cells_apart(frame)
+    found = found or _points_apart(_axes_apart(frame), pair, row_per_point)
     if found is None:
         return frame, columns
-    table, points = found
-    return table, columns if patterns and not pair else points
+    return found[0], columns if patterns and not pair else found[1]
 
 
 def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | None:
     """Return a table whose cells hold points with a column for each coordinate."""
-    found: dict[Hashable, Any] = {}
+    found: dict[str, NDArray] = {}
     for name in frame.select_dtypes(["object", "string"]):
         cells = frame[name].dropna().astype(str)
-        if len(cells) and cells.map(_NUMBERS.fullmatch).notna().all():
-            first = cells.iloc[0]
-            numbers, inner = cells.map(_NUMBER.findall), _INNERMOST.search(first)
-            n_all = len(numbers.iloc[0])
-            n_each = len(_NUMBER.findall(inner[1])) if inner else n_all
-            if n_all > 1 and (numbers.map(len) == n_all).all():
-                n_each = n_each if 1 < n_each < 5 else 2
-                values = pd.DataFrame(numbers.tolist(), cells.index).reindex(
-                    frame.index
-                )
-                found[name] = values.to_numpy(float), n_each
-            elif n_all >= 2 * MIN_POINTS:
-                raise ValueError(
-                    f"the cells of the column {name!r} hold several numbers, {n_all} in "
-                    "the first, and other numbers of them in others: all need the same"
-                )
-    points = {name: v[:, :2] for name, (v, _) in found.items() if v.shape[1] in (2, 3)}
-    lists = {n: v for n, (v, _) in found.items() if v.shape[1] >= MIN_POINTS}
-    pairs = [each[:2] for each in axis_pairs(lists)]
+        if not len(cells) or cells.map(_NUMBERS.fullmatch).isna().any():
+            continue
+        numbers, inner = cells.map(_NUMBER.findall), _INNERMOST.search(cells.iloc[0])
+        n_all = len(numbers.iloc[0])
+        n_each = len(_NUMBER.findall(inner[1])) if inner else n_all
+        n_each = n_each if 1 < n_each < 5 and n_all % n_each == 0 else 1
+        if n_all > 1 and (numbers.map(len) == n_all).all():
+            values = pd.DataFrame(numbers.tolist(), cells.index).reindex(frame.index)
+            values = values.to_numpy(float).reshape(len(frame), -1, n_each)
+            found[name] = values[..., :2].reshape(len(frame), -1)
+        elif n_all >= 2 * MIN_POINTS:
+            raise ValueError(
+                f"the cells of the column {name!r} hold several numbers, {n_all} in the "
+                "first, and other numbers of them in others: all need the same"
+            )
+    points = [name for name, values in found.items() if values.shape[1] == 2]
+    lists = [name for name, values in found.items() if values.shape[1] >= MIN_POINTS]
+    pairs = [[x, y] for x, y, _ in axis_pairs(lists)]
     if len(points) >= MIN_POINTS:
-        tracks, labels, used = np.stack([*points.values()], 1), [*points], [*points]
+        used, tracks = points, np.stack([found[name] for name in points], axis=1)
     elif len(pairs) == 1:
-        tracks, used = np.stack([lists[name] for name in pairs[0]], 2), [*pairs[0]]
-        labels = range(tracks.shape[1])
-    elif len(lists) == 1 and not pairs:
-        (name,), ((values, n_each),) = lists, [found[name] for name in lists]
-        if values.shape[1] % n_each or values.shape[1] < n_each * MIN_POINTS:
-            return None
-        tracks, used = values.reshape(len(values), -1, n_each)[..., :2], [name]
-        labels = range(tracks.shape[1])
+        used, tracks = pairs[0], np.stack([found[name] for name in pairs[0]], axis=2)
+    elif len(lists) == 1 and found[lists[0]].shape[1] % 2 == 0:
+        used, tracks = lists, found[lists[0]].reshape(len(frame), -1, 2)
     else:
         return None
     warn_caller(
         f"the cells of {first_items(map(repr, used))} hold several numbers: they are "
         f"read as x and y of {tracks.shape[1]} points"
     )
-    points_of = _names(labels, "xy")
-    values = pd.DataFrame(tracks.reshape(len(frame), -1), frame.index, points_of)
-    return pd.concat([frame.drop(columns=used), values], axis=1), points_of
+    names = _names(points if used is points else range(tracks.shape[1]), "xy")
+    values = pd.DataFrame(tracks.reshape(len(frame), -1), frame.index, names)
+    return pd.concat([frame.drop(columns=used), values], axis=1), names
 
 
 def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
@@ -145,7 +138,8 @@ def _points_apart(
     frame = frame.rename(columns=lambda name: str(name).strip())
     names = list(frame)
     pairs = axis_pairs(only_points(names)) or axis_pairs(names)  # beside width, height
-    pairs = [(*pair, -1)] if pair else pairs
+    if pair:
+        pairs = [(pair[0], pair[1], -1)]
     plain = [each for each in pairs if "".join(each[:2]).lower() == "xy"]
     if not 0 < len(pairs) < MIN_POINTS:
         return None
@@ -161,7 +155,7 @@ def _points_apart(
     if len(pairs) > 1 and not plain:
         listed = " or ".join(repr(f"{x},{y}") for x, y, _ in pairs)
         raise ValueError(
-            "the table has a row for each point, and more than one pair of coordinates. "
+            "the table has a row for each point, and several pairs of coordinates. "
             f"Choose with columns (command line: --columns), {listed}"
         )
     frame, by_frame, by_point = found
@@ -177,9 +171,8 @@ def _points_apart(
         point, labels = np.argsort(order)[point], numbers.astype(int)[order].tolist()
     if (twice := pd.DataFrame({"row": row, "point": point}).duplicated()).any():
         raise ValueError(
-            f"the table has several rows for the point {texts[twice].iloc[0]!r} of one "
-            "frame: name all columns that tell frames apart with row_per_point (command "
-            "line: --row-per-point)"
+            f"a frame has several rows for the point {texts[twice].iloc[0]!r}: name all "
+            "columns that tell frames apart in row_per_point (--row-per-point)"
         )
     parts: dict[str, Any] = {}
     for axis, name in values.items():
@@ -214,9 +207,7 @@ def _names(labels: Iterable[Any], axes: Iterable[str]) -> list[str]:
     return [f"{a}_{j}" if j.isdigit() else f"{j}_{a}" for j, a in pairs]
 
 
-def _keys_as_given(
-    frame: "pd.DataFrame", given: str | Sequence[str]
-) -> tuple["pd.DataFrame", list[str], list[str]]:
+def _keys_as_given(frame: "pd.DataFrame", given: str | Sequence[str]) -> Keys:
     """Return a table, and the columns that tell its frames and points apart, as given.
 
     One that is not there is counted among the rows that the others do not tell apart.
@@ -235,9 +226,7 @@ def _keys_as_given(
     return frame.assign(**counts), by_frame, point.split("+")
 
 
-def _keys_of(
-    frame: "pd.DataFrame", keys: list[str]
-) -> tuple["pd.DataFrame", list[str], list[str]] | None:
+def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
     """Return a table, and the fewest columns that tell its frames and points apart.
 
     None if it has no row for each point.
@@ -277,12 +266,8 @@ def _keys_of(
     by = [name for name in keys if sizes[name] <= len(frame) / 2]
     counted = "point" if not named else "individual" if len(by) > 1 else "frame"
     alike = codes.groupby(by).size() if by else pd.Series([1])
-    least = MIN_POINTS if counted == "point" else 2
+    least = 2 if named else MIN_POINTS if image in by else np.inf
     if alike.nunique() > 1 or alike.iloc[0] < least:
         return None
-    if counted == "point" and image not in by:
-        return None
-    table = frame.assign(**{counted: frame.groupby(by, dropna=False).cumcount()})
-    if counted == "point":
-        return table, by, ["point"]
-    return table, [*(name for name in by if name != named[0]), counted], named[:1]
+    by = [name for name in by if name not in named[:1]]
+    return _keys_as_given(frame, [*by, counted, *named[:1]])
