@@ -53,7 +53,7 @@ def check_table(X: Any, layout: Layout) -> None:
         way = f": give X{two}{order}.reshape(len(X), -1)"
         raise ValueError(
             "X must be a table with one row per frame and two columns per point; got "
-            f"the shape {shape}{way if len(shape) == 3 and 1 < min(shape[1:]) < 5 else ''}"
+            f"the shape {shape}{way * (len(shape) == 3 and 1 < min(shape[1:]) < 5)}"
         )
     names = getattr(X, "columns", None)
     if names is not None:

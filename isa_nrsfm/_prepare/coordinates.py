@@ -27,7 +27,7 @@ LEAST = 0.2
 CENTRED = 0.03
 # Largest relative difference of the spreads of columns scaled one by one, in all rows
 # and in some of them.
-EQUAL, SIMILAR = 2e-3, 0.3
+EQUAL, SIMILAR = 0.01, 0.3
 # Spread of points that move over that of points that stand still.
 FARTHER = 10
 # Attribute of a DataFrame of points of which `read_landmarks` has warned.
@@ -54,11 +54,9 @@ def warn_of_rows(
     warn_of_still_points(tracks, describe)
     if attrs.get(TOLD):
         return
-    have_codes = warn_of_codes(
-        tracks, "rows" if len(few) == rows.n_frames else "rows of a sample"
-    )
-    if not have_codes and are_scaled(tracks, SIMILAR):
-        warn_of_scaled_columns(rows.whole().mT)
+    if are_scaled(tracks, SIMILAR) and warn_of_scaled_columns(rows.whole().mT):
+        return
+    warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
     if camera != "affine":
         warn_of_shares(tracks)
 
@@ -71,7 +69,7 @@ def warn_of_places(
     Trackers place points that they do not see beyond the image. Return whether there
     are any.
     """
-    warned = warn_of_codes(tracks) or warn_of_scaled_columns(tracks)
+    warned = warn_of_scaled_columns(tracks) or warn_of_codes(tracks)
     unsure = np.asarray(confidence, dtype=float)[..., None] < UNSURE
     if 0 < unsure.mean() < 0.5:  # scores of some programs are all lower
         tracks = np.where(unsure, np.nan, tracks)
@@ -96,8 +94,8 @@ def warn_of_scaled_columns(tracks: NDArray) -> bool:
 def are_scaled(tracks: NDArray, tol: float) -> bool:
     """Return whether all columns of tracks have the same spread, up to `tol` of it.
 
-    That is the standard deviation with n or n - 1, smallest and largest value, largest
-    magnitude, or median and quartiles.
+    That is the standard deviation with n or n - 1, smallest and largest value, or
+    median and quartiles.
     """
     X = tracks.reshape(len(tracks), 2 * tracks.shape[1])
     X = X[:, np.isfinite(X).sum(axis=0) > max(len(X) / 2, 9)].astype(np.float64)
@@ -110,7 +108,6 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
         [np.nanstd(X, axis=0)],
         [np.nanstd(X, axis=0, ddof=1)],
         [high - low, low],
-        [np.maximum(-low, high)],
         [third - first, median],
     )
     return any(
@@ -120,7 +117,7 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
 
 
 def warn_of_still_points(tracks: NDArray, describe: Callable[[int], str] = str) -> None:
-    """Warn if three points or more stand still, and most others move together, farther.
+    """Warn if three points or more stand still, and most move together, farther.
 
     Two points may be fixed by alignment; a limb moves before a body at rest.
     """
@@ -150,7 +147,7 @@ def warn_of_still_points(tracks: NDArray, describe: Callable[[int], str] = str) 
 
 
 def _spread(tracks: NDArray) -> NDArray:
-    """Return the distance (n_points,) between the first and the last tenth of frames."""
+    """Return the distances (n_points,) between the first and last tenth of frames."""
     first, last = np.nanpercentile(tracks, [10, 90], axis=0)
     return np.asarray(np.hypot(*(last - first).T))
 

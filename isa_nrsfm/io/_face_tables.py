@@ -44,8 +44,8 @@ def read_openface(path: Path) -> Landmarks:
     The columns are those of ``RecorderCSV.cpp``: ``frame, face_id, timestamp,
     confidence, success`` (``face, confidence`` for images) and optional gaze, eyes,
     pose, ``x_0 ... x_67, y_0 ... y_67`` and more. OpenFace 1 has no ``face_id``, and
-    blanks before the names; the first versions have ``x0 ... x67``. Rows in which ``success`` is 0 hold numbers that are not of
-    a face.
+    blanks before the names; the first versions have ``x0 ... x67``. Rows in which
+    ``success`` is 0 hold numbers that are not of a face.
     """
     names = header_names(path)
     if not (first := {"x_0", "x0"}.intersection(names)):

@@ -89,9 +89,7 @@ def find_landmark_columns(
                 "columns must name x and y columns in turn, such as 'x_#,y_#'; "
                 f"got {columns!r}"
             )
-        for sign, pattern in ((p[0], p[1:]) for p in listed if p not in patterns):
-            chosen = {n for n in names if fnmatchcase(str(n).strip(), pattern)}
-            names = [name for name in names if (name in chosen) == (sign == "+")]
+        names = _chosen(names, [part for part in listed if part not in patterns])
         given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
         return _select(names if given else without_boxes(names), patterns)
     all_names, names = without_boxes(names), only_points(names)
@@ -172,22 +170,30 @@ def _refuse_copies(names: Sequence[Hashable]) -> None:
         same = [a == b for a, b in zip(f"{point}\n", copy, strict=False)].index(False)
         words.append(copy[same : same + len(copy) - len(point)])
     if copies:
-        others = ",".join(f"-*{word}*" for word in words)
-        _ask_which(names, " and ".join(copies[0]), [*words], [others])
+        _ask_which(names, " and ".join(copies[0]), words, [f"-*{w}*" for w in words])
 
 
 def _ask_which(
-    names: Sequence[Hashable], which: str, words: list[str], further: Sequence[str] = ()
+    names: Sequence[Hashable], which: str, words: list[str], without: Sequence[str] = ()
 ) -> NoReturn:
     """Raise the question which of points that are there twice are to be read."""
-    every = _all_sets(names)
-    ways = [*further, *(f"+*{word}*" for word in words)]
+    ways = [*([without] if without else []), *([f"+*{word}*"] for word in words)]
+    every = [",".join([_all_sets(_chosen(names, way)), *way]) for way in ways]
     raise ValueError(
         f"the points are probably there more than once, such as {which}, in another "
         "unit or filtered. Choose with columns (command line: --columns): "
-        f"{', '.join(repr(f'{every},{way}') for way in ways)}; or {every!r} if all are "
-        "points of one body"
+        f"{', '.join(map(repr, every))}; or {_all_sets(names)!r} if all are points of "
+        "one body"
     )
+
+
+def _chosen(names: Sequence[Hashable], patterns: Iterable[str]) -> list[Hashable]:
+    """Return names without those of patterns after "-", only those of ones after "+"."""
+    chosen = list(names)
+    for sign, pattern in ((each[0], each[1:]) for each in patterns):
+        found = {name for name in chosen if fnmatchcase(str(name).strip(), pattern)}
+        chosen = [name for name in chosen if (name in found) == (sign == "+")]
+    return chosen
 
 
 def _all_sets(names: Iterable[Hashable]) -> str:

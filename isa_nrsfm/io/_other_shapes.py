@@ -84,8 +84,8 @@ def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | No
             found[name] = values[..., :2].reshape(len(frame), -1)
         elif n_all >= 2 * MIN_POINTS:
             raise ValueError(
-                f"the cells of the column {name!r} hold several numbers, {n_all} in the "
-                "first, and other numbers of them in others: all need the same"
+                f"the cells of the column {name!r} hold several numbers, but not the "
+                f"same number of them: the first has {n_all}"
             )
     points = [name for name, values in found.items() if values.shape[1] == 2]
     lists = [name for name, values in found.items() if values.shape[1] >= MIN_POINTS]
@@ -171,8 +171,8 @@ def _points_apart(
         point, labels = np.argsort(order)[point], numbers.astype(int)[order].tolist()
     if (twice := pd.DataFrame({"row": row, "point": point}).duplicated()).any():
         raise ValueError(
-            f"a frame has several rows for the point {texts[twice].iloc[0]!r}: name all "
-            "columns that tell frames apart in row_per_point (--row-per-point)"
+            f"a frame has several rows for the point {texts[twice].iloc[0]!r}: name "
+            "all columns that tell frames apart in row_per_point (--row-per-point)"
         )
     parts: dict[str, Any] = {}
     for axis, name in values.items():
