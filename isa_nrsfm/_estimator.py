@@ -54,12 +54,7 @@ from isa_nrsfm._tables.sources import (
     open_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import (
-    LAYOUTS,
-    Layout,
-    describe_point,
-    tracks_to_table,
-)
+from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
 from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
@@ -559,9 +554,7 @@ default="affine"
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
-        names = getattr(opened, "feature_names_in_", None)
-        describe = partial(describe_point, layout=self.layout, names=names)
-        warn_of_rows(source, self.camera, getattr(X, "attrs", {}), describe)
+        warn_of_rows(source, opened, getattr(X, "attrs", {}))
         isa = ready_strategy(
             self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
         )

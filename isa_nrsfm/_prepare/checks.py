@@ -249,8 +249,8 @@ def check_arrangement(
             parts = X.reshape(len(X), -1, n).transpose(0, 2, 1)
             certain = 0.1 if n == 3 else _visibility(parts)
             ratio = _noise_ratio(given, parts[:, :2], scale_frames)
-            # Points of three numbers leave 0.004 to 0.6 of the energy of the wrong
-            # ones. If there are two, the other way leaves 2.4 times as much, and more.
+            # Points of three numbers leave 0.004 to 0.6 of the energy of two; if there
+            # are two, 2.4 times as much: docs/benchmarks/README.md, "Thresholds".
             if certain > 0.5 or (certain > 0.05 and ratio < min(0.8, swapped)):
                 raise ValueError(
                     f"X seems to have {n} numbers for each point (x, y, z, or a "

@@ -5,6 +5,7 @@ points that stand still while the object moves.
 """
 
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.tracks import describe_point
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
@@ -38,26 +40,23 @@ class CoordinateWarning(UserWarning):
     """Coordinates are probably codes of missing points, or shares of an image."""
 
 
-def warn_of_rows(
-    rows: FrameBlocks,
-    camera: str,
-    attrs: dict[Hashable, Any],
-    describe: Callable[[int], str] = str,
-) -> None:
+def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> None:
     """Warn of some rows of a table, evenly spread; not of shares if cameras are affine.
 
     These absorb the stretch of shares. The attributes of a DataFrame may have `TOLD`.
-    `describe` names the point of a number.
     """
     few = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
     tracks = rows.take(few).mT
-    warn_of_still_points(tracks, describe)
+    names = getattr(model, "feature_names_in_", None)
+    warn_of_still_points(
+        tracks, partial(describe_point, layout=model.layout, names=names)
+    )
     if attrs.get(TOLD):
         return
     if are_scaled(tracks, SIMILAR) and warn_of_scaled_columns(rows.whole().mT):
         return
     warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
-    if camera != "affine":
+    if model.camera != "affine":
         warn_of_shares(tracks)
 
 
@@ -116,7 +115,7 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
     )
 
 
-def warn_of_still_points(tracks: NDArray, describe: Callable[[int], str] = str) -> None:
+def warn_of_still_points(tracks: NDArray, describe: Callable[[int], str]) -> None:
     """Warn if three points or more stand still, and most move together, farther.
 
     Two points may be fixed by alignment; a limb moves before a body at rest.

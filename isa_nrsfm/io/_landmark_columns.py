@@ -188,7 +188,7 @@ def _ask_which(
 
 
 def _chosen(names: Sequence[Hashable], patterns: Iterable[str]) -> list[Hashable]:
-    """Return names without those of patterns after "-", only those of ones after "+"."""
+    """Return names without those of patterns after -, only those of ones after +."""
     chosen = list(names)
     for sign, pattern in ((each[0], each[1:]) for each in patterns):
         found = {name for name in chosen if fnmatchcase(str(name).strip(), pattern)}
