@@ -32,9 +32,9 @@ MIN_POINTS = 7
 # another unit, filtered, or their velocities.
 _NO_POINT = re.compile(
     "(?i)(?<![a-z])(?:gyro|gyroscope|accel|accelerometer|acceleration|magnetometer|imu|"
-    "gaze|fixation|cursor|pointer|joystick|rotation|rot|euler|angle|angular|orientation|"
+    "gaze|fixation|cursor|joystick|rotation|head_?(?:rot|angle)|euler|angular_?velocity|"
     "quaternion|translation|velocity|speed|b?box|roi|crop|centroid|cent(?:er|re)_?of_?mass"
-    "|com|cog|stimulus)(?![a-z])|^(?:mouse|target|center|centre|origin|head_?pose)$"
+    "|com|cog|stimulus)(?![a-z])|^(?:mouse|target|origin|head_?pose)$"
 )
 _COPY = re.compile(
     "(?i)world|pixels?|px|norm|normali[sz]ed|raw|filt|filtered|filter|smooth|smoothed|"
@@ -428,8 +428,11 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
     listed, example = [], max(candidates, key=lambda pattern: candidates[pattern])
     whole = regular_expression(example.split(",")[0])
     inside = [p for p in candidates if "#" in p and whole.fullmatch(p.split(",")[0])]
-    # Numbered points beside others, such as their centroid
-    if inside and candidates[example] > sum(candidates[p] for p in inside):
+    # Numbered points beside few others, such as their centroid
+    if (
+        inside
+        and 0 < candidates[example] - sum(candidates[p] for p in inside) < MIN_POINTS
+    ):
         example = max(inside, key=lambda pattern: candidates[pattern])
     for pattern, n_points in candidates.items():
         x = list(_columns_matching(names, pattern.split(",")[0]).values())

@@ -72,13 +72,15 @@ def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | No
     found: dict[str, NDArray] = {}
     for name in frame.select_dtypes(["object", "string"]):
         cells = frame[name].dropna().astype(str)
-        if not len(cells) or cells.map(_NUMBERS.fullmatch).isna().any():
+        if cells.empty or len(_NUMBER.findall(cells.iloc[0])) < 2:
+            continue
+        if cells.map(_NUMBERS.fullmatch).isna().any():
             continue
         numbers, inner = cells.map(_NUMBER.findall), _INNERMOST.search(cells.iloc[0])
         n_all = len(numbers.iloc[0])
         n_each = len(_NUMBER.findall(inner[1])) if inner else n_all
         n_each = n_each if 1 < n_each < 5 and n_all % n_each == 0 else 1
-        if n_all > 1 and (numbers.map(len) == n_all).all():
+        if (numbers.map(len) == n_all).all():
             values = pd.DataFrame(numbers.tolist(), cells.index).reindex(frame.index)
             values = values.to_numpy(float).reshape(len(frame), -1, n_each)
             found[name] = values[..., :2].reshape(len(frame), -1)
@@ -110,6 +112,8 @@ def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | No
 def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
     """Return a table with a row for each coordinate with columns x and y instead."""
     for name in frame.select_dtypes(["object", "string"]):
+        if frame[name].nunique() > len(frame) / 2:
+            continue
         texts = frame[name].astype(str).str.strip()
         axes, known = texts.str.lower(), {}
         coordinates = {text: parse_coordinate(text) for text in texts.unique()}
