@@ -95,7 +95,7 @@ def test_several_sets_are_refused_with_the_ways_to_choose():
 
 
 def test_a_numbered_set_with_another_point_of_that_form_is_ambiguous():
-    names = [*named("lm_{p}_{a}"), "box_x", "box_y"]
+    names = [*named("lm_{p}_{a}"), "ear_x", "ear_y"]
     refused(r"'lm_#_x,lm_#_y' \(9 .*'\*_x,\*_y' \(10 ", find_landmark_columns, names)
     assert len(find_landmark_columns(names, columns="lm_#_x,lm_#_y").x) == N_POINTS
     assert len(find_landmark_columns(names, columns="*_x,*_y").x) == N_POINTS + 1
@@ -119,7 +119,7 @@ def test_patterns_reach_names_of_any_form():
 
 
 def test_small_sets_do_not_compete_and_do_not_suffice():
-    small = named("{p}_{a}", points=["gaze", *"abcde"])
+    small = named("{p}_{a}", points=["hat", *"abcde"])
     assert len(small) == 2 * (MIN_POINTS - 1)
     assert find_landmark_columns(small + named("{a}{p}")).pattern == "x#,y#"
     refused(r"fewer than 7 points: '\*_x,\*_y' \(6\)", find_landmark_columns, small)

@@ -435,7 +435,7 @@ def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
         way = told.rpartition("give ")[2]
         table = eval(way, {"X": X})
         np.testing.assert_array_equal(table, expected.reshape(N, -1))
-    for X in (tracks[None], np.zeros((30, 12, 3))):
+    for X in (tracks[None], np.zeros((30, 12, 5))):
         refused(r"one row per frame .* got the shape .*\)$", estimator.fit, X)
 
 
@@ -500,13 +500,11 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
 
 WIDE = landmarks(2).round(1)
 TEXT = WIDE.to_csv(index=False)
-LONG = "frame,point,x,y\n" + "".join(f"{i // 8},{i % 8},{i},{-i}\n" for i in range(16))
 
 
 @pytest.mark.parametrize(
     ("name", "contents", "message"),
     [
-        ("a.csv", LONG, r"one row for each point, .* table\.pivot\("),
         ("a.csv", WIDE.to_csv(index=False, header=False), "line with column names"),
         ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
         ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
@@ -541,15 +539,6 @@ def followed(call, given, /, **scope):
     for line in told.partition("In pandas: ")[2].split(", and "):
         exec(line, scope)
     return scope
-
-
-@pytest.mark.parametrize("names", ["x,y", "X,Y"])
-def test_the_way_from_one_row_a_point_is_right(tmp_path, names):
-    (tmp_path / "a.csv").write_text(LONG.replace("x,y", names))
-    table = pd.read_csv(tmp_path / "a.csv")
-    wide = followed(landmark_table, table, table=table)["wide"]
-    found = landmark_table(wide).points.iloc[:, 6:8]
-    np.testing.assert_array_equal(found, [[3, -3], [11, -11]])
 
 
 LEVELS = WIDE.set_axis(

@@ -23,6 +23,7 @@ from isa_nrsfm._tables.tracks import (
     seen_points,
     table_to_rows,
     tracks_to_table,
+    two_of,
     without_half_points,
 )
 from isa_nrsfm.skeletons._column_names import names_layout, parse_coordinate
@@ -47,11 +48,12 @@ def check_table(X: Any, layout: Layout) -> None:
     if isinstance(X, list | tuple):
         shape = np.shape(X)
     if len(shape) > 2:
-        order = ".swapaxes(1, 2)" * ((layout == "planar") != (shape[-1] != 2))
-        way = f": give X{order}.reshape(len(X), -1)"
+        order = ".swapaxes(1, 2)" * ((layout == "planar") != (shape[-1] > 4))
+        two = "" if 2 in shape[1:] else "[..., :2]" if shape[-1] < 5 else "[:, :2]"
+        way = f": give X{two}{order}.reshape(len(X), -1)"
         raise ValueError(
             "X must be a table with one row per frame and two columns per point; got "
-            f"the shape {shape}{way if len(shape) == 3 and 2 in shape[1:] else ''}"
+            f"the shape {shape}{way * (len(shape) == 3 and 1 < min(shape[1:]) < 5)}"
         )
     names = getattr(X, "columns", None)
     if names is not None:
@@ -225,43 +227,74 @@ def check_points(
         )
 
 
-def warn_if_other_layout(
-    rows: FrameBlocks, n_points: int, layout: Layout, scale_frames: bool
+def check_arrangement(
+    rows: FrameBlocks, n_points: int, layout: Layout, scale_frames: bool, named: bool
 ) -> None:
     """Warn if a rigid object fits the other column layout much better.
 
-    Compares mean squares, not shares of the total energy. The wrong layout mixes x and
-    y, and a rigid object explains the energy of their offset.
+    Raise if it fits points of three or four numbers, unless columns are named. Compares
+    mean squares, not shares of the total energy. The wrong order mixes x and y, and a
+    rigid object explains the energy of their offset.
     """
     if min(rows.n_frames, n_points) < FEWEST_COMPARED:
         return
     # Some frames, evenly spread
     enough = max(min(1000, 1_000_000 // n_points), 100)
     given = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
-    other = next(name for name in LAYOUTS if name != layout)
     X = tracks_to_table(given.transpose(0, 2, 1), layout)
-    both = [given, without_half_points(table_to_rows(X, other))[0]]
+    other = next(name for name in LAYOUTS if name != layout)
+    swapped = _noise_ratio(given, table_to_rows(X, other), scale_frames)
+    for n in [] if named or layout == "planar" else [3, 4]:
+        if X.shape[1] % n == 0:
+            parts = X.reshape(len(X), -1, n).transpose(0, 2, 1)
+            certain = 0.1 if n == 3 else _visibility(parts)
+            ratio = _noise_ratio(given, parts[:, :2], scale_frames)
+            # Points of three numbers leave 0.004 to 0.6 of the energy of two; if there
+            # are two, 2.4 times as much: docs/benchmarks/README.md, "Thresholds".
+            if certain > 0.5 or (certain > 0.05 and ratio < min(0.8, swapped)):
+                raise ValueError(
+                    f"X seems to have {n} numbers for each point (x, y, z, or a "
+                    f"visibility); x and y are needed. Give {two_of(n)}"
+                )
+    # On real tables the right layout leaves 0.04 to 0.5 of the energy of the other.
+    if swapped < 0.6:
+        warn_caller(
+            f"layout={other!r} explains the table much better than layout={layout!r}: "
+            f"its non-rigid part has {swapped:.2g} times the energy"
+        )
+
+
+def _visibility(parts: NDArray) -> float:
+    """Return how certainly the fourth of four numbers (I, 4, J) are visibilities.
+
+    They are from 0 to 1: the share of the others that are not; 1 if they are all equal.
+    """
+    others, fourth = parts[:, :3], parts[:, 3]
+    if not (np.isnan(fourth) | ((fourth >= 0) & (fourth <= 1))).all():
+        return 0.0
+    is_constant = np.nanmin(fourth) == np.nanmax(fourth)
+    return 1.0 if is_constant else float(np.mean((others < 0) | (others > 1)))
+
+
+def _noise_ratio(given: NDArray, other: NDArray, scale_frames: bool) -> float:
+    """Return the noise of a rigid fit over that to given rows; inf for small tables."""
+    both = [given, without_half_points(other)[0]]
     # Points that few frames show are left out first, then frames that show few points
-    # in one of the layouts.
+    # in one of the orders.
     both = [r[:, :, seen_points(r).sum(axis=0) >= FEWEST_POINTS] for r in both]
     n_seen = np.min([seen_points(r).sum(axis=1) for r in both], axis=0)
     both = [r[n_seen >= FEWEST_POINTS] for r in both]
     if min(min(len(r), r.shape[2]) for r in both) < FEWEST_COMPARED:
-        return
+        return np.inf
     centred, reports = zip(*map(centred_frames, both), strict=True)
-    # The size of a frame is the smaller of both layouts, that of the right one.
+    # The size of a frame is the smaller of both orders, that of the right one.
     sizes = np.min([report.size for report in reports], axis=0)
     if not scale_frames:
         squares = [np.mean(report.size**2) for report in reports]
         sizes = np.full_like(sizes, np.sqrt(min(squares)))
     sizes = np.where(sizes > 0, sizes, 1.0)
     noise, swapped = (_rigid_noise(part / sizes[:, None, None]) for part in centred)
-    # On real tables the right layout leaves 0.04 to 0.5 of the energy of the other.
-    if noise > OF_DIFFERENCES and swapped < 0.6 * noise:
-        warn_caller(
-            f"layout={other!r} explains the table much better than layout={layout!r}: "
-            f"its non-rigid part has {swapped / noise:.2g} times the energy"
-        )
+    return swapped / noise if noise > OF_DIFFERENCES else np.inf
 
 
 def _rigid_noise(rows: NDArray) -> float:

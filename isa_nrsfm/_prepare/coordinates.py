@@ -1,13 +1,20 @@
-"""Coordinates that are no places in an image: codes of missing points, shares."""
+"""Coordinates that are no places in an image, or of no object.
 
-from collections.abc import Hashable
+Codes of missing points, shares of the image, columns that were scaled one by one, and
+points that stand still while the object moves.
+"""
+
+from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.tracks import describe_point
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
@@ -20,6 +27,11 @@ FEW = 0.05
 LEAST = 0.2
 # Largest median of centred coordinates.
 CENTRED = 0.03
+# Largest relative difference of the spreads of columns scaled one by one, in all rows
+# and in some of them.
+EQUAL, SIMILAR = 0.01, 0.3
+# Spread of points that move over that of points that stand still.
+FARTHER = 10
 # Attribute of a DataFrame of points of which `read_landmarks` has warned.
 TOLD = "warned of coordinates"
 
@@ -28,17 +40,23 @@ class CoordinateWarning(UserWarning):
     """Coordinates are probably codes of missing points, or shares of an image."""
 
 
-def warn_of_rows(rows: FrameBlocks, camera: str, attrs: dict[Hashable, Any]) -> None:
+def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> None:
     """Warn of some rows of a table, evenly spread; not of shares if cameras are affine.
 
     These absorb the stretch of shares. The attributes of a DataFrame may have `TOLD`.
     """
-    if attrs.get(TOLD):
-        return
     few = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
     tracks = rows.take(few).mT
+    names = getattr(model, "feature_names_in_", None)
+    warn_of_still_points(
+        tracks, partial(describe_point, layout=model.layout, names=names)
+    )
+    if attrs.get(TOLD):
+        return
+    if are_scaled(tracks, SIMILAR) and warn_of_scaled_columns(rows.whole().mT):
+        return
     warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
-    if camera != "affine":
+    if model.camera != "affine":
         warn_of_shares(tracks)
 
 
@@ -50,11 +68,87 @@ def warn_of_places(
     Trackers place points that they do not see beyond the image. Return whether there
     are any.
     """
-    have_codes = warn_of_codes(tracks)
+    warned = warn_of_scaled_columns(tracks) or warn_of_codes(tracks)
     unsure = np.asarray(confidence, dtype=float)[..., None] < UNSURE
-    if unsure.any():
+    if 0 < unsure.mean() < 0.5:  # scores of some programs are all lower
         tracks = np.where(unsure, np.nan, tracks)
-    return warn_of_shares(tracks, format) or have_codes
+    return warn_of_shares(tracks, format) or warned
+
+
+def warn_of_scaled_columns(tracks: NDArray) -> bool:
+    """Warn, and return True, if the columns of tracks were scaled one by one."""
+    step = -(-len(tracks) // MOST_ROWS) or 1
+    if not (are_scaled(tracks[::step], SIMILAR) and are_scaled(tracks, EQUAL)):
+        return False
+    warn_caller(
+        "all columns have the same spread, as after z-scores, StandardScaler or "
+        "MinMaxScaler. Each column was scaled by itself, which stretches each point in "
+        "x and y by another factor: shapes will be wrong. Give the coordinates as they "
+        "were before, in a pipeline without the scaler",
+        CoordinateWarning,
+    )
+    return True
+
+
+def are_scaled(tracks: NDArray, tol: float) -> bool:
+    """Return whether all columns of tracks have the same spread, up to `tol` of it.
+
+    That is the standard deviation with n or n - 1, smallest and largest value, or
+    median and quartiles.
+    """
+    X = tracks.reshape(len(tracks), 2 * tracks.shape[1])
+    X = X[:, np.isfinite(X).sum(axis=0) > max(len(X) / 2, 9)].astype(np.float64)
+    largest = np.nanmax(np.abs(X), initial=0.0)
+    if X.shape[1] < 2 or not largest:
+        return False
+    X /= largest  # squares stay in range
+    low, first, median, third, high = np.nanpercentile(X, [0, 25, 50, 75, 100], axis=0)
+    spreads = (
+        [np.nanstd(X, axis=0)],
+        [np.nanstd(X, axis=0, ddof=1)],
+        [high - low, low],
+        [third - first, median],
+    )
+    return any(
+        max(np.ptp(each) for each in spread) <= tol * spread[0].max() > 0
+        for spread in spreads
+    )
+
+
+def warn_of_still_points(tracks: NDArray, describe: Callable[[int], str]) -> None:
+    """Warn if three points or more stand still, and most move together, farther.
+
+    Two points may be fixed by alignment; a limb moves before a body at rest.
+    """
+    known = np.flatnonzero(np.isfinite(tracks[..., 0]).sum(axis=0) > 9)
+    if len(known) < 7:
+        return
+    spread = _spread(tracks[:, known])
+    order = np.argsort(spread)
+    n_still = np.arange(3, len(known) // 2 + 1)
+    apart = spread[order[n_still]] > FARTHER * spread[order[n_still - 1]]
+    if not apart.any():
+        return
+    still, moving = np.split(order, n_still[apart][-1:])
+    shown = tracks[:, known[moving]]
+    shown = shown[np.isfinite(shown[..., 0]).any(axis=1)]
+    if _spread(np.nanmean(shown, axis=1, keepdims=True))[0] < 0.5 * np.median(
+        spread[moving]
+    ):
+        return
+    listed = first_items(map(describe, sorted(known[still].tolist())))
+    warn_caller(
+        f"{len(still)} of {len(known)} points stand still, while the others move "
+        f"together more than {FARTHER} times as far: {listed}. If they are not of the "
+        "object, such as corners of an arena, leave them out",
+        CoordinateWarning,
+    )
+
+
+def _spread(tracks: NDArray) -> NDArray:
+    """Return the distances (n_points,) between the first and last tenth of frames."""
+    first, last = np.nanpercentile(tracks, [10, 90], axis=0)
+    return np.asarray(np.hypot(*(last - first).T))
 
 
 def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:

@@ -9,7 +9,7 @@ from sklearn.utils import check_array
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._prepare.checks import check_points, check_size, warn_if_other_layout
+from isa_nrsfm._prepare.checks import check_arrangement, check_points, check_size
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import is_read_later, unmasked
@@ -22,6 +22,7 @@ from isa_nrsfm._tables.tracks import (
     weighted_sizes,
     without_half_points,
 )
+from isa_nrsfm.skeletons._column_names import names_layout
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
 LARGEST_WEIGHT = 1e30
@@ -112,7 +113,8 @@ def scaled_table(
         check_points(visible, n_points, n_components, layout, names)
         if weights is not None:
             check_weights(weights, n_components, camera)
-    warn_if_other_layout(blocks, n_points, layout, scale_frames)
+    named = names is not None and names_layout(names) == layout
+    check_arrangement(blocks, n_points, layout, scale_frames, named)
     translation, size, n_seen, *_ = rest
     if weights is not None:
         size = blocks.joined(weighted_sizes, weights)

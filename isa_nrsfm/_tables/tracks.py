@@ -35,10 +35,16 @@ def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
 def refuse_odd(n_columns: int) -> None:
     """Refuse a number of columns that is odd."""
     if n_columns % 2:
+        three = f". If points have x, y and a third number, give {two_of(3)}"
         raise ValueError(
             "X must have two columns per point (x and y), an even number; "
-            f"got n_features={n_columns}"
+            f"got n_features={n_columns}{three * (n_columns % 3 == 0)}"
         )
+
+
+def two_of(n_numbers: int) -> str:
+    """Return what makes an interleaved table X of the first two numbers of points."""
+    return f"X.reshape(len(X), -1, {n_numbers})[..., :2].reshape(len(X), -1)"
 
 
 def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:

@@ -165,9 +165,12 @@ HELP = {
     f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for any table "
     "with named columns (default: auto, recognised by the beginning of the file)",
     "columns PATTERN": "patterns of the x and y columns, if their names are ambiguous: "
-    "# for a number, * for any text, such as 'x_#,y_#' or '*.px,*.py'",
+    "# for a number, * for any text, such as 'x_#,y_#' or '*.px,*.py'; a pattern after "
+    "- leaves columns out, as in '*_x,*_y,-gaze_*'",
     "individuals NAMES": "individuals in one row, such as 1,2 for nose_1_x and "
     "nose_2_x: each gets a row of its own, with the column individual",
+    "row_per_point NAMES": "of a table with a row for each point, the columns that "
+    "tell frames apart and, last, that of the points, such as video,frame,landmark",
     "skip_rows COLUMN=REGEX": "leave out rows whose column matches the expression, "
     "such as 'name=^ir'",
     "zeros_missing": "treat points at exactly (0, 0) as missing",
@@ -287,8 +290,8 @@ DEFAULTS = {
 }
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
 TABLE_OPTIONS = (
-    *("format", "columns", "individuals", "skip_rows", "zeros_missing"),
-    *("missing_value", "min_confidence", "image_size", "part"),
+    *("format", "columns", "individuals", "row_per_point", "skip_rows"),
+    *("zeros_missing", "missing_value", "min_confidence", "image_size", "part"),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, skeletons
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.damaged_files import errors_of, reading
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters.choices import FACE_PRIORS, SKELETON_NAMES
 from isa_nrsfm._prepare.coordinates import UNSURE, CoordinateWarning, warn_of_places
@@ -34,6 +34,8 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
+from isa_nrsfm.io._landmarks import unsure_points
+from isa_nrsfm.io._other_shapes import frames_of
 from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import (
@@ -43,7 +45,7 @@ from isa_nrsfm.skeletons._column_names import (
 )
 
 # Options of some formats.
-_OF_FORMATS = ("image_size", "columns", "individuals", "part")
+_OF_FORMATS = ("image_size", "columns", "individuals", "row_per_point", "part")
 INNER, WITHOUT = "inner", "without:"
 # The columns of the size of an image, in pixels, by format.
 _SIZES = {"coco": ("width", "height"), "pyfeat": ("FrameWidth", "FrameHeight")}
@@ -114,12 +116,13 @@ def read_frames(
             sure = found.confidence.set_axis(x, axis=1)
     elif table is None:
         table = individuals_as_rows(read_table(args.table), args.individuals)
-        if args.columns is not None:
-            chosen = find_landmark_columns(table.columns, args.columns)
+        table, names = frames_of(table, args.columns, args.row_per_point)
+        if names is not None:
+            chosen = find_landmark_columns(table.columns, names)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
     else:
-        columns = chosen or find_landmark_columns(table.columns, table=table)
+        columns = chosen or find_landmark_columns(table.columns)
     table, sure, not_used = _with_confidences(args, table, columns, sure)
     kept, left_out = _rows_to_keep(args, table)
     if estimator is not None and chosen is not None:
@@ -141,7 +144,8 @@ def read_frames(
     if not sure.empty:
         confidence = sure[list(columns.x)].to_numpy(np.float64)
     if args.min_confidence is not None:
-        tracks[confidence < args.min_confidence] = np.nan
+        with errors_of(f"--min-confidence {args.min_confidence:g}"):
+            tracks[unsure_points(confidence, args.min_confidence)] = np.nan
     if (zeros := zeros_far_away(tracks)).any():
         tracks[zeros] = np.nan
         args.missing_value = sorted({*args.missing_value, 0.0})
@@ -154,19 +158,17 @@ def read_frames(
     tracks, confidence, weighting = cleaned.mT, confidence[shown], {}
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
+        if (largest := np.nanmax(confidence, initial=0.0)) > 1:
+            confidence = confidence / largest
+            warn_caller(f"confidences up to {largest:g} are divided by it, as weights")
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     usable = slice(None) if report.usable.all() else report.usable
     warn_of_places(tracks[usable], confidence[usable], args.format)
-    unsure = confidence[~np.isnan(tracks[..., 0])] < UNSURE
-    if unsure.any() and args.min_confidence is None and args.weights is None:
-        warn_caller(
-            f"{100 * unsure.mean():.3g} % of the points have a confidence below "
-            f"{UNSURE:g}, and count like all others. If they are wrong, leave them out "
-            f"with --min-confidence {UNSURE:g}"
-        )
+    if args.min_confidence is None and args.weights is None:
+        _warn_of_unsure(confidence, ~np.isnan(tracks[..., 0]))
     other = table.drop(columns=names)
     if found is None:
         sets = landmark_sets(other.columns)
@@ -185,6 +187,24 @@ def read_frames(
         weighting={name: each[report.usable] for name, each in weighting.items()},
         principal_point=_principal_point(args, other),
     )
+
+
+def _warn_of_unsure(confidence: NDArray, seen: NDArray) -> None:
+    """Warn of seen points (n_frames, n_points) of low confidence, if some are sure.
+
+    Other numbers are no probabilities. The advice leaves at least half of the table.
+    """
+    unsure = seen & (confidence < UNSURE)
+    if unsure.any() and UNSURE <= np.nanmax(confidence) <= 1:
+        left = (seen & ~unsure).sum(axis=1)
+        least = max(seen.sum(), 1) / 2, (seen.sum(axis=1) >= FEWEST_POINTS).sum() / 2
+        enough = left.sum() >= least[0] and (left >= FEWEST_POINTS).sum() >= least[1]
+        way = f"leave them out with --min-confidence {UNSURE:g}"
+        warn_caller(
+            f"{100 * unsure.sum() / seen.sum():.3g} % of the points have a confidence "
+            f"below {UNSURE:g}, and count like all others. If they are wrong, "
+            f"{way if enough else 'give them less weight with --weights confidence'}"
+        )
 
 
 def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
@@ -270,6 +290,13 @@ def _with_confidences(
         known = confidences_in(table, columns.x, columns.y, strict=bool(option))
         names = [*known]
         known = known.set_axis([*columns.x][: len(names)], axis=1)
+    if not known.empty and known.min(axis=None) == known.max(axis=None):
+        if option:
+            raise ValueError(
+                f"{option}: all confidences of {args.table} are "
+                f"{known.max(axis=None):g}: they do not tell points apart"
+            )
+        known = known[[]]
     if known.empty and option:
         raise ValueError(
             f"{option}: {args.table} ({args.format}) has no confidences of all points. "
@@ -321,7 +348,7 @@ def _columns_of_model(
     fitted = getattr(estimator, "feature_names_in_", None)
     n_points = len(estimator.mean_shape_)
     if fitted is None:
-        found = chosen or find_landmark_columns(table.columns, table=table)
+        found = chosen or find_landmark_columns(table.columns)
         if len(found.points) != n_points:
             raise ValueError(
                 f"the model has {n_points} points, the table has {len(found.points)} "

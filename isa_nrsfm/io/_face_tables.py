@@ -34,7 +34,7 @@ def is_openface(path: Path) -> bool:
     """Return whether the header is one of OpenFace."""
     names = header_names(path)
     of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
-    groups = {"x_0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
+    groups = {"x_0", "x0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
     return (of_video or names[:2] == ["face", "confidence"]) and bool(groups)
 
 
@@ -44,18 +44,18 @@ def read_openface(path: Path) -> Landmarks:
     The columns are those of ``RecorderCSV.cpp``: ``frame, face_id, timestamp,
     confidence, success`` (``face, confidence`` for images) and optional gaze, eyes,
     pose, ``x_0 ... x_67, y_0 ... y_67`` and more. OpenFace 1 has no ``face_id``, and
-    blanks before the names. Rows in which ``success`` is 0 hold numbers that are not of
-    a face.
+    blanks before the names; the first versions have ``x0 ... x67``. Rows in which
+    ``success`` is 0 hold numbers that are not of a face.
     """
     names = header_names(path)
-    if "x_0" not in names:
+    if not (first := {"x_0", "x0"}.intersection(names)):
         raise ValueError(
             "it has no 2D landmarks x_0, ..., y_0, ...: run OpenFace with -2Dfp"
         )
     of_video = names[:1] != ["face"]
     scores = ["confidence", "success"] if of_video else ["confidence"]
     _need(names, scores)
-    found = find_landmark_columns(names, "x_#,y_#")
+    found = find_landmark_columns(names, "x_#,y_#" if "x_0" in first else "x#,y#")
     numbers = [*found.interleaved, *scores]
     table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
     if of_video:

@@ -150,7 +150,7 @@ def read_landmarks(
         one of "pose", "face", "hand_left" and "hand_right"; ``part`` of whole bodies of
         "coco" and "mmpose", one of "body", "feet", "face", "left_hand", "right_hand"
         and "all"; ``columns`` and ``missing`` of "table" and "mediapipe", and
-        ``individuals`` of "table", as in `landmark_table`.
+        ``individuals`` and ``row_per_point`` of "table", as in `landmark_table`.
 
     Returns
     -------
@@ -268,6 +268,7 @@ def find_format(path: str | os.PathLike[str]) -> str:
             f"{found.name}: {found.expected}, in {_listed(found.suffixes)}"
             for found in (*possible, FORMATS[TABLE])
         )
+        + ". Rename tables of separated values to .csv"
     )
 
 
@@ -382,7 +383,7 @@ _ALL = (
         "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
         _TABLES,
         "_tables.named_columns",
-        ("columns", "missing", "individuals"),
+        ("columns", "missing", "individuals", "row_per_point"),
     ),
 )
 

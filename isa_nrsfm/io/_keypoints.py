@@ -37,13 +37,12 @@ _PLACES = {
 }
 _JSON = re.compile(r"(?is)(?!\.).*\.json")
 _NAME = re.compile(r"(?is)(?!\.).*_keypoints\.json")
-_OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
-_MMPOSE = re.compile(
-    rb'\s*(\{\s*"(meta_info|instance_info|predictions|visualization)"|'
-    rb'\[\s*\{\s*"(frame_id"\s*:\s*\d+\s*,\s*"instances|keypoints"\s*:\s*\[\s*\[))'
+# Names of entries by which json of these programs is known; others are of COCO.
+_ENTRY = re.compile(rb'"(\w+)"\s*:')
+_OPENPOSE = frozenset({b"people"})
+_MMPOSE = frozenset(
+    {b"instance_info", b"instances", b"keypoint_scores", b"predictions"}
 )
-# An image without instances has an empty list.
-_MMPOSE_ALSO = re.compile(_MMPOSE.pattern + rb"|\s*\[\s*\]")
 _TPS = re.compile(r"(?i)LM\s*=\s*\d+")
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
@@ -61,14 +60,15 @@ _WFLW_LENGTHS = (197, 207)
 
 def is_coco(path: Path) -> bool:
     """Return whether a file begins as a json object or list, of no other format."""
-    begins = _beginning(path)[:1] in (b"{", b"[")
-    return begins and not is_openpose(path) and not is_mmpose(path)
+    names = _entry_names(path)
+    return names is not None and not names & (_OPENPOSE | _MMPOSE)
 
 
-def _beginning(path: Path) -> bytes:
-    """Return the first bytes of a file, without byte order mark and leading blanks."""
+def _entry_names(path: Path) -> frozenset[bytes] | None:
+    """Return names of entries at the beginning of a json file; None for other files."""
     with path.open("rb") as file:
-        return file.read(256).removeprefix(b"\xef\xbb\xbf").lstrip()
+        text = file.read(2**16).removeprefix(b"\xef\xbb\xbf").lstrip()
+    return frozenset(_ENTRY.findall(text)) if text[:1] in (b"{", b"[") else None
 
 
 def read_coco(path: Path, part: str | None = None) -> Landmarks:
@@ -378,20 +378,29 @@ def _each_file(
 
 
 def _files_of(
-    path: Path, names: re.Pattern[str], begins: re.Pattern[bytes] | None = None
+    path: Path,
+    names: re.Pattern[str],
+    entries: frozenset[bytes] = frozenset(),
+    empty: bool = False,
 ) -> list[Path]:
-    """Return a file, or those of a folder, that have such a name and beginning."""
+    """Return a file, or those of a folder, that have such a name and any such entries.
+
+    `empty`: also those without entries.
+    """
     files = sorted(path.iterdir(), key=by_number) if path.is_dir() else [path]
+    files = [file for file in files if names.fullmatch(file.name)]
+    if not entries:
+        return files
+    found = [(file, _entry_names(file)) for file in files if file.is_file()]
     return [
         file
-        for file in files
-        if names.fullmatch(file.name)
-        and (begins is None or (file.is_file() and begins.match(_beginning(file))))
+        for file, has in found
+        if has is not None and (has & entries or (empty and not has))
     ]
 
 
 def _openpose_files(path: Path) -> list[Path]:
-    """Return the files of OpenPose in a folder, by their names or beginnings."""
+    """Return the files of OpenPose in a folder, by their names or entries."""
     named = _files_of(path, _NAME) if path.is_dir() else []
     return named or _files_of(path, _JSON, _OPENPOSE)
 
@@ -427,7 +436,8 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     ``keypoints``, [x, y] of each point, and ``keypoint_scores``. ``part`` chooses a
     part of whole bodies. An image without instances has one row without points.
     """
-    files, absent = _files_of(path, _JSON, _MMPOSE_ALSO), "no file of it is of MMPose"
+    # An image without instances has an empty list.
+    files, absent = _files_of(path, _JSON, _MMPOSE, True), "no file of it is of MMPose"
     _, contents = _each_file(path, files, absent, _instances_in)
     entries = [entry for found in contents for entry in found]
     return _landmarks(entries, None, part, "mmpose", "instance")
@@ -450,6 +460,11 @@ def _instances_in(file: Path) -> list[dict[str, Any]]:
         if "frame_id" in frame:
             known["frame"] = frame["frame_id"]
         for person, each in enumerate(frame["instances"]):
+            if {*map(len, each["keypoints"])} - {2} or "keypoint_scores" not in each:
+                raise ValueError(
+                    "instances need keypoints, x and y of each point, and "
+                    "keypoint_scores; keypoints x, y, z are points in space"
+                )
             pairs = zip(each["keypoints"], each["keypoint_scores"], strict=True)
             values = [float(v) for (x, y), score in pairs for v in (x, y, score)]
             entries.append(known | each | {"person": person, "keypoints": values})
@@ -488,9 +503,12 @@ def read_tps(path: Path) -> Landmarks:
 
     ``LM=12`` and twelve lines ``x y`` are followed by lines such as ``IMAGE=a.jpg``,
     ``ID=1`` and ``SCALE=0.1``, the columns of the frames. y points up. Points of curves
-    are left out.
+    are left out. Missing points are NA NA or -1 -1.
     """
     text = path.read_text(encoding="utf-8-sig")
+    if commas := re.findall(r"(?m)^\s*(-?\d+,\d+)\s+-?\d+(?:,\d+)?\s*$", text):
+        text = re.sub(r"(?m)(?<=\d),(?=\d+(?:\s+-?[\d,]+)?\s*$)", ".", text)
+        warn_caller(f"numbers have decimal commas, such as {commas[0]}")
     head, *parts = re.split(r"(?im)^\s*LM\s*=", text)
     if head.strip() or not parts:
         raise ValueError(f"expected LM= and a number of landmarks; got {text[:40]!r}")
@@ -506,9 +524,15 @@ def read_tps(path: Path) -> Landmarks:
         n_left += sum(not equals for _, equals, _ in entries)
         known = {name.strip().lower(): value.strip() for name, _, value in entries}
         rows.append({name: known[name] for name in _TPS_ENTRIES if name in known})
+    if n_left and not any(len(each[0]) for each in tracks):
+        raise ValueError(
+            f"all its {n_left} points are on curves, which are left out: append them "
+            "to the landmarks, in tpsUtil with 'Append tps curve to landmarks'"
+        )
     if n_left:
         warn_caller(f"{n_left} points of curves are left out")
     *_, values = stacked(tracks, [f"specimen {i}" for i in range(len(tracks))])
+    values[(values == -1).all(axis=2)] = np.nan  # as tpsDig and geomorph write them
     return assemble(values, None, rows, format="tps")
 
 

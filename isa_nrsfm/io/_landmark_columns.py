@@ -7,11 +7,12 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
+from fnmatch import fnmatchcase
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
-from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm.skeletons._column_names import (
     individuals_in,
     parse_coordinate,
@@ -27,11 +28,18 @@ CONFIDENCES = (
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
 
-# Columns that name points, and frames or people, in tables with a row for each point.
-_POINT = "point|landmark|joint|marker|node|part(?!ic)"
-_FRAME = (
-    "frame|time|image|video|file|session|trial|person|people|participant|subject|"
-    "patient|animal|track|face|hand"
+# Words of columns with x and y that are no points, and of the same points once more: in
+# another unit, filtered, or their velocities.
+_NO_POINT = re.compile(
+    "(?i)(?<![a-z])(?:gyro|gyroscope|accel|accelerometer|acceleration|magnetometer|imu|"
+    "gaze|fixation|cursor|joystick|rotation|head_?(?:rot|angle)|euler|angular_?velocity|"
+    "quaternion|translation|velocity|speed|b?box|roi|crop|centroid|cent(?:er|re)_?of_?mass"
+    "|com|cog|stimulus)(?![a-z])|^(?:mouse|target|origin|head_?pose)$"
+)
+_COPY = re.compile(
+    "(?i)world|pixels?|px|norm|normali[sz]ed|raw|filt|filtered|filter|smooth|smoothed|"
+    "interp|interpolated|vel|velocity|speed|acc|acceleration|[cm]?m|rel|relative|abs|"
+    "absolute|image|img|[23]d|pred|predicted|gt|true|truth|orig|original|corrected"
 )
 
 
@@ -56,17 +64,16 @@ class LandmarkColumns(NamedTuple):
 
 
 def find_landmark_columns(
-    names: Iterable[Hashable],
-    columns: str | Sequence[str] | None = None,
-    table: "pd.DataFrame | None" = None,
+    names: Iterable[Hashable], columns: str | Sequence[str] | None = None
 ) -> LandmarkColumns:
     """
     Find the landmark columns among the columns of a table.
 
     `columns` are patterns of the x and the y columns in turn, such as ``"x_#,y_#"``.
-    Several pairs are put one after the other. Without it, the table must have exactly
-    one set of landmarks of at least `MIN_POINTS` points. Numbered points are in the
-    order of their numbers, others in that of their x columns.
+    Several pairs are put one after the other; a pattern after ``-`` leaves columns
+    out, one after ``+`` all others. Without it, the table must have exactly one set of
+    landmarks of at least `MIN_POINTS` points. Numbered points are in the order of their
+    numbers, others in that of their x columns.
 
     >>> from isa_nrsfm.io._landmark_columns import find_landmark_columns
     >>> names = ["file"] + [f"{a}_{j}" for a in "xy" for j in range(8)]
@@ -75,23 +82,22 @@ def find_landmark_columns(
     """
     names = list(names)
     if columns is not None:
-        listed = columns.split(",") if isinstance(columns, str) else list(columns)
-        patterns = [pattern.strip() for pattern in listed]
+        listed = split_patterns(columns)
+        patterns = [pattern for pattern in listed if pattern[:1] not in ("-", "+")]
         if not patterns or len(patterns) % 2 or not all(patterns):
             raise ValueError(
                 "columns must name x and y columns in turn, such as 'x_#,y_#'; "
                 f"got {columns!r}"
             )
+        names = _chosen(names, [part for part in listed if part not in patterns])
         given = not all({"#", "*"}.intersection(pattern) for pattern in patterns)
         return _select(names if given else without_boxes(names), patterns)
-    names = without_boxes(names)
+    all_names, names = without_boxes(names), only_points(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
+    _refuse_copies(names)
     _refuse_individuals(names, candidates or sets)
     if not candidates:
-        x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
-        if x and y:
-            raise ValueError(_pivoted(names, [x[0], y[0]], table))
         if any(isinstance(name, tuple) for name in names):
             raise ValueError(
                 "the names of the columns have several levels: join them to names such "
@@ -102,8 +108,10 @@ def find_landmark_columns(
         small = f" (fewer than {MIN_POINTS} points: {small})" if small else ""
         raise ValueError(
             "no landmark columns such as x0, y0, x1, y1 or nose_x, nose_y were found"
-            f"{small}; {_first_columns(names)}. If they have other names, give columns "
-            f"(command line: --columns), such as {_likely_pattern(names)!r}"
+            f"{small}; {_first_columns(names)}. If there is a row for each point, give "
+            "row_per_point (command line: --row-per-point). If they have other names, "
+            "give columns (command line: --columns), such as "
+            f"{_likely_pattern(names)!r}"
         )
     if len(candidates) > 1:
         raise ValueError(_several_found(names, candidates))
@@ -114,55 +122,113 @@ def find_landmark_columns(
             f"the columns '{axis}', '{axis}.1', ... come from a header that repeats "
             "the same names: give every point a name of its own, such as x0, y0, x1, y1"
         )
-    return _select(names, pattern.split(","))
+    patterns, others = pattern.split(","), {*all_names}.difference(names)
+    of_set = [n for n in others if any(matches(n, each) for each in patterns)]
+    if of_set:
+        warn_caller(
+            f"the columns {first_items(sorted(of_set))} are no points by their names, "
+            "and are left out. If they are, give columns (command line: --columns), "
+            f"such as {pattern!r}"
+        )
+    return _select(names, patterns)
 
 
-def _pivoted(
-    names: Sequence[Hashable], values: list[Hashable], table: "pd.DataFrame | None"
-) -> str:
-    """Return how a table with a row for each point gets one for each frame."""
-    told = (
-        "the table has one row for each point, with columns x and y; one row for each "
-        "frame is needed. Columns must tell frames and points apart"
+def split_patterns(columns: str | Sequence[str] | None) -> list[str]:
+    """Return the patterns or names of columns that are given."""
+    listed = columns.split(",") if isinstance(columns, str) else columns or []
+    return [pattern.strip() for pattern in listed]
+
+
+def only_points(names: Iterable[Hashable]) -> list[Hashable]:
+    """Leave out corners of boxes, and columns with x and y that are no points.
+
+    These are so called, and most others are not.
+    """
+    names = without_boxes(list(names))
+    of_points = {n: c[1] for n in names if (c := parse_coordinate(n)) is not None}
+    others = {name for name, point in of_points.items() if _NO_POINT.search(point)}
+    few = 2 * len(others) < len(of_points)
+    return [name for name in names if name not in others] if few else names
+
+
+def _refuse_copies(names: Sequence[Hashable]) -> None:
+    """Raise if most points are there once more, with a further word in their names."""
+    texts = [name.strip() for name, axis, _ in _coordinates(names) if axis == 0]
+    parts = {t: re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", t) for t in texts}
+    keys = {" ".join(each).lower(): text for text, each in parts.items()}
+    pairs: dict[str, list[tuple[str, str]]] = {}
+    for text, each in parts.items():
+        for i, word in enumerate(each):
+            other = keys.get(" ".join([*each[:i], *each[i + 1 :]]).lower())
+            if other is not None and not word.isdigit():
+                pairs.setdefault(word.lower(), []).append((other, text))
+    plain = len(texts) - sum(map(len, pairs.values()))
+    least = max(MIN_POINTS, 0.8 * plain)
+    copies = [found[0] for found in pairs.values() if len(found) >= least]
+    words = []
+    for point, copy in copies:
+        same = [a == b for a, b in zip(f"{point}\n", copy, strict=False)].index(False)
+        words.append(copy[same : same + len(copy) - len(point)])
+    if copies:
+        _ask_which(names, " and ".join(copies[0]), words, [f"-*{w}*" for w in words])
+
+
+def _ask_which(
+    names: Sequence[Hashable], which: str, words: list[str], without: Sequence[str] = ()
+) -> NoReturn:
+    """Raise the question which of points that are there twice are to be read."""
+    ways = [*([without] if without else []), *([f"+*{word}*"] for word in words)]
+    every = [",".join([_all_sets(_chosen(names, way)), *way]) for way in ways]
+    raise ValueError(
+        f"the points are probably there more than once, such as {which}, in another "
+        "unit or filtered. Choose with columns (command line: --columns): "
+        f"{', '.join(map(repr, every))}; or {_all_sets(names)!r} if all are points of "
+        "one body"
     )
-    aside = {"x", "y", "z", "", *CONFIDENCES}
-    keys = [name for name in names if str(name).strip().lower() not in aside]
-    points = [name for name in keys if re.search(_POINT, str(name), re.IGNORECASE)]
-    last = [name for name in keys if not re.search(_FRAME, str(name), re.IGNORECASE)]
-    if not keys:
-        return f"{told}: add columns frame and point with their numbers"
-    several = table is not None and table.duplicated(keys).any()
-    points = points or ([] if several else last[-1:])
-    frames = [name for name in keys if name not in points]
-    counted = "table[{!r}] = table.groupby({}).cumcount(), and "
-    if not points:
-        points = ["point"]
-        counted = counted.format("point", keys)
-    elif not frames or several:
-        frames.append("individual" if frames else "frame")
-        counted = counted.format(frames[-1], keys)
-    else:
-        counted = ""
-    return (
-        f"{told}. In pandas: {counted}"
-        f"wide = table.pivot(index={frames}, columns={points[0]!r}, values={values}), "
-        "and wide.columns = "
-        "[f'{axis}_{j}' for axis, j in wide.columns], and wide = wide.reset_index()"
+
+
+def _chosen(names: Sequence[Hashable], patterns: Iterable[str]) -> list[Hashable]:
+    """Return names without those of patterns after -, only those of ones after +."""
+    chosen = list(names)
+    for sign, pattern in ((each[0], each[1:]) for each in patterns):
+        found = {name for name in chosen if fnmatchcase(str(name).strip(), pattern)}
+        chosen = [name for name in chosen if (name in found) == (sign == "+")]
+    return chosen
+
+
+def _all_sets(names: Iterable[Hashable]) -> str:
+    """Return patterns of all coordinates, each in one of them."""
+    x = {pattern.partition(",")[0]: pattern for pattern in landmark_sets(names)}
+    whole = [regular_expression(one) for one in x if "*" in one]
+    return ",".join(
+        pattern
+        for one, pattern in x.items()
+        if "*" in one or not any(each.fullmatch(one) for each in whole)
     )
+
+
+def axis_pairs(names: Iterable[Hashable]) -> list[tuple[str, str, int]]:
+    """Return pairs of names that differ in one letter, x and y, and its place.
+
+    >>> from isa_nrsfm.io._landmark_columns import axis_pairs
+    >>> axis_pairs(["frame", "pos_x", "pos_y", "X [px]", "Y [px]"])
+    [('pos_x', 'pos_y', 4), ('X [px]', 'Y [px]', 0)]
+    """
+    texts = [str(name).strip() for name in names]
+    places = ((t, i) for t in texts for i, letter in enumerate(t) if letter in "xX")
+    pairs = [(t, t[:i] + chr(ord(t[i]) + 1) + t[i + 1 :], i) for t, i in places]
+    known = {*texts}
+    return [pair for pair in pairs if pair[1] in known]
 
 
 def _likely_pattern(names: Iterable[Hashable]) -> str:
     """Return the pattern of most names that differ in the letters x and y alone."""
-    texts = [str(name).strip() for name in names]
     found: Counter[str] = Counter()
-    places = [(text, i) for text in texts for i in range(len(text))]
-    for text, place in places:
-        before, letter, after = text[:place], text[place], text[place + 1 :]
-        if letter not in "xX" or f"{before}{chr(ord(letter) + 1)}{after}" not in texts:
-            continue
+    for x, y, i in axis_pairs(names):
+        before, after = x[:i], x[i + 1 :]
         numbered = [re.sub(r"\d+", "#", part) for part in (before, after)]
         for one, other in (numbered, ("*" if before else "", after), (before, "*")):
-            found[f"{one}{letter}{other},{one}{chr(ord(letter) + 1)}{other}"] += 1
+            found[f"{one}{x[i]}{other},{one}{y[i]}{other}"] += 1
     likely = ((pattern, n) for pattern, n in found.items() if pattern.count(",") == 1)
     pattern, size = max(likely, key=lambda each: each[1], default=("", 0))
     return pattern if size >= MIN_POINTS else "px_#,py_#"
@@ -191,7 +257,7 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
         or not any(
             other_size == size
             and "#" in other[0]
-            and _regular_expression(patterns[0]).fullmatch(other[0])
+            and regular_expression(patterns[0]).fullmatch(other[0])
             for other, other_size in sizes.items()
         )
     }
@@ -229,6 +295,13 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     x = list(dict.fromkeys(chain.from_iterable(lists)))
     if not (who := individuals_in(x, MIN_POINTS)):
         return
+    if any(map(_COPY.fullmatch, who)):
+        found = [
+            re.search(rf"[ _.\-]*{re.escape(w)}[ _.\-]*", " ".join(x)) for w in who
+        ]
+        _ask_which(
+            names, " and ".join(who), [each[0].strip(" ") for each in found if each]
+        )
     largest = max(sets, key=sets.__getitem__)
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
@@ -285,7 +358,7 @@ def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, st
     exact = [name for name in texts if name.strip() == pattern]
     if len(exact) == 1:
         return {(): exact[0]}
-    expression = _regular_expression(pattern)
+    expression = regular_expression(pattern)
     wildcards = re.findall("[#*]", pattern)
     found: dict[tuple, str] = {}
     for name in texts:
@@ -306,7 +379,12 @@ def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, st
     return found
 
 
-def _regular_expression(pattern: str) -> re.Pattern[str]:
+def matches(name: Hashable, pattern: str) -> bool:
+    """Return whether a name has the form of a pattern."""
+    return regular_expression(pattern).fullmatch(str(name).strip()) is not None
+
+
+def regular_expression(pattern: str) -> re.Pattern[str]:
     """Translate a pattern into a regular expression with a group for each wildcard."""
     wildcards = {"#": r"(\d+)", "*": "(.+)"}
     parts = re.split(r"([#*])", pattern)
@@ -347,7 +425,15 @@ def _coordinates(names: Iterable[Hashable]) -> list[tuple[str, int, tuple]]:
 
 def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str:
     """List the sets of landmarks of a table, and how to choose one."""
-    listed = []
+    listed, example = [], max(candidates, key=lambda pattern: candidates[pattern])
+    whole = regular_expression(example.split(",")[0])
+    inside = [p for p in candidates if "#" in p and whole.fullmatch(p.split(",")[0])]
+    # Numbered points beside few others, such as their centroid
+    if (
+        inside
+        and 0 < candidates[example] - sum(candidates[p] for p in inside) < MIN_POINTS
+    ):
+        example = max(inside, key=lambda pattern: candidates[pattern])
     for pattern, n_points in candidates.items():
         x = list(_columns_matching(names, pattern.split(",")[0]).values())
         count = f"{n_points} points" + (", with a z each" if _z_of(names, x) else "")
@@ -355,7 +441,7 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
     return (
         "the table has more than one set of landmark columns: "
         f"{'; '.join(listed)}. Choose with columns (command line: --columns), "
-        f"such as {max(candidates, key=lambda pattern: candidates[pattern])!r}"
+        f"such as {example!r}"
     )
 
 

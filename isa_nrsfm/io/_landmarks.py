@@ -79,7 +79,8 @@ class Landmarks:
         Raises
         ------
         ValueError
-            If there are no confidences, or the threshold is not a finite number.
+            If there are no confidences, none is as high, or the threshold is not a
+            finite number.
         """
         if isinstance(min_confidence, bool | str) or not math.isfinite(min_confidence):
             raise ValueError(
@@ -90,8 +91,19 @@ class Landmarks:
                 f"min_confidence is given, but these landmarks ({self.format}) have "
                 "no confidences"
             )
-        unsure = np.repeat(self.confidence.to_numpy() < min_confidence, 2, axis=1)
-        return replace(self, points=self.points.mask(unsure))
+        unsure = unsure_points(self.confidence.to_numpy(), min_confidence)
+        return replace(self, points=self.points.mask(np.repeat(unsure, 2, axis=1)))
+
+
+def unsure_points(confidence: NDArray, least: float) -> NDArray[np.bool_]:
+    """Return which points (n_frames, n_points) have a lower confidence; not all."""
+    unsure = confidence < least
+    if unsure.all():
+        raise ValueError(
+            f"no point has a confidence of {least:g} or more: they are from "
+            f"{confidence.min():.3g} to {confidence.max():.3g}"
+        )
+    return np.asarray(unsure)
 
 
 def assemble(

@@ -21,6 +21,7 @@ from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
+from isa_nrsfm.io._other_shapes import frames_of
 from isa_nrsfm.skeletons._column_names import (
     columns_of_individuals,
     parse_coordinate,
@@ -162,6 +163,7 @@ def landmark_table(
     columns: str | Sequence[str] | None = None,
     missing: Missing = None,
     individuals: str | Sequence[str] | None = None,
+    row_per_point: str | Sequence[str] | None = None,
 ) -> LandmarkTable:
     """
     Take the landmark columns out of a table, in the order x0, y0, x1, y1, ....
@@ -177,7 +179,9 @@ def landmark_table(
     columns : str or sequence of str, optional
         The landmark columns, if their names are ambiguous: patterns of x and
         y columns in turn, such as ``"x_#,y_#"``, with ``#`` for a number and ``*`` for
-        any text.
+        any text. A pattern after ``-``, as in ``"*_x,*_y,-gaze_*"``, leaves columns
+        out, one after ``+`` all others. Of a table with a row for each point, also the
+        names of x and y.
     missing : float or sequence of float, optional
         The x and y of missing points, such as 0 or -1, exactly; they become NaN. Of
         several numbers, a point has one.
@@ -185,6 +189,10 @@ def landmark_table(
         The individuals in one row, such as ``"1,2"`` for nose_1_x and nose_2_x: the
         parts by which their columns differ. Each has a row of its own, and the other
         columns have ``frame``, the number of the row, and ``individual``.
+    row_per_point : str or sequence of str, optional
+        Of a table with a row for each point, the columns that tell frames apart and,
+        last, that of the points, such as ``"video,frame,landmark"``; several of points
+        with ``+``. One that is not in the table is counted. By default they are found.
 
     Returns
     -------
@@ -218,7 +226,8 @@ def landmark_table(
             "(polars tables have a method to_pandas)"
         )
     frame = individuals_as_rows(frame, individuals)
-    names = find_landmark_columns(frame.columns, columns, frame).interleaved
+    frame, columns = frames_of(frame, columns, row_per_point)
+    names = find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, missing).reshape(len(frame), len(names))
     return LandmarkTable(
@@ -293,12 +302,11 @@ def read_named_columns(
     path: Path,
     columns: str | None = None,
     missing: Missing = None,
-    individuals: str | Sequence[str] | None = None,
+    **shape: str | Sequence[str] | None,
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
-    points, other = landmark_table(
-        parse_table(path), columns=columns, missing=missing, individuals=individuals
-    )
+    table = parse_table(path)
+    points, other = landmark_table(table, columns=columns, missing=missing, **shape)
     names = points.columns
     confidence = confidences_in(other, names[::2], names[1::2])
     return assemble(
@@ -331,6 +339,10 @@ def confidences_in(
             raise ValueError(
                 f"{names[0]}, ... are no confidences: they are not all from 0 to 1"
             )
+        if (
+            names and len(known) and not known.any()
+        ):  # as MediaPipe writes for faces and hands
+            raise ValueError(f"{names[0]}, ... are no confidences: they are all 0")
         return values
     except ValueError:
         if strict:
@@ -580,12 +592,18 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         raise ValueError("it is empty; a first line with column names is needed")
     if len(header) == 1:
         _refuse_one_column(path, separator, header[0])
-    if pd.to_numeric(pd.Series(header).replace("", 0), errors="coerce").notna().all():
+    second = [cell.strip().lower() for cell in next(rows)]
+    n_header, n_second = (
+        pd.to_numeric(pd.Series(row).replace("", 0), errors="coerce").notna().sum()
+        for row in (header, second)
+    )
+    # Numbers may be names, of columns whose cells hold points, or beside coordinates.
+    most = 2 * n_header > len(header) and not any(map(parse_coordinate, header))
+    if n_second and (n_header == len(header) or (n_header >= 14 and most)):
         raise ValueError(
             "its first line has numbers; a first line with column names is needed, "
             "such as x0, y0, x1, y1"
         )
-    second = [cell.strip().lower() for cell in next(rows)]
     if second.count("x") == second.count("y") > 1:
         index = "" if second[0] in ("x", "y") else ", index_col=0"
         commas = any("," in cell for cell in next(rows, []))

@@ -1,0 +1,361 @@
+"""Tables as programs write them that are not two columns for each point of one body."""
+
+import json
+import re
+import warnings
+
+import landmark_files as files
+import numpy as np
+import pandas as pd
+import pytest
+from fit_runs import QUICK
+from landmark_files import BODYPARTS, TRACKS
+from numpy.testing import assert_array_equal
+from refusals import refused
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.io import landmark_table, read_landmarks
+
+N, J = TRACKS.shape[:2]
+FLAT, FRAMES, POINTS = TRACKS.reshape(N, -1), np.repeat(range(N), J), [*range(J)] * N
+LONG = pd.DataFrame({"frame": FRAMES, "point": POINTS})
+LONG[["x", "y"]] = TRACKS.reshape(-1, 2)
+NAMED = LONG.assign(bodyparts=BODYPARTS * N).drop(columns="point")
+BESIDE = LONG.rename(columns={"x": "px_x", "y": "px_y"}).assign(mm_x=LONG.x, mm_y=1.0)
+PEOPLE = pd.concat([LONG.assign(person=who) for who in "ab"]).sort_values(
+    ["frame", "person"], kind="stable"
+)
+KAGGLE = pd.concat([LONG.assign(type=part, z=0.1) for part in ("pose", "hand")])
+KAGGLE["point"] += 4 * (KAGGLE.type == "hand")
+KAGGLE["row_id"] = [
+    f"{f}-{t}-{p}" for f, t, p in KAGGLE[["frame", "type", "point"]].values
+]
+
+
+def wide(name="{part}_{axis}", tracks=TRACKS, parts=BODYPARTS):
+    """Return a table of points under names such as "{part}_{axis}"."""
+    names = [name.format(part=part, axis=axis) for part in parts for axis in "xy"]
+    return pd.DataFrame(tracks.reshape(len(tracks), -1), columns=names)
+
+
+def tidy(**names):
+    """Return a table with a row for each coordinate."""
+    table = NAMED.melt(["frame", "bodyparts"], ["x", "y"], "coords")
+    return table.rename(columns=names)
+
+
+def cells(write, names=BODYPARTS):
+    """Return a table with a point in each cell."""
+    columns = zip(names, TRACKS.swapaxes(0, 1).tolist(), strict=True)
+    return pd.DataFrame({name: [write(*xy) for xy in track] for name, track in columns})
+
+
+def faces(write):
+    """Return a table with all points of an image in one cell."""
+    return pd.DataFrame({"image": map(str, range(N)), "points": map(write, TRACKS)})
+
+
+def moved(**names):
+    """Return named points, with columns that are no points."""
+    return wide().assign(**{name: np.arange(N) + k for name, k in names.items()})
+
+
+TWICE = "the points are probably there more than once"
+# A table, and what is read: the points, or a part of a message.
+TABLES = {
+    "R": (LONG.rename(columns={"frame": "Image", "point": "Landmark"}), FLAT),
+    "TrackMate": (
+        LONG.set_axis(["FRAME", "SPOT", "POSITION_X", "POSITION_Y"], axis=1).assign(
+            ID=range(N * J)
+        ),
+        FLAT,
+    ),
+    "MediaPipe": (NAMED.assign(z=0.1, visibility=0.9, width=640, height=480), FLAT),
+    "Kaggle, a part": (KAGGLE[KAGGLE.type == "pose"], FLAT),
+    "ImageJ": (LONG.rename(columns={"x": "X [px]", "y": "Y [px]"}), FLAT),
+    "times": (LONG.assign(time=FRAMES / 25, score=np.linspace(0, 1, N * J)), FLAT),
+    "videos": (LONG.assign(video=FRAMES // 6, frame=FRAMES % 6), FLAT),
+    "people": (PEOPLE, FLAT.repeat(2, axis=0)),
+    "people without numbers": (PEOPLE.drop(columns="person"), FLAT.repeat(2, axis=0)),
+    "order": (LONG.drop(columns="point"), FLAT),
+    "frames in order": (LONG.drop(columns="frame"), FLAT),
+    "movement": (
+        tidy(coords="space", value="position", bodyparts="keypoints").assign(
+            individuals="mouse", confidence=0.5
+        ),
+        FLAT,
+    ),
+    "DeepLabCut stacked": (tidy().assign(scorer="net"), FLAT),
+    "tidyr": (wide().assign(frame=range(N)).melt("frame", var_name="name"), FLAT),
+    "pixels and millimetres": (BESIDE, "'px_x,px_y' or 'mm_x,mm_y'"),
+    "gaze": (LONG[["x", "y"]].assign(frame=range(N * J)), "--row-per-point"),
+    "trials of gaze": (LONG[["x", "y"]].assign(trial=FRAMES), "--row-per-point"),
+    "lists": (cells("[{}, {}]".format), FLAT),
+    "numbers above tuples": (cells("({}, {})".format, map(str, range(J))), FLAT),
+    "json": (cells(lambda x, y: json.dumps({"x": x, "y": y})), FLAT),
+    "x, y, z": (cells("({}, {}, -0.1)".format), FLAT),
+    "AffectNet": (faces(lambda face: ";".join(map(str, face.ravel()))), FLAT),
+    "lists of lists": (faces(lambda face: str(face.tolist())), FLAT),
+    "numpy": (faces(str), FLAT),
+    "lists of x": (
+        pd.DataFrame(
+            {a: map(str, TRACKS[..., k].tolist()) for k, a in enumerate("xy")}
+        ),
+        FLAT,
+    ),
+    "lengths": (faces(lambda f: str(f[: 7 + int(f[0, 0]) % 2].tolist())), "'points'"),
+    "world": (wide().join(wide("{part}_world_{axis}", TRACKS / 9)), TWICE),
+    "before": (wide().join(wide("world_{part}_{axis}", TRACKS / 9)), TWICE),
+    "units": (wide("{part}_px_{axis}").join(wide("{part}_mm_{axis}")), TWICE),
+    "derivatives": (
+        wide().join(wide("{part}_vel_{axis}")).join(wide("{part}_acc_{axis}")),
+        TWICE,
+    ),
+    "camel": (wide().join(wide("{part}Filtered_{axis}")), TWICE),
+    "numbered": (
+        wide("{axis}_{part}", parts=range(J)).join(
+            wide("world_{axis}_{part}", parts=range(J))
+        ),
+        TWICE,
+    ),
+    "after": (wide("{axis}_{part}").join(wide("{axis}_{part}_raw")), TWICE),
+    "gyroscope": (moved(gyro_x=1, gyro_y=2, gyro_z=3), FLAT),
+    "gaze angles": (moved(gaze_angle_x=1, gaze_angle_y=2), FLAT),
+    "head": (moved(head_rotation_x=1, head_rotation_y=2), FLAT),
+    "box": (moved(bbox_center_x=1, bbox_center_y=2), FLAT),
+    "cursor": (moved(mouse_x=1, mouse_y=2, cursor_x=3, cursor_y=1), FLAT),
+    "centroid": (moved(centroid_x=1, centroid_y=2), FLAT),
+    "targets": (wide("target_{part}_{axis}"), FLAT),
+}
+
+
+def read(path, **options):
+    """Read a file; return texts of warnings and the error, and landmarks or None."""
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        try:
+            found, error = read_landmarks(path, **options), ""
+        except ValueError as raised:
+            found, error = None, str(raised)
+    return " ".join([*(str(each.message) for each in caught), error]), found
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_of_other_shapes(tmp_path, name, suffix):
+    (table, expected), path = TABLES[name], tmp_path / f"a{suffix}"
+    if suffix == ".csv":
+        table.to_csv(path, index=False)
+    else:
+        table.to_parquet(path, index=False)
+    told, found = read(path)
+    if isinstance(expected, str):
+        assert expected in told
+        advised = re.findall(r"'([^' ]*,[-+][^']*)'", told)
+        assert bool(advised) == (expected == TWICE)
+        for columns in advised:
+            assert len(read_landmarks(path, columns=columns).point_names) == J
+        return
+    assert_array_equal(found.points, expected)
+    assert bool(told) == (name != "targets")
+    if option := re.search("row_per_point='(.*?)'", told):  # the same, as it says
+        again = read(path, row_per_point=option[1])[1]
+        pd.testing.assert_frame_equal(again.points, found.points)
+        pd.testing.assert_frame_equal(again.frames, found.frames)
+    if left := re.search("the columns (.*) are no points", told):
+        every = re.search("such as '(.*)'", told)[1]
+        more = len(read_landmarks(path, columns=every).point_names) - J
+        assert 2 * more == len([n for n in left[1].split(", ") if n[-1] != "z"])
+
+
+def test_other_columns_of_a_row_for_each_point():
+    table = LONG.assign(row=range(N * J), age=FRAMES % 3, score=0.25 + 0.01 * FRAMES)
+    with pytest.warns(match="left out, as they differ between its points: row$"):
+        points, other = landmark_table(table[3:].sample(frac=1, random_state=0))
+    assert np.isnan(points.to_numpy()).sum() == 6
+    assert list(other.columns[:2]) == ["frame", "age"]
+    assert_array_equal(other.age, other.frame % 3)
+    assert_array_equal(other.score_7, 0.25 + 0.01 * other.frame)
+    many = {"row_per_point": "frame,type+point", "columns": "hand_#_x,hand_#_y"}
+    with pytest.warns(match="row_id"):
+        found = landmark_table(KAGGLE, **many).points
+    assert_array_equal(found, FLAT)
+    with pytest.warns(match="row_per_point='frame,type[+]point'"):
+        refused("more than one set", landmark_table, KAGGLE)
+    wrong = {"row_per_point": "image,landmark"}
+    refused(r"no \['image', 'landmark'\]", landmark_table, LONG, **wrong)
+    refused(
+        "several rows for the point '0'",
+        landmark_table,
+        PEOPLE,
+        row_per_point="frame,point",
+    )
+
+
+def test_a_fit_of_a_row_for_each_point(tmp_path, fits, transforms):
+    tracks = make_face_tracks(40, random_state=0).data.reshape(40, 68, 2)[:, ::5]
+    rows = [(i, j, *tracks[i, j]) for i in range(40) for j in range(14)]
+    table = pd.DataFrame(rows, columns=["photo", "lm", "x", "y"])
+    table.to_csv(path := tmp_path / "a.csv", index=False)
+    option = ["--row-per-point", "photo,lm"]
+    model = fits(path, *QUICK, "1", *option).path
+    found, *_ = transforms(model, path, *option)
+    assert list(found["photo"]) == [*range(40)]
+
+
+ARRAY = make_face_tracks(60, random_state=0)
+FACES = ARRAY.data.reshape(60, 68, 2)
+PIXELS = 300 + 400 * FACES
+THIRD = np.sin(np.arange(60 * 68)).reshape(60, 68, 1) * FACES.std()
+SEEN = 0.95 + 0.05 * np.cos(np.arange(60 * 68)).reshape(60, 68, 1)
+COLUMNS = FACES.reshape(60, -1)
+CENTRED = COLUMNS - COLUMNS.mean(axis=0)
+RANGE = (COLUMNS - COLUMNS.min(axis=0)) / np.ptp(COLUMNS, axis=0)
+LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
+
+
+@pytest.mark.parametrize(
+    "scaled",
+    [
+        CENTRED / COLUMNS.std(axis=0),
+        (CENTRED / COLUMNS.std(axis=0, ddof=1)).round(2),
+        COLUMNS / COLUMNS.std(axis=0),
+        RANGE,
+        100 * RANGE,
+        2 * RANGE - 1,
+        (COLUMNS - np.median(COLUMNS, axis=0)) / (HIGH - LOW),
+    ],
+)
+def test_columns_scaled_one_by_one(tmp_path, scaled):
+    told = "Each column was scaled by itself"
+    with pytest.warns(match=told):
+        AffineNRSfM(1, refinement=None).fit(scaled)
+    wide("{axis}{part}", scaled, range(68)).to_csv(tmp_path / "a.csv", index=False)
+    assert told in read(tmp_path / "a.csv")[0]
+
+
+@pytest.mark.parametrize(
+    ("further", "n"),
+    [
+        ([THIRD], 3),
+        ([SEEN], 3),
+        ([0 * SEEN], 3),
+        ([THIRD, SEEN], 4),
+        ([THIRD, 0 * SEEN], 4),
+    ],
+)
+@pytest.mark.parametrize("tracks", [FACES, PIXELS])
+@pytest.mark.filterwarnings("ignore:(in 1 of|68 of 136)")
+def test_points_of_three_or_four_numbers(tracks, further, n):
+    X = np.concatenate([tracks, *further], axis=2)
+    model = AffineNRSfM(1, refinement=None)
+    told = str(refused(f"{n} numbers for each point", model.fit, X.reshape(60, -1)))
+    found = eval(told.rpartition("Give ")[2], {"X": X.reshape(60, -1)})
+    assert_array_equal(found, tracks.reshape(60, -1))
+    told = str(refused("the shape", model.fit, X))
+    assert_array_equal(eval(told.rpartition("give ")[2], {"X": X}), found)
+    if n == 3:
+        odd = X[:, :21].reshape(60, -1)
+        told = str(refused("an even number", model.fit, odd))
+        assert eval(told.rpartition("give ")[2], {"X": odd}).shape == (60, 42)
+
+
+@pytest.mark.parametrize("still", [2, 3, 30])
+def test_points_that_stand_still(still):
+    walk = 30 * np.cumsum(np.random.default_rng(0).normal(size=(60, 1, 2)), axis=0)
+    X = FACES + walk
+    X[:, -still:] = FACES[:1, -still:] + 0.01 * FACES[:, -still:]
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        AffineNRSfM(1, refinement=None).fit(X.reshape(60, -1))
+    told = [str(each.message) for each in caught if "stand still" in str(each.message)]
+    assert [text[:8].split()[0] for text in told] == [str(still)] * (still > 2)
+
+
+SCORES = np.linspace(0.02, 0.4, N * J).reshape(N, J)
+
+
+@pytest.mark.parametrize(
+    ("scores", "told"),
+    [
+        (SCORES, ""),  # of Detectron2
+        (0 * SCORES, ""),  # of MediaPipe's faces
+        (0 * SCORES + 0.5, ""),
+        (250 * SCORES, ""),
+        (1 - SCORES, ""),
+        (1 - 1.5 * SCORES, "--min-confidence 0.6"),
+        (1 - 2.4 * SCORES, "--weights confidence"),
+    ],
+)
+def test_confidences_of_other_scales(tmp_path, fits, fails, scores, told):
+    scores, tracks = np.tile(scores, (2, 1)), make_face_tracks(24, random_state=1).data
+    tracks = tracks.reshape(24, 68, 2)[:, ::9] * 100 + 300
+    names = [f"{part}_score" for part in BODYPARTS]
+    table = wide("{part}_{axis}", tracks).join(pd.DataFrame(scores, columns=names))
+    table.to_csv(path := tmp_path / "a.csv", index=False)
+    err = fits(path, *QUICK, "1").err
+    assert told in err if told else "confidence" not in err
+    if scores.min() == scores.max():
+        option = ["--weights", "confidence"]
+        assert "left out" not in fails(
+            "fit", path, *QUICK, "1", "-o", tmp_path, *option
+        )
+    if scores.max() < 0.5:
+        assert read(path, min_confidence=0.6)[1] is None
+
+
+PERSON = {"pose_keypoints_2d": files.SCORED[0].ravel().tolist()}
+INSTANCE = dict(sorted(files.mmpose(files.SCORED[0]).items()))
+
+
+@pytest.mark.parametrize(
+    ("content", "format"),
+    [
+        ({"version": "AlphaPose v0.3", "people": [PERSON]}, "openpose"),
+        ({"canvas_width": 9, "canvas": {"height": 3}, "people": [PERSON]}, "openpose"),
+        ([INSTANCE], "mmpose"),
+        ([{"instances": [INSTANCE], "frame_id": 0}], "mmpose"),
+        ({"dataset": {"name": "a"}, "instance_info": [[INSTANCE]]}, "mmpose"),
+        ([dict(reversed(files.RESULTS[0].items()))], "coco"),
+        ([{"instances": [INSTANCE | {"keypoints": [[1, 2, 3]] * J}]}], "in space"),
+        ([INSTANCE | {"keypoint_scores": 3}], "keypoint_scores"),
+    ],
+)
+def test_json_is_known_by_its_entries(tmp_path, content, format):
+    told, found = read(files.write_json(tmp_path / "a.json", content))
+    if found is None:
+        assert format in told
+    else:
+        assert found.format == format
+        assert_array_equal(found.points, FLAT[:1])
+
+
+def test_codes_and_commas_of_tps(tmp_path):
+    path = files.write_tps(tmp_path / "a.tps", TRACKS)
+    text = path.read_text()
+    path.write_text(re.sub("(?m)^[0-9.]+ [0-9.]+$", "-1.00000 -1.0", text, count=1))
+    assert read(path)[1].points.isna().to_numpy().sum() == 2
+    path.write_text(text.replace(".", ",").replace(",jpg", ".jpg"))
+    told, found = read(path)
+    assert "decimal commas" in told
+    assert_array_equal(found.points, FLAT)
+    path.write_text(text.replace("LM=8", "LM=0\nCURVES=1\nPOINTS=8"))
+    assert "append them to the landmarks" in read(path)[0]
+
+
+def test_failed_frames_of_the_first_openface(tmp_path):
+    table = wide("{axis}{part}", parts=range(J)).add_prefix(" ")
+    table.insert(0, "frame", range(N))
+    table = table.assign(timestamp=0.1, confidence=0.9, success=1 - (table.frame == 3))
+    table.to_csv(path := tmp_path / "a.csv", index=False)
+    found = read_landmarks(path)
+    assert found.format == "openface"
+    assert list(np.flatnonzero(found.failed)) == [3]
+    table.to_csv(path := tmp_path / "a.txt", index=False)
+    assert "Rename tables" in read(path)[0]
+
+
+@pytest.mark.parametrize("names", [["a.jpg"], ["a.jpg", "happy"]])
+def test_a_first_line_of_numbers_is_no_header(tmp_path, names):
+    table = pd.DataFrame([[*names, *row] for row in FLAT])
+    table.to_csv(path := tmp_path / "a.csv", index=False, header=False)
+    assert "its first line has numbers" in read(path)[0]
