@@ -182,13 +182,13 @@ class TestFigures:
         first, *_, head, one, two = str(found).splitlines()
         depth = f"{100 * found.depth_uncertainty:.3g} % of the depth"
         if camera == "affine":
-            assert (first, two.split()[2:]) == ("Use more frames", ["10", "%"])
+            assert (first, two.split()[2:4]) == ("Use more frames", ["10", "%"])
             depth = "not estimated"
         else:
             assert first == "no warning"
         assert f"\ndepth error: {depth}\n" in str(found)
         assert f"\ncameras: {found.camera_meaning}\n" in str(found)
-        assert head.split() == ["effective", "frames", "pose", "share"]
+        assert head.split() == "effective frames pose share in another fit".split()
         assert one.split()[:2] == ["alpha_1", f"{found.effective_frames[0]:.1f}"]
         assert len(one) == len(two) == len(head)
 

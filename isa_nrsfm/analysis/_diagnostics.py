@@ -8,12 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import TransformerMixin
+from sklearn.utils import estimator_html_repr
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.cached import cached_property
+from isa_nrsfm._compat.scikit_learn import CoefficientsMixin
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
+from isa_nrsfm._stability import HalfTables
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.analysis._advice import (
     GROSS,
@@ -25,6 +30,7 @@ from isa_nrsfm.analysis._advice import (
     gross_residuals,
     layout_of,
 )
+from isa_nrsfm.analysis._stability import stability, stability_words
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -49,6 +55,10 @@ class Diagnostics(NamedTuple):
         coefficients or shapes. They belong to uncorrelated directions, in decreasing
         order. Directions near zero are noise: the table does not support as many basis
         shapes.
+    stability : tuple of str
+        Whether each coefficient is reproduced by a fit of other people with a
+        correlation of at least .85 (`stability_`): "stable", "only together with" up to
+        two others, whose combination is reproduced, or "unstable". Empty if not known.
     effective_frames : ndarray of shape (n_components,)
         Effective number of frames that determine each basis shape, ``(sum_i
         alpha_ik^2)^2 / sum_i alpha_ik^4``.
@@ -89,6 +99,7 @@ class Diagnostics(NamedTuple):
     camera_singular_values: NDArray
     deformation_amplitude: float
     reliability: NDArray
+    stability: tuple[str, ...]
     effective_frames: NDArray
     weak_deviations: NDArray
     depth_uncertainty: float
@@ -113,6 +124,8 @@ class Diagnostics(NamedTuple):
         if self.pose_removed.any():
             for row, share in zip(rows, ["removed", *self.pose_removed], strict=True):
                 row.append(share if isinstance(share, str) else percent(share))
+        for row, word in zip(rows, ["in another fit", *self.stability], strict=True):
+            row.append(word)
         lines = [
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
@@ -122,6 +135,39 @@ class Diagnostics(NamedTuple):
             aligned(rows),
         ]
         return "\n".join(lines)
+
+
+class DiagnosedMixin(CoefficientsMixin, TransformerMixin):
+    """A transformer to coefficients that tells of them what it is asked."""
+
+    _halves: HalfTables | None
+    _model: Any
+
+    @cached_property
+    def _stability(self) -> tuple[NDArray, NDArray]:
+        """Stability (K,) and stable sets (K, K) of the coefficients."""
+        if "_halves" not in vars(self):
+            needs = "stability_ and stable_sets_ need a joint fit without a prior"
+            raise AttributeError(needs, name="stability_", obj=self)
+        K = self._model.n_components
+        if self._halves is None:
+            return np.full(K, np.nan), np.zeros((K, K), dtype=bool)
+        return stability(self._halves, self._model.frames.gauge, K)
+
+    @cached_property
+    def stability_(self) -> NDArray:
+        """Expected correlation (K,) of each coefficient with that of another fit."""
+        return self._stability[0]
+
+    @cached_property
+    def stable_sets_(self) -> NDArray:
+        """Coefficients (K, K) in whose space each one lies in another fit, too."""
+        return self._stability[1]
+
+    def _html_repr(self) -> str:
+        """Return scikit-learn's diagram for notebooks, and a summary."""
+        picture = estimator_html_repr(self)
+        return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
 
 @one_blas_thread
@@ -169,6 +215,7 @@ def diagnose(
         np.linalg.svd(images, compute_uv=False) / np.sqrt(len(images)),
         float(np.sqrt(deformation / np.sum(mean_shape**2))),
         estimator.reliability_,
+        stability_words(estimator),
         np.divide(square, fourth, where=fourth > 0, out=np.zeros_like(square)),
         np.sqrt(frames.noise_variance / known),
         frames.certainty.total,

@@ -113,6 +113,8 @@ def model_report(
             "effective_frames": None if found is None else found.effective_frames,
             "pose_share": None if found is None else found.pose_share,
             "pose_removed": None if found is None else found.pose_removed,
+            "stability": getattr(estimator, "stability_", None),
+            "stability_word": None if found is None else found.stability,
         }
     )
     return {
