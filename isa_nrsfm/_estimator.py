@@ -619,8 +619,8 @@ default="affine"
         opened.__dict__.update(attributes)
         if errors and not model.frames.certainty.determined:
             parts = frames[:3] if weights is None else (*frames[:3], weights)
-            share, _ = gross_residuals(source.joined(model.distances, *parts))
-            warn_caller(depth_advice(facts_of(opened, outlier_share=share)))
+            _, energy, _ = gross_residuals(source.joined(model.distances, *parts))
+            warn_caller(depth_advice(facts_of(opened, outlier_energy=energy)))
         self.__dict__.update(vars(opened))
 
     def _ready(

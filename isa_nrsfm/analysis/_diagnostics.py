@@ -4,7 +4,7 @@ import html
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,9 @@ class Diagnostics(NamedTuple):
     outlier_share : float
         Share of the points of a table with gross residuals, more than 8 robust standard
         deviations. NaN without a table.
+    outlier_energy : float
+        Share of the squared residuals that these have. Above 0.1, the table has
+        outliers.
     outliers : ndarray of shape (n_outliers, 2)
         Row and point of each gross residual, the largest first.
     messages : tuple of str
@@ -108,6 +111,7 @@ class Diagnostics(NamedTuple):
     pose_share: NDArray
     pose_removed: NDArray
     outlier_share: float
+    outlier_energy: float
     outliers: NDArray
     messages: tuple[str, ...] = ()
 
@@ -140,6 +144,8 @@ class Diagnostics(NamedTuple):
 class DiagnosedMixin(CoefficientsMixin, TransformerMixin):
     """A transformer to coefficients that tells of them what it is asked."""
 
+    # A pipeline passes groups only if they are requested.
+    __metadata_request__fit: ClassVar[dict[str, bool]] = {"groups": False}
     _halves: HalfTables | None
     _model: Any
 
@@ -229,7 +235,7 @@ def diagnose(
     facts = facts_of(
         estimator,
         deviation=found.weak_deviations[-1],
-        outlier_share=found.outlier_share,
+        outlier_energy=found.outlier_energy,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
         pose=_of_pose(found, mean_shape, basis, layout, estimator),
@@ -262,7 +268,7 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
 
 def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     """Describe the outliers; empty if they are few enough to ignore."""
-    if not found.outlier_share > MOST_GROSS:
+    if not found.outlier_energy > MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
     points, counts = np.unique(found.outliers[:, 1], return_counts=True)

@@ -164,7 +164,7 @@ def perspective_report(
     point, none = frames.principal_point, {"better": False, "text": ""}
     if found is None or point is None or estimator.camera_ != "weak_perspective":
         return none
-    if facts_of(estimator, outlier_share=found.outlier_share).bent:
+    if facts_of(estimator, outlier_energy=found.outlier_energy).bent:
         return none
     show_stage("comparison with perspective")
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))

@@ -469,6 +469,12 @@ def _label(label: dict[str, Any]) -> Section:
         [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
         for name, value, p in found
     ]
+    head = ["", statistic, "p"]
+    if label["corrected"] is not None:
+        head.append("corrected")
+        for row, value in zip(rows, label["corrected"], strict=True):
+            row.append(f"{value:z.2f}")
+        meaning += "; corrected: without the errors of the coefficients"
     answer = f"{label['column']} was not tested: {label['untested']}."
     test = "no p-values"
     means: list[str] = []
@@ -481,7 +487,7 @@ def _label(label: dict[str, Any]) -> Section:
             means = _class_means(label, names)
     return [
         answer,
-        Cells(["", statistic, "p"], rows, title),
+        Cells(head, rows, title),
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),
