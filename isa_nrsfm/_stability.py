@@ -20,8 +20,8 @@ from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import seen_points
 
-# Groups are divided into so many parts at random: 15 halves.
-N_PARTS = 16
+# Groups are divided into 15 parts at random, which 15 halves have or have not.
+SIGNS = hadamard(16)[1:, 1:]
 # Change of converged shapes over that of one step of expectation maximisation:
 # docs/stability.md, "How it is estimated".
 PER_STEP = 4.0
@@ -61,7 +61,7 @@ def half_tables(
         units = np.unique(groups[table.shown], return_inverse=True)[1]
     if units.max() < 3:
         return None
-    part = (np.random.RandomState(0).permutation(units.max() + 1) % N_PARTS)[units]
+    part = (np.random.RandomState(0).permutation(units.max() + 1) % len(SIGNS))[units]
     shapes, n_shapes = model.shapes, len(model.shapes)
 
     def scores(
@@ -79,20 +79,19 @@ def half_tables(
             w = seen * frame_weights(model.loss, off, deviation, robust_sizes(rows))
         rest = (rest - mean[:, :, None]) * w[:, None]
         X = stacked_motion(motion, alpha).reshape(*rest.shape[:2], -1)
-        chosen = [part == number for number in range(N_PARTS)]
+        chosen = [part == number for number in range(len(SIGNS))]
         return np.stack(
             [np.tensordot(X[i], rest[i], axes=((0, 1), (0, 1))) for i in chosen]
         )
 
     weights = () if table.weights is None else (table.weights,)
     total = sum(table.rows.map(scores, part, motion, alpha, *weights))
-    signs = hadamard(N_PARTS)[1:]
-    steps = inverse @ np.tensordot(signs, total, 1)
+    steps = inverse @ np.tensordot(SIGNS, total, 1)
     # Mixtures of the shapes themselves are left to the gauge.
-    flat, steps = shapes.reshape(n_shapes, -1), steps.reshape(len(signs), n_shapes, -1)
+    flat, steps = shapes.reshape(n_shapes, -1), steps.reshape(len(SIGNS), n_shapes, -1)
     steps = PER_STEP * (steps - steps @ np.linalg.pinv(flat) @ flat)
     points = spread(np.arange(shapes.shape[2]), MOST_POINTS)
     moved = (shapes + steps.reshape(-1, *shapes.shape))[..., points]
     frames = spread(np.arange(len(alpha)), MOST_FRAMES)
-    halves = signs[:, part[frames]] > 0
+    halves = SIGNS[:, part[frames]] > 0
     return HalfTables(centred(moved), halves, motion[frames], alpha[frames], kind)

@@ -228,10 +228,11 @@ def check_points(
 def warn_if_other_layout(
     rows: FrameBlocks, n_points: int, layout: Layout, scale_frames: bool
 ) -> None:
-    """Warn if a rigid object fits the other column layout much better.
+    """Warn if an object with one basis shape fits the other layout much better.
 
     Compares mean squares, not shares of the total energy. The wrong layout mixes x and
-    y, and a rigid object explains the energy of their offset.
+    y, and a rigid object explains the energy of their offset. Without a basis shape,
+    legs that walk, seen from two sides, fit the wrong layout better.
     """
     if min(rows.n_frames, n_points) < FEWEST_COMPARED:
         return
@@ -255,22 +256,22 @@ def warn_if_other_layout(
         squares = [np.mean(report.size**2) for report in reports]
         sizes = np.full_like(sizes, np.sqrt(min(squares)))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    noise, swapped = (_rigid_noise(part / sizes[:, None, None]) for part in centred)
-    # On real tables the right layout leaves 0.04 to 0.5 of the energy of the other.
+    noise, swapped = (_residual(part / sizes[:, None, None]) for part in centred)
+    # On real tables the right layout leaves 0.05 to 0.40 of the energy of the other.
     if noise > OF_DIFFERENCES and swapped < 0.6 * noise:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
-            f"its non-rigid part has {swapped / noise:.2g} times the energy"
+            f"what one basis shape leaves has {swapped / noise:.2g} times the energy"
         )
 
 
-def _rigid_noise(rows: NDArray) -> float:
-    """Return the noise variance of a rigid fit to centred rows (I, 2, J)."""
+def _residual(rows: NDArray) -> float:
+    """Return the noise variance of centred rows (I, 2, J) beyond one basis shape."""
     if np.isfinite(rows).all():
         W = rows.reshape(-1, rows.shape[2])
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
-        return max(float(energy[:-3].sum()), 0.0) / W.size
-    return completion_model(rows, rank=3)[1]
+        return max(float(energy[:-6].sum()), 0.0) / W.size
+    return completion_model(rows, rank=6)[1]
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:

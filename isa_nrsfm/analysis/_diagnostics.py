@@ -89,7 +89,7 @@ class Diagnostics(NamedTuple):
         Share of the points of a table with gross residuals, more than 8 robust standard
         deviations. NaN without a table.
     outlier_energy : float
-        Share of the squared residuals that these have. Above 0.1, the table has
+        Share of the squared residuals that these have. Above 0.04, the table has
         outliers.
     outliers : ndarray of shape (n_outliers, 2)
         Row and point of each gross residual, the largest first.
