@@ -28,7 +28,7 @@ CASES = (
     Case("MUCT-68 K=9", "muct_68", 9),
     Case("faces_wild K=9", "faces_wild_68_combined", 9),
 )
-SHARK, DRINK, PICKUP, YOGA, _, ICT, MUCT, FACES = CASES
+SHARK, DRINK, PICKUP, YOGA, HANDS, ICT, MUCT, FACES = CASES
 EXPRESSIONS = Case("expressions K=9", "expressions_dlib_68", 9)
 
 

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import BaseEstimator
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_array, check_scalar, estimator_html_repr
+from sklearn.utils import check_array, check_scalar
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
-    CoefficientsMixin,
     HasMethods,
     Interval,
     StrOptions,
@@ -56,7 +55,8 @@ from isa_nrsfm._tables.sources import (
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
-from isa_nrsfm.analysis._diagnostics import Diagnostics, diagnose, summary_html
+from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
+from isa_nrsfm.analysis._frame_columns import group_numbers
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa._strategies import ready_strategy
@@ -74,9 +74,7 @@ _OTHER_NAMES = {
 }
 
 
-class AffineNRSfM(
-    CallbackSupportMixin, CoefficientsMixin, TransformerMixin, BaseEstimator
-):
+class AffineNRSfM(CallbackSupportMixin, DiagnosedMixin, BaseEstimator):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
 
@@ -275,6 +273,12 @@ default="affine"
     reliability_ : ndarray of shape (n_components,)
         Shares of the variance of the coefficients that are signal, not uncertainty of
         coefficients or shapes, along uncorrelated directions, decreasing.
+    stability_ : ndarray of shape (n_components,)
+        Expected correlation of each coefficient with that of a fit of as many other
+        people (`groups`), otherwise rows; NaN with fewer than four. Not with a prior.
+    stable_sets_ : ndarray of bool, shape (n_components, n_components)
+        Row k: k and up to two other coefficients of such a fit that together have a
+        multiple correlation of .85 with it; none if none have.
     objective_history_ : ndarray of shape (`n_iter_` + 1,)
         Minus twice the log posterior, up to a constant, before the last refinement and
         after each of its steps; it never rises.
@@ -462,7 +466,9 @@ default="affine"
         self.verbose = verbose
 
     @fit_context(nested=True)
-    def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
+    def fit(
+        self, X: Any, y: Any = None, *, point_weight: Any = None, groups: Any = None
+    ) -> Self:
         """
         Factorise a table.
 
@@ -479,6 +485,8 @@ default="affine"
             refinement with ``loss="linear"`` and tables in memory. A point of weight w
             counts as w observations. A point of weight zero is missing; weights of
             missing points have no effect. None for weights of one.
+        groups : array-like of shape (n_frames,), default=None
+            People or videos of the rows, for `stability_` only.
 
         Returns
         -------
@@ -508,12 +516,12 @@ default="affine"
         self._forget()
         with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
             progress = FitProgress(self, stages_of(self), stepwise=STEPWISE, X=X, y=y)
-            self._fit(X, point_weight, progress, keep=keep, errors=True)
+            self._fit(X, point_weight, progress, keep=keep, errors=True, groups=groups)
         progress.end()
         return self
 
     def fit_transform(
-        self, X: Any, y: Any = None, *, point_weight: Any = None
+        self, X: Any, y: Any = None, *, point_weight: Any = None, groups: Any = None
     ) -> NDArray:
         """
         Factorise a table and return the coefficients of its frames.
@@ -524,15 +532,15 @@ default="affine"
             The table, one frame a row, in the order of `layout`.
         y : None
             Ignored.
-        point_weight : array-like of shape (n_frames, n_points), default=None
-            Weights of the points, as in `fit`.
+        point_weight, groups : array-like, default=None
+            As in `fit`.
 
         Returns
         -------
         ndarray of shape (n_frames, n_components)
             `alpha_`.
         """
-        self.fit(X, point_weight=point_weight)
+        self.fit(X, point_weight=point_weight, groups=groups)
         if self.keep_frames:
             return self.alpha_.copy()
         return self.transform(X, point_weight=point_weight)
@@ -546,14 +554,13 @@ default="affine"
         start: TableModel | None = None,
         keep: Keep = dict,
         errors: bool = False,
+        groups: Any = None,
     ) -> None:
-        """Fit a table, and set all attributes at once.
-
-        The joint fit starts from the model of a similar table, if given. `errors`:
-        estimate the errors of the depths, and warn if depths are not determined.
-        """
+        """Fit a table, from a start if given; `errors`: with those of the depths."""
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
+        if groups is not None:
+            settings = settings._replace(groups=group_numbers(groups, source.n_frames))
         warn_of_rows(source, opened, getattr(X, "attrs", {}))
         isa = ready_strategy(
             self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
@@ -612,8 +619,8 @@ default="affine"
         opened.__dict__.update(attributes)
         if errors and not model.frames.certainty.determined:
             parts = frames[:3] if weights is None else (*frames[:3], weights)
-            share, _ = gross_residuals(source.joined(model.distances, *parts))
-            warn_caller(depth_advice(facts_of(opened, outlier_share=share)))
+            _, energy, _ = gross_residuals(source.joined(model.distances, *parts))
+            warn_caller(depth_advice(facts_of(opened, outlier_energy=energy)))
         self.__dict__.update(vars(opened))
 
     def _ready(
@@ -661,7 +668,7 @@ default="affine"
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""
-        private = ("_model", "_frame_sizes", "_n_features_out")
+        private = "_model", "_frame_sizes", "_halves", "_stability", "_n_features_out"
         names = [n for n in vars(self) if n not in private and not n.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in names}
 
@@ -688,11 +695,6 @@ default="affine"
             if reason is not None:
                 raise AttributeError(f"{name} {reason}", name=name, obj=self)
             return super().__getattribute__(name)
-
-    def _html_repr(self) -> str:
-        """Return scikit-learn's diagram for notebooks, and a summary."""
-        picture = estimator_html_repr(self)
-        return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
     def transform(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """

@@ -79,6 +79,7 @@ from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
+from isa_nrsfm._stability import half_tables
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.tracks import of_all_rows
 
@@ -369,6 +370,7 @@ def _joint_frames(
     # Gauge of shapes, cameras and coefficients
     prior, noise = s.shape_prior, model.noise_variance
     unit = table.unit if s.camera == "orthographic" else None
+    attributes: dict[str, Any] = {}
     if prior is None:
         kind = s.independence, s.camera, unit, n_components, remove_pose
         mean_shape, basis, gauge = independent_gauge(model.shapes, motion, alpha, *kind)
@@ -384,6 +386,9 @@ def _joint_frames(
     information = shape_information(motion, alpha, prior_moments, share, slices)
     if prior is None:
         uncertainty = np.linalg.pinv(information, hermitian=True)
+        attributes["_halves"] = half_tables(
+            table, model, motion, alpha, uncertainty, s.groups, kind
+        )
     else:
         uncertainty = prior.inverse(information[None], noise)[0]
     known = prior or widths
@@ -403,7 +408,7 @@ def _joint_frames(
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
-    attributes = {
+    attributes |= {
         "mode_covariance_": square
         * mode_covariance(cameras, frames.alpha[:, :n_components]),
         "noise_variance_": square * noise,

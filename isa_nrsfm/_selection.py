@@ -58,7 +58,9 @@ class StartedNRSfM(AffineNRSfM):
         """Return a copy with the same start."""
         return copy.copy(self)
 
-    def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
+    def fit(
+        self, X: Any, y: Any = None, *, point_weight: Any = None, groups: Any = None
+    ) -> Self:
         """Fit a table, and remember whether the fit has not converged."""
         with warnings.catch_warnings(record=True, action="always") as caught:
             self._fit(X, point_weight, NoProgress(), start=self.start)

@@ -182,13 +182,13 @@ class TestFigures:
         first, *_, head, one, two = str(found).splitlines()
         depth = f"{100 * found.depth_uncertainty:.3g} % of the depth"
         if camera == "affine":
-            assert (first, two.split()[2:]) == ("Use more frames", ["10", "%"])
+            assert (first, two.split()[2:4]) == ("Use more frames", ["10", "%"])
             depth = "not estimated"
         else:
             assert first == "no warning"
         assert f"\ndepth error: {depth}\n" in str(found)
         assert f"\ncameras: {found.camera_meaning}\n" in str(found)
-        assert head.split() == ["effective", "frames", "pose", "share"]
+        assert head.split() == "effective frames pose share in another fit".split()
         assert one.split()[:2] == ["alpha_1", f"{found.effective_frames[0]:.1f}"]
         assert len(one) == len(two) == len(head)
 
@@ -277,11 +277,12 @@ class TestOutliers:
         lengths[7] *= 10
         lengths[:, 3] *= 10
         lengths[2, 5], lengths[4, 4], lengths[9, 9] = 20.0, 30.0, np.nan
-        share, found = gross_residuals(lengths)
+        share, energy, found = gross_residuals(lengths)
         assert found.tolist() == [[4, 4], [2, 5]]
         assert share == 2 / 999
-        share, found = gross_residuals(np.zeros((3, 4)))
-        assert share == 0
+        assert energy == pytest.approx(1300 / np.nansum(lengths**2))
+        share, energy, found = gross_residuals(np.zeros((3, 4)))
+        assert share == energy == 0
         assert found.shape == (0, 2)
 
     def test_are_named_and_stand_for_what_they_cause(self):
@@ -323,11 +324,12 @@ class TestOutliers:
 def test_outliers_are_named_by_rows_and_most_frequent_points():
     def described(share):
         points = np.array([[3, 1], [0, 2], [3, 2], [7, 0]])
-        found = SimpleNamespace(outlier_share=share, outliers=points)
+        known = {"outlier_share": 6e-4, "outliers": points}
+        found = SimpleNamespace(outlier_energy=share, **known)
         return outlier_text(found, np.arange(10, 20), "abc")
 
-    assert described(5e-4) == ""
-    assert described(6e-4) == (
+    assert described(0.04) == ""
+    assert described(0.05) == (
         "the table has outliers: 4 points (0.06 %) in 3 frames are more than 8 "
         "standard deviations from the model, in the rows 10, 13, 17, most often the "
         "points c, a, b"
@@ -379,13 +381,13 @@ BENT = 'they bend the shapes. Use loss="cauchy", or correct them'
 class TestAdvice:
     def test_messages_agree(self):
         cameras, ratios = ["affine", "weak_perspective"], [1.0, 1.5, 100.0, np.nan]
-        shares, flags = [np.nan, 0.0, 0.01], [False, True]
+        shares, flags = [np.nan, 0.0, 0.2], [False, True]
         cases = product(cameras, UNKNOWN, ratios, range(4), flags, shares)
         for camera, depth, ratio, supported, auto, share in cases:
             known = {"noise_ratio": ratio, "auto": auto, "camera": camera}
             known |= {"reliability": 1.0 * (np.arange(3) < supported)}
             known |= {"certainty": UNKNOWN[depth], "deviation": 0.3, "few": "frames"}
-            known |= {"outliers": "wrong points", "outlier_share": share}
+            known |= {"outliers": "wrong points", "outlier_energy": share}
             found = advice(facts(**known, pose="the outline"))
             text = " | ".join(found)
             assert len({*found}) == len(found) <= 3
@@ -479,7 +481,7 @@ class TestAdvice:
             known |= {"camera": camera, "consensus": refinement == "consensus"}
             certainty = UNKNOWN[depth]._replace(weighted=extra == "weights")
             known |= {"certainty": certainty, "noise_ratio": ratio}
-            for wrong in ({}, {"outlier_share": 0.01, "outliers": "wrong points"}):
+            for wrong in ({}, {"outlier_energy": 0.2, "outliers": "wrong points"}):
                 for sentence in ". ".join(advice(facts(**known | wrong))).split(". "):
                     parameters = re.findall(
                         r'(\w+)=("\w+"|[\w.]+\([^)]*\)|\w+)', sentence

@@ -140,7 +140,7 @@ class TestOtherLayout:
     def test_is_warned_of(self, layout, scale_frames):
         (other,) = set(LAYOUTS) - {layout}
         message = rf"layout='{other}' explains the table much better than "
-        message += rf"layout='{layout}': its non-rigid part has 0\.\d+ times the energy"
+        message += rf"layout='{layout}': what one basis shape leaves has 0\.\d+ times"
         X = table_of(FACES, other)
         warned(message, fit, X, layout=layout, scale_frames=scale_frames)
 

@@ -65,6 +65,7 @@ class FitSettings(NamedTuple):
     scale_frames: False with orthographic cameras. names: those of the columns, if any.
     prior: the `TableModel` of the estimator, or None; shape_prior: made from it.
     mirror_certainty: that of the prior.
+    groups (n_rows,): numbers of the people or videos of the rows, if given.
     silent_isa: whether a strategy that only starts the joint fit may end early.
     on_step: called before each step of the joint fit.
     whole: whether fits of calibrated cameras have all directions of a shape.
@@ -89,6 +90,7 @@ class FitSettings(NamedTuple):
     limits: Limits = LIMITS
     on_step: Callable[[], None] | None = None
     whole: bool = True
+    groups: NDArray | None = None
 
     @property
     def joint(self) -> bool:

@@ -230,11 +230,12 @@ def check_points(
 def check_arrangement(
     rows: FrameBlocks, n_points: int, layout: Layout, scale_frames: bool, named: bool
 ) -> None:
-    """Warn if a rigid object fits the other column layout much better.
+    """Warn if an object with one basis shape fits the other layout much better.
 
     Raise if it fits points of three or four numbers, unless columns are named. Compares
     mean squares, not shares of the total energy. The wrong order mixes x and y, and a
-    rigid object explains the energy of their offset.
+    rigid object explains the energy of their offset. Without a basis shape, legs that
+    walk, seen from two sides, fit the wrong layout better.
     """
     if min(rows.n_frames, n_points) < FEWEST_COMPARED:
         return
@@ -243,24 +244,26 @@ def check_arrangement(
     given = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
     X = tracks_to_table(given.transpose(0, 2, 1), layout)
     other = next(name for name in LAYOUTS if name != layout)
-    swapped = _noise_ratio(given, table_to_rows(X, other), scale_frames)
+    swapped = table_to_rows(X, other)
+    rigid = _noise_ratio(given, swapped, scale_frames, 3)
     for n in [] if named or layout == "planar" else [3, 4]:
         if X.shape[1] % n == 0:
             parts = X.reshape(len(X), -1, n).transpose(0, 2, 1)
             certain = 0.1 if n == 3 else _visibility(parts)
-            ratio = _noise_ratio(given, parts[:, :2], scale_frames)
+            ratio = _noise_ratio(given, parts[:, :2], scale_frames, 3)
             # Points of three numbers leave 0.004 to 0.6 of the energy of two; if there
             # are two, 2.4 times as much: docs/benchmarks/README.md, "Thresholds".
-            if certain > 0.5 or (certain > 0.05 and ratio < min(0.8, swapped)):
+            if certain > 0.5 or (certain > 0.05 and ratio < min(0.8, rigid)):
                 raise ValueError(
                     f"X seems to have {n} numbers for each point (x, y, z, or a "
                     f"visibility); x and y are needed. Give {two_of(n)}"
                 )
-    # On real tables the right layout leaves 0.04 to 0.5 of the energy of the other.
-    if swapped < 0.6:
+    # On real tables the right layout leaves 0.05 to 0.40 of the energy of the other.
+    with_basis = _noise_ratio(given, swapped, scale_frames, 6)
+    if with_basis < 0.6:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
-            f"its non-rigid part has {swapped:.2g} times the energy"
+            f"what one basis shape leaves has {with_basis:.2g} times the energy"
         )
 
 
@@ -276,8 +279,10 @@ def _visibility(parts: NDArray) -> float:
     return 1.0 if is_constant else float(np.mean((others < 0) | (others > 1)))
 
 
-def _noise_ratio(given: NDArray, other: NDArray, scale_frames: bool) -> float:
-    """Return the noise of a rigid fit over that to given rows; inf for small tables."""
+def _noise_ratio(
+    given: NDArray, other: NDArray, scale_frames: bool, rank: int
+) -> float:
+    """Return the noise of other rows over that of given ones; inf for small tables."""
     both = [given, without_half_points(other)[0]]
     # Points that few frames show are left out first, then frames that show few points
     # in one of the orders.
@@ -293,17 +298,17 @@ def _noise_ratio(given: NDArray, other: NDArray, scale_frames: bool) -> float:
         squares = [np.mean(report.size**2) for report in reports]
         sizes = np.full_like(sizes, np.sqrt(min(squares)))
     sizes = np.where(sizes > 0, sizes, 1.0)
-    noise, swapped = (_rigid_noise(part / sizes[:, None, None]) for part in centred)
+    noise, swapped = (_residual(part / sizes[:, None, None], rank) for part in centred)
     return swapped / noise if noise > OF_DIFFERENCES else np.inf
 
 
-def _rigid_noise(rows: NDArray) -> float:
-    """Return the noise variance of a rigid fit to centred rows (I, 2, J)."""
+def _residual(rows: NDArray, rank: int) -> float:
+    """Return the noise variance of centred rows (I, 2, J) beyond some rank."""
     if np.isfinite(rows).all():
         W = rows.reshape(-1, rows.shape[2])
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
-        return max(float(energy[:-3].sum()), 0.0) / W.size
-    return completion_model(rows, rank=3)[1]
+        return max(float(energy[:-rank].sum()), 0.0) / W.size
+    return completion_model(rows, rank=rank)[1]
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:

@@ -28,11 +28,9 @@ SAME_UNIT = (
 )
 # Least length of gross residuals, in robust standard deviations.
 GROSS = 8.0
-# Share of points with gross residuals above which a table has outliers. Without
-# outliers the share is at most 0.02 %: generated faces, bodies and hands, captured
-# motion, photos of faces, K = 3 and 9. With one wrong point in a thousand, at half the
-# size of a face, it is 0.06 to 0.13 %.
-MOST_GROSS = 5e-4
+# Share of the squared residuals, which a fit with the linear loss minimises, that gross
+# ones have in a table with outliers: docs/benchmarks/README.md, "Thresholds".
+MOST_GROSS = 0.04
 MOST_MESSAGES = 3
 
 
@@ -53,7 +51,7 @@ class Facts(NamedTuple):
         `reliability_` and `camera_noise_ratio_`; NaN if it was not measured.
     deviation : float
         Largest standard deviation of the weakly determined parts of the basis shapes.
-    outlier_share : float
+    outlier_energy : float
         As in `Diagnostics`.
     outliers, few, pose : str
         Descriptions of outliers, of coefficients that a few frames determine, and of
@@ -72,7 +70,7 @@ class Facts(NamedTuple):
     reliability: NDArray
     noise_ratio: float
     deviation: float = 0.0
-    outlier_share: float = np.nan
+    outlier_energy: float = np.nan
     outliers: str = ""
     few: str = ""
     pose: str = ""
@@ -99,7 +97,7 @@ class Facts(NamedTuple):
     @property
     def bent(self) -> bool:
         """Whether outliers have their full influence on the fit."""
-        return self.loss == "linear" and self.outlier_share > MOST_GROSS
+        return self.loss == "linear" and self.outlier_energy > MOST_GROSS
 
     @property
     def n_supported(self) -> int:
@@ -216,8 +214,10 @@ def depth_advice(facts: Facts) -> str:
     )
 
 
-def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
-    """Return the share of points with gross residuals, and their rows and points.
+def gross_residuals(distance: NDArray | None) -> tuple[float, float, NDArray]:
+    """Return the shares of gross residuals, and their rows and points.
+
+    The shares are those of the points, and of the squares of all residuals.
 
     The outliers (n_outliers, 2) are sorted, the largest first. The scale is the median
     residual. It is larger for points and frames with a larger median of their own,
@@ -225,10 +225,10 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
     """
     none = np.empty((0, 2), dtype=np.intp)
     if distance is None or not (shown := np.isfinite(distance)).any():
-        return np.nan, none
+        return np.nan, np.nan, none
     median = float(np.median(distance[shown]))
     if not median > 0:
-        return 0.0, none
+        return 0.0, 0.0, none
     limit = GROSS * median / MEDIAN_DISTANCE
     found = np.argwhere(shown & (distance > limit))
     relative = distance[tuple(found.T)]
@@ -238,7 +238,8 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
         relative = relative / np.maximum(1.0, own / median)[places]
     found, relative = found[relative > limit], relative[relative > limit]
     order = np.argsort(-relative, kind="stable")
-    return len(found) / np.count_nonzero(shown), found[order]
+    energy = np.sum(distance[tuple(found.T)] ** 2) / np.sum(distance[shown] ** 2)
+    return len(found) / np.count_nonzero(shown), float(energy), found[order]
 
 
 def camera_meaning(ratio: float) -> str:

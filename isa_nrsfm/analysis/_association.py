@@ -64,6 +64,9 @@ class Association(NamedTuple):
         groups" if they were permuted within groups.
     untested : str
         Why there are no p-values; empty if there are.
+    corrected : ndarray of shape (n_components,) or None
+        The statistic corrected for attenuation: that of coefficients without errors, an
+        estimate that can exceed one. None without `alpha_std`.
     """
 
     kind: str
@@ -72,6 +75,7 @@ class Association(NamedTuple):
     n_frames: int
     permuted: str
     untested: str = ""
+    corrected: NDArray | None = None
 
     def __repr__(self) -> str:
         """Return the results as a table and what they are."""
@@ -80,6 +84,10 @@ class Association(NamedTuple):
         for value, p in zip(self.statistic, self.p_value, strict=True):
             known = "" if self.untested else f"{p:.3f}"
             rows.append([f"alpha_{len(rows)}", f"{value:.2f}", known])
+        if self.corrected is not None:
+            shown = [f"{value:.2f}" for value in self.corrected]
+            for row, text in zip(rows, ["corrected", *shown], strict=True):
+                row.insert(2, text)
         test = f"p-values: permutations of {self.permuted}"
         if self.untested:
             test = f"no p-values: {self.untested}"
@@ -92,7 +100,8 @@ class Association(NamedTuple):
         Returns
         -------
         DataFrame
-            A row for each coefficient, counted from 1, with its statistic and p_value.
+            A row for each coefficient, counted from 1, with its statistic, the
+            corrected one if it is known, and p_value.
 
         Raises
         ------
@@ -101,7 +110,9 @@ class Association(NamedTuple):
         """
         name = "eta_squared" if self.kind == "classes" else "spearman"
         index = pd.RangeIndex(1, len(self.statistic) + 1, name="component")
-        columns = {name: self.statistic, "p_value": self.p_value}
+        columns = {name: self.statistic, f"{name}_corrected": self.corrected}
+        columns = {key: each for key, each in columns.items() if each is not None}
+        columns["p_value"] = self.p_value
         return pd.DataFrame(columns, index=index)
 
 
@@ -111,6 +122,7 @@ def association(
     groups: Any = None,
     *,
     time: Any = None,
+    alpha_std: Any = None,
     kind: str = "auto",
     n_permutations: int = 999,
     random_state: Any = None,
@@ -131,6 +143,9 @@ def association(
     time : array-like of shape (n_frames,), default=None
         Times of the frames; None for the order of the rows. If neighbours in time
         depend on each other, frequencies or blocks are permuted instead of frames.
+    alpha_std : array-like of shape (n_frames, n_components), default=None
+        Posterior standard deviations of the coefficients, `alpha_std_`. If given, the
+        statistic is also corrected for attenuation by them.
     kind : {"auto", "classes", "number"}, default="auto"
         Kind of the labels. "auto" treats names, booleans and whole numbers as classes,
         as scikit-learn does.
@@ -142,8 +157,8 @@ def association(
     Returns
     -------
     Association
-        Named tuple of kind, statistic, p_value (n_components,), n_frames, permuted and
-        untested.
+        Named tuple of kind, statistic, p_value (n_components,), n_frames, permuted,
+        untested and corrected.
 
     Raises
     ------
@@ -158,6 +173,18 @@ def association(
 
     If labels differ both between and within groups, both parts are tested together.
     Each part is divided by its mean over the permutations, and the parts are summed.
+
+    p-values are for equal means, or no rank correlation: classes may differ in spread.
+    The statistics of independent frames and of groups are studentised (Chung, Romano,
+    "Exact and asymptotically robust permutation tests", 2013). With eight groups and
+    more, what each adds within it gets random signs, if labels stay the same over
+    neighbours or these depend on each other, as in sessions. If frames repeat people
+    that are not given, nearest neighbours have one label: then there are no p-values.
+
+    A correlation with a coefficient of errors is too small by the root of its
+    reliability, eta squared by the reliability (Spearman, "The proof and measurement of
+    association between two things", 1904): the variance of the coefficient over that
+    variance plus the mean square of `alpha_std`.
 
     Neighbouring frames are compared after removal of the part of the coefficients that
     labels explain. Frames sorted by their label can thus be independent. If they are
@@ -179,6 +206,7 @@ def association(
     array([False,  True])
     """
     check_scalar(n_permutations, "n_permutations", Integral, min_val=1)
+    given = alpha
     alpha, labels, _, order = _known_frames(alpha, y, groups, time)
     kind = kind_of(labels, kind)
     columns, classes = _label_columns(labels, kind), kind == "classes"
@@ -192,7 +220,11 @@ def association(
     p_value = _step_down_p_values(energies)
     if untested:
         p_value[:] = np.nan
-    return Association(kind, statistic, p_value, len(alpha), permuted, untested)
+    found = Association(kind, statistic, p_value, len(alpha), permuted, untested)
+    if alpha_std is None:
+        return found
+    ratio = _reliability(given, alpha_std)
+    return found._replace(corrected=statistic / (ratio if classes else np.sqrt(ratio)))
 
 
 def predictability(
@@ -281,6 +313,19 @@ def _known_frames(
     known = known[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
     order = FrameOrder(numbers[known], seconds[known])
     return features[known], labels[known], numbers[known], order
+
+
+def _reliability(alpha: Any, alpha_std: Any) -> NDArray:
+    """Return the shares (K,) of the variance of coefficients that are no errors."""
+    alpha, deviations = np.asarray(alpha, float), np.asarray(alpha_std, float)
+    if deviations.shape != alpha.shape:
+        raise ValueError(
+            f"alpha_std must have the shape {alpha.shape} of alpha; got "
+            f"{deviations.shape}"
+        )
+    variance = np.nanvar(alpha, axis=0)
+    total = variance + np.nanmean(deviations**2, axis=0)
+    return np.asarray(variance / np.where(total > 0, total, np.nan))
 
 
 def _rounded(features: NDArray) -> NDArray:

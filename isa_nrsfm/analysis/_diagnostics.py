@@ -4,16 +4,21 @@ import html
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import TransformerMixin
+from sklearn.utils import estimator_html_repr
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.cached import cached_property
+from isa_nrsfm._compat.scikit_learn import CoefficientsMixin
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
+from isa_nrsfm._stability import HalfTables
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.analysis._advice import (
     GROSS,
@@ -25,6 +30,7 @@ from isa_nrsfm.analysis._advice import (
     gross_residuals,
     layout_of,
 )
+from isa_nrsfm.analysis._stability import stability, stability_words
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -49,6 +55,10 @@ class Diagnostics(NamedTuple):
         coefficients or shapes. They belong to uncorrelated directions, in decreasing
         order. Directions near zero are noise: the table does not support as many basis
         shapes.
+    stability : tuple of str
+        Whether each coefficient is reproduced by a fit of other people with a
+        correlation of at least .85 (`stability_`): "stable", "only together with" up to
+        two others, whose combination is reproduced, or "unstable". Empty if not known.
     effective_frames : ndarray of shape (n_components,)
         Effective number of frames that determine each basis shape, ``(sum_i
         alpha_ik^2)^2 / sum_i alpha_ik^4``.
@@ -78,6 +88,9 @@ class Diagnostics(NamedTuple):
     outlier_share : float
         Share of the points of a table with gross residuals, more than 8 robust standard
         deviations. NaN without a table.
+    outlier_energy : float
+        Share of the squared residuals that these have. Above 0.04, the table has
+        outliers.
     outliers : ndarray of shape (n_outliers, 2)
         Row and point of each gross residual, the largest first.
     messages : tuple of str
@@ -89,6 +102,7 @@ class Diagnostics(NamedTuple):
     camera_singular_values: NDArray
     deformation_amplitude: float
     reliability: NDArray
+    stability: tuple[str, ...]
     effective_frames: NDArray
     weak_deviations: NDArray
     depth_uncertainty: float
@@ -97,6 +111,7 @@ class Diagnostics(NamedTuple):
     pose_share: NDArray
     pose_removed: NDArray
     outlier_share: float
+    outlier_energy: float
     outliers: NDArray
     messages: tuple[str, ...] = ()
 
@@ -113,6 +128,8 @@ class Diagnostics(NamedTuple):
         if self.pose_removed.any():
             for row, share in zip(rows, ["removed", *self.pose_removed], strict=True):
                 row.append(share if isinstance(share, str) else percent(share))
+        for row, word in zip(rows, ["in another fit", *self.stability], strict=True):
+            row.append(word)
         lines = [
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
@@ -122,6 +139,41 @@ class Diagnostics(NamedTuple):
             aligned(rows),
         ]
         return "\n".join(lines)
+
+
+class DiagnosedMixin(CoefficientsMixin, TransformerMixin):
+    """A transformer to coefficients that tells of them what it is asked."""
+
+    # A pipeline passes groups only if they are requested.
+    __metadata_request__fit: ClassVar[dict[str, bool]] = {"groups": False}
+    _halves: HalfTables | None
+    _model: Any
+
+    @cached_property
+    def _stability(self) -> tuple[NDArray, NDArray]:
+        """Stability (K,) and stable sets (K, K) of the coefficients."""
+        if "_halves" not in vars(self):
+            needs = "stability_ and stable_sets_ need a joint fit without a prior"
+            raise AttributeError(needs, name="stability_", obj=self)
+        K = self._model.n_components
+        if self._halves is None:
+            return np.full(K, np.nan), np.zeros((K, K), dtype=bool)
+        return stability(self._halves, self._model.frames.gauge, K)
+
+    @cached_property
+    def stability_(self) -> NDArray:
+        """Expected correlation (K,) of each coefficient with that of another fit."""
+        return self._stability[0]
+
+    @cached_property
+    def stable_sets_(self) -> NDArray:
+        """Coefficients (K, K) in whose space each one lies in another fit, too."""
+        return self._stability[1]
+
+    def _html_repr(self) -> str:
+        """Return scikit-learn's diagram for notebooks, and a summary."""
+        picture = estimator_html_repr(self)
+        return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
 
 @one_blas_thread
@@ -169,6 +221,7 @@ def diagnose(
         np.linalg.svd(images, compute_uv=False) / np.sqrt(len(images)),
         float(np.sqrt(deformation / np.sum(mean_shape**2))),
         estimator.reliability_,
+        stability_words(estimator),
         np.divide(square, fourth, where=fourth > 0, out=np.zeros_like(square)),
         np.sqrt(frames.noise_variance / known),
         frames.certainty.total,
@@ -182,7 +235,7 @@ def diagnose(
     facts = facts_of(
         estimator,
         deviation=found.weak_deviations[-1],
-        outlier_share=found.outlier_share,
+        outlier_energy=found.outlier_energy,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
         pose=_of_pose(found, mean_shape, basis, layout, estimator),
@@ -215,7 +268,7 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
 
 def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     """Describe the outliers; empty if they are few enough to ignore."""
-    if not found.outlier_share > MOST_GROSS:
+    if not found.outlier_energy > MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
     points, counts = np.unique(found.outliers[:, 1], return_counts=True)

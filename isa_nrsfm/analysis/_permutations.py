@@ -3,10 +3,18 @@
 Labels may be permuted only between units that are exchangeable under the null
 hypothesis of no association (Winkler, Webster, Vidaurre, Nichols, Smith, "Multi-level
 block permutation", 2015). The means of labels over groups are permuted among the
-groups, and independent frames within each group. If neighbouring frames of a video
+groups. Within many groups, what each adds to the covariance with the labels gets a
+random sign. That allows for any dependence of its frames, such as on sessions. Within
+few groups independent frames are permuted. If neighbouring frames of a video
 depend on each other, the frequencies of the coefficients are independent instead: the
 cosine transform nearly diagonalises the covariance of any stationary series, and of
 random walks.
+
+The statistics of independent units are studentised: permutations then keep the level
+for classes with other variances (Janssen, "Studentized permutation tests for non-i.i.d.
+hypotheses and the generalized Behrens-Fisher problem", 1997; Chung, Romano, "Exact and
+asymptotically robust permutation tests", 2013; DiCiccio, Romano, "Robust permutation
+tests for correlation and regression coefficients", 2017).
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,7 +25,9 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct
 from scipy.sparse import csr_array, hstack
 from scipy.sparse.linalg import lsmr
-from scipy.stats import norm
+from scipy.spatial import cKDTree
+from scipy.special import softmax
+from scipy.stats import norm, rankdata
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 
@@ -27,10 +37,19 @@ ONE_EVENT = (
     "event in common, which may be chance. Record more events, or give several people "
     "or videos as groups"
 )
+REPEATED = (
+    "frames with nearly the same coefficients have the same label far more often than "
+    "their coefficients tell, as photos of the same people do. Give the people as "
+    "groups"
+)
 JUMPS = (
     "the coefficients jump {} times, first after {} frames, as where clips are joined. "
     "Give the clips as groups"
 )
+# Within so many groups, signs of groups are drawn: 128 different results.
+MANY_GROUPS = 8
+# Number of the nearest frames whose labels are compared, and level of this test.
+NEAREST, REPEATED_LEVEL = 3, 0.01
 
 
 class FrameOrder:
@@ -134,6 +153,7 @@ def permuted_energies(
     total = square - len(alpha) * np.sum((sizes.T @ of_labels / len(alpha)) ** 2)
     energies, permuted = np.zeros((n_permutations + 1, n_components)), []
     untested = ""
+    inside = square - np.sum(sizes.T @ of_labels.power(2)) > OF_DIFFERENCES * total
     weights = _weights(labels, of_labels, order)
     between = of_labels.multiply(weights).tocsr()
     # Less the mean of the labels: a part along the weights, and one along ones
@@ -145,14 +165,27 @@ def permuted_energies(
         centres = _standard(means, weights)
         orders = (rng.permutation(len(means)) for _ in range(n_permutations))
         permuted_centres = (centres[i] for i in orders)
-        energies += _energies(centres, between, permuted_centres, along)
+        if inside:
+            energies += _energies(centres, between, permuted_centres, along)
+        else:
+            energies += _studentised(centres, _unit(of_labels), permuted_centres)
         permuted.append("groups")
-    if square - np.sum(sizes.T @ of_labels.power(2)) > OF_DIFFERENCES * total:
+    if inside:
         rest = unexplained(alpha, labels, order)
         length, in_runs = independent_length(rest), _are_sorted(labels, order)
+    runs = _runs(labels, order) if inside and len(means) > 1 else None
+    by_group = indicators(order.groups).T
+    varying = np.sum((by_group @ labels.power(2)) - sizes * of_labels.power(2), axis=1)
+    many = np.sum(varying > OF_DIFFERENCES) >= MANY_GROUPS
+    if inside and many and (length > 1 or runs is not None):
+        signs = rng.choice([-1.0, 1.0], (n_permutations + 1, len(means)))
+        signs[0] = 1.0
+        energies += _signed(alpha, labels, by_group, signs)
+        permuted.append("signs of groups within them")
+    elif inside:
         units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
         # Blocks of frames, permuted within groups
-        block = order.blocks(length)
+        block = order.blocks(length) if runs is None or length > 1 else runs
         places = (
             rng.random_sample(block[-1] + 1)[block] for _ in range(n_permutations)
         )
@@ -160,7 +193,7 @@ def permuted_energies(
             alpha[np.lexsort((place, order.groups))] for place in places
         )
         if length == 1:
-            units = "frames"
+            units = "frames" if runs is None else "runs of a label"
         elif not in_runs:
             units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
             one_event = _one_event(alpha, labels, order)
@@ -170,8 +203,11 @@ def permuted_energies(
                 cuts = np.intersect1d(seams(values[order.rows]), seams(rest))
                 if len(cuts):
                     untested = JUMPS.format(len(cuts), cuts[0])
+        if length == len(means) == 1 and _people_repeat(alpha, labels):
+            untested = REPEATED
         if not untested:
-            energies += _energies(alpha, labels, shuffled)
+            statistic = _studentised if length == 1 else _energies
+            energies += statistic(alpha, labels, shuffled)
         permuted.append(f"{units} within groups" if len(means) > 1 else units)
     return energies, ", and ".join(permuted), untested
 
@@ -190,6 +226,21 @@ def _are_sorted(labels: csr_array, order: FrameOrder) -> bool:
         return bool(np.count_nonzero(np.diff(labels.indices)) < labels.shape[1])
     steps = np.diff(labels.toarray(), axis=0)
     return bool((steps >= 0).all() or (steps <= 0).all())
+
+
+def _runs(labels: csr_array, order: FrameOrder) -> NDArray | None:
+    """Number the runs of equal labels in groups (n_frames,); None if they are chance.
+
+    Frames of a session have one label, and what else the session does to them.
+    """
+    values = labels.indices if labels.shape[1] > 1 else labels.toarray()[:, 0]
+    numbers = np.unique(values, return_inverse=True)[1]
+    changes = (np.diff(numbers) != 0) | (np.diff(order.groups) != 0)
+    kinds, counts = np.unique([order.groups, numbers], axis=1, return_counts=True)
+    expected = np.sum(counts * (counts - 1) / order.sizes[kinds[0]])
+    if np.count_nonzero(~changes) - expected <= 2 * np.sqrt(expected):
+        return None
+    return np.cumsum(np.append(False, changes))
 
 
 def _one_event(alpha: NDArray, labels: csr_array, order: FrameOrder) -> bool:
@@ -267,3 +318,95 @@ def _energies(
     energies = np.array([np.sum((labels.T @ a) ** 2, axis=0) for a in rests])
     energies /= np.where(energy > 0, energy, 1.0)
     return np.asarray(energies / (energies.mean() or 1.0))
+
+
+def _unit(labels: csr_array) -> csr_array:
+    """Return indicators, or a centred column, with norm one."""
+    if labels.shape[1] == 1:
+        labels = csr_array(labels.toarray() - labels.mean())
+    return csr_array(labels / np.sqrt(labels.power(2).sum(axis=0)))
+
+
+def _studentised(
+    alpha: NDArray, labels: csr_array, permuted: Iterable[NDArray]
+) -> NDArray:
+    """Return statistics (n_permutations + 1, n_components) of mean one.
+
+    Of indicators of classes, of norm one, that of Welch ("On the comparison of several
+    mean values", 1951) without the factor for the degrees of freedom; of a centred
+    column x the square of ``sum_i x_i a_i`` over the sum of the squares of its terms.
+    Each class has one more frame of the pooled variance.
+    """
+    squares, n_classes = labels.power(2), labels.shape[1]
+    sizes = labels.sum(axis=0)[:, None] ** 2
+
+    def statistic(a: NDArray) -> NDArray:
+        means, moments = labels.T @ a, squares.T @ a**2  # sqrt(n) m, mean of squares
+        if n_classes == 1:
+            return _ratio(means**2, moments)[0]
+        within = np.maximum(sizes * moments - means**2, 0.0)
+        pooled = within.sum(axis=0) / max(len(a) - n_classes, 1)
+        weights = _ratio(sizes**2, within + pooled)
+        means = means / np.sqrt(sizes)
+        centre = _ratio(np.sum(weights * means, axis=0), weights.sum(axis=0))
+        return np.asarray(np.sum(weights * (means - centre) ** 2, axis=0))
+
+    found = np.array([statistic(a) for a in (alpha, *permuted)])
+    return np.asarray(found / (found.mean() or 1.0))
+
+
+def _ratio(above: NDArray, below: NDArray) -> NDArray:
+    """Return a ratio, zero where the divisor is."""
+    above = np.broadcast_to(above, below.shape)
+    return np.divide(above, below, where=below > 0, out=np.zeros(below.shape))
+
+
+def _signed(
+    alpha: NDArray, labels: csr_array, by_group: csr_array, signs: NDArray
+) -> NDArray:
+    """Return statistics (n, n_components) of mean one for signs (n, n_groups).
+
+    ``sum_c (sum_g s_g u_gc)^2 / sum_g u_gc^2`` with the covariances u_gc of a group and
+    a label, of coefficients less their means over groups.
+    """
+    found = []
+    for a in alpha.T:
+        covariances = (by_group @ labels.multiply(a[:, None])).toarray()
+        sums = (signs @ covariances) ** 2
+        found.append(
+            _ratio(sums, 0 * sums + np.sum(covariances**2, axis=0)).sum(axis=1)
+        )
+    energies = np.stack(found, axis=1)
+    return np.asarray(energies / (energies.mean() or 1.0))
+
+
+def _people_repeat(alpha: NDArray, labels: csr_array) -> bool:
+    """Return whether near frames have one label more often than coefficients tell.
+
+    Each class, or quarter of the ranks, has a normal distribution of the coefficients.
+    If frames are independent, so are the errors of the predicted classes.
+    """
+    classes = labels.indices
+    if labels.shape[1] == 1:
+        classes = rankdata(labels.toarray()[:, 0]) * 4 // (len(alpha) + 1)
+    classes = np.unique(classes, return_inverse=True)[1]
+    variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
+    kept = variance > OF_DIFFERENCES * max(variance[-1], OF_DIFFERENCES)
+    z, K = alpha @ axes[:, kept] / np.sqrt(variance[kept]), int(kept.sum())
+    if not K or len(z) <= 2 * NEAREST:
+        return False
+    scores = []
+    for number, size in enumerate(np.bincount(classes)):
+        own = z[classes == number]
+        rest = own - own.mean(axis=0)
+        covariance = (rest.T @ rest + np.eye(K)) / (size + 1)
+        d = z - own.mean(axis=0)
+        off = np.vecdot(d, d @ np.linalg.inv(covariance))
+        scores.append(np.log(size) - (off + np.linalg.slogdet(covariance)[1]) / 2)
+    errors = (classes[:, None] == np.arange(len(scores))) - softmax(scores, axis=0).T
+    near = cKDTree(z).query(z, NEAREST + 1)[1][:, 1:]
+    pairs = np.column_stack([np.repeat(np.arange(len(z)), NEAREST), near.ravel()])
+    first, second = np.unique(np.sort(pairs, axis=1), axis=0).T
+    products = np.vecdot(errors[first], errors[second])
+    limit = norm.isf(REPEATED_LEVEL) * np.linalg.norm(products)
+    return bool(products.sum() > limit)

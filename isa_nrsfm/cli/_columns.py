@@ -71,8 +71,9 @@ def column_results(
     columns: dict[str, NDArray] = {}
     if frames.labels:
         features = {"alpha": alpha} | _aligned_pca(estimator, X)
+        std = getattr(estimator, "alpha_std_", None)
         report["labels"] = [
-            _label_report(label, features, frames, args.random_state)
+            _label_report(label, features, frames, args.random_state, std)
             for label in frames.labels
         ]
     if frames.groups is not None:
@@ -214,7 +215,11 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray
 
 
 def _label_report(
-    label: "pd.Series", features: dict[str, NDArray], frames: Frames, seed: int
+    label: "pd.Series",
+    features: dict[str, NDArray],
+    frames: Frames,
+    seed: int,
+    std: NDArray | None,
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
     alpha = features["alpha"]
@@ -226,7 +231,8 @@ def _label_report(
         "kind": "classes" if classes else "number",
         "random_state": seed,
     }
-    found = analysis.association(alpha[known], **options)
+    deviations = None if std is None else std[known]
+    found = analysis.association(alpha[known], alpha_std=deviations, **options)
     report: dict[str, Any] = {
         "column": label.name,
         "kind": found.kind,
@@ -235,6 +241,7 @@ def _label_report(
         "n_copies": np.sum(known) - found.n_frames,
         "statistic": "eta_squared" if classes else "spearman",
         "values": found.statistic,
+        "corrected": found.corrected,
         "p_values": found.p_value,
         "permuted": found.permuted,
         "untested": found.untested,

@@ -282,7 +282,7 @@ def _fitted(
     else:
         # For `shown_progress`; the model that is written does not have it.
         with warnings.catch_warnings(record=True) as told:
-            estimator.set_params(verbose=2).fit(X, **frames.weighting)
+            estimator.set_params(verbose=2).fit(X, groups=groups, **frames.weighting)
         with_prior = _with_face_prior(args, estimator, frames)
         for each in told if with_prior is None else ():
             warnings.warn(each.message, stacklevel=1)
@@ -294,7 +294,7 @@ def _fitted(
     if perspective["better"] and args.camera is None and args.refinement == "joint":
         show_stage("fit with perspective cameras")
         estimator.set_params(verbose=2, n_components=len(estimator.basis_), **near)
-        estimator.fit(X, **frames.weighting)
+        estimator.fit(X, groups=groups, **frames.weighting)
         diagnostics = estimator.diagnostics(X, **frames.weighting)
     estimator.set_params(verbose=0)
     clock["fit"] = time.perf_counter()

@@ -113,6 +113,8 @@ def model_report(
             "effective_frames": None if found is None else found.effective_frames,
             "pose_share": None if found is None else found.pose_share,
             "pose_removed": None if found is None else found.pose_removed,
+            "stability": getattr(estimator, "stability_", None),
+            "stability_word": None if found is None else found.stability,
         }
     )
     return {
@@ -162,7 +164,7 @@ def perspective_report(
     point, none = frames.principal_point, {"better": False, "text": ""}
     if found is None or point is None or estimator.camera_ != "weak_perspective":
         return none
-    if facts_of(estimator, outlier_share=found.outlier_share).bent:
+    if facts_of(estimator, outlier_energy=found.outlier_energy).bent:
         return none
     show_stage("comparison with perspective")
     rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))

@@ -11,6 +11,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
+from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -384,16 +385,23 @@ def _alpha(model: dict[str, Any]) -> Section:
             f"{row['max']:z.2f}",
             f"{row['row_of_max']}",
             f"{100 * max(share, 0):.0f} %" if pd.notna(share) else "",
+            row["stability_word"] or "",
         ]
         for row, share in zip(coefficients, shares, strict=True)
     ]
-    head = ["", "energy", "mean", "std", "min", "row", "max", "row", "pose"]
-    is_posed = any(row[-1] for row in rows)
-    head, *rows = [line[: len(head) - (not is_posed)] for line in (head, *rows)]
+    head = ["", "energy", "mean", "std", "min", "row", "max", "row", "pose", "again"]
+    shown = [True] * 8 + [any(row[k] for row in rows) for k in (8, 9)]
+    is_posed = shown[8]
+    head, *rows = [[*compress(line, shown)] for line in (head, *rows)]
     parts: list[str | Cells] = [
         Cells(head, rows),
         "energy: share of the deformation in the images (sum of squares)",
     ]
+    if shown[9]:
+        parts.append(
+            "again: whether a fit of other people has the coefficient, with a "
+            "correlation of at least .85"
+        )
     if is_posed:
         parts.append("pose: variance that yaw, pitch and roll predict, cross-validated")
     if model["parameters"]["remove_pose"]:
@@ -461,6 +469,12 @@ def _label(label: dict[str, Any]) -> Section:
         [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
         for name, value, p in found
     ]
+    head = ["", statistic, "p"]
+    if label["corrected"] is not None:
+        head.append("corrected")
+        for row, value in zip(rows, label["corrected"], strict=True):
+            row.append(f"{value:z.2f}")
+        meaning += "; corrected: without the errors of the coefficients"
     answer = f"{label['column']} was not tested: {label['untested']}."
     test = "no p-values"
     means: list[str] = []
@@ -473,7 +487,7 @@ def _label(label: dict[str, Any]) -> Section:
             means = _class_means(label, names)
     return [
         answer,
-        Cells(["", statistic, "p"], rows, title),
+        Cells(head, rows, title),
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),

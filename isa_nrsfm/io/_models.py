@@ -270,7 +270,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((P, 3), ["mean_shape_", "mean_shape"]),
         ((D + 1, 3, P), ["shapes"]),
         ((D - K, P, 3), ["further_basis"]),
-        ((K,), ["energy_share_", "reliability_"]),
+        ((K,), ["energy_share_", "reliability_", "stability_"]),
         ((None, D), ["coefficient_starts"]),
         ((D + 1, D + 1), ["mixing"]),
         ((3 * K, 3 * K), ["mode_covariance_"]),
@@ -284,6 +284,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_", "focal_length_"]),
         ((3, K), ["pose_effect_"]),
+        ((K, K), ["stable_sets_"]),
         ((N, 2, 3), ["motion_"]),
         ((N, 2), ["translation_"]),
         ((N, K), ["alpha_", "alpha_std_"]),
@@ -298,7 +299,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
                 raise ValueError(f"{name} is missing")
             continue
         found, kinds = np.shape(value), "f" if shape else "iuf"
-        kinds = "O" if name == "feature_names_in_" else kinds
+        kinds = {"feature_names_in_": "O", "stable_sets_": "b"}.get(name, kinds)
         fits = len(found) == len(shape) and all(
             n in (None, m) for n, m in zip(shape, found, strict=True)
         )
@@ -433,6 +434,8 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
 def packed_model(estimator: AffineNRSfM, prefix: str, arrays: Arrays) -> dict[str, Any]:
     """Return the parts of a fitted estimator as JSON values."""
     config = vars(estimator).get("_sklearn_output_config", {})
+    for name in ("stability_", "stable_sets_"):  # a file has no halves
+        getattr(estimator, name, None)
     return {
         **packed_parts(estimator, prefix, arrays),
         "set_output": config.get("transform"),

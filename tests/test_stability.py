@@ -1,0 +1,72 @@
+"""Stability of coefficients: halves of a table, and what is said of them."""
+
+import pickle
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._stability import SIGNS
+from isa_nrsfm.analysis._stability import stability_words
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.io import load_model, save_model
+
+
+def faces(noise=0.01, n_frames=240):
+    return make_face_tracks(n_frames, n_components=3, noise=noise, random_state=0).data
+
+
+def test_halves_differ_like_independent_tables():
+    # All parts differ alike, but for their sum, and about as two tables of this size.
+    pairs = [a - b for i, a in enumerate(SIGNS) for b in SIGNS[:i]]
+    square = np.einsum("pi,pj->ij", pairs, pairs) / len(pairs)
+    assert_allclose(square, 2 * 8 / 7 * (np.eye(15) - 1 / 15), atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+@pytest.mark.parametrize("independence", ["shapes", None])
+def test_clear_coefficients_are_stable(camera, independence):
+    params = {"camera": camera, "independence": independence, "random_state": 0}
+    model = AffineNRSfM(3, **params).fit(faces())
+    assert model.stability_.shape == (3,)
+    assert (model.stability_ <= 1 + 1e-12).all()
+    if independence:
+        assert (model.stability_ > 0.9).all()
+        assert model.diagnostics().stability == ("stable",) * 3
+        assert_array_equal(model.stable_sets_, np.eye(3, dtype=bool))
+
+
+def test_what_noise_decides_is_less_stable():
+    table = faces(0.01)
+    clear = AffineNRSfM(3, random_state=0).fit(table)
+    noisy = AffineNRSfM(3, random_state=0).fit(faces(0.08, 60))
+    assert noisy.stability_.min() < clear.stability_.min() - 0.02
+
+
+def test_groups_jobs_and_files(tmp_path):
+    table, groups = faces(), np.repeat(np.arange(40), 6)
+    model = AffineNRSfM(3, random_state=0).fit(table, groups=groups)
+    again = AffineNRSfM(3, random_state=0, n_jobs=2).fit(table, groups=groups)
+    assert_array_equal(model.stability_, again.stability_)
+    rows = AffineNRSfM(3, random_state=0).fit(table)
+    assert (rows.stability_ != model.stability_).any()
+    copied = pickle.loads(pickle.dumps(rows))
+    save_model(rows, tmp_path / "model.npz")
+    loaded = load_model(tmp_path / "model.npz")
+    for each in (copied, loaded):
+        assert_array_equal(each.stability_, rows.stability_)
+        assert_array_equal(each.stable_sets_, rows.stable_sets_)
+    few = AffineNRSfM(3, random_state=0).fit(table, groups=groups // 20)
+    assert np.isnan(few.stability_).all()
+    assert stability_words(few) == ("",) * 3
+    with pytest.raises(ValueError, match="groups must have one entry"):
+        model.fit(table, groups=groups[1:])
+
+
+def test_only_joint_fits_have_it():
+    assert not hasattr(AffineNRSfM(), "stability_")
+    model = AffineNRSfM(2, refinement="alternating", random_state=0).fit(faces())
+    with pytest.raises(AttributeError, match="need a joint fit without a prior"):
+        _ = model.stability_
+    assert stability_words(model) == ("", "")
