@@ -299,6 +299,8 @@ default="affine"
         The fitted strategy, of the paper's pipeline. None with a prior.
     camera_ : str
         The camera model of the fit.
+    trials_ : list of Trial
+        What `AutoNRSfM` has tried, if it made this fit.
     frames_scaled_ : bool
         Whether each frame was divided by its own size.
     n_iter_ : int
@@ -376,6 +378,7 @@ default="affine"
     isa_: Any
     n_iter_: int
     camera_: str
+    trials_: list[Any]
     frames_scaled_: bool
     n_features_in_: int
     feature_names_in_: NDArray
@@ -1101,7 +1104,7 @@ default="affine"
             twice the noise variance to its prediction.
         """
         table, weights = self._opened(X, point_weight, judged=False)
-        noise, signal = table.joined(self._model.held_out, *weights).sum(axis=0)
+        noise, signal = table.joined(self._model.held_out_sums, *weights).sum(axis=0)
         return -float(noise / signal) if signal > 0 else float("nan")
 
     def diagnostics(self, X: Any = None, *, point_weight: Any = None) -> Diagnostics:

@@ -82,7 +82,7 @@ def adapting_errors(
     with warnings.catch_warnings(action="ignore"):
         adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)
     others = [each[1::2] for each in (rows, *weights)]
-    parts = [each._model.held_out(*others)[0] for each in (estimator, adapted)]
+    parts = [each._model.held_out_sums(*others)[0] for each in (estimator, adapted)]
     return tuple(float(noise / signal) for noise, signal in parts)
 
 
