@@ -7,7 +7,7 @@ cannot win. It starts from the best fit so far.
 
 import time
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -23,6 +23,7 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
+from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
@@ -66,7 +67,7 @@ class Trial(NamedTuple):
     seconds : float
         Time of the fit.
     result : str
-        "used", "not better", or the reason why it was not tried.
+        "used", "less good", "not better", or the reason why it was not tried.
     """
 
     setting: str
@@ -208,13 +209,10 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
             )
         estimator = AffineNRSfM() if self.estimator is None else self.estimator
         check_class(estimator, "estimator")
-        names = "n_components", "camera", "refinement", "loss", "prior"
-        free = {name for name in names if _is_auto(getattr(self, name))}
-        given = {name: getattr(self, name) for name in names if name not in free}
-        estimator = clone(estimator).set_params(**FIRST | given)
-        if estimator.refinement not in choices.JOINT_REFINEMENTS:
-            others = {"n_components": 3, "camera": "affine"}
-            estimator.set_params(**others | given)
+        given = {name: getattr(self, name) for name in FIRST}
+        given = {name: each for name, each in given.items() if not _is_auto(each)}
+        params, free = first_settings(given)
+        estimator = clone(estimator).set_params(**params)
         point = None if self.image_size is None else np.divide(self.image_size, 2)
         if estimator.camera == "perspective" and estimator.principal_point is None:
             estimator.set_params(principal_point=point)
@@ -258,6 +256,22 @@ FIRST = {
 def _is_auto(value: Any) -> bool:
     """Return whether a parameter is to be decided."""
     return isinstance(value, str) and value == AUTO
+
+
+def first_settings(given: dict[str, Any]) -> tuple[dict[str, Any], set[str]]:
+    """Return parameters of the first fit, and those that may change: none is given.
+
+    A prior determines the camera and the refinement. Without the joint refinement
+    nothing is compared.
+    """
+    params, free = FIRST | given, {*FIRST} - {*given}
+    if params["refinement"] not in choices.JOINT_REFINEMENTS:
+        return FIRST | {"n_components": 3, "camera": "affine"} | given, set()
+    if params["prior"] is not None:
+        camera = getattr(fitted_prior(params["prior"]), "camera_", params["camera"])
+        params |= {"camera": given.get("camera", camera)}
+        free -= {"camera", "refinement"}
+    return params, free
 
 
 class _Rows(NamedTuple):
@@ -321,10 +335,12 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
     model, point = best.model, rows.principal_point
     if point is None:
         return "the size of the images is not known"
+    if model.refinement != "joint":
+        return "not with the consensus"
     near = {"camera": "perspective", "principal_point": tuple(map(float, point))}
     known = {"n_components": min(len(model.basis_), MOST_SHAPES), "prior": None}
     params = model.get_params(deep=False) | known
-    trials = {}, near | {"focal_length": 5 * max(point)}
+    trials: Sequence[dict[str, Any]] = ({}, near | {"focal_length": 5 * max(point)})
     fits = [
         StartedNRSfM(**params | each).fit(rows.X, **rows.weights) for each in trials
     ]
@@ -366,8 +382,8 @@ def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
 
 def _affine(best: _Fit, rows: _Rows) -> Proposal:
     ratio = best.model.camera_noise_ratio_
-    if not ratio >= OTHER_CAMERAS or best.model.prior:
-        return f"calibrated cameras have {ratio:.2f} times the noise"
+    if best.model.prior or not ratio >= OTHER_CAMERAS:
+        return "calibrated cameras explain the table"
     return {"camera": "affine", "refinement": "joint"}
 
 
@@ -386,7 +402,7 @@ PROPOSALS: tuple[tuple[str, str, Callable, Callable], ...] = (
     ),
     ("prior", "face prior", _face_prior, lambda found, _: found.determined),
     (
-        *("refinement", "consensus of groups of points", _consensus),
+        *("refinement", "consensus", _consensus),
         lambda found, best: found.determined and found.error < LARGER * best.error,
     ),
     ("camera", "orthographic", _orthographic, _lower),
@@ -423,8 +439,11 @@ def decided(
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
     best, robust = fitted(estimator, False), False
-    trials = [Trial(_words(estimator), best.error, best.depth, best.seconds, "used")]
-    joint = estimator.refinement in choices.JOINT_REFINEMENTS
+    trials: list[Trial] = []
+    trials.append(
+        Trial(_words(estimator), best.error, best.depth, best.seconds, "used")
+    )
+    used, joint = 0, estimator.refinement in choices.JOINT_REFINEMENTS
     for name, setting, proposal, wins in PROPOSALS if joint else ():
         if name not in free:
             continue
@@ -440,15 +459,18 @@ def decided(
         if found is None:
             trials.append(Trial(setting, np.nan, np.nan, 0.0, str(changes)))
             continue
-        result = "used" if wins(found, best) else "not better"
+        result = "not better"
+        if wins(found, best):
+            best, result = found, "used"
+            trials[used] = trials[used]._replace(result="less good")
+            used = len(trials)
         trials.append(Trial(setting, found.error, found.depth, found.seconds, result))
-        best = found if result == "used" else best
     model = best.model
     if model.prior is not None:
         model.set_params(n_components=model.n_components_)
     for each in best.caught:
         warn_caller(str(each.message), each.category)
-    model.trials_ = trials
+    model._trials = trials
     return model, trials
 
 

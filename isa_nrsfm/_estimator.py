@@ -299,8 +299,6 @@ default="affine"
         The fitted strategy, of the paper's pipeline. None with a prior.
     camera_ : str
         The camera model of the fit.
-    trials_ : list of Trial
-        What `AutoNRSfM` has tried, if it made this fit.
     frames_scaled_ : bool
         Whether each frame was divided by its own size.
     n_iter_ : int
@@ -378,7 +376,6 @@ default="affine"
     isa_: Any
     n_iter_: int
     camera_: str
-    trials_: list[Any]
     frames_scaled_: bool
     n_features_in_: int
     feature_names_in_: NDArray
@@ -664,7 +661,7 @@ default="affine"
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""
-        private = ("_model", "_frame_sizes", "_n_features_out")
+        private = ("_model", "_frame_sizes", "_n_features_out", "_trials")
         names = [n for n in vars(self) if n not in private and not n.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in names}
 

@@ -111,7 +111,7 @@ class Facts(NamedTuple):
 def facts_of(model: Any, **found: Any) -> Facts:
     """Return what the attributes of a joint fit tell, and what else was found."""
     frames, ratio = model._model.frames, getattr(model, "camera_noise_ratio_", np.nan)
-    consensus, decided = model.refinement == "consensus", hasattr(model, "trials_")
+    consensus, decided = model.refinement == "consensus", hasattr(model, "_trials")
     known = frames.certainty, model.reliability_, ratio, len(model.mean_shape_)
     found |= {"prior": model.prior is not None}
     return Facts(model.camera_, frames.loss, consensus, decided, *known, **found)

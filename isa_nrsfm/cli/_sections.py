@@ -20,7 +20,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import as_utf8, first_items, percent
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.analysis._frame_columns import STATISTICS
-from isa_nrsfm.cli._options import AUTO, PROGRAM
+from isa_nrsfm.cli._options import PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
 from isa_nrsfm.export._names import names_of_components
@@ -39,8 +39,8 @@ _CAMERAS = {
 }
 
 _DATA = {REPORT: "the numbers of this report, for programs"}
-# Rows of a table in the terminal, at most.
-MOST_SHOWN = 16
+# Coefficients in the summary, at most; and characters of its texts in a line.
+MOST_SHOWN, WIDTH = 5, 80
 
 
 class Cells(NamedTuple):
@@ -70,8 +70,81 @@ Sections = Mapping[str, Section]
 
 def fit_title(report: dict[str, Any]) -> str:
     """Return the title of the report of a fit."""
-    table, basis = report["table"], _shapes(report["model"])
-    return f"{basis} fitted to {table['n_frames']} frames of {table['n_points']} points"
+    table, n, layout = report["table"], len(report["model"]["alpha"]), ""
+    if report["model"]["skeleton"] is not None:
+        layout = f" ({report['model']['skeleton']})"
+    rows = f"{table['n_frames']} frames of {table['n_points']} points{layout}"
+    return f"{n} movement{'s' * (n != 1)} in {rows}"
+
+
+def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
+    """Return what a fit has found in a few rows: a name, a mark, and a text.
+
+    The terminal and the page begin with it, and `report.json` has it.
+    """
+    model, table = report["model"], report["table"]
+    off = f"points are off by {model['rms_point_error']:.3g} in the unit of the table"
+    error = f"{percent(model['held_out_error'])} of left-out points unexplained"
+    rows = [["fit", model["fit"].upper(), f"{off}; {error}"]]
+    rows.append(["depth", model["depth"].upper(), _depth(model)])
+    for row in model["alpha"][:MOST_SHOWN]:
+        pose, share = "", row["pose_share"]
+        if share is not None and share == share:
+            pose = f"pose explains {100 * max(share, 0):.0f} %; "
+        rows_of = f"from row {row['row_of_min']} to row {row['row_of_max']}"
+        rows.append([row["name"], f"{100 * row['energy_share']:.0f} %", pose + rows_of])
+    if more := len(model["alpha"][MOST_SHOWN:]):
+        rows.append(["", "", f"{more} more in {PAGE}"])
+    rows += [["label", "", _answer(label)] for label in report.get("labels", ())]
+    if "between" in report.get("groups", ()):
+        groups = report["groups"]
+        most = int(np.argmax(groups["between"]))
+        name, share = model["alpha"][most]["name"], groups["between"][most]
+        text = f"{100 * share:.0f} % of the variance of {name} is between groups"
+        rows.append(["group", "", f"{groups['column']}: {text}"])
+    if "time" in report:
+        rows.append(["time", "", str(_time(report["time"])[0])])
+    fitted = [each for each in report["tried"] if each["seconds"]]
+    tried = [each["text"] for each in fitted]
+    others = [each["text"] for each in report["tried"] if each not in fitted]
+    if "choice" in report:
+        choice = report["choice"]
+        listed = first_items(choice["n_components"], len(choice["n_components"]))
+        tried.insert(0, f"K = {listed}: {choice['chosen']} is used")
+    tried += [f"not tried: {'; '.join(others)}"] if others else []
+    rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
+    out = [
+        f"{each['n_rows']} rows: {each['reason']}" for each in table["rows_left_out"]
+    ]
+    rows.append(["left out", "", "; ".join(out) or "no row"])
+    if names := table.get("other_columns"):
+        listed = first_items(map(str, names), 6)
+        rows.append(["next", "", f"--label, --group or --time COLUMN: {listed}"])
+    return [*rows, ["open", "", f"{Path(folder, PAGE)}  viewer.html  alpha.csv"]]
+
+
+def _depth(model: dict[str, Any]) -> str:
+    """Return how well the depth is known, and which of the mirror images it is."""
+    error, mirror = model["depth_uncertainty"], model["mirror_certainty"]
+    if not model["depth"]:
+        return "affine cameras leave it open, and angles and proportions with it"
+    if not model["depth_determined"]:
+        return f"not determined (off by {100 * error:.0f} %): no angles and proportions"
+    text = f"known to {100 * error:.2g} %"
+    if not mirror or not math.isfinite(mirror):
+        return f"{text}; its mirror image is as likely"
+    least = min(math.floor(1000 * mirror) / 10, 99.9)
+    return f"{text}; the right one of two mirror images with {least:g} %"
+
+
+def _answer(label: dict[str, Any]) -> str:
+    """Return whether a label goes with coefficients."""
+    if label["untested"]:
+        return f"{label['column']} was not tested: {label['untested']}."
+    names = names_of_components(None, len(label["values"]))
+    related = np.asarray(names)[np.less(label["p_values"], 0.05)]
+    coefficients = ", ".join(related) or "no coefficient"
+    return f"{label['column']} goes with {coefficients} (p < 0.05)."
 
 
 def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
@@ -88,8 +161,6 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     sections["Alpha"] = _alpha(model)
     if "choice" in report:
         sections["Choice"] = _choice(report["choice"])
-    elif model["parameters"]["n_components"] == AUTO:
-        sections["Choice"] = [f"K = {model['n_components']}: found by {AUTO}"]
     sections["Fit"] = _fit(report)
     sections["Cameras"] = _cameras(model, report.get("position_unit"))
     return sections | {"Table": table_section(report["table"])}
@@ -129,19 +200,13 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
     return parts
 
 
-def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cells]:
-    """Return the quality of a fit, with a remark on its inverse SNR."""
-    weighted = ""
-    if quality["held_out_error_weighted"]:
-        weighted = (
-            " Points count by their weights here, and equally in the inverse SNR."
-        )
+def quality_section(quality: dict[str, Any]) -> list[str | Cells]:
+    """Return the quality of a fit."""
+    weighted = " Points count by their weights." * quality["held_out_error_weighted"]
     return [
-        f"inverse SNR {percent(quality['inverse_snr'])}{remark}: energy (sum of "
-        "squares) of the residuals, relative to that of the centred points.",
-        f"held-out error {percent(quality['held_out_error'])}: the same for points "
-        f"predicted from the other points of their frame.{weighted} Wrong points and "
-        "too many basis shapes make it much larger.",
+        f"held-out error {percent(quality['held_out_error'])}: energy of the errors of "
+        "points that are predicted from the other points of their frame, relative to "
+        f"that of the centred points.{weighted} Wrong points make it much larger.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
         "square, in pixels or the unit of the table)",
     ]
@@ -158,15 +223,14 @@ def text_of(title: str, sections: Sections) -> str:
     return "\n\n".join(blocks)
 
 
-def fit_text(report: dict[str, Any], folder: Path, more: Sections) -> str:
-    """Return the report of a fit as text, with more sections after it."""
-    described = [
-        [name, content.partition(";")[0].partition(": the image")[0]]
-        for name, content in (report["files"] | _DATA).items()
-    ]
-    listed: Section = [f"in {folder}", Cells([], described)]
-    sections = fit_sections(report) | {"Files": listed, **more}
-    return text_of(fit_title(report), sections | {"Open": [f"{folder / PAGE}"]})
+def fit_text(report: dict[str, Any], *more: list[str]) -> str:
+    """Return the summary of a fit as text, with more rows after it."""
+    lines = [fit_title(report)]
+    for name, mark, text in [*report["summary"], *more]:
+        first, *rest = textwrap.wrap(text, WIDTH, break_on_hyphens=False) or [""]
+        lines.append(f"{name:9}{mark:6}{first}" if mark else f"{name:9}{first}")
+        lines += [f"{'':{15 if mark else 9}}{line}" for line in rest]
+    return "\n".join(lines)
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
@@ -199,6 +263,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     title = escape(fit_title(report))
     about = escape(f"{report['table']['path']}, {report['finished']}")
     parts = [f"<h1>{title}</h1>", f'<p class="quiet">{about}</p>']
+    parts += _markup("", [Cells([], report["summary"])])
     for warning in report["warnings"]:
         parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
     parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
@@ -225,10 +290,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
 
 
 def _lines(part: str | Cells) -> list[str]:
-    """Return the lines of a part: sentences, which end with a point, are wrapped.
-
-    Tables with a head end after `MOST_SHOWN`.
-    """
+    """Return the lines of a part: sentences, which end with a point, are wrapped."""
     if isinstance(part, str):
         if part.endswith("."):
             return textwrap.wrap(part, 90, break_on_hyphens=False)
@@ -238,15 +300,12 @@ def _lines(part: str | Cells) -> list[str]:
     for column, is_number in zip(cells, part.numbers, strict=True):
         align, width = ">" if is_number else "<", max(map(len, column))
         columns.append([f"{cell:{align}{width}}" for cell in column])
-    rows = ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
-    if part.head and (more := len(rows[MOST_SHOWN:])):
-        rows[MOST_SHOWN:] = [f"... {more} more in {PAGE}"]
-    return [part.title, *rows] if part.title else rows
+    return ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
 
 
 def _markup(name: str, parts: Section) -> list[str]:
     """Return the HTML of a section, of an empty one nothing."""
-    found = [f"<h2>{name}</h2>"] if parts else []
+    found = [f"<h2>{name}</h2>"] if parts and name else []
     for part in parts:
         if isinstance(part, str):
             found.append(f"<p>{escape(part)}</p>")
@@ -266,15 +325,9 @@ def _markup(name: str, parts: Section) -> list[str]:
 
 
 def _fit(report: dict[str, Any]) -> Section:
-    """Return the quality of the fit, its noise and its time."""
-    model, seconds = report["model"], report["seconds"]
-    remark = ""
-    if model["parameters"]["loss"] != "linear":
-        remark = " (outliers count fully)"
-    elif (model["rank_floor"] or 0) > np.finfo(float).eps and "prior" not in report:
-        floor = percent(model["rank_floor"])
-        remark = f" (no model with {_shapes(model)} is below {floor})"
-    parts = quality_section(model, remark)
+    """Return the quality of the fit and its noise."""
+    model = report["model"]
+    parts = quality_section(model)
     worst = model["largest_error"]
     parts.append(f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}")
     if model["noise_variance"] is not None:
@@ -285,8 +338,6 @@ def _fit(report: dict[str, Any]) -> Section:
         parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
     if "prior" in report:
         parts.append(_prior(report["prior"]))
-    fit = seconds["fit"] + seconds.get("choose", 0.0)
-    parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
     if model["skeleton"] is not None:
         parts.append(f"points recognised as {model['skeleton']}")
     elif model["n_edges"] == 0 or model["spanning_tree"]:
@@ -316,44 +367,30 @@ def _prior(prior: dict[str, Any]) -> str:
 
 def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
     """Return the camera model, the certainty of the depth, and what the noise means."""
-    title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
+    title = _CAMERAS[model["camera"]]
     if model["camera"] != "affine" and not model["depth_determined"]:
         return [
             f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
             "no angles, and proportions in viewer.html are not true.",
             *_perspective(model, unit),
         ]  # the ratio of the noise means nothing
-    if model["camera"] == "perspective" and not model["mirror_decided_by_perspective"]:
-        title += " and a mirror image in depth"
+    mirror, which = model["mirror_certainty"], "missing points are farther away"
     parts = [title, *_perspective(model, unit)]
-    if uncertainty and math.isfinite(uncertainty):
-        parts.append(
-            f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
-            "square)"
-        )
-    mirror = model["mirror_certainty"]
     if mirror and math.isfinite(mirror):
-        least = min(math.floor(1000 * mirror) / 10, 99.9)
-        probability = f"right with a probability of at least {least:g} %"
-        which = (
-            f"one in which missing points are farther away, {probability} if the "
-            "object hides them. If it does not, use --no-hidden-points."
-        )
         if model["mirror_decided_by_perspective"]:
-            which = f"one that fits perspective, {probability}"
+            which = "perspective fits"
         elif model["parameters"]["prior"] is not None:
-            which = f"one of the prior, {probability}"
-        parts.append(f"mirror image in depth: the {which}")
+            which = "the prior is alike"
+        parts.append(f"mirror image in depth: the one for which {which}")
     meaning = model["camera_meaning"]
     return [*parts, _sentence(meaning)] if meaning else parts
 
 
 def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str]:
-    """Return comparison, focal length and unit of positions of perspective cameras."""
+    """Return focal length and unit of positions of perspective cameras."""
     focal, deviation = model["focal_length"], model["focal_length_std"]
-    compared = [_sentence(model["perspective"])] if model["perspective"] else []
     if focal is None:
-        return compared
+        return []
     if not math.isfinite(focal):
         return ["no perspective: the focal length is too long to estimate it"]
     shown = "given"
@@ -367,7 +404,6 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
     return [
         f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})",
         f"positions in cameras.csv: {length}",
-        *compared,
     ]
 
 
@@ -379,7 +415,7 @@ def _alpha(model: dict[str, Any]) -> Section:
         [
             row["name"],
             f"{100 * row['energy_share']:.1f} %",
-            *(f"{row[key]:z.2f}" for key in ("mean", "std", "min")),
+            f"{row['min']:z.2f}",
             f"{row['row_of_min']}",
             f"{row['max']:z.2f}",
             f"{row['row_of_max']}",
@@ -387,7 +423,7 @@ def _alpha(model: dict[str, Any]) -> Section:
         ]
         for row, share in zip(coefficients, shares, strict=True)
     ]
-    head = ["", "energy", "mean", "std", "min", "row", "max", "row", "pose"]
+    head = ["", "energy", "min", "row", "max", "row", "pose"]
     is_posed = any(row[-1] for row in rows)
     head, *rows = [line[: len(head) - (not is_posed)] for line in (head, *rows)]
     parts: list[str | Cells] = [
@@ -426,7 +462,7 @@ def _choice(choice: dict[str, Any]) -> Section:
             f"{k}",
             f"{_digits(100 * error, 3)} %",
             f"{_digits(100 * deviation, 2)} %",
-            "the least" * (k == choice["chosen"]),
+            "used" * (k == choice["chosen"]),
         ]
         for k, error, deviation in zip(tried, errors, deviations, strict=True)
     ]
@@ -436,13 +472,11 @@ def _choice(choice: dict[str, Any]) -> Section:
         from isa_nrsfm._selection import NO_SHAPE
 
         return [cells, NO_SHAPE]
-    parts: list[str | Cells] = [cells, "as under Fit, in frames left out of the fit"]
-    if choice["larger_may_be_better"]:
-        more = f"three more take at least {3 * choice['seconds'][-1]:.0f} s"
-        parts.append(
-            f"larger K may be better: this is the largest of those tried; {more}"
-        )
-    return parts
+    return [
+        cells,
+        "As under Fit, in frames left out of the fit. The fewest basis shapes within "
+        "one standard error of the least are used.",
+    ]
 
 
 def _label(label: dict[str, Any]) -> Section:
@@ -461,18 +495,14 @@ def _label(label: dict[str, Any]) -> Section:
         [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
         for name, value, p in found
     ]
-    answer = f"{label['column']} was not tested: {label['untested']}."
     test = "no p-values"
     means: list[str] = []
     if not label["untested"]:
-        related = np.asarray(names)[np.less(label["p_values"], 0.05)]
-        coefficients = ", ".join(related) or "no coefficient"
-        answer = f"{label['column']} goes with {coefficients} (p < 0.05)."
         test = f"corrected p-values: permutations of {label['permuted']}"
-        if "class_means" in label and len(related):
+        if "class_means" in label and np.less(label["p_values"], 0.05).any():
             means = _class_means(label, names)
     return [
-        answer,
+        _answer(label),
         Cells(["", statistic, "p"], rows, title),
         f"{statistic}: {meaning}; {test}",
         *means,
@@ -562,12 +592,6 @@ def _time(time: dict[str, Any]) -> Section:
         f"{name}: {'; '.join(found)}",
         f"smoothed coefficients differ by {time['changed_by']:.2f} (root mean square)",
     ]
-
-
-def _shapes(model: dict[str, Any]) -> str:
-    """Return how many basis shapes a model has."""
-    n_components = model["n_components"]
-    return f"{n_components} basis shape{'s' * (n_components != 1)}"
 
 
 def _sentence(text: str) -> str:

@@ -20,7 +20,6 @@ from isa_nrsfm.cli._outputs import (
 from isa_nrsfm.cli._report import quality_report, table_report
 from isa_nrsfm.cli._sections import quality_section, table_section, text_of
 from isa_nrsfm.io._tables import table_suffix
-from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 
@@ -50,9 +49,7 @@ def run(args: Namespace, warned: list[str]) -> str:
         explained = estimator.inverse_transform(alpha, motion, translation)
         square = np.nanmean((explained - np.asarray(X)) ** 2)
         found = quality_report(estimator, X, square, frames.weighting)
-        layout, scaled = estimator.layout, estimator.frames_scaled_
-        snr = inverse_snr(X, explained, layout=layout, scale_frames=scaled)
-        quality = quality_section(found | {"inverse_snr": snr})
+        quality = quality_section(found)
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting
