@@ -554,7 +554,7 @@ default="affine"
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
         source, weights, settings = opened._ready(X, point_weight)
-        warn_of_rows(source, self.camera, getattr(X, "attrs", {}))
+        warn_of_rows(source, self.camera, getattr(X, "attrs", {}), opened)
         isa = ready_strategy(
             self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
         )

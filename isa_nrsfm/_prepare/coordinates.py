@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
@@ -20,6 +22,9 @@ FEW = 0.05
 LEAST = 0.2
 # Largest median of centred coordinates.
 CENTRED = 0.03
+# Largest movement of points that stand still, relative to the others' centroid, which
+# moves by at least half of their size.
+STILL, LEAST_WAY = 0.05, 0.5
 # Attribute of a DataFrame of points of which `read_landmarks` has warned.
 TOLD = "warned of coordinates"
 
@@ -28,10 +33,13 @@ class CoordinateWarning(UserWarning):
     """Coordinates are probably codes of missing points, or shares of an image."""
 
 
-def warn_of_rows(rows: FrameBlocks, camera: str, attrs: dict[Hashable, Any]) -> None:
+def warn_of_rows(
+    rows: FrameBlocks, camera: str, attrs: dict[Hashable, Any], estimator: Any
+) -> None:
     """Warn of some rows of a table, evenly spread; not of shares if cameras are affine.
 
     These absorb the stretch of shares. The attributes of a DataFrame may have `TOLD`.
+    The estimator knows the names of the points.
     """
     if attrs.get(TOLD):
         return
@@ -40,6 +48,37 @@ def warn_of_rows(rows: FrameBlocks, camera: str, attrs: dict[Hashable, Any]) -> 
     warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
     if camera != "affine":
         warn_of_shares(tracks)
+    if len(still := still_points(tracks)):
+        names = names_of_points(estimator, tracks.shape[1])
+        warn_caller(
+            f"{len(still)} of {tracks.shape[1]} points stand still while the others "
+            f"move through the image: {first_items((names[j] for j in still), 12)}. "
+            "They are no part of the object: leave their columns out",
+            CoordinateWarning,
+        )
+
+
+def still_points(tracks: NDArray) -> NDArray:
+    """Return the numbers of points that stand still while the others move together.
+
+    Tracks are (n_frames, n_points, 2). Medians: a point may be wrong in some frames.
+    The origin of the coordinates is a point of aligned objects.
+    """
+    n_frames, n_points, _ = tracks.shape
+    seen = np.isfinite(tracks[..., 0]).sum(axis=0) > 1
+    if n_frames < 10 or seen.sum() < n_points:
+        return np.arange(0)
+    way = np.linalg.norm(tracks - np.nanmedian(tracks, axis=0), axis=2)
+    way = np.nanmedian(way, axis=0)
+    still = way < STILL * way.max()
+    if still.all() or not still.any():
+        return np.arange(0)
+    centroid = np.nanmean(tracks[:, ~still], axis=1)
+    size = np.nanmedian(np.linalg.norm(tracks[:, ~still] - centroid[:, None], axis=2))
+    moved = np.nanmedian(np.linalg.norm(centroid - np.nanmedian(centroid, 0), axis=1))
+    if moved < LEAST_WAY * size:  # parts of an object that stays in place
+        return np.arange(0)
+    return np.flatnonzero((way < STILL * moved) & ~(tracks == 0).all(axis=(0, 2)))
 
 
 def warn_of_places(

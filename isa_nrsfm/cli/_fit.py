@@ -15,10 +15,12 @@ from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
 from isa_nrsfm._compat import pandas as pd, whole_files
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
 from isa_nrsfm._parameters.choices import FACE_PRIORS as LAYOUTS, JOINT_REFINEMENTS
-from isa_nrsfm._prepare.coordinates import TOLD
+from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs
@@ -68,7 +70,7 @@ def fit_table(
     if prior not in FACE_PRIORS:
         _load_prior(args)
     folder, clock = Path(args.output), {"": args.since}
-    frames = read_frames(args, table=table)
+    frames = _moving_points(args, read_frames(args, table=table), table)
     if prior in FACE_PRIORS:
         layout = face_layout(args, frames)
         if layout is None:
@@ -178,6 +180,21 @@ def _load_prior(args: Namespace, layout: str = "ibug-68") -> None:
         args.prior = load_face_prior(K, layout=layout)
     elif args.prior not in (None, NONE):
         args.prior = load_model(args.prior)
+
+
+def _moving_points(args: Namespace, frames: Frames, table: Any) -> Frames:
+    """Leave out points that stand still, unless the options name the points."""
+    tracks = frames.X.to_numpy().reshape(len(frames.X), -1, 2)
+    still = still_points(tracks) if args.points is None else ()
+    if not len(still):
+        return frames
+    names = [frames.columns.points[j] for j in still]
+    args.points = f"without:{','.join(names)}"
+    warn_caller(
+        f"{len(names)} points stand still while the others move through the image, and "
+        f"are left out: {first_items(names, 12)}. --points fits those that it names"
+    )
+    return read_frames(args, table=table)
 
 
 def _check_options(args: Namespace) -> None:

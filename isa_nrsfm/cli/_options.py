@@ -170,7 +170,9 @@ HELP = {
     "nose_2_x: each gets a row of its own, with the column individual",
     "skip_rows COLUMN=REGEX": "leave out rows whose column matches the expression, "
     "such as 'name=^ir'",
-    "zeros_missing": "treat points at exactly (0, 0) as missing",
+    "zeros_missing": "treat points at exactly (0, 0) as missing, also among others",
+    "keep_zeros": "do not treat points at (0, 0) as missing, even if all others are "
+    "elsewhere",
     "missing_value VALUE": "treat points whose x and y are this number, such as -1, as "
     "missing",
     "min_confidence CONFIDENCE": "treat points with a lower confidence as missing",
@@ -289,8 +291,14 @@ DEFAULTS = {
 }
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
 TABLE_OPTIONS = (
-    *("format", "columns", "individuals", "skip_rows", "zeros_missing"),
-    *("missing_value", "min_confidence", "image_size", "part"),
+    *("format", "columns", "individuals", "skip_rows"),
+    *(
+        ("zeros_missing", "keep_zeros"),
+        "missing_value",
+        "min_confidence",
+        "image_size",
+        "part",
+    ),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 
