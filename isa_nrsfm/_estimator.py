@@ -1044,7 +1044,7 @@ default="affine"
         self, alpha: Any, motion: Any = None, translation: Any = None
     ) -> NDArray:
         """
-        Return the table of shapes with given coefficients.
+        Return images of coefficients in one mean view; `reproject` has those of rows.
 
         Parameters
         ----------

@@ -146,7 +146,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         return
     if facts.bent:
         yield f"{facts.outliers}: they bend the shapes. Correct them{facts.compare}"
-    yield depth_advice(facts)
+    yield (depth := depth_advice(facts))
     if facts.bent:  # outliers may cause all that follows
         return
     n_components, n_supported = len(facts.reliability), facts.n_supported
@@ -163,7 +163,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         yield (
             f"the table does not support n_components={n_components}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
-            "probably noise. Interpret the others, or record more frames"
+            'probably noise. n_components="auto" leaves them out'
         )
     elif facts.camera == "affine" and facts.deviation > LARGEST_DEVIATION:
         yield (
@@ -174,7 +174,8 @@ def _messages(facts: Facts) -> Iterator[str]:
     if facts.few and n_supported == n_components:
         what = "Look for wrong landmarks in the frames with the largest coefficients"
         yield f"{facts.few}. {what}"
-    yield facts.pose
+    if not depth:
+        yield facts.pose
 
 
 def poor_fit(facts: Facts) -> str:

@@ -313,8 +313,9 @@ def _of_pose(
             f"{text}, beyond what remove_pose has removed. Compare coefficients of "
             "similar views only"
         )
-    calibrated = "calibrated cameras and " * (model.camera_ == "affine")
-    way = f"use {calibrated}--remove-pose (in Python remove_pose=True)"
+    way = "use --remove-pose (in Python remove_pose=True)"
+    if model.camera_ == "affine":
+        way = "use isa_nrsfm.AutoNRSfM(AffineNRSfM(remove_pose=True)).fit(X)"
     if layout is None or not layout.contour or model.prior is not None:
         return (
             f"{text}: points slide over the surface as the view changes, or the object "

@@ -1,6 +1,7 @@
 """The command fit."""
 
 import contextlib
+import re
 import sys
 import time
 from argparse import Namespace
@@ -43,6 +44,12 @@ from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 from isa_nrsfm.metrics._reprojection import frame_energies
 
+# Columns that are probably labels or groups come first: action units, emotions, people.
+LABEL = re.compile(
+    r"^\W*AU\W?\d|emotion|expression|label|class|gesture|action|behaviou?r|condition|"
+    r"subject|person|participant|sex|gender|^\W*age\b|group",
+    re.IGNORECASE,
+)
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
@@ -116,6 +123,7 @@ def fit_table(
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
+        unused.sort(key=lambda name: not LABEL.search(str(name)))
         clock["read"] = time.perf_counter()
         estimator, trials, search, diagnostics = _fitted(args, frames, clock)
         show_stage("answers")
