@@ -26,10 +26,9 @@ from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 from isa_nrsfm.analysis._advice import (
-    MOST_GROSS,
     OTHER_CAMERAS,
     gross_residuals,
     layout_of,
@@ -43,6 +42,8 @@ FACE_COMPONENTS = 9
 # Rows and basis shapes of rough fits, at most.
 ROUGH_ROWS, MOST_SHAPES = 100, 12
 # All of these: docs/benchmarks/README.md, "Thresholds".
+# Share of gross errors of held-out points above which robust losses are tried.
+MOST_WRONG = 1e-3
 # Largest variation of the scales of frames for which one scale is tried.
 EQUAL_SCALES = 0.1
 # A setting is used if it lowers the error of held-out points to this share; perspective
@@ -283,20 +284,19 @@ class _Rows(NamedTuple):
     principal_point: Any
     face_layout: str | None
 
-    def opened(self, model: AffineNRSfM) -> tuple[FrameBlocks, Any]:
-        """Return the rows in blocks, and their weights."""
-        return model._opened(self.X, **self.weights, judged=False)
-
     def error(self, model: AffineNRSfM, robust: bool) -> float:
         """Return the error of held-out points."""
-        table, weights = self.opened(model)
+        table, weights = model._opened(self.X, **self.weights, judged=False)
         return unexplained(model._model, table.whole(), *weights, robust=robust)
 
     def outlier_share(self, model: AffineNRSfM) -> float:
-        """Return the share of points with gross residuals."""
-        table, weights = self.opened(model)
-        fit = table.joined(model._model.decompose, *weights)[:3]
-        return gross_residuals(table.joined(model._model.distances, *fit, *weights))[0]
+        """Return the share of gross errors among held-out points.
+
+        Fits with all directions of deformation follow outliers, held-out points cannot.
+        """
+        table, _ = model._opened(self.X, judged=False)
+        error = table.joined(model._model.held_out)[..., 0]
+        return gross_residuals(np.sqrt(error))[0]
 
 
 class _Fit(NamedTuple):
@@ -326,7 +326,7 @@ Proposal = str | dict[str, Any]
 def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
     if rows.weights:
         return "points have weights"
-    if rows.outlier_share(best.model) <= MOST_GROSS:
+    if not rows.outlier_share(best.model) > MOST_WRONG:
         return "no outliers"
     return {"loss": "cauchy"}
 

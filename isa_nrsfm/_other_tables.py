@@ -53,9 +53,9 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
             before, after = adapting_errors(estimator, rows, *own)
             if after < before:
                 way = (
-                    "Adapt the model to X: sklearn.base.clone(model).set_params("
-                    "n_components='auto', refinement='joint', prior=model).fit(X). "
-                    "Held-out points of some rows then have an inverse SNR of "
+                    "Adapt the model to X: AutoNRSfM(prior=model).fit(X), in the "
+                    "command line isa-nrsfm fit TABLE --prior MODEL. Held-out points "
+                    "of some rows then have an inverse SNR of "
                     f"{after:.2g}, now {before:.2g}"
                 )
         warn_caller(

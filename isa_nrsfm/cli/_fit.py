@@ -3,7 +3,6 @@
 import contextlib
 import re
 import sys
-import time
 from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,7 +37,7 @@ from isa_nrsfm.cli._reading import (
     read_frames,
 )
 from isa_nrsfm.cli._report import model_report, table_report
-from isa_nrsfm.cli._sections import fit_text, summary, write_report
+from isa_nrsfm.cli._sections import fit_title, summary, text_of, write_report
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
@@ -61,7 +60,8 @@ _PARAMETERS = (
 
 def run(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
-    return fit_text(fit_table(args, warned)[0])
+    report, _ = fit_table(args, warned)
+    return text_of(fit_title(report), report["summary"])
 
 
 def fit_table(
@@ -76,7 +76,7 @@ def fit_table(
     _check_options(args)
     if prior not in FACE_PRIORS:
         _load_prior(args)
-    folder, clock = Path(args.output), {"": args.since}
+    folder = Path(args.output)
     frames = _moving_points(args, read_frames(args, table=table), table)
     if prior in FACE_PRIORS:
         layout = face_layout(args, frames)
@@ -124,8 +124,7 @@ def fit_table(
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
         unused.sort(key=lambda name: not LABEL.search(str(name)))
-        clock["read"] = time.perf_counter()
-        estimator, trials, search, diagnostics = _fitted(args, frames, clock)
+        estimator, trials, search, diagnostics = _fitted(args, frames)
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
@@ -161,9 +160,7 @@ def fit_table(
                 "warnings": warned,
                 "versions": {"isa_nrsfm": __version__, "python": python_version()},
             }
-            clock["write"] = time.perf_counter()
-            report |= {"seconds": _seconds(clock), "files": results}
-            report |= {"summary": summary(report, folder)}
+            report |= {"files": results, "summary": summary(report, folder)}
             report = write_report(new, report)
         if not figures:
             return report, estimator
@@ -175,8 +172,7 @@ def fit_table(
                     "has its files, and no figures of this run"
                 )
             captions = write_figures(new, figures, fit)
-            clock["figures"] = time.perf_counter()
-            report |= {"seconds": _seconds(clock), "files": results | captions}
+            report |= {"files": results | captions}
             report = write_report(new, report)
     return report, estimator
 
@@ -192,7 +188,7 @@ def _load_prior(args: Namespace, layout: str = "ibug-68") -> None:
 
 def _moving_points(args: Namespace, frames: Frames, table: Any) -> Frames:
     """Leave out points that stand still, unless the options name the points."""
-    tracks = frames.X.to_numpy().reshape(len(frames.X), -1, 2)
+    tracks = frames.X.to_numpy().reshape(len(frames.X), len(frames.columns.points), 2)
     still = still_points(tracks) if args.points is None else ()
     if not len(still):
         return frames
@@ -238,14 +234,8 @@ def _check_options(args: Namespace) -> None:
             )
 
 
-def _seconds(clock: dict[str, float]) -> dict[str, float]:
-    """Return the seconds of each stage by the times of their ends."""
-    of_stages = np.diff([*clock.values()]).round(3)
-    return dict(zip([*clock][1:], of_stages, strict=True))
-
-
 def _fitted(
-    args: Namespace, frames: Frames, clock: dict[str, float]
+    args: Namespace, frames: Frames
 ) -> tuple[AffineNRSfM, list[Trial], AffineNRSfMCV | None, Diagnostics | None]:
     """Return the model that held-out points prefer, and what was tried.
 
@@ -288,7 +278,6 @@ def _fitted(
         with contextlib.redirect_stdout(sys.stderr):  # results are printed at once
             search.fit(X, groups=groups)
         estimator = search.best_estimator_
-        clock["choose"] = time.perf_counter() - search.refit_time_
     else:  # for `shown_progress`; the model that is written does not have it
         estimator.set_params(verbose=2)
     estimator, trials = decided(
@@ -302,7 +291,6 @@ def _fitted(
     diagnostics = None
     if estimator.refinement in JOINT_REFINEMENTS:
         diagnostics = estimator.diagnostics(X, **frames.weighting)
-    clock["fit"] = time.perf_counter()
     return estimator, trials, search, diagnostics
 
 

@@ -57,8 +57,10 @@ def quality_report(
 
     `square` is the mean of the squared errors of its coordinates.
     """
+    error = -estimator.score(X, **weighting)
     return {
-        "held_out_error": -estimator.score(X, **weighting),
+        "fit": verdict(error, *FIT),
+        "held_out_error": error,
         "held_out_error_weighted": bool(weighting),
         "rms_point_error": np.sqrt(2 * square),
     }
@@ -82,9 +84,8 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     for message in () if found is None else found.messages:
         warn_caller(message)
     quality = quality_report(estimator, X, mean_of(square), frames.weighting)
-    error = quality["held_out_error"]
     if estimator.loss != "linear" and found is not None:
-        error = found.held_out_error  # of the median point
+        quality |= {"fit": found.fit}  # of the median point
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),
@@ -100,7 +101,6 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     )
     return {
         "n_components": alpha.shape[1],
-        "fit": verdict(error, *FIT),
         "depth": "" if found is None else found.depth,
         "inverse_snr": estimator.inverse_snr_,
         **quality,
@@ -122,10 +122,8 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         "n_edges": None if edges is None else n_edges,
         "spanning_tree": lines is not None and lines.name == SPANNING_TREE,
         "outliers": None if found is None else _outliers(found, estimator, X),
-        "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),
         "alpha": coefficients.to_dict("records"),
-        "correlations": pd.DataFrame(alpha).corr().to_numpy(),
     }
 
 

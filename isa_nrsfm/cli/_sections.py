@@ -8,7 +8,7 @@ import json
 import math
 import shlex
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -26,7 +26,6 @@ from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.io._formats import TABLE
-from isa_nrsfm.skeletons import SKELETONS
 
 _CAMERAS = {
     "affine": "affine: shapes are known up to an affine transformation of space. "
@@ -65,7 +64,6 @@ class Cells(NamedTuple):
 
 
 Section = Sequence[str | Cells]
-Sections = Mapping[str, Section]
 
 
 def fit_title(report: dict[str, Any]) -> str:
@@ -83,10 +81,7 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
     The terminal and the page begin with it, and `report.json` has it.
     """
     model, table = report["model"], report["table"]
-    off = f"points are off by {model['rms_point_error']:.3g} in the unit of the table"
-    error = f"{percent(model['held_out_error'])} of left-out points unexplained"
-    rows = [["fit", model["fit"].upper(), f"{off}; {error}"]]
-    rows.append(["depth", model["depth"].upper(), _depth(model)])
+    rows = [quality_row(model), ["depth", model["depth"].upper(), _depth(model)]]
     for row in model["alpha"][:MOST_SHOWN]:
         pose, share = "", row["pose_share"]
         if share is not None and share == share:
@@ -162,71 +157,53 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     if "choice" in report:
         sections["Choice"] = _choice(report["choice"])
     sections["Fit"] = _fit(report)
-    sections["Cameras"] = _cameras(model, report.get("position_unit"))
     return sections | {"Table": table_section(report["table"])}
 
 
-def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
+def table_section(table: dict[str, Any]) -> Section:
     """Return the rows and columns of a table that are used, and the others."""
-    format, n_missing = table["format"], table["n_missing_points"]
+    format = table["format"]
     listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
     parts: list[str | Cells] = [
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
+        f"{table['n_frames']} of {table['n_rows']} rows. {left_out_row(table)[2]}",
     ]
-    if table["coordinates_not_used"]:
-        not_used = table["coordinates_not_used"].items()
-        listed = "; ".join(f"{pattern} ({n_points})" for pattern, n_points in not_used)
-        parts.append(f"coordinates not used: {listed}")
-    if table.get("other_columns"):
-        listed = first_items(map(str, table["other_columns"]), MOST_LISTED)
-        parts.append(
-            f"other columns: {listed}. Use --label COLUMN to see how coefficients "
-            "depend on one, --group COLUMN for people or videos, and --time COLUMN."
-        )
-    rows = [[f"{table['n_rows']}", "rows"]]
-    for out in table["rows_left_out"]:
-        result = "left out" if out["skipped_on_request"] else unusable
-        rows.append([f"{out['n_rows']}", f"{result}: {out['reason']}"])
-    parts.append(Cells([], [*rows, [f"{table['n_frames']}", "used"]]))
-    for number in table["missing_values"]:
-        parts.append(f"points at ({number:.15g}, {number:.15g}) count as missing")
-    if n_missing:
-        share = n_missing / (table["n_frames"] * table["n_points"])
-        parts.append(
-            f"{n_missing} points ({percent(share)}) are missing in "
-            f"{table['n_frames_with_missing_points']} of these rows"
-        )
+    others = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
+    for what, names in (
+        ("coordinates not used", others),
+        ("other columns", table.get("other_columns")),
+    ):
+        if names:
+            parts.append(f"{what}: {first_items(map(str, names), MOST_LISTED)}")
     return parts
 
 
-def quality_section(quality: dict[str, Any]) -> list[str | Cells]:
-    """Return the quality of a fit."""
-    weighted = " Points count by their weights." * quality["held_out_error_weighted"]
-    return [
-        f"held-out error {percent(quality['held_out_error'])}: energy of the errors of "
-        "points that are predicted from the other points of their frame, relative to "
-        f"that of the centred points.{weighted} Wrong points make it much larger.",
-        f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
-        "square, in pixels or the unit of the table)",
+def quality_row(quality: dict[str, Any]) -> list[str]:
+    """Return how well points are explained, as a row of a summary."""
+    off = f"points are off by {quality['rms_point_error']:.3g} in the unit of the table"
+    text = f"{percent(quality['held_out_error'])} of left-out points unexplained"
+    return ["fit", quality["fit"].upper(), f"{off}; {text}"]
+
+
+def left_out_row(table: dict[str, Any]) -> list[str]:
+    """Return the rows that are left out, and missing points, as a row of a summary."""
+    out = [
+        f"{each['n_rows']} rows: {each['reason']}" for each in table["rows_left_out"]
     ]
+    numbers = [f"({n:.15g}, {n:.15g})" for n in table["missing_values"]]
+    out += [f"points at {place} count as missing" for place in numbers]
+    if n_missing := table["n_missing_points"]:
+        share = n_missing / (table["n_frames"] * table["n_points"])
+        rows = f"in {table['n_frames_with_missing_points']} of the others"
+        out.append(f"{n_missing} points ({percent(share)}) are missing {rows}")
+    return ["left out", "", "; ".join(out) or "no row"]
 
 
-def text_of(title: str, sections: Sections) -> str:
-    """Return a report as text, with the name of each section beside its lines."""
-    blocks = [title] if title else []
-    for name, parts in sections.items():
-        lines = [line for part in parts for line in _lines(part)]
-        labels = [name] + [""] * (len(lines) - 1)
-        beside = zip(labels, lines, strict=True)
-        blocks.append("\n".join(f"{name:11}{line}".rstrip() for name, line in beside))
-    return "\n\n".join(blocks)
-
-
-def fit_text(report: dict[str, Any], *more: list[str]) -> str:
-    """Return the summary of a fit as text, with more rows after it."""
-    lines = [fit_title(report)]
-    for name, mark, text in [*report["summary"], *more]:
+def text_of(title: str, rows: Sequence[Sequence[str]]) -> str:
+    """Return a summary as text: rows of a name, a mark, and a text that is wrapped."""
+    lines = [title] * bool(title)
+    for name, mark, text in rows:
         first, *rest = textwrap.wrap(text, WIDTH, break_on_hyphens=False) or [""]
         lines.append(f"{name:9}{mark:6}{first}" if mark else f"{name:9}{first}")
         lines += [f"{'':{15 if mark else 9}}{line}" for line in rest]
@@ -289,20 +266,6 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     write_whole(folder / PAGE, page.encode(errors="replace"))
 
 
-def _lines(part: str | Cells) -> list[str]:
-    """Return the lines of a part: sentences, which end with a point, are wrapped."""
-    if isinstance(part, str):
-        if part.endswith("."):
-            return textwrap.wrap(part, 90, break_on_hyphens=False)
-        return [part]
-    columns = []
-    cells = zip(*part.lines, strict=True)
-    for column, is_number in zip(cells, part.numbers, strict=True):
-        align, width = ">" if is_number else "<", max(map(len, column))
-        columns.append([f"{cell:{align}{width}}" for cell in column])
-    return ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
-
-
 def _markup(name: str, parts: Section) -> list[str]:
     """Return the HTML of a section, of an empty one nothing."""
     found = [f"<h2>{name}</h2>"] if parts and name else []
@@ -325,79 +288,64 @@ def _markup(name: str, parts: Section) -> list[str]:
 
 
 def _fit(report: dict[str, Any]) -> Section:
-    """Return the quality of the fit and its noise."""
-    model = report["model"]
-    parts = quality_section(model)
-    worst = model["largest_error"]
-    parts.append(f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}")
-    if model["noise_variance"] is not None:
-        noise = math.sqrt(model["noise_variance"])
-        size = f"{percent(noise)} of the frame's size"
-        if not model["frames_scaled"]:
-            size = f"{noise:.3g} in the units of the table"
-        parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
+    """Return the numbers of the fit and its cameras, with what they mean."""
+    model, table = report["model"], report["table"]
+    worst, camera = model["largest_error"], _CAMERAS[model["camera"]]
+    square, mirror = model["noise_variance"], model["mirror_certainty"]
+    parts = [
+        f"held-out error {percent(model['held_out_error'])}: energy of the errors of "
+        "points that are predicted from the other points of their frame, relative to "
+        "that of the centred points."
+        + " Points count by their weights."
+        * model["held_out_error_weighted"],
+        f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}",
+    ]
+    if square is not None:
+        noise = f"{math.sqrt(square):.3g} in the units of the table"
+        if model["frames_scaled"]:
+            noise = f"{percent(math.sqrt(square))} of the frame's size"
+        parts.append(f"noise in the fit {noise} (standard deviation of a coordinate)")
     if "prior" in report:
-        parts.append(_prior(report["prior"]))
-    if model["skeleton"] is not None:
-        parts.append(f"points recognised as {model['skeleton']}")
-    elif model["n_edges"] == 0 or model["spanning_tree"]:
-        drawn = "join them by a minimal spanning tree; give lines"
-        if not model["spanning_tree"]:
-            drawn = "have no lines between them; give these"
-        n_points = report["table"]["n_points"]
-        alike = [s.name for s in SKELETONS.values() if s.n_points == n_points]
+        name, (width, _) = report["prior"]["name"], report["prior"]["std"]
         parts.append(
-            f"points of no known layout: figures and viewer {drawn} with --edges FILE "
-            "or --skeleton LAYOUT"
-            + (f" (of {n_points} points: {', '.join(alike)})" if alike else "")
-            + ". If they are upside down, y points up in the table: use --origin lower."
+            f"prior {name}: the mean shape differs by {100 * width:.2g} % of the size "
+            "of the object from that of the prior (standard deviation of a coordinate)."
+            " Coefficients are those of the prior, so that studies with the same prior "
+            "can be compared."
         )
-    return parts
-
-
-def _prior(prior: dict[str, Any]) -> str:
-    """Return how far the shapes are from those of the prior, and what that means."""
-    return (
-        f"prior {prior['name']}: the mean shape differs by {100 * prior['std'][0]:.2g} "
-        "% of the size of the object from that of the prior (standard deviation of a "
-        "coordinate). Coefficients are those of the prior, so that studies with the "
-        "same prior can be compared."
-    )
-
-
-def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
-    """Return the camera model, the certainty of the depth, and what the noise means."""
-    title = _CAMERAS[model["camera"]]
+    if model["skeleton"] is None and (model["n_edges"] == 0 or model["spanning_tree"]):
+        parts.append(
+            f"{table['n_points']} points of no known layout: give lines of figures and "
+            "viewer with --edges FILE or --skeleton LAYOUT. If they are upside down, "
+            "use --origin lower."
+        )
     if model["camera"] != "affine" and not model["depth_determined"]:
-        return [
-            f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
-            "no angles, and proportions in viewer.html are not true.",
-            *_perspective(model, unit),
-        ]  # the ratio of the noise means nothing
-    mirror, which = model["mirror_certainty"], "missing points are farther away"
-    parts = [title, *_perspective(model, unit)]
-    if mirror and math.isfinite(mirror):
+        camera = f"{camera.partition(':')[0]}: the depth is not determined. cameras.csv"
+        camera += " has no angles, and proportions in viewer.html are not true."
+    elif mirror and math.isfinite(mirror):
+        which = "missing points are farther away"
         if model["mirror_decided_by_perspective"]:
             which = "perspective fits"
         elif model["parameters"]["prior"] is not None:
             which = "the prior is alike"
         parts.append(f"mirror image in depth: the one for which {which}")
-    meaning = model["camera_meaning"]
-    return [*parts, _sentence(meaning)] if meaning else parts
+    parts += [camera, *_perspective(model, report.get("position_unit"))]
+    if model["depth_determined"] and model["camera_meaning"]:
+        parts.append(_sentence(model["camera_meaning"]))
+    return parts
 
 
 def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str]:
     """Return focal length and unit of positions of perspective cameras."""
-    focal, deviation = model["focal_length"], model["focal_length_std"]
+    focal = model["focal_length"]
     if focal is None:
         return []
     if not math.isfinite(focal):
         return ["no perspective: the focal length is too long to estimate it"]
-    shown = "given"
+    shown, length = "given", "in units of the shapes"
     if model["parameters"]["focal_length"] is None:
-        shown = f"estimated, standard deviation {deviation:.2g}"
+        shown = f"estimated, standard deviation {model['focal_length_std']:.2g}"
     x, y = model["principal_point"]
-    length = "in units of the shapes"
     if unit is not None:
         a, b = unit["points"]
         length = f"points {a} and {b} of the mean shape are {unit['length']:g} apart"
@@ -439,17 +387,6 @@ def _alpha(model: dict[str, Any]) -> Section:
             f"--remove-pose: what yaw predicts was removed, up to {share}. It assumes "
             "that the objects move alike in all views"
         )
-    correlations = np.triu(np.nan_to_num(np.array(model["correlations"], float)), 1)
-    if correlations.any():
-        place = np.unravel_index(abs(correlations).argmax(), correlations.shape)
-        first, second = (coefficients[k]["name"] for k in place)
-        found = (
-            f"largest correlation: {correlations[place]:.2f}, of {first} and {second}"
-        )
-        others = "; --independence coefficients lowers it"
-        given, is_joint = model["parameters"], model["noise_variance"] is not None
-        is_open = given["independence"] == "shapes" and given["prior"] is None
-        parts.append(found + others * (is_joint and is_open))
     return parts
 
 
@@ -507,7 +444,6 @@ def _label(label: dict[str, Any]) -> Section:
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),
-        *_many(label),
     ]
 
 
@@ -532,21 +468,6 @@ def _score(label: dict[str, Any]) -> str:
     if classes:
         parts.append(f"largest class {100 * label['largest_class']:.1f} %")
     return f"cross-validated {parts[0]} {', '.join(parts[1:])}"
-
-
-def _many(label: dict[str, Any]) -> list[str]:
-    """Return that classes have too many coefficients for their frames, if they have.
-
-    From .4 coefficients a frame: docs/benchmarks/README.md, "Thresholds".
-    """
-    n_frames, n_components = label["n_frames"], len(label["values"])
-    if label["score"] != "accuracy" or n_components < 0.4 * n_frames:
-        return []
-    return [
-        f"{n_components} coefficients are many for {n_frames} frames: fewer predict "
-        "classes better. Keep this fit for shapes and depths; for classes, fit again "
-        f"without --prior, with -k {max(n_frames // 6, 1)} or less."
-    ]
 
 
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
