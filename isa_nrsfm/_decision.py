@@ -335,7 +335,7 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
     """Compare rough fits, with a focal length that is too long for most cameras."""
     model, point = best.model, rows.principal_point
     if point is None:
-        return "the size of the images is not known"
+        return "image size not known"
     if model.refinement != "joint":
         return "not with the consensus"
     near = {"camera": "perspective", "principal_point": tuple(map(float, point))}
@@ -352,39 +352,39 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
     layout, K = rows.face_layout, best.model.n_components
     if best.determined:
-        return "the depth is determined"
+        return "the depth is known"
     if best.model.camera != "weak_perspective":
         return f"not with {best.model.camera} cameras"
     layout = layout or getattr(layout_of(best.model), "name", None)
     if layout not in choices.FACE_PRIORS:
-        return "the points are of no layout of faces that has one"
+        return "no layout of faces"
     prior = load_face_prior(FACE_COMPONENTS if K == AUTO else K, layout=layout)
     return {"prior": prior, "n_components": AUTO}
 
 
 def _consensus(best: _Fit, rows: _Rows) -> Proposal:
     if best.determined:
-        return "the depth is determined"
+        return "the depth is known"
     if best.model.camera not in ("weak_perspective", "orthographic") or rows.weights:
-        return "not with weights, affine or perspective cameras"
+        return "not with these cameras or weights"
     return {"refinement": "consensus"}
 
 
 def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
     model = best.model
     if model.camera != "weak_perspective" or model.prior or not best.determined:
-        return "the scales of frames are not known"
+        return "scales not known"
     if model.refinement != "joint":
-        return "groups of points have scales of their own"
+        return "the depth needs groups"
     if model.scales_.std() > EQUAL_SCALES * model.scales_.mean():
-        return "the scales of frames differ"
+        return "scales differ"
     return {"camera": "orthographic"}
 
 
 def _affine(best: _Fit, rows: _Rows) -> Proposal:
     ratio = best.model.camera_noise_ratio_
     if best.model.prior or not ratio >= OTHER_CAMERAS:
-        return "calibrated cameras explain the table"
+        return "not stretched"
     return {"camera": "affine", "refinement": "joint"}
 
 

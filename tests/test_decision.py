@@ -135,7 +135,7 @@ def test_perspective_needs_the_size_of_images():
     found, model = tried(faces.data, image_size=2 * np.array(faces.principal_point))
     assert (found["perspective"].result, model.camera) == ("used", "perspective")
     found, model = tried(faces.data)
-    assert found["perspective"].result == "the size of the images is not known"
+    assert found["perspective"].result == "image size not known"
 
 
 def test_given_settings_are_kept():

@@ -101,17 +101,18 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
         rows.append(["time", "", str(_time(report["time"])[0])])
     fitted = [each for each in report["tried"] if each["seconds"]]
     tried = [each["text"] for each in fitted]
-    others = [each["text"] for each in report["tried"] if each not in fitted]
+    others: dict[str, list[str]] = {}
+    for each in report["tried"]:
+        if not each["seconds"]:
+            others.setdefault(each["result"], []).append(each["setting"])
     if "choice" in report:
         choice = report["choice"]
         listed = first_items(choice["n_components"], len(choice["n_components"]))
         tried.insert(0, f"K = {listed}: {choice['chosen']} is used")
-    tried += [f"not tried: {'; '.join(others)}"] if others else []
+    listed = "; ".join(f"{', '.join(them)} ({why})" for why, them in others.items())
+    tried += [f"not tried: {listed}"] * bool(others)
     rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
-    out = [
-        f"{each['n_rows']} rows: {each['reason']}" for each in table["rows_left_out"]
-    ]
-    rows.append(["left out", "", "; ".join(out) or "no row"])
+    rows.append(left_out_row(table))
     if names := table.get("other_columns"):
         listed = first_items(map(str, names), 6)
         rows.append(["next", "", f"--label, --group or --time COLUMN: {listed}"])
@@ -188,9 +189,8 @@ def quality_row(quality: dict[str, Any]) -> list[str]:
 
 def left_out_row(table: dict[str, Any]) -> list[str]:
     """Return the rows that are left out, and missing points, as a row of a summary."""
-    out = [
-        f"{each['n_rows']} rows: {each['reason']}" for each in table["rows_left_out"]
-    ]
+    reasons = table["rows_left_out"]
+    out = [f"{each['n_rows']} rows: {each['reason']}" for each in reasons]
     numbers = [f"({n:.15g}, {n:.15g})" for n in table["missing_values"]]
     out += [f"points at {place} count as missing" for place in numbers]
     if n_missing := table["n_missing_points"]:
