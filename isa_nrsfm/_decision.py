@@ -29,6 +29,7 @@ from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 from isa_nrsfm.analysis._advice import (
+    COMPARE,
     OTHER_CAMERAS,
     gross_residuals,
     layout_of,
@@ -50,7 +51,7 @@ EQUAL_SCALES = 0.1
 # to the second one.
 LOWER, MUCH_LOWER = 0.97, 0.9
 # Shapes that determine the depth may have an error of held-out points so much larger.
-LARGER = 1.25
+LARGER = 1.5
 
 
 class Trial(NamedTuple):
@@ -469,8 +470,8 @@ def decided(
     model = best.model
     if model.prior is not None:
         model.set_params(n_components=model.n_components_)
-    for each in best.caught:
-        warn_caller(str(each.message), each.category)
+    for each in best.caught:  # made before the comparison
+        warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
     model._trials = trials
     return model, trials
 
