@@ -41,7 +41,7 @@ AUTO = "auto"
 # Components of the face prior: docs/depth.md has figures of nine and of forty.
 FACE_COMPONENTS = 9
 # Rows and basis shapes of rough fits, at most.
-ROUGH_ROWS, MOST_SHAPES = 100, 12
+ROUGH_ROWS, MOST_SHAPES = 50, 4
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Share of gross errors of held-out points above which robust losses are tried.
 MOST_WRONG = 1e-3

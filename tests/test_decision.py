@@ -7,19 +7,23 @@ import warnings
 import numpy as np
 import pytest
 from layers import slow_after
+from refusals import refused
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from isa_nrsfm import AffineNRSfM, AutoNRSfM
 from isa_nrsfm._decision import FIRST, first_settings
+from isa_nrsfm._prepare.coordinates import still_points
 from isa_nrsfm.analysis._advice import COMPARE
+from isa_nrsfm.analysis._frame_columns import runs_between_gaps
 from isa_nrsfm.datasets import (
     load_face_prior,
     make_body_tracks,
     make_face_tracks,
     make_nonrigid_tracks,
 )
+from isa_nrsfm.export import write_viewer
 
 
 def with_outliers(X):
@@ -163,3 +167,77 @@ def test_is_an_estimator_of_scikit_learn():
     assert again.get_feature_names_out()[0] == "alpha_1"
     assert again.score(X) == again.best_estimator_.score(X)
     assert again.get_params()["loss"] == "linear"
+
+
+def arena(n_still, jitter=0.7):
+    """Return tracks (150, 15 + n_still, 2) of a body that walks between points."""
+    rng = np.random.default_rng(0)
+    body = make_nonrigid_tracks(150, 15, noise=0.01, **GIVEN).data.reshape(150, 15, 2)
+    body = 40 * body + 300 + 12 * rng.normal(size=(150, 1, 2)).cumsum(axis=0)
+    still = rng.uniform(50, 600, (n_still, 2)) + jitter * rng.normal(
+        size=(150, n_still, 2)
+    )
+    return np.concatenate([body, still], axis=1)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.7])
+def test_points_that_stand_still_are_found(jitter):
+    assert still_points(arena(4, jitter)).tolist() == [15, 16, 17, 18]
+    assert not len(still_points(arena(0)))
+    aligned = arena(0) - arena(0)[:, :1]  # the first point is the origin
+    assert not len(still_points(aligned))
+    in_place = arena(0) - arena(0).mean(axis=1, keepdims=True)
+    in_place[:, :3] = in_place[:1, :3]  # parts of an object that stays in place
+    assert not len(still_points(in_place))
+
+
+def test_the_command_line_leaves_them_out(fits, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    names = [f"{axis}_{j}" for j in range(19) for axis in "xy"]
+    table = pandas.DataFrame(arena(4).reshape(150, -1), columns=names)
+    table.to_csv(tmp_path / "maze.csv", index=False)
+    options = [tmp_path / "maze.csv", "--no-figures", "--refinement", "none", "-k", 1]
+    found = fits(*options)
+    assert "4 points stand still while the others move through the image" in found.err
+    assert len(found.model.mean_shape_) == 15
+    found = fits(*options, "--points", "0-18", "--force")
+    assert len(found.model.mean_shape_) == 19
+
+
+@pytest.mark.parametrize("option", [None, "--keep-zeros"])
+def test_zeros_to_one_side_of_all_points_are_missing(fits, tmp_path, option):
+    pandas = pytest.importorskip("pandas")
+    X = make_nonrigid_tracks(40, 16, noise=0.01, **GIVEN).data
+    X += 0.1 - X.min()  # nearer to (0, 0) than points are spread
+    X[[3, 8, 20], 4:6] = 0.0
+    names = [f"{axis}_{j}" for j in range(16) for axis in "xy"]
+    pandas.DataFrame(X, columns=names).to_csv(tmp_path / "a.csv", index=False)
+    options = "--no-figures --refinement none -k 1".split() + [option] * bool(option)
+    table = fits(tmp_path / "a.csv", *options).report["table"]
+    assert table["n_missing_points"] == (0 if option else 3)
+
+
+def test_runs_between_gaps_are_groups():
+    time = np.arange(100.0)
+    assert runs_between_gaps(time) is None
+    kept = (time < 30) | (time > 55)
+    order = np.random.default_rng(0).permutation(kept.sum())
+    runs = runs_between_gaps(time[kept][order])
+    np.testing.assert_array_equal(runs, time[kept][order] > 40)
+    assert runs_between_gaps(np.random.default_rng(0).random(100).cumsum() ** 3) is None
+
+
+def test_pages_are_shown_in_notebooks(tmp_path):
+    X = make_nonrigid_tracks(30, 16, noise=0.01, **GIVEN).data
+    model = AffineNRSfM(2, camera="weak_perspective", random_state=0).fit(X)
+    page = write_viewer(model, tmp_path / "a.html")
+    assert page == (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert page._repr_html_().startswith("<iframe srcdoc=")
+    assert "<script" not in page._repr_html_()
+    assert len(repr(page)) < 50
+
+
+def test_strategies_without_components_are_refused():
+    X = make_nonrigid_tracks(30, 16, **GIVEN).data
+    model = AffineNRSfM(1, isa=StandardScaler(), refinement=None)
+    refused("isa must give components_ of shape", model.fit, X)
