@@ -325,6 +325,7 @@ Proposal = str | dict[str, Any]
 
 
 def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
+    """Outliers have their full influence on a fit with the linear loss."""
     if rows.weights:
         return "points have weights"
     if not rows.outlier_share(best.model) > MOST_WRONG:
@@ -351,6 +352,7 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
 
 
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
+    """The prior of faces supplies depths that a table does not determine."""
     layout, K = rows.face_layout, best.model.n_components
     if best.determined:
         return "the depth is known"
@@ -364,6 +366,7 @@ def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
 
 
 def _consensus(best: _Fit, rows: _Rows) -> Proposal:
+    """Groups of points determine depths that all points together do not."""
     if best.determined:
         return "the depth is known"
     if best.model.camera not in ("weak_perspective", "orthographic") or rows.weights:
@@ -372,6 +375,7 @@ def _consensus(best: _Fit, rows: _Rows) -> Proposal:
 
 
 def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
+    """One scale for all frames has fewer unknowns."""
     model = best.model
     if model.camera != "weak_perspective" or model.prior or not best.determined:
         return "scales not known"
@@ -383,6 +387,7 @@ def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
 
 
 def _affine(best: _Fit, rows: _Rows) -> Proposal:
+    """Affine cameras absorb the stretch of images."""
     ratio = best.model.camera_noise_ratio_
     if best.model.prior or not ratio >= OTHER_CAMERAS:
         return "not stretched"

@@ -53,10 +53,10 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
             before, after = adapting_errors(estimator, rows, *own)
             if after < before:
                 way = (
-                    "Adapt the model to X: AutoNRSfM(prior=model).fit(X), in the "
-                    "command line isa-nrsfm fit TABLE --prior MODEL. Held-out points "
-                    "of some rows then have an inverse SNR of "
-                    f"{after:.2g}, now {before:.2g}"
+                    "Adapt the model to X: AutoNRSfM(prior=model).fit(X). Held-out "
+                    "points of some rows then have an inverse SNR of "
+                    f"{after:.2g}, now {before:.2g} (command line: fit TABLE --prior "
+                    "model.npz)"
                 )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "

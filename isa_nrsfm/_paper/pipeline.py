@@ -272,7 +272,7 @@ def _independent_subspaces(
     samples = np.round(signals, 5).T
     isa.fit(samples[np.lexsort(samples.T)], **accepted)
     n_signals = len(signals)
-    found = np.shape(getattr(isa, "components_", None))
+    found = getattr(getattr(isa, "components_", None), "shape", ())
     if found != (n_signals, n_signals):
         raise ValueError(
             f"isa must give components_ of shape {(n_signals, n_signals)}; "

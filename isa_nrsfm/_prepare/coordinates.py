@@ -65,6 +65,7 @@ def still_points(tracks: NDArray) -> NDArray:
     The origin of the coordinates is a point of aligned objects.
     """
     n_frames, n_points, _ = tracks.shape
+    tracks = tracks / (np.nanmax(np.abs(tracks), initial=0.0) or 1.0)  # no overflow
     seen = np.isfinite(tracks[..., 0]).sum(axis=0) > 1
     if n_frames < 10 or seen.sum() < n_points:
         return np.arange(0)

@@ -38,8 +38,9 @@ _CAMERAS = {
 }
 
 _DATA = {REPORT: "the numbers of this report, for programs"}
-# Coefficients in the summary, at most; and characters of its texts in a line.
-MOST_SHOWN, WIDTH = 5, 80
+# Coefficients in the summary, at most; its texts in lines, without a break in paths.
+MOST_SHOWN = 5
+WRAPPED = textwrap.TextWrapper(80, break_on_hyphens=False, break_long_words=False)
 
 
 class Cells(NamedTuple):
@@ -204,7 +205,7 @@ def text_of(title: str, rows: Sequence[Sequence[str]]) -> str:
     """Return a summary as text: rows of a name, a mark, and a text that is wrapped."""
     lines = [title] * bool(title)
     for name, mark, text in rows:
-        first, *rest = textwrap.wrap(text, WIDTH, break_on_hyphens=False) or [""]
+        first, *rest = WRAPPED.wrap(text) or [""]
         lines.append(f"{name:9}{mark:6}{first}" if mark else f"{name:9}{first}")
         lines += [f"{'':{15 if mark else 9}}{line}" for line in rest]
     return "\n".join(lines)
