@@ -40,7 +40,7 @@ from isa_nrsfm.datasets import load_face_prior
 AUTO = "auto"
 # Components of the face prior: docs/depth.md has figures of nine and of forty.
 FACE_COMPONENTS = 9
-# Rows and basis shapes of rough fits, at most.
+# Rows of rough fits, and basis shapes of fits with perspective, at most.
 ROUGH_ROWS, MOST_SHAPES = 50, 4
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Share of gross errors of held-out points above which robust losses are tried.
@@ -340,9 +340,12 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
         return "image size not known"
     if model.refinement != "joint":
         return "not with the consensus"
-    near = {"camera": "perspective", "principal_point": tuple(map(float, point))}
-    known = {"n_components": min(len(model.basis_), MOST_SHAPES), "prior": None}
-    params = model.get_params(deep=False) | known
+    near: dict[str, Any] = {"camera": "perspective"}
+    near["principal_point"] = tuple(map(float, point))
+    # More basis shapes would explain the perspective.
+    few = {"n_components": min(len(model.basis_), MOST_SHAPES)}
+    near |= few if model.n_components == AUTO else {}
+    params = model.get_params(deep=False) | few | {"prior": None}
     trials: Sequence[dict[str, Any]] = ({}, near | {"focal_length": 5 * max(point)})
     some = spread(np.arange(rows.X.shape[0]), ROUGH_ROWS)
     X, weights = taken_rows(rows.X, some), {n: w[some] for n, w in rows.weights.items()}

@@ -53,8 +53,8 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
             before, after = adapting_errors(estimator, rows, *own)
             if after < before:
                 way = (
-                    "Adapt the model to X: AutoNRSfM(prior=model).fit(X). Held-out "
-                    "points of some rows then have an inverse SNR of "
+                    "Adapt the model to X: AutoNRSfM(model, prior=model).fit(X). Held-"
+                    "out points of some rows then have an inverse SNR of "
                     f"{after:.2g}, now {before:.2g} (command line: fit TABLE --prior "
                     "model.npz)"
                 )

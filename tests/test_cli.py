@@ -199,7 +199,7 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     off = np.random.default_rng(0).normal(size=X.shape[1]) * 0.02 * X.std()
     other = saved(pd.DataFrame(X + off, columns=LANDMARKS), tmp_path)
     *_, err = transforms(found.path, other)
-    assert "Adapt the model to X: AutoNRSfM(prior=model).fit(X)" in err
+    assert "Adapt the model to X: AutoNRSfM(model, prior=model).fit(X)" in err
     again = ["fit", table, "-o", tmp_path, "--prior", found.path, "--no-figures"]
     assert f"{found.path} would be overwritten by the results" in fails(*again)
     again[5] = path

@@ -159,7 +159,7 @@ def _messages(facts: Facts) -> Iterator[str]:
     if facts.noise_ratio >= OTHER_CAMERAS and facts.camera != "affine":
         yield f"{camera_meaning(facts.noise_ratio)}. Make sure that {SAME_UNIT}"
         return  # wrong cameras look like coefficients that depend on the pose
-    if n_supported < n_components and not facts.prior:
+    if n_supported < n_components and not (facts.prior or facts.decided):
         yield (
             f"the table does not support n_components={n_components}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
