@@ -48,7 +48,6 @@ def walks():
 GIVEN = {"n_components": 2, "random_state": 0}
 TABLES = {
     "bodies": lambda: make_body_tracks(80, random_state=0).data,
-    "outliers": lambda: with_outliers(make_nonrigid_tracks(80, 20, **GIVEN).data),
     "frontal faces": frontal,
     "walks": walks,
     "one scale": lambda: (
@@ -61,6 +60,7 @@ TABLES = {
         * np.tile([1.0, 0.5], 16)
     ),
     "few frames": lambda: make_nonrigid_tracks(14, 24, noise=0.02, **GIVEN).data,
+    "outliers": lambda: with_outliers(make_nonrigid_tracks(50, 16, **GIVEN).data),
 }
 
 

@@ -164,12 +164,12 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
 
 def table_section(table: dict[str, Any]) -> Section:
     """Return the rows and columns of a table that are used, and the others."""
-    format = table["format"]
+    format, out = table["format"], left_out_row(table)[2]
     listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
     parts: list[str | Cells] = [
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
-        f"{table['n_frames']} of {table['n_rows']} rows. {left_out_row(table)[2]}",
+        f"{table['n_frames']} of {table['n_rows']} rows; left out: {out}",
     ]
     others = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
     for what, names in (
