@@ -101,6 +101,7 @@ sphinx_gallery_conf = {
             "plot_occluded_points.py",
             "plot_shape_model.py",
             "plot_hands.py",
+            "plot_real_hands.py",
             "plot_body.py",
         ]
     ),

@@ -668,7 +668,8 @@ default="affine"
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""
-        private = "_model", "_frame_sizes", "_halves", "_stability", "_n_features_out"
+        private = {"_model", "_frame_sizes", "_halves", "_stability", "_trials"}
+        private |= {"_n_features_out"}
         names = [n for n in vars(self) if n not in private and not n.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in names}
 
@@ -1046,7 +1047,7 @@ default="affine"
         self, alpha: Any, motion: Any = None, translation: Any = None
     ) -> NDArray:
         """
-        Return the table of shapes with given coefficients.
+        Return images of coefficients in one mean view; `reproject` has those of rows.
 
         Parameters
         ----------
@@ -1103,7 +1104,7 @@ default="affine"
             twice the noise variance to its prediction.
         """
         table, weights = self._opened(X, point_weight, judged=False)
-        noise, signal = table.joined(self._model.held_out, *weights).sum(axis=0)
+        noise, signal = table.joined(self._model.held_out_sums, *weights).sum(axis=0)
         return -float(noise / signal) if signal > 0 else float("nan")
 
     def diagnostics(self, X: Any = None, *, point_weight: Any = None) -> Diagnostics:

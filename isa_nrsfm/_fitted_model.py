@@ -287,34 +287,34 @@ class TableModel(NamedTuple):
         return distance / of_all_rows(sizes, usable)[:, None]
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
-        """Return the energies (1, 2) of the error and the signal of held-out points.
+        """Return squared errors and signals (n, J, 2) of held-out points.
 
         The points are divided into five parts, the same for all tables. Each part is
         predicted from the others: camera, position and coefficients of each frame are
-        fitted without it. The energies are ``sum ||m - m_hat||^2`` and ``sum ||m -
-        centroid_i||^2`` over the points, divided by the squared sizes (I,) of frames,
-        and multiplied by weights (I, J), if given.
+        fitted without it. The squares are ``||m - m_hat||^2`` and ``||m -
+        centroid_i||^2``, divided by the squared sizes (n,) of frames, and multiplied by
+        weights (n, J), if given.
 
-        A point is left out if the other points of its frame do not determine the fit.
-        In frames with missing points it is also left out if the affine camera of the
-        mean shape adds more than twice the noise variance to its prediction: a few such
-        frames would dominate the score. This does not depend on the basis, so scores of
-        different K use the same points.
+        A point is left out, as NaN, if the other points of its frame do not determine
+        the fit. In frames with missing points it is also left out if the affine camera
+        of the mean shape adds more than twice the noise variance to its prediction: a
+        few such frames would dominate the score. This does not depend on the basis, so
+        scores of different K use the same points.
         """
         given, _, _, sizes, weights = self._ready(rows, weights)
-        rows = rows[given]
+        squares = np.full((*rows.shape[::2], 2), np.nan)
+        rows, numbers = rows[given], np.flatnonzero(given)
         folds = np.random.RandomState(0).permutation(rows.shape[2]) % 5
         seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
-        counts = (counts * sizes[:, None] ** -2.0)[..., None]
+        counts = counts * sizes[:, None] ** -2.0
         # Complete frames are fitted without these points, others with NaN instead.
         frames = self.frames
         linear = self.pinhole is None and frames.loss == "linear"
         complete = linear and weights is None and bool(seen.all())
         tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
         mean_of = np.mean if seen.all() else np.nanmean  # which takes a copy
-        energies = counts * (tracks - mean_of(tracks, 1, keepdims=True)) ** 2
-        known, total = (counts, tracks, seen, energies), np.zeros(2)
+        signal = np.square(tracks - mean_of(tracks, 1, keepdims=True)).sum(axis=2)
         for fold in range(5):
             held = folds == fold
             # Fit without the held-out points
@@ -339,17 +339,21 @@ class TableModel(NamedTuple):
             # Prediction of the held-out points, and its error
             shapes = compose(mean, others, fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
-            # `compress` is quicker than a mask.
-            size, true, shown, energy = (np.compress(held, x, 1)[usable] for x in known)
-            error = size * (true - predicted) ** 2
-            counted = shown & np.isfinite(predicted).all(axis=2)
+            places = np.ix_(usable, np.flatnonzero(held))
+            error = np.square(tracks[places] - predicted).sum(axis=2)
+            counted = seen[places] & np.isfinite(error)
             some = ~seen[usable].all(axis=1)
             # Effect of the threshold 2: docs/benchmarks/README.md, "Thresholds"
             leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
             counted[some] &= leverage[:, held] <= 2.0
-            parts = (part.reshape(-1, 2) for part in (error, energy))
-            total += [np.compress(counted.ravel(), part, 0).sum() for part in parts]
-        return total[None]
+            found = counts[places][..., None] * np.stack([error, signal[places]], 2)
+            found[~counted] = np.nan
+            squares[np.ix_(numbers[usable], places[1][0])] = found
+        return squares
+
+    def held_out_sums(self, *rows_and_weights: NDArray) -> NDArray:
+        """Return the sums (1, 2) of squared errors and signals of held-out points."""
+        return np.nansum(self.held_out(*rows_and_weights), axis=(0, 1))[None]
 
     def _ready(
         self, rows: NDArray, weights: NDArray | None = None

@@ -53,10 +53,10 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
             before, after = adapting_errors(estimator, rows, *own)
             if after < before:
                 way = (
-                    "Adapt the model to X: sklearn.base.clone(model).set_params("
-                    "n_components='auto', refinement='joint', prior=model).fit(X). "
-                    "Held-out points of some rows then have an inverse SNR of "
-                    f"{after:.2g}, now {before:.2g}"
+                    "Adapt the model to X: AutoNRSfM(model, prior=model).fit(X). Held-"
+                    "out points of some rows then have an inverse SNR of "
+                    f"{after:.2g}, now {before:.2g} (command line: fit TABLE --prior "
+                    "model.npz)"
                 )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "
@@ -82,7 +82,7 @@ def adapting_errors(
     with warnings.catch_warnings(action="ignore"):
         adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)
     others = [each[1::2] for each in (rows, *weights)]
-    parts = [each._model.held_out(*others)[0] for each in (estimator, adapted)]
+    parts = [each._model.held_out_sums(*others)[0] for each in (estimator, adapted)]
     return tuple(float(noise / signal) for noise, signal in parts)
 
 

@@ -68,9 +68,60 @@ class StartedNRSfM(AffineNRSfM):
         return self
 
 
-class AffineNRSfMCV(
-    CoefficientsMixin, TransformerMixin, MetaEstimatorMixin, BaseEstimator
-):
+class ChosenMixin(CoefficientsMixin, TransformerMixin, MetaEstimatorMixin):
+    """Methods of an estimator that keeps the best of several fits."""
+
+    best_estimator_: AffineNRSfM
+
+    def transform(self, X: Any) -> NDArray:
+        """
+        Return the coefficients of the frames of a table.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, `n_components_`)
+            As in `AffineNRSfM.transform`.
+        """
+        return self._fitted().transform(X)
+
+    def inverse_transform(
+        self, alpha: Any, motion: Any = None, translation: Any = None
+    ) -> NDArray:
+        """
+        Return the table of shapes with given coefficients.
+
+        Parameters
+        ----------
+        alpha : array-like of shape (n_frames, `n_components_`)
+            Coefficients.
+        motion : array-like of shape (n_frames, 2, 3) or (2, 3), default=None
+            Cameras, as in `AffineNRSfM.inverse_transform`.
+        translation : array-like of shape (n_frames, 2) or (2,), default=None
+            Positions, as in `AffineNRSfM.inverse_transform`.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 2 * n_points)
+            The table.
+        """
+        return self._fitted().inverse_transform(alpha, motion, translation)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        """Return whether a fit has ended."""
+        return hasattr(self, "best_estimator_")
+
+    def _fitted(self) -> AffineNRSfM:
+        """Return the fit of all frames, or raise if there is none."""
+        check_is_fitted(self)
+        return self.best_estimator_
+
+
+class AffineNRSfMCV(ChosenMixin, BaseEstimator):
     """
     `AffineNRSfM` with the number of basis shapes chosen by cross-validation.
 
@@ -294,44 +345,6 @@ class AffineNRSfMCV(
         validate_data(self, X, skip_check_array=True)  # number and names of columns
         return self
 
-    def transform(self, X: Any) -> NDArray:
-        """
-        Return the coefficients of the frames of a table.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, `n_components_`)
-            As in `AffineNRSfM.transform`.
-        """
-        return self._fitted().transform(X)
-
-    def inverse_transform(
-        self, alpha: Any, motion: Any = None, translation: Any = None
-    ) -> NDArray:
-        """
-        Return the table of shapes with given coefficients.
-
-        Parameters
-        ----------
-        alpha : array-like of shape (n_frames, `n_components_`)
-            Coefficients.
-        motion : array-like of shape (n_frames, 2, 3) or (2, 3), default=None
-            Cameras, as in `AffineNRSfM.inverse_transform`.
-        translation : array-like of shape (n_frames, 2) or (2,), default=None
-            Positions, as in `AffineNRSfM.inverse_transform`.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, 2 * n_points)
-            The table.
-        """
-        return self._fitted().inverse_transform(alpha, motion, translation)
-
     def score(self, X: Any, y: Any = None, **params: Any) -> float:
         """
         Return the score of `best_estimator_` on a table, by `scoring`.
@@ -363,15 +376,6 @@ class AffineNRSfMCV(
             From `fit` to the splitter and the scorer, from `score` to the scorer.
         """
         return self._plain_search().get_metadata_routing()
-
-    def __sklearn_is_fitted__(self) -> bool:
-        """Return whether a fit has ended."""
-        return hasattr(self, "best_estimator_")
-
-    def _fitted(self) -> AffineNRSfM:
-        """Return the fit of all frames, or raise if there is none."""
-        check_is_fitted(self)
-        return self.best_estimator_
 
     def _plain_search(self) -> GridSearchCV:
         """Return a search with a clone of the estimator, its scorer and splitter."""

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import re
+from html import unescape
 
 import pandas as pd
 
@@ -29,6 +31,12 @@ class Results:
     @property
     def report(self):
         return json.loads((self.folder / "report.json").read_text(encoding="utf-8"))
+
+    @property
+    def page(self):
+        """Text of the report."""
+        page = (self.folder / "report.html").read_text(encoding="utf-8")
+        return unescape(re.sub("<[^<>]+>", " ", page))
 
     @property
     def alpha(self):

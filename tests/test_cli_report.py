@@ -18,7 +18,7 @@ from sklearn.model_selection import GroupKFold
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
 from isa_nrsfm.analysis import WithinGroups, association, between_share
 from isa_nrsfm.cli import main
-from isa_nrsfm.cli._sections import fit_sections, text_of
+from isa_nrsfm.cli._sections import fit_sections, summary
 from isa_nrsfm.cli._times import read_times
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses
@@ -79,7 +79,7 @@ def test_the_text_is_as_expected(answers):
     """Numbers and lines are left out: they differ between machines."""
     found, *_ = answers
     text = found.out.replace(str(found.folder.parent), "")
-    text = re.sub(r"\n {11}", " ", re.sub(r"[+-]?\d+(\.\d+)?(e-\d+)?", "#", text))
+    text = re.sub(r"\n {9,}", " ", re.sub(r"[+-]?\d+(\.\d+)?(e-\d+)?", "#", text))
     text = re.sub(r"(?<=age goes with )[^(]+", "# ", text)
     assert re.sub(" +", " ", text) == EXPECTED.read_text(encoding="utf-8")
 
@@ -182,29 +182,6 @@ def test_means_of_classes_are_of_significant_coefficients(answers):
     )
 
 
-def test_many_coefficients_for_few_frames_are_named(answers):
-    labels = answers[0].report["labels"][:2]
-    for n_frames, many in ((4, ["mood"]), (6, [])):
-        cases = [label | {"n_frames": n_frames} for label in labels]
-        found = fit_sections(answers[0].report | {"labels": cases})["Labels"]
-        lines = [text for text in found if "coefficients are many for" in str(text)]
-        assert len(lines) == len(many)
-        assert all("with -k 1 or less" in line for line in lines)
-
-
-def test_the_largest_correlation_is_named(answers):
-    report = answers[0].report
-    model = report["model"]
-    r = np.corrcoef(answers[0].model.alpha_.T)[0, 1]
-    for independence in ("shapes", "coefficients"):
-        parameters = model["parameters"] | {"independence": independence}
-        text = fit_sections(report | {"model": model | {"parameters": parameters}})
-        found = f"largest correlation: {r:.2f}, of alpha_1 and alpha_2"
-        assert text["Alpha"][-1].startswith(found)
-        advised = "--independence coefficients" in text["Alpha"][-1]
-        assert advised == (independence == "shapes")
-
-
 @pytest.mark.parametrize("n_classes", [12, 13])
 def test_means_of_twelve_classes_are_listed(answers, n_classes):
     report = answers[0].report
@@ -219,11 +196,9 @@ def test_means_of_twelve_classes_are_listed(answers, n_classes):
 def test_numbers_that_say_nothing_are_left_out(answers):
     model = answers[0].report["model"]
     rows = [row | {"pose_share": None} for row in model["alpha"]]
-    model = model | {"rank_floor": 1e-30, "alpha": rows}
-    sections = fit_sections(answers[0].report | {"model": model})
-    text = text_of("", {name: sections[name] for name in ("Alpha", "Fit")})
-    assert "pose" not in text
-    assert "no model with" not in text
+    report = answers[0].report | {"model": model | {"alpha": rows}}
+    assert "pose" not in str(fit_sections(report)["Alpha"])
+    assert "pose" not in str(summary(report, "out"))
 
 
 @pytest.mark.slow
@@ -330,7 +305,10 @@ def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
     found = fits(path, *options, *["--group", "person"] * groups)
     assert len(found.err.splitlines()) == 3
     search = AffineNRSfMCV(
-        [1, 2, 3], estimator=ESTIMATOR, cv=GroupKFold(3) if groups else 3
+        [1, 2, 3],
+        estimator=ESTIMATOR,
+        cv=GroupKFold(3) if groups else 3,
+        select="one_standard_error",
     ).fit(X[::2], groups=table["person"] if groups else None)
     parts = [-search.cv_results_[f"split{i}_test_score"] for i in range(3)]
     report, of_parts = found.report["choice"], np.transpose(parts)
@@ -341,30 +319,16 @@ def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
         ("held_out_error_standard_error", of_parts.std(axis=1, ddof=1) / np.sqrt(3)),
     ):
         np.testing.assert_allclose(report[name], values, rtol=1e-6)
-    best = 1 + of_parts.mean(axis=1).argmin()
-    assert report["chosen"] == search.n_components_ == best
-    assert min(report["seconds"]) > 0
+    assert report["chosen"] == search.n_components_
     message = fails("fit", path, "-o", tmp_path, *options, "--group", "same")
     assert "needs two groups; got 1" in message
-
-
-@pytest.mark.slow
-def test_larger_numbers_are_advised_if_the_table_allows_them(fits, tmp_path):
-    scene = make_nonrigid_tracks(48, 20, 2, noise=0.01, random_state=0)
-    table = pd.DataFrame(scene.data, columns=scene.feature_names)
-    # 20 points allow no more than five basis shapes, 14 points three.
-    for n_points, tried, allowed in ((20, "1,2", True), (14, "2,3", False)):
-        path = tmp_path / f"{n_points}.csv"
-        table.iloc[:, : 2 * n_points].to_csv(path, index=False)
-        choice = fits(path, "-k", tried, *UNREFINED, "--n-init", 6).report["choice"]
-        assert choice["larger_may_be_better"] == allowed
 
 
 @pytest.mark.parametrize(
     ("errors", "chosen", "expected"),
     [
-        ([1.23, 0.05], 2, "those tried; three more take at least 10 s"),
-        ([0.05, 1.23], 1, "the least\n"),
+        ([1.23, 0.05], 2, "0.30 %  used\n"),
+        ([0.05, 1.23], 1, "12 %  used\n"),
         ([1.2, 1.1], 2, "no number of basis shapes predicts held-out points"),
     ],
 )
@@ -373,12 +337,10 @@ def test_the_choice_in_words(answers, errors, chosen, expected):
         "n_components": [1, 2],
         "held_out_error": errors,
         "held_out_error_standard_error": [0.12, 0.003],
-        "seconds": [2.0, 3.4],
         "chosen": chosen,
-        "larger_may_be_better": chosen == 2,
     }
-    section = fit_sections(answers[0].report | {"choice": choice})["Choice"]
-    text = text_of("", {"Choice": section})
+    cells, text = fit_sections(answers[0].report | {"choice": choice})["Choice"]
+    text = "\n".join("  ".join(row) + "\n" for row in cells.rows) + text
     assert expected in text
     assert ("frames left out of the fit" in text) == (min(errors) < 1)
     assert "%" in text
@@ -388,8 +350,9 @@ def test_the_choice_in_words(answers, errors, chosen, expected):
 @pytest.mark.parametrize(("certainty", "shown"), [(0.9979, "99.7 %"), (1.0, "99.9 %")])
 def test_the_mirror_image_in_words(answers, certainty, shown):
     report = answers[0].report
-    assert "mirror image in depth:" not in " ".join(fit_sections(report)["Cameras"])
+    assert "mirror image in depth:" not in " ".join(fit_sections(report)["Fit"])
     model = report["model"] | {"mirror_certainty": certainty}
-    text = fit_sections(report | {"model": model})["Cameras"][-2]
-    assert f"probability of at least {shown}" in text
-    assert "--no-hidden-points" in text
+    text = " ".join(fit_sections(report | {"model": model})["Fit"])
+    assert "for which missing points are farther away" in text
+    text = summary(report | {"model": model}, "out")[1][2]
+    assert f"the right one of two mirror images with {shown}" in text

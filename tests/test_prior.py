@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import sklearn.base
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
@@ -20,7 +19,7 @@ from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, AutoNRSfM
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import FrameMap
@@ -463,8 +462,8 @@ def test_foreign_tables_are_warned_of_once(turned, params, other):
     else:  # the way works
         code, _, told = way.removeprefix("Adapt the model to X: ").partition(". H")
         assert told.startswith("eld-out points of some rows")
-        names = {"sklearn": sklearn, "model": model, "X": X}
-        assert eval(code, names).prior_std_[0] > 0.01
+        names = {"AutoNRSfM": AutoNRSfM, "model": model, "X": X}
+        assert eval(code, names).best_estimator_.prior_std_[0] > 0.01
 
 
 def test_weights_of_points_and_other_tables():

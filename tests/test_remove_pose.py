@@ -155,7 +155,8 @@ def test_command_line_removes_it_in_fit_and_transform(table, tmp_path, capsys):
     pd.DataFrame(table, columns=names).to_csv(path, index=False)
     given = [str(path), "-k", "2", "--remove-pose", "--no-figures", "-o", str(out)]
     assert main(["fit", *given]) == 0
-    assert "--remove-pose: what yaw predicts was removed" in capsys.readouterr().out
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "--remove-pose: what yaw predicts was removed" in page
     new = tmp_path / "new.csv"
     assert main(["transform", str(out / "model.npz"), str(path), "-o", str(new)]) == 0
     both = [pd.read_csv(f).filter(like="alpha_") for f in (out / "alpha.csv", new)]

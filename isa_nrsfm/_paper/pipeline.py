@@ -272,10 +272,11 @@ def _independent_subspaces(
     samples = np.round(signals, 5).T
     isa.fit(samples[np.lexsort(samples.T)], **accepted)
     n_signals = len(signals)
-    if isa.components_.shape != (n_signals, n_signals):
+    found = getattr(getattr(isa, "components_", None), "shape", ())
+    if found != (n_signals, n_signals):
         raise ValueError(
             f"isa must give components_ of shape {(n_signals, n_signals)}; "
-            f"got {isa.components_.shape}"
+            f"got {found or 'none'}"
         )
     # The nearest orthogonal matrix: the signals are white, up to rounding.
     return polar(isa.components_)[0]

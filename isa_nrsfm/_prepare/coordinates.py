@@ -4,8 +4,7 @@ Codes of missing points, shares of the image, columns that were scaled one by on
 points that stand still while the object moves.
 """
 
-from collections.abc import Callable, Hashable
-from functools import partial
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import describe_point
+from isa_nrsfm.skeletons._column_names import names_of_points
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
@@ -27,11 +26,12 @@ FEW = 0.05
 LEAST = 0.2
 # Largest median of centred coordinates.
 CENTRED = 0.03
-# Largest relative difference of the spreads of columns scaled one by one, in all rows
+# Relative difference of the spreads of columns scaled one by one, at most: in all rows
 # and in some of them.
 EQUAL, SIMILAR = 0.01, 0.3
-# Spread of points that move over that of points that stand still.
-FARTHER = 10
+# Largest movement of points that stand still, relative to the others' centroid, which
+# moves by at least half of their size.
+STILL, LEAST_WAY = 0.05, 0.5
 # Attribute of a DataFrame of points of which `read_landmarks` has warned.
 TOLD = "warned of coordinates"
 
@@ -44,13 +44,18 @@ def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> N
     """Warn of some rows of a table, evenly spread; not of shares if cameras are affine.
 
     These absorb the stretch of shares. The attributes of a DataFrame may have `TOLD`.
+    The model knows the names of the points.
     """
     few = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
     tracks = rows.take(few).mT
-    names = getattr(model, "feature_names_in_", None)
-    warn_of_still_points(
-        tracks, partial(describe_point, layout=model.layout, names=names)
-    )
+    if len(still := still_points(tracks)):
+        names = names_of_points(model, tracks.shape[1])
+        warn_caller(
+            f"{len(still)} of {tracks.shape[1]} points stand still while the others "
+            f"move through the image: {first_items((names[j] for j in still), 12)}. "
+            "They are no part of the object: leave their columns out",
+            CoordinateWarning,
+        )
     if attrs.get(TOLD):
         return
     if are_scaled(tracks, SIMILAR) and warn_of_scaled_columns(rows.whole().mT):
@@ -58,6 +63,30 @@ def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> N
     warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
     if model.camera != "affine":
         warn_of_shares(tracks)
+
+
+def still_points(tracks: NDArray) -> NDArray:
+    """Return the numbers of points that stand still while the others move together.
+
+    Tracks are (n_frames, n_points, 2). Medians: a point may be wrong in some frames.
+    The origin of the coordinates is a point of aligned objects.
+    """
+    n_frames, n_points, _ = tracks.shape
+    tracks = tracks / (np.nanmax(np.abs(tracks), initial=0.0) or 1.0)  # no overflow
+    seen = np.isfinite(tracks[..., 0]).sum(axis=0) > 1
+    if n_frames < 10 or seen.sum() < n_points:
+        return np.arange(0)
+    way = np.linalg.norm(tracks - np.nanmedian(tracks, axis=0), axis=2)
+    way = np.nanmedian(way, axis=0)
+    still = way < STILL * way.max()
+    if still.all() or not still.any():
+        return np.arange(0)
+    centroid = np.nanmean(tracks[:, ~still], axis=1)
+    size = np.nanmedian(np.linalg.norm(tracks[:, ~still] - centroid[:, None], axis=2))
+    moved = np.nanmedian(np.linalg.norm(centroid - np.nanmedian(centroid, 0), axis=1))
+    if moved < LEAST_WAY * size:  # parts of an object that stays in place
+        return np.arange(0)
+    return np.flatnonzero((way < STILL * moved) & ~(tracks == 0).all(axis=(0, 2)))
 
 
 def warn_of_places(
@@ -113,42 +142,6 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
         max(np.ptp(each) for each in spread) <= tol * spread[0].max() > 0
         for spread in spreads
     )
-
-
-def warn_of_still_points(tracks: NDArray, describe: Callable[[int], str]) -> None:
-    """Warn if three points or more stand still, and most move together, farther.
-
-    Two points may be fixed by alignment; a limb moves before a body at rest.
-    """
-    known = np.flatnonzero(np.isfinite(tracks[..., 0]).sum(axis=0) > 9)
-    if len(known) < 7:
-        return
-    spread = _spread(tracks[:, known])
-    order = np.argsort(spread)
-    n_still = np.arange(3, len(known) // 2 + 1)
-    apart = spread[order[n_still]] > FARTHER * spread[order[n_still - 1]]
-    if not apart.any():
-        return
-    still, moving = np.split(order, n_still[apart][-1:])
-    shown = tracks[:, known[moving]]
-    shown = shown[np.isfinite(shown[..., 0]).any(axis=1)]
-    if _spread(np.nanmean(shown, axis=1, keepdims=True))[0] < 0.5 * np.median(
-        spread[moving]
-    ):
-        return
-    listed = first_items(map(describe, sorted(known[still].tolist())))
-    warn_caller(
-        f"{len(still)} of {len(known)} points stand still, while the others move "
-        f"together more than {FARTHER} times as far: {listed}. If they are not of the "
-        "object, such as corners of an arena, leave them out",
-        CoordinateWarning,
-    )
-
-
-def _spread(tracks: NDArray) -> NDArray:
-    """Return the distances (n_points,) between the first and last tenth of frames."""
-    first, last = np.nanpercentile(tracks, [10, 90], axis=0)
-    return np.asarray(np.hypot(*(last - first).T))
 
 
 def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import n_reliable
-from isa_nrsfm._parameters.choices import FACE_PRIORS
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
@@ -26,6 +25,13 @@ SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
 SAME_UNIT = (
     "x and y have the same unit, unlike shares of the width and height of an image"
 )
+# Errors of held-out points, as shares of the energy, up to which a fit is good, and
+# above which it is poor; errors of depths likewise, of which the second withholds them.
+# Few points and frames: docs/benchmarks/README.md, "Thresholds".
+FIT, DEPTH = (0.02, 0.2), (0.2, LARGEST_SHARE)
+FEW_POINTS = 10
+# What to do if other settings may be better; the command line does it by itself.
+COMPARE = "isa_nrsfm.AutoNRSfM().fit(X) compares other settings by held-out points"
 # Least length of gross residuals, in robust standard deviations.
 GROSS = 8.0
 # Share of the squared residuals, which a fit with the linear loss minimises, that gross
@@ -42,13 +48,16 @@ class Facts(NamedTuple):
     ----------
     camera, loss : str
         Those of the fit.
-    consensus, auto : bool
-        Whether groups of points were fitted, and whether the fit has chosen the number
-        of basis shapes.
+    consensus, decided : bool
+        Whether groups of points were fitted, and whether settings were compared.
     certainty : DepthCertainty
         Errors of the depths.
     reliability, noise_ratio : ndarray of shape (n_components,), float
         `reliability_` and `camera_noise_ratio_`; NaN if it was not measured.
+    n_points : int
+        Number of points.
+    held_out_error : float
+        As in `Diagnostics`.
     deviation : float
         Largest standard deviation of the weakly determined parts of the basis shapes.
     outlier_energy : float
@@ -56,43 +65,30 @@ class Facts(NamedTuple):
     outliers, few, pose : str
         Descriptions of outliers, of coefficients that a few frames determine, and of
         those that the pose predicts; empty if there are none.
-    perspective : str
-        Message if perspective explains the table better, otherwise empty.
-    layout, prior : str, bool
-        The layout of the points, if known, and whether a fitted model was the prior.
+    prior : bool
+        Whether a fitted model was the prior.
     """
 
     camera: str
     loss: str
     consensus: bool
-    auto: bool
+    decided: bool
     certainty: DepthCertainty
     reliability: NDArray
     noise_ratio: float
+    n_points: int
+    held_out_error: float = np.nan
     deviation: float = 0.0
     outlier_energy: float = np.nan
     outliers: str = ""
     few: str = ""
     pose: str = ""
-    perspective: str = ""
-    layout: str = ""
     prior: bool = False
 
     @property
-    def affine(self) -> str:
-        """Parameters of a fit with affine cameras."""
-        others = {
-            'refinement="joint"': self.consensus,
-            "prior=None": self.prior,
-            "focal_length=None, principal_point=None": self.camera == "perspective",
-        }
-        return ", ".join(['camera="affine"', *(n for n, i in others.items() if i)])
-
-    @property
-    def robust(self) -> str:
-        """What to do if points are wrong."""
-        weighted = self.certainty.weighted
-        return "give them weight zero" if weighted else 'use loss="cauchy"'
+    def compare(self) -> str:
+        """What to do if other settings may be better; nothing if they were compared."""
+        return "" if self.decided else f". {COMPARE}"
 
     @property
     def bent(self) -> bool:
@@ -113,11 +109,10 @@ class Facts(NamedTuple):
 def facts_of(model: Any, **found: Any) -> Facts:
     """Return what the attributes of a joint fit tell, and what else was found."""
     frames, ratio = model._model.frames, getattr(model, "camera_noise_ratio_", np.nan)
-    consensus, auto = model.refinement == "consensus", model.n_components == "auto"
-    known = frames.certainty, model.reliability_, ratio
-    layout = getattr(layout_of(model), "name", "")
-    found |= {"layout": layout, "prior": model.prior is not None}
-    return Facts(model.camera_, frames.loss, consensus, auto, *known, **found)
+    consensus, decided = model.refinement == "consensus", hasattr(model, "_trials")
+    known = frames.certainty, model.reliability_, ratio, len(model.mean_shape_)
+    found |= {"prior": model.prior is not None}
+    return Facts(model.camera_, frames.loss, consensus, decided, *known, **found)
 
 
 def layout_of(model: Any) -> Skeleton | None:
@@ -126,91 +121,92 @@ def layout_of(model: Any) -> Skeleton | None:
     return find_skeleton(len(names), names, shape=image)
 
 
+def verdict(error: float, good: float, poor: float) -> str:
+    """Return whether an error is good, fair or poor; empty if it is not known."""
+    if np.isnan(error):
+        return ""
+    return "good" if error <= good else "fair" if error <= poor else "poor"
+
+
 def advice(facts: Facts) -> tuple[str, ...]:
     """Return what happened, why, and what to do: the most important messages."""
     return tuple(islice(filter(None, _messages(facts)), MOST_MESSAGES))
 
 
 def _messages(facts: Facts) -> Iterator[str]:
-    """Yield messages that do not contradict each other, the most important first."""
+    """Yield messages that do not contradict each other, the most important first.
+
+    Those that name other settings do so once: after a comparison of settings, messages
+    say what the recording lacks.
+    """
+    if verdict(facts.held_out_error, *FIT) == "poor":
+        yield poor_fit(facts)
+        return
     if facts.bent:
-        remedy = f"{facts.robust.capitalize()}, or correct them"
-        yield f"{facts.outliers}: they bend the shapes. {remedy}"
+        yield f"{facts.outliers}: they bend the shapes. Correct them{facts.compare}"
     yield (depth := depth_advice(facts))
     if facts.bent:  # outliers may cause all that follows
         return
-    if facts.perspective:  # which looks like deformation, and like other cameras
-        yield facts.perspective
-        return
     n_components, n_supported = len(facts.reliability), facts.n_supported
     if not n_supported:
-        outliers = f". If some points are wrong, {facts.robust}"
         yield (
             "no deformation was found beyond the noise: the object may be rigid. Do "
-            f"not interpret the coefficients{outliers * (facts.loss == 'linear')}"
+            "not interpret the coefficients"
         )
         return
-    if n_supported < n_components and not (facts.prior or "prior=" in depth):
+    if facts.noise_ratio >= OTHER_CAMERAS and facts.camera != "affine":
+        yield f"{camera_meaning(facts.noise_ratio)}. Make sure that {SAME_UNIT}"
+        return  # wrong cameras look like coefficients that depend on the pose
+    if n_supported < n_components and not (facts.prior or facts.decided):
         yield (
             f"the table does not support n_components={n_components}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
-            f"probably noise. Use at most n_components={n_supported}"
+            'probably noise. n_components="auto" leaves them out'
         )
-    elif facts.camera != "affine" and not depth and facts.noise_ratio >= SAME_NOISE:
-        other_fit = f"affine cameras ({facts.affine})"
-        if not facts.auto and facts.noise_ratio < OTHER_CAMERAS:
-            other_fit = 'more basis shapes (n_components="auto" finds how many)'
-        meaning = camera_meaning(facts.noise_ratio)
-        yield f"{meaning}. Make sure that {SAME_UNIT}, or use {other_fit}"
-        return  # wrong cameras look like coefficients that depend on the pose
     elif facts.camera == "affine" and facts.deviation > LARGEST_DEVIATION:
         yield (
             f"the basis shapes are uncertain by up to {100 * facts.deviation:.2g} % of "
-            "the mean shape: affine cameras absorb such deformation. Use more frames, "
-            "best of objects that turn further"
+            "the mean shape: affine cameras absorb such deformation. Record more "
+            f"frames, best of objects that turn further{facts.compare}"
         )
     if facts.few and n_supported == n_components:
         what = "Look for wrong landmarks in the frames with the largest coefficients"
         yield f"{facts.few}. {what}"
-    yield facts.pose
+    if not depth:
+        yield facts.pose
+
+
+def poor_fit(facts: Facts) -> str:
+    """Return the message on a fit that does not predict held-out points."""
+    text = (
+        "the fit is poor: points left out of it are not predicted by the others of "
+        f"their frame ({100 * facts.held_out_error:.2g} % unexplained). Do not "
+        "interpret it. "
+    )
+    if facts.n_points < FEW_POINTS:
+        return f"{text}There are {facts.n_points} points only: record more of the body"
+    return (
+        f"{text}The points are not those of one deforming body, or a column is not the "
+        "same point in all rows, or rows are too few for so large movements"
+    )
 
 
 def depth_advice(facts: Facts) -> str:
     """Return the message on depths that calibrated cameras do not determine."""
-    certainty, most = facts.certainty, max(facts.n_supported, 1)
+    certainty = facts.certainty
     if facts.camera == "affine" or certainty.determined:
         return ""
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
     text = f"the depth of the shapes is not determined: {error}"
     if facts.bent:
         return f"{text}. The outliers may be the reason"
-    why, remedy = "parts of the points lead to different depths", "fit more points"
-    if turned := certainty.deformation > LARGEST_SHARE**2:
+    why, lacking = "parts of the points lead to different depths", "more points"
+    if certainty.deformation > LARGEST_SHARE**2:
         why = "deformation explains the images as well as rotations do"
-    given = "" if facts.auto else ', n_components="auto"'
-    given += ', refinement="joint"' * facts.consensus
-    grouped = facts.camera != "perspective" and not certainty.weighted
-    if facts.prior:
-        remedy = "fit more frames, best of objects that turn further, "
-        remedy += "or use a prior with fewer basis shapes"
-    elif (layout := facts.layout) in FACE_PRIORS and facts.camera != "orthographic":
-        face = f'prior=isa_nrsfm.datasets.load_face_prior(layout="{layout}"){given}'
-        n_points = len(FACE_PRIORS[layout])
-        remedy = f"if these are the {n_points} points of faces, use {face}"
-    elif turned:
-        remedy = f"fit a table in which the objects turn, then use prior=model{given}"
-    elif most < len(facts.reliability):
-        remedy = f"use at most n_components={most}"
-    elif grouped and not facts.consensus:
-        remedy = f'use refinement="consensus"{given}'
-    elif not facts.auto:
-        remedy = 'use n_components="auto"'
-    if facts.noise_ratio >= SAME_NOISE:
-        remedy = f"make sure that {SAME_UNIT}, then {remedy}"
+        lacking = "the objects also from further sides, or turning further"
     return (
-        f"{text}, because {why}. {remedy[0].upper()}{remedy[1:]}. If coefficients "
-        f'suffice, use affine cameras ({facts.affine}). See "How reliable is the '
-        'depth?" in the documentation'
+        f"{text}, because {why}. Angles and proportions are withheld. Record {lacking}"
+        f'{facts.compare}. See "How reliable is the depth?" in the documentation'
     )
 
 

@@ -30,6 +30,7 @@ from isa_nrsfm.analysis._frame_columns import (
     group_numbers,
     kind_of,
     refuse_infinite,
+    runs_between_gaps,
 )
 from isa_nrsfm.analysis._permutations import (
     FrameOrder,
@@ -143,6 +144,7 @@ def association(
     time : array-like of shape (n_frames,), default=None
         Times of the frames; None for the order of the rows. If neighbours in time
         depend on each other, frequencies or blocks are permuted instead of frames.
+        Without groups, the runs between gaps of the times are groups.
     alpha_std : array-like of shape (n_frames, n_components), default=None
         Posterior standard deviations of the coefficients, `alpha_std_`. If given, the
         statistic is also corrected for attenuation by them.
@@ -306,8 +308,10 @@ def _known_frames(
         raise ValueError("no frame has coefficients: all rows of alpha have NaN")
     labels = checked_column("y", y, len(features))
     refuse_infinite("y", labels, np.arange(len(features)))
-    numbers = group_numbers(groups, len(features))
     seconds = checked_times(time, len(features))
+    if groups is None and time is not None:  # gaps are no jumps of a clip
+        groups = runs_between_gaps(seconds)
+    numbers = group_numbers(groups, len(features))
     classes = np.unique(labels, return_inverse=True)[1][known]
     rows = np.column_stack([_rounded(features[known]), classes])
     known = known[np.sort(np.unique(rows, axis=0, return_index=True)[1])]

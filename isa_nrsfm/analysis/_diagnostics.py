@@ -19,8 +19,10 @@ from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._stability import HalfTables
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm.analysis._advice import (
+    DEPTH,
+    FIT,
     GROSS,
     MOST_GROSS,
     SAME_UNIT,
@@ -29,6 +31,7 @@ from isa_nrsfm.analysis._advice import (
     facts_of,
     gross_residuals,
     layout_of,
+    verdict,
 )
 from isa_nrsfm.analysis._stability import stability, stability_words
 from isa_nrsfm.skeletons import Skeleton
@@ -37,6 +40,8 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
 # to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
 MOST_POSE = 0.3
+# Rows on which held-out points are compared, at most.
+MOST_ROWS = 300
 
 
 class Diagnostics(NamedTuple):
@@ -95,8 +100,17 @@ class Diagnostics(NamedTuple):
         Row and point of each gross residual, the largest first.
     messages : tuple of str
         What happened, why, and what to do: at most three, the most important first;
-        empty if all is well. If the table has outliers and the loss is linear, only
-        these and a depth that is not determined are named.
+        empty if all is well. If the fit is poor, only that is named. If the table has
+        outliers and the loss is linear, only these and a depth that is not determined.
+    held_out_error : float
+        Share of the energy of points left out of the fit of their frame that the others
+        do not predict, in at most 300 rows: minus `AffineNRSfM.score`, and of the
+        median point if the loss is robust. NaN without a table.
+    fit : str
+        "good" if `held_out_error` is at most 2 %, "fair" up to 20 %, otherwise "poor".
+    depth : str
+        "good" if `depth_uncertainty` is at most 20 %, "fair" up to 55 %, otherwise
+        "poor". Both are empty if they are not known.
     """
 
     camera_singular_values: NDArray
@@ -114,6 +128,9 @@ class Diagnostics(NamedTuple):
     outlier_energy: float
     outliers: NDArray
     messages: tuple[str, ...] = ()
+    held_out_error: float = np.nan
+    fit: str = ""
+    depth: str = ""
 
     def __repr__(self) -> str:
         """Return the messages, the figures of the table and those of coefficients."""
@@ -130,7 +147,11 @@ class Diagnostics(NamedTuple):
                 row.append(share if isinstance(share, str) else percent(share))
         for row, word in zip(rows, ["in another fit", *self.stability], strict=True):
             row.append(word)
+        known = "" if not self.fit else f"{self.fit.upper()}, "
+        known += f"{percent(self.held_out_error)} of left-out points unexplained"
         lines = [
+            f"fit: {known if self.fit else 'not known without the table'}",
+            f"depth: {self.depth.upper() or 'not known for affine cameras'}",
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
             f"depth error: {certainty}",
@@ -187,13 +208,13 @@ def diagnose(
     """
     frames, sizes = estimator._model.frames, estimator._frame_sizes
     distance = None
+    model = estimator._model  # with the directions that are not reported
     if table is not None:
         if table.n_frames != len(sizes):
             raise ValueError(
                 f"diagnostics needs the fitted table, which has {len(sizes)} rows; got "
                 f"X with {table.n_frames}"
             )
-        model = estimator._model  # with the directions that are not reported
         fit = table.joined(partial(model.decompose, deviations=False), *weights)[:3]
         distance = table.joined(model.distances, *fit, *weights)
     fitted = np.isfinite(sizes)
@@ -232,15 +253,40 @@ def diagnose(
         *gross_residuals(distance),
     )
     names, layout = names_of_points(estimator), layout_of(estimator)
+    error = np.nan
+    if table is not None:
+        few = spread(np.arange(table.n_frames), MOST_ROWS)
+        error = unexplained(model, table.take(few), *(w[few] for w in weights))
     facts = facts_of(
         estimator,
+        held_out_error=error,
         deviation=found.weak_deviations[-1],
         outlier_energy=found.outlier_energy,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
         pose=_of_pose(found, mean_shape, basis, layout, estimator),
     )
-    return found._replace(messages=advice(facts))
+    return found._replace(
+        messages=advice(facts),
+        held_out_error=error,
+        fit=verdict(error, *FIT),
+        depth=verdict(found.depth_uncertainty, *DEPTH),
+    )
+
+
+def unexplained(
+    model: Any, rows: NDArray, *weights: NDArray, robust: bool = False
+) -> float:
+    """Return the share of the energy of held-out points that is not explained.
+
+    Of robust fits it is that of the median point, with normally distributed errors.
+    """
+    error, signal = np.moveaxis(model.held_out(rows, *weights), 2, 0)
+    if np.isnan(error).all():
+        return np.nan
+    if robust or model.frames.loss != "linear":
+        return float(np.nanmedian(error) / (2 * np.log(2)))  # frames have size one
+    return float(np.nansum(error) / np.nansum(signal))
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
@@ -320,18 +366,19 @@ def _of_pose(
             f"{text}, beyond what remove_pose has removed. Compare coefficients of "
             "similar views only"
         )
+    way = "use --remove-pose (in Python remove_pose=True)"
+    if model.camera_ == "affine":
+        way = "use isa_nrsfm.AutoNRSfM(AffineNRSfM(remove_pose=True)).fit(X)"
     if layout is None or not layout.contour or model.prior is not None:
-        calibrated = "calibrated cameras and " * (model.camera_ == "affine")
         return (
             f"{text}: points slide over the surface as the view changes, or the object "
-            f"moves otherwise in other views. If it moves alike in all views, use "
-            f"{calibrated}--remove-pose (in Python remove_pose=True)"
+            f"moves otherwise in other views. If it moves alike in all views, {way}"
         )
     return (
-        f"{text}: {len(layout.contour)} points "
-        f"of {layout.name} follow the visible outline, which slides over the "
-        "surface as the head turns. Fit the other points alone (--points inner; in "
-        f"Python the columns get_skeleton({layout.name!r}).inner_columns)"
+        f"{text}: {len(layout.contour)} points of {layout.name} follow the visible "
+        "outline, which slides over the surface as the head turns. Fit the other "
+        "points alone (--points inner; in Python the columns "
+        f"get_skeleton({layout.name!r}).inner_columns), and {way}"
     )
 
 

@@ -108,6 +108,23 @@ def checked_times(time: Any, n_rows: int) -> NDArray:
     return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")
 
 
+def runs_between_gaps(time: NDArray) -> NDArray | None:
+    """Return the number of the run of each frame, None if times have no gaps.
+
+    Times (n_rows,) are in any order. Runs of less than ten frames on average, such as
+    photos, are none.
+    """
+    order = np.argsort(time, kind="stable")
+    steps = np.diff(time[order])
+    known = steps[steps > 0]
+    if not len(known):
+        return None
+    runs = np.append(0, np.cumsum(steps > 1.5 * np.median(known)))
+    numbers = np.empty(len(time), dtype=int)
+    numbers[order] = runs
+    return numbers if 0 < runs[-1] < len(time) / 10 else None
+
+
 def sequences_of(
     time: NDArray, groups: NDArray, max_gap: int
 ) -> tuple[list[tuple[NDArray, NDArray]], float]:

@@ -10,7 +10,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm.cli._fit import fit_table
 from isa_nrsfm.cli._options import PROGRAM, build_parser
 from isa_nrsfm.cli._reading import drawing_options
-from isa_nrsfm.cli._sections import fit_text
+from isa_nrsfm.cli._sections import fit_title, text_of
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -22,8 +22,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     table.insert(0, "frame", [f"face{i:03d}" for i in range(len(table))])
     folder = Path(args.output)
     options = [
-        *("fit", str(folder / "tracks.csv"), "--n-components", "1-5"),
-        *("--output", str(folder)),
+        *("fit", str(folder / "tracks.csv"), "--output", str(folder)),
         *["--force"] * args.force,
         *["--no-figures"] * args.no_figures,
         *drawing_options(args),
@@ -38,5 +37,6 @@ def run(args: Namespace, warned: list[str]) -> str:
         f"the 3D shapes of the frames are off by {100 * error:.1f} % (the mean shape "
         f"alone: {100 * alone:.1f} %)"
     )
-    ending = {"Truth": [truth], "Again": [shlex.join([PROGRAM, *options])]}
-    return fit_text(report, folder, ending)
+    again = shlex.join([PROGRAM, *options])
+    rows = [*report["summary"], ["truth", "", truth], ["again", "", again]]
+    return text_of(fit_title(report), rows)

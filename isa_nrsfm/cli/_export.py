@@ -37,15 +37,15 @@ def run(args: Namespace, warned: list[str]) -> str:
     if options.get("camera") == NONE:
         options["camera"] = None
 
-    lines = [str(output)]
+    what = ""
     if content == "pdm":
         pdm = export.point_distribution_model(estimator, **options)
         export.write_pdm(pdm, output)
-        lines.append(f"{len(pdm.eigenvalues)} modes of {len(pdm.mean)} points")
+        what = f"{len(pdm.eigenvalues)} modes of {len(pdm.mean)} points, "
     else:
         getattr(export, f"write_{content}")(estimator, output, **options)
-    lines.append(f"{output.stat().st_size} bytes")
-    return text_of("", {"Model": [args.model], "Output": lines})
+    text = f"{output}  {what}{output.stat().st_size} bytes"
+    return text_of("", [["model", "", args.model], ["output", "", text]])
 
 
 def _content(output: Path) -> str:

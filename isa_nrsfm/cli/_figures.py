@@ -68,7 +68,7 @@ def figures_of(args: Namespace, frames: Frames) -> Figures:
         caption = "coefficients in time, with a band of one standard deviation"
         figures["time.png"] = caption, _in_time
     figures |= ALWAYS
-    if len(args.n_components) > 1:
+    if args.n_components and len(args.n_components) > 1:
         figures["choice.png"] = (
             "held-out error by the number of basis shapes, with one standard error",
             _choice,

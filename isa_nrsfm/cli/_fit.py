@@ -1,9 +1,8 @@
 """The command fit."""
 
 import contextlib
+import re
 import sys
-import time
-import warnings
 from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,19 +11,17 @@ from typing import Any
 
 import numpy as np
 from joblib import parallel_config
-from sklearn.base import clone
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
 from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._fitted_model import frames_of
+from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
 from isa_nrsfm._parameters.choices import FACE_PRIORS as LAYOUTS, JOINT_REFINEMENTS
-from isa_nrsfm._prepare.checks import most_components
-from isa_nrsfm._prepare.coordinates import TOLD
+from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
-from isa_nrsfm.analysis._advice import facts_of
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
@@ -39,29 +36,32 @@ from isa_nrsfm.cli._reading import (
     face_layout,
     read_frames,
 )
-from isa_nrsfm.cli._report import model_report, perspective_report, table_report
-from isa_nrsfm.cli._sections import fit_text, write_report
+from isa_nrsfm.cli._report import model_report, table_report
+from isa_nrsfm.cli._sections import fit_title, summary, text_of, write_report
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 from isa_nrsfm.metrics._reprojection import frame_energies
 
+# Columns that are probably labels or groups come first: action units, emotions, people.
+LABEL = re.compile(
+    r"^\W*AU\W?\d|emotion|expression|label|class|gesture|action|behaviou?r|condition|"
+    r"subject|person|participant|sex|gender|^\W*age\b|group",
+    re.IGNORECASE,
+)
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
-# Components of the face prior of tables that do not determine depths by themselves:
-# docs/depth.md has figures of nine and of forty.
-FACE_COMPONENTS = 9
 # Options that are parameters of the same name; none stands for None.
 _PARAMETERS = (
-    *("block_recovery", "refinement", "camera", "focal_length", "independence"),
-    *("prior", "loss", "random_state", "n_jobs"),
+    *("block_recovery", "focal_length", "independence", "random_state", "n_jobs"),
 )
 
 
 def run(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
-    return fit_text(fit_table(args, warned)[0], Path(args.output), {})
+    report, _ = fit_table(args, warned)
+    return text_of(fit_title(report), report["summary"])
 
 
 def fit_table(
@@ -73,10 +73,11 @@ def fit_table(
     far, and grows.
     """
     prior = args.prior
-    _load_prior(args)
     _check_options(args)
-    folder, clock = Path(args.output), {"": args.since}
-    frames = read_frames(args, table=table)
+    if prior not in FACE_PRIORS:
+        _load_prior(args)
+    folder = Path(args.output)
+    frames = _moving_points(args, read_frames(args, table=table), table)
     if prior in FACE_PRIORS:
         layout = face_layout(args, frames)
         if layout is None:
@@ -85,7 +86,7 @@ def fit_table(
                 f"not one of {', '.join(LAYOUTS)}. Name it with --skeleton, "
                 "or give --prior the model.npz of a table in which the objects turn"
             )
-        args.prior = load_face_prior(len(args.prior.basis_), layout=layout)
+        _load_prior(args, layout)
     frames.points.attrs[TOLD] = True
     X = frames.X
     if X.empty:
@@ -122,8 +123,8 @@ def fit_table(
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
-        clock["read"] = time.perf_counter()
-        estimator, search, diagnostics, perspective = _fitted(args, frames, clock)
+        unused.sort(key=lambda name: not LABEL.search(str(name)))
+        estimator, trials, search, diagnostics = _fitted(args, frames)
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
@@ -142,7 +143,7 @@ def fit_table(
             explained = estimator.reproject(X, **frames.weighting)
             energy, error, _ = frame_energies(X, explained, estimator.layout)
             snr = error / energy
-            choice = None if search is None else choice_report(search, X)
+            choice = None if search is None else choice_report(search)
             fit = Fit(estimator, frames, choice, smooth, drawn, explained, snr)
             _outputs.write_results(new, fit, unit, **shown)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
@@ -153,13 +154,13 @@ def fit_table(
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args, frames) | {"other_columns": unused},
                 **({} if choice is None else {"choice": choice}),
-                "model": model_report(fit, diagnostics, perspective),
+                "model": model_report(fit, diagnostics),
+                "tried": [{**each._asdict(), "text": repr(each)} for each in trials],
                 **answers,
                 "warnings": warned,
                 "versions": {"isa_nrsfm": __version__, "python": python_version()},
             }
-            clock["write"] = time.perf_counter()
-            report |= {"seconds": _seconds(clock), "files": results}
+            report |= {"files": results, "summary": summary(report, folder)}
             report = write_report(new, report)
         if not figures:
             return report, estimator
@@ -171,25 +172,33 @@ def fit_table(
                     "has its files, and no figures of this run"
                 )
             captions = write_figures(new, figures, fit)
-            clock["figures"] = time.perf_counter()
-            report |= {"seconds": _seconds(clock), "files": results | captions}
+            report |= {"files": results | captions}
             report = write_report(new, report)
     return report, estimator
 
 
-def _load_prior(args: Namespace) -> None:
-    """Load the prior, and set the options that it determines unless they are given."""
-    n_components, auto = 3, args.n_components in (None, (AUTO,))
-    args.face_components = FACE_COMPONENTS if auto else args.n_components[0]
-    if args.prior not in (None, NONE):
-        face, K = args.prior in FACE_PRIORS, None if auto else args.n_components[0]
-        args.prior = load_face_prior(K) if face else load_model(args.prior)
-        n_components = len(args.prior.basis_)
-        if args.n_components == (AUTO,):
-            args.n_components = None
-        if args.camera is None and args.prior.camera_ != "affine":  # which is refused
-            args.camera = args.prior.camera_
-    args.n_components = args.n_components or (n_components,)
+def _load_prior(args: Namespace, layout: str = "ibug-68") -> None:
+    """Load the prior that the options name, for a layout of faces."""
+    if args.prior in FACE_PRIORS:
+        K = None if args.n_components in (None, (AUTO,)) else args.n_components[0]
+        args.prior = load_face_prior(K, layout=layout)
+    elif args.prior not in (None, NONE):
+        args.prior = load_model(args.prior)
+
+
+def _moving_points(args: Namespace, frames: Frames, table: Any) -> Frames:
+    """Leave out points that stand still, unless the options name the points."""
+    tracks = frames.X.to_numpy().reshape(len(frames.X), len(frames.columns.points), 2)
+    still = still_points(tracks) if args.points is None else ()
+    if not len(still):
+        return frames
+    names = [frames.columns.points[j] for j in still]
+    args.points = f"without:{','.join(names)}"
+    warn_caller(
+        f"{len(names)} points stand still while the others move through the image, and "
+        f"are left out: {first_items(names, 12)}. --points fits those that it names"
+    )
+    return read_frames(args, table=table)
 
 
 def _check_options(args: Namespace) -> None:
@@ -205,9 +214,9 @@ def _check_options(args: Namespace) -> None:
     for name in ("focal_length", "principal_point"):
         if getattr(args, name) is not None and args.camera != "perspective":
             raise ValueError(f"{flag_of(name)} needs --camera perspective")
-    joint = {"--std": args.std, "--n-components auto": args.n_components[0] == AUTO}
+    joint = {"--std": args.std, "--n-components auto": args.n_components == (AUTO,)}
     for option, is_given in joint.items():
-        if is_given and args.refinement not in JOINT_REFINEMENTS:
+        if is_given and args.refinement not in (None, *JOINT_REFINEMENTS):
             raise ValueError(
                 f"{option} needs --refinement joint or consensus; got --refinement "
                 f"{args.refinement}"
@@ -217,51 +226,43 @@ def _check_options(args: Namespace) -> None:
         "prior": "a fit has those of the prior",
     }
     for name, why in one.items():
-        if getattr(args, name) not in (None, NONE) and len(args.n_components) > 1:
+        several = args.n_components and len(args.n_components) > 1
+        if several and getattr(args, name) not in (None, NONE):
             raise ValueError(
                 f"{flag_of(name)} needs one number of basis shapes, because {why}; "
                 "give it with --n-components, or auto"
             )
 
 
-def _seconds(clock: dict[str, float]) -> dict[str, float]:
-    """Return the seconds of each stage by the times of their ends."""
-    of_stages = np.diff([*clock.values()]).round(3)
-    return dict(zip([*clock][1:], of_stages, strict=True))
-
-
 def _fitted(
-    args: Namespace, frames: Frames, clock: dict[str, float]
-) -> tuple[AffineNRSfM, AffineNRSfMCV | None, Diagnostics | None, dict[str, Any]]:
-    """Return model, search for its K, diagnostics of a joint fit, and a comparison.
+    args: Namespace, frames: Frames
+) -> tuple[AffineNRSfM, list[Trial], AffineNRSfMCV | None, Diagnostics | None]:
+    """Return the model that held-out points prefer, and what was tried.
 
-    The model has perspective cameras if the options leave it open, and these explain
-    the table better.
+    Also the search for its K and the diagnostics. Options that are given are kept.
     """
     isa = None
     if args.isa == "fast" or args.n_init is not None:
         strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
         isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
-    given: dict[str, Any] = {
-        name: None if getattr(args, name) == NONE else getattr(args, name)
-        for name in _PARAMETERS
-    }
-    near = {"camera": "perspective", "principal_point": frames.principal_point}
-    if args.camera is None:
-        joint = args.refinement in JOINT_REFINEMENTS
-        given["camera"] = "weak_perspective" if joint else "affine"
-    elif args.camera == "perspective":
-        given |= near
+    given = {name: getattr(args, name) for name in (*FIRST, *_PARAMETERS)}
+    given = {name: None if each == NONE else each for name, each in given.items()}
+    given["n_components"] = args.n_components and args.n_components[0]
+    kept = {n: given.pop(n) for n in FIRST}
+    unset = (None, (AUTO,))
+    kept = {n: each for n, each in kept.items() if getattr(args, n) not in unset}
+    params, free = first_settings(kept)
     estimator = AffineNRSfM(
-        args.n_components[0],
         isa=isa,
         scale_frames=not args.no_scale_frames,
         hidden_points=not args.no_hidden_points,
         remove_pose=args.remove_pose,
-        **given,
+        **params | given,
     )
+    if estimator.camera == "perspective":
+        estimator.set_params(principal_point=frames.principal_point)
     search, X, groups = None, frames.X, frames.groups
-    if len(args.n_components) > 1:
+    if args.n_components and len(args.n_components) > 1:
         show_stage("choice of the number of basis shapes")
         splitter: Any = N_PARTS
         if groups is not None:
@@ -272,87 +273,37 @@ def _fitted(
                     f"which needs two groups; got {n_groups}"
                 )
             splitter = GroupKFold(min(N_PARTS, n_groups))
-        search = AffineNRSfMCV(
-            args.n_components, estimator=estimator, cv=splitter, verbose=1
-        )
+        options = {"cv": splitter, "select": "one_standard_error", "verbose": 1}
+        search = AffineNRSfMCV(args.n_components, estimator=estimator, **options)
         with contextlib.redirect_stdout(sys.stderr):  # results are printed at once
             search.fit(X, groups=groups)
         estimator = search.best_estimator_
-        clock["choose"] = time.perf_counter() - search.refit_time_
-    else:
-        # For `shown_progress`; the model that is written does not have it.
-        with warnings.catch_warnings(record=True) as told:
-            estimator.set_params(verbose=2).fit(X, groups=groups, **frames.weighting)
-        with_prior = _with_face_prior(args, estimator, frames)
-        for each in told if with_prior is None else ():
-            warnings.warn(each.message, stacklevel=1)
-        estimator = with_prior or estimator
-    diagnostics = None
-    if args.refinement in JOINT_REFINEMENTS:
-        diagnostics = estimator.diagnostics(X, **frames.weighting)
-    perspective = perspective_report(estimator, frames, diagnostics)
-    if perspective["better"] and args.camera is None and args.refinement == "joint":
-        show_stage("fit with perspective cameras")
-        estimator.set_params(verbose=2, n_components=len(estimator.basis_), **near)
-        estimator.fit(X, groups=groups, **frames.weighting)
-        diagnostics = estimator.diagnostics(X, **frames.weighting)
-    estimator.set_params(verbose=0)
-    clock["fit"] = time.perf_counter()
-    return estimator, search, diagnostics, perspective
-
-
-def _with_face_prior(
-    args: Namespace, estimator: AffineNRSfM, frames: Frames
-) -> AffineNRSfM | None:
-    """Return a fit with the face prior, if that and nothing else determines depths."""
-    certainty = frames_of(estimator).certainty if args.refinement == "joint" else None
-    plain = args.prior is None and estimator.camera_ == "weak_perspective"
-    layout = face_layout(args, frames) if plain else None
-    if layout is None or certainty is None or certainty.determined:
-        return None
-    show_stage("fit with the face prior")
-    prior = load_face_prior(args.face_components, layout=layout)
-    with_prior = clone(estimator).set_params(n_components="auto", prior=prior)
-    with warnings.catch_warnings(action="ignore"):
-        try:
-            with_prior.fit(frames.X, **frames.weighting)
-            with_prior.set_params(n_components=len(prior.basis_))
-        except ValueError:  # other points
-            return None
-    if not frames_of(with_prior).certainty.determined:
-        return None
-    warn_caller(
-        "the table by itself does not determine the depth of the shapes (expected "
-        f"error {100 * certainty.total:.0f} % of the depth): they are fitted with the "
-        f"face prior, as with --prior {FACE_PRIOR} --n-components "
-        f"{len(prior.basis_)}, because the layout of the points is {layout}. "
-        f"--prior {NONE} fits the table by itself"
+    else:  # for `shown_progress`; the model that is written does not have it
+        estimator.set_params(verbose=2)
+    estimator, trials = decided(
+        *(estimator, X, free),
+        principal_point=frames.principal_point,
+        face_layout=face_layout(args, frames),
+        show=show_stage,
+        groups=groups,
+        **frames.weighting,
     )
-    return with_prior
+    estimator.set_params(verbose=0)
+    diagnostics = None
+    if estimator.refinement in JOINT_REFINEMENTS:
+        diagnostics = estimator.diagnostics(X, **frames.weighting)
+    return estimator, trials, search, diagnostics
 
 
-def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
-    """Return the numbers tried, their held-out errors, seconds, and the one chosen.
-
-    Also whether a larger one may be better: it is the largest, and the table supports
-    it and allows others.
-    """
+def choice_report(search: AffineNRSfMCV) -> dict[str, Any]:
+    """Return the numbers tried, their held-out errors, and the one chosen."""
     results, n_parts = search.cv_results_, search.n_splits_
-    tried, chosen = results["param_n_components"], search.n_components_
-    of_part = results["mean_fit_time"] + results["mean_score_time"]
     scores = [results[f"split{part}_test_score"] for part in range(n_parts)]
     of_parts = -np.transpose(scores)
-    fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
-    best = search.best_estimator_
-    joint = best.refinement in JOINT_REFINEMENTS
-    most = most_components(fitted, X.shape[1] // 2, best.camera_ if joint else None)
-    supported = not joint or facts_of(best).n_supported == chosen
     return {
-        "n_components": tried.tolist(),
+        "n_components": results["param_n_components"].tolist(),
         "held_out_error": -results["mean_test_score"],
         "held_out_error_standard_error": standard_errors(of_parts),
         "held_out_error_of_parts": of_parts,
-        "seconds": results["path_fit_time"] + n_parts * of_part,
-        "chosen": chosen,
-        "larger_may_be_better": bool(supported and chosen == tried[-1] < most),
+        "chosen": search.n_components_,
     }

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import TextIO
 
-from isa_nrsfm.cli._options import FACE_PRIOR, NONE, PROGRAM, build_parser, flag_of
+from isa_nrsfm.cli._options import NONE, PROGRAM, build_parser, flag_of
 from isa_nrsfm.cli._progress import show_stage, shown_progress
 
 # Parameters that messages name, as options of the same names.
@@ -69,28 +69,12 @@ def _message(error: Exception, args: Namespace) -> str:
 def _with_options(text: str, args: Namespace) -> str:
     """Join the lines of a message, and name options instead of parameters of Python."""
     text = " ".join(text.split())
-    model = f"--prior {getattr(args, 'model', 'model.npz')}"
-    for way, option in (
-        (
-            r"sklearn\.base\.\S* .*prior=model\)\.fit\(X\)",
-            f"{PROGRAM} fit TABLE {model}",
-        ),
-        (r"prior=model", model),
-        (r"prior=[\w.]+\([^)]*\)", f"--prior {FACE_PRIOR}"),
-    ):
-        text = re.sub(way, option.replace("\\", r"\\"), text)
     for name in filter(partial(hasattr, args), _PARAMETERS):
         text = text.replace(f"{name}=None", f"{name}={NONE}")
         value = r"=(?P<quote>['\"]?)(?P<value>[\w.-]*\w)(?P=quote)"
         option = rf"{flag_of(name)} \g<value>"
         text = re.sub(rf"(?<![\w/\\-]){name}{value}", option, text)
-    for name in ("prior", "focal_length", "principal_point"):
-        text = text.replace(f"{name}=None", f"no {flag_of(name)}")
     text = re.sub(r"(--[\w-]+ [^\s,]+), (?=--)", r"\1 ", text)  # as they are typed
-    if vars(args).get("image_size"):
-        from isa_nrsfm.analysis._advice import SAME_UNIT
-
-        text = re.sub(rf"Make sure that {SAME_UNIT}, (?:then|or) u", "U", text)
     if hasattr(args, "n_components"):
         text = re.sub(r"(?<![\w'\"-])n_components\b", "--n-components", text)
     return text

@@ -173,7 +173,9 @@ HELP = {
     "tell frames apart and, last, that of the points, such as video,frame,landmark",
     "skip_rows COLUMN=REGEX": "leave out rows whose column matches the expression, "
     "such as 'name=^ir'",
-    "zeros_missing": "treat points at exactly (0, 0) as missing",
+    "zeros_missing": "treat points at exactly (0, 0) as missing, also among others",
+    "keep_zeros": "do not treat points at (0, 0) as missing, even if all others are "
+    "elsewhere",
     "missing_value VALUE": "treat points whose x and y are this number, such as -1, as "
     "missing",
     "min_confidence CONFIDENCE": "treat points with a lower confidence as missing",
@@ -225,21 +227,21 @@ HELP = {
     "fps NUMBER": "instead of --time, the frames per second of a video; frames have "
     "the numbers of the column frame, of the names of images, or of the rows",
     # The method.
-    "n_components K": "number of basis shapes (default: 3, or that of the prior). Of "
-    "several, such as 1-8 or 3,6,9, the best in cross-validation is used; auto uses as "
-    "many as the table determines, at most twelve",
+    "n_components K": "number of basis shapes (default: auto, as many as the table "
+    "determines, at most twelve, or those of the prior). Of several, such as 1-8 or "
+    "3,6,9, the fewest within one standard error of the best in cross-validation",
     "camera": "camera model: weak_perspective (a rotation and a scale per frame), "
     "orthographic (one scale), perspective (for objects near the camera, as before a "
     "webcam), or affine (no assumption, for stretched images), which leaves depth and "
-    "proportions open (default: that of the prior; perspective if the size of the "
-    "images is known and held-out points say so; otherwise weak_perspective)",
+    "proportions open (default: what held-out points prefer; perspective needs the "
+    "size of the images)",
     "focal_length NUMBER": "of perspective cameras, in pixels (default: estimated)",
     "principal_point X Y": "of perspective cameras: the point of the image on the axis "
     "of the camera, in pixels (default: the middle of the images)",
     "prior MODEL": "a fitted model of a table in which the objects turn, such as "
     f"model.npz, or {FACE_PRIOR} for faces: with it frontal photos and few frames have "
-    f"true depths. Its layouts are {', '.join(choices.FACE_PRIORS)}; tables of these "
-    f"that do not determine depths have it by default. {NONE}: no prior",
+    f"true depths. Its layouts are {', '.join(choices.FACE_PRIORS)} (default: that of "
+    f"faces, if their table does not determine depths). {NONE}: no prior",
     "export.camera": "camera model for a model with affine cameras; none exports "
     "affine shapes, whose angles and depth are not true (default: weak_perspective)",
     "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
@@ -247,10 +249,12 @@ HELP = {
     "block_recovery": "algorithm that finds the block structure",
     "refinement": "joint: cameras, coefficients and basis shapes together; consensus: "
     "afterwards groups of neighbouring points, for the truest shapes of calibrated "
-    "cameras; alternating: the refinement of the paper, with cameras of the rigid part",
+    "cameras; alternating: the refinement of the paper, with cameras of the rigid part "
+    "(default: joint, or consensus if only that determines the depth)",
     "independence": "joint refinement: independent basis shapes, or independent "
     "coefficients",
-    "loss": "joint refinement: all but linear limit the influence of outliers",
+    "loss": "joint refinement: all but linear limit the influence of outliers "
+    "(default: linear, or cauchy if the table has outliers)",
     "remove_pose": "calibrated cameras: coefficients minus what the yaw of the cameras "
     "predicts, if points slide over the surface and people move alike in all views",
     "no_scale_frames": "weight frames by their size in the image, as orthographic "
@@ -282,7 +286,7 @@ CHOICES: dict[str, Sequence[str]] = {
     "loss": choices.LOSSES,
 }
 # Options whose first choice is their value by default, which the help states.
-FIRST = ("isa", "block_recovery", "refinement", "independence", "loss")
+FIRST = ("isa", "block_recovery", "independence")
 DEFAULTS = {
     **{name: CHOICES[name][0] for name in ("format", *FIRST)},
     **{"length": 1.0, "random_state": 0},
@@ -291,7 +295,13 @@ DEFAULTS = {
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
 TABLE_OPTIONS = (
     *("format", "columns", "individuals", "row_per_point", "skip_rows"),
-    *("zeros_missing", "missing_value", "min_confidence", "image_size", "part"),
+    *(
+        ("zeros_missing", "keep_zeros"),
+        "missing_value",
+        "min_confidence",
+        "image_size",
+        "part",
+    ),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 

@@ -25,28 +25,15 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 
 PAGE = "report.html"
 REPORT = "report.json"
-# The files of every fit and their contents. The text shows the first clause.
+# The files of every fit and their contents; docs/command_line.md has their columns.
 RESULTS = {
     PAGE: "this report with its figures, for any browser",
     "model.npz": "the fitted model, for isa-nrsfm transform",
-    "alpha.csv": "row of the table, its other columns, the coefficients of each frame; "
-    "alpha_1_within, ... (--group): less the mean of the group; alpha_1_smooth, ... "
-    "(--time, --fps): smoothed; alpha_1_std, ... (--std): standard deviations; "
-    "distance_62_66 (--distance): distance of points 62 and 66, in units of --unit",
-    "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
-    "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; for "
-    "calibrated cameras a scale times two rows of a rotation (perspective cameras, "
-    "which see near points larger, at the origin of the shapes); inverse_snr is the "
-    "energy of the reprojection error relative to that of the frame; yaw, pitch and "
-    "roll in degrees, if the cameras determine them: zero for a frontal, upright "
-    "object of a known layout, and for the mean camera of other objects; yaw_smooth, "
-    "pitch_smooth, roll_smooth (--time, --fps): smoothed; position_x, position_y, "
-    "position_z (--camera perspective): position in the axes of the camera, z along "
-    "its axis, in units of the shapes, or of distances (--distance, --unit, --length)",
-    "shapes.csv": "mean shape and basis shapes, a row for each point; the shape of a "
-    "frame is mean + sum_k alpha_k basis_k, in the axes X, Y, Z of cameras.csv",
-    "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
-    "a frame is mean_shape + sum_k alpha_k basis[k]",
+    "alpha.csv": "row of the table, its other columns, the coefficients of each frame",
+    "cameras.csv": "row of the table, camera of each frame: the image of (X, Y, Z) is "
+    "x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; angles in degrees",
+    "shapes.csv": "mean shape and basis shapes, a row for each point",
+    "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays",
     "viewer.html": "the shapes and the frames in 3D, for any browser",
 }
 

@@ -146,12 +146,12 @@ def read_frames(
     if args.min_confidence is not None:
         with errors_of(f"--min-confidence {args.min_confidence:g}"):
             tracks[unsure_points(confidence, args.min_confidence)] = np.nan
-    if (zeros := zeros_far_away(tracks)).any():
+    if not args.keep_zeros and (zeros := zeros_far_away(tracks)).any():
         tracks[zeros] = np.nan
         args.missing_value = sorted({*args.missing_value, 0.0})
         warn_caller(
             f"{zeros.sum():,} points at (0, 0), in {zeros.any(axis=1).sum():,} rows, "
-            "are missing: no other point is near (0, 0)",
+            "are missing: other points are elsewhere. --keep-zeros keeps them",
             CoordinateWarning,
         )
     cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[shown]
@@ -410,16 +410,18 @@ def _layout(
 def zeros_far_away(tracks: NDArray) -> NDArray:
     """Return which points (n_frames, n_points) at (0, 0) are missing.
 
-    They are there exactly, in at least three frames, and all other points are farther
-    away than they are spread (root mean square distance from their centroid).
+    They are there exactly, in at least three frames, and all other points are to one
+    side of (0, 0) in x and in y, or farther away than they are spread (root mean square
+    distance from their centroid).
     """
     zeros = (tracks == 0).all(axis=2)
     # The origin of the coordinates is one point in all frames.
     zeros &= (~zeros & ~np.isnan(tracks[..., 0])).any(axis=0)
     if zeros.any(axis=1).sum() > 2:
         others = tracks[~zeros]
+        beyond = (np.nanmin(others, axis=0) > 0) | (np.nanmax(others, axis=0) < 0)
         spread = np.sqrt(np.nanvar(others, axis=0).sum())
-        if np.nanmin(np.linalg.norm(others, axis=1)) > spread:
+        if beyond.all() or np.nanmin(np.linalg.norm(others, axis=1)) > spread:
             return zeros
     return np.zeros_like(zeros)
 

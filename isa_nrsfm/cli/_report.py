@@ -9,23 +9,16 @@ import numpy as np
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
-from isa_nrsfm.analysis._advice import advice, camera_meaning, facts_of
+from isa_nrsfm.analysis._advice import FIT, camera_meaning, verdict
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli._outputs import Fit
-from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Rows and points that are listed, and classes whose means are shown, at most.
 MOST_LISTED, MOST_CLASSES = 10, 12
-# Rows and basis shapes of fits that are compared, at most.
-MOST_ROWS, MOST_SHAPES = 300, 12
-# Perspective is advised if it lowers the error of held-out points to this share:
-# docs/benchmarks/README.md, "Thresholds".
-MUCH_LOWER = 0.9
 
 
 def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
@@ -64,21 +57,17 @@ def quality_report(
 
     `square` is the mean of the squared errors of its coordinates.
     """
+    error = -estimator.score(X, **weighting)
     return {
-        "held_out_error": -estimator.score(X, **weighting),
+        "fit": verdict(error, *FIT),
+        "held_out_error": error,
         "held_out_error_weighted": bool(weighting),
         "rms_point_error": np.sqrt(2 * square),
     }
 
 
-def model_report(
-    fit: Fit, found: Diagnostics | None, perspective: dict[str, Any]
-) -> dict[str, Any]:
-    """Describe a fitted model and how well it explains its table.
-
-    `found` are the diagnostics of a joint fit, `perspective` is the comparison with
-    perspective cameras.
-    """
+def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
+    """Describe a fitted model, with the diagnostics of a joint fit, and its quality."""
     # Not needed by transform
     from isa_nrsfm.plotting._axes import SPANNING_TREE
     from isa_nrsfm.plotting._views import view_and_layout
@@ -92,20 +81,15 @@ def model_report(
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     n_edges = 0 if lines is None else len(lines.edges)
-    messages = () if found is None else found.messages
-    if perspective["better"] and estimator.camera_ == "weak_perspective":
-        joint = ', refinement="joint"' * (estimator.refinement == "consensus")
-        use = f'{perspective["text"]}. Use camera="perspective"{joint}'
-        messages = advice(facts_of(estimator, perspective=use))
-    for message in messages:
+    for message in () if found is None else found.messages:
         warn_caller(message)
-    complete = estimator.loss == "linear" and not missing
+    quality = quality_report(estimator, X, mean_of(square), frames.weighting)
+    if estimator.loss != "linear" and found is not None:
+        quality |= {"fit": found.fit}  # of the median point
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),
             "energy_share": estimator.energy_share_,
-            "mean": alpha.mean(axis=0),
-            "std": alpha.std(axis=0),
             "min": alpha.min(axis=0),
             "row_of_min": X.index[alpha.argmin(axis=0)],
             "max": alpha.max(axis=0),
@@ -119,11 +103,10 @@ def model_report(
     )
     return {
         "n_components": alpha.shape[1],
+        "depth": "" if found is None else found.depth,
         "inverse_snr": estimator.inverse_snr_,
-        **quality_report(estimator, X, mean_of(square), frames.weighting),
+        **quality,
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
-        # Known only if the fit has seen the table as it is.
-        "rank_floor": estimator.rank_floor_ if complete else None,
         "noise_variance": getattr(estimator, "noise_variance_", None),
         "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
@@ -135,62 +118,15 @@ def model_report(
         "focal_length": getattr(estimator, "focal_length_", None),
         "focal_length_std": getattr(estimator, "focal_length_std_", None),
         "principal_point": estimator.principal_point,
-        "perspective": perspective["text"],
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "skeleton": None if layout is None else layout.name,
         # None if no lines are wanted.
         "n_edges": None if edges is None else n_edges,
         "spanning_tree": lines is not None and lines.name == SPANNING_TREE,
         "outliers": None if found is None else _outliers(found, estimator, X),
-        "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),
         "alpha": coefficients.to_dict("records"),
-        "correlations": pd.DataFrame(alpha).corr().to_numpy(),
     }
-
-
-def perspective_report(
-    estimator: AffineNRSfM, frames: Frames, found: Diagnostics | None
-) -> dict[str, Any]:
-    """Compare fits of some rows with perspective and without; say what is better.
-
-    Nothing is compared if the fit had other cameras, or outliers bend it, or the point
-    on the axis of the camera is not known. The first focal length is too long for most
-    cameras, which does no harm. It takes two or three times as long as the fit without
-    perspective, and the estimate ten.
-    """
-    from isa_nrsfm._selection import StartedNRSfM  # not needed by transform
-
-    point, none = frames.principal_point, {"better": False, "text": ""}
-    if found is None or point is None or estimator.camera_ != "weak_perspective":
-        return none
-    if facts_of(estimator, outlier_energy=found.outlier_energy).bent:
-        return none
-    show_stage("comparison with perspective")
-    rows = np.unique(np.linspace(0, len(frames.X) - 1, MOST_ROWS).astype(int))
-    X, K = frames.X.iloc[rows], min(len(estimator.basis_), MOST_SHAPES)
-    weights = {name: values[rows] for name, values in frames.weighting.items()}
-    fixed = {"n_components": K, "refinement": "joint", "prior": None}
-    params = estimator.get_params(deep=False) | fixed
-    seen = {"camera": "perspective", "principal_point": point}
-    errors = []
-    try:
-        for camera in ({}, seen | {"focal_length": 5 * max(point)}, seen):
-            model = StartedNRSfM(**params | camera)
-            errors.append(-model.fit(X, **weights).score(X, **weights))
-            if errors[-1] > errors[0]:
-                break
-    except ValueError:  # too few of the rows show a point
-        return none
-    weak, *_, error = errors
-    better = error < MUCH_LOWER * weak and np.isfinite(model.focal_length_)
-    what = "explains the table better"
-    if not better:
-        what = "does not explain the table much better"
-    if np.isinf(model.focal_length_):
-        what = "is too weak to estimate the focal length"
-    text = f"error of held-out points {percent(error)} instead of {percent(weak)}"
-    return {"better": better, "text": f"perspective {what}: {text}"}
 
 
 def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:

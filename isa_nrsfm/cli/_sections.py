@@ -8,7 +8,7 @@ import json
 import math
 import shlex
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 from itertools import compress
@@ -21,13 +21,12 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import as_utf8, first_items, percent
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.analysis._frame_columns import STATISTICS
-from isa_nrsfm.cli._options import AUTO, PROGRAM
+from isa_nrsfm.cli._options import PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.io._formats import TABLE
-from isa_nrsfm.skeletons import SKELETONS
 
 _CAMERAS = {
     "affine": "affine: shapes are known up to an affine transformation of space. "
@@ -40,8 +39,9 @@ _CAMERAS = {
 }
 
 _DATA = {REPORT: "the numbers of this report, for programs"}
-# Rows of a table in the terminal, at most.
-MOST_SHOWN = 16
+# Coefficients in the summary, at most; its texts in lines, without a break in paths.
+MOST_SHOWN = 5
+WRAPPED = textwrap.TextWrapper(80, break_on_hyphens=False, break_long_words=False)
 
 
 class Cells(NamedTuple):
@@ -66,13 +66,83 @@ class Cells(NamedTuple):
 
 
 Section = Sequence[str | Cells]
-Sections = Mapping[str, Section]
 
 
 def fit_title(report: dict[str, Any]) -> str:
     """Return the title of the report of a fit."""
-    table, basis = report["table"], _shapes(report["model"])
-    return f"{basis} fitted to {table['n_frames']} frames of {table['n_points']} points"
+    table, n, layout = report["table"], len(report["model"]["alpha"]), ""
+    if report["model"]["skeleton"] is not None:
+        layout = f" ({report['model']['skeleton']})"
+    rows = f"{table['n_frames']} frames of {table['n_points']} points{layout}"
+    return f"{n} movement{'s' * (n != 1)} in {rows}"
+
+
+def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
+    """Return what a fit has found in a few rows: a name, a mark, and a text.
+
+    The terminal and the page begin with it, and `report.json` has it.
+    """
+    model, table = report["model"], report["table"]
+    rows = [quality_row(model), ["depth", model["depth"].upper(), _depth(model)]]
+    for row in model["alpha"][:MOST_SHOWN]:
+        pose, share = "", row["pose_share"]
+        if share is not None and share == share:
+            pose = f"pose explains {100 * max(share, 0):.0f} %; "
+        rows_of = f"from row {row['row_of_min']} to row {row['row_of_max']}"
+        rows.append([row["name"], f"{100 * row['energy_share']:.0f} %", pose + rows_of])
+    if more := len(model["alpha"][MOST_SHOWN:]):
+        rows.append(["", "", f"{more} more in {PAGE}"])
+    rows += [["label", "", _answer(label)] for label in report.get("labels", ())]
+    if "between" in report.get("groups", ()):
+        groups = report["groups"]
+        most = int(np.argmax(groups["between"]))
+        name, share = model["alpha"][most]["name"], groups["between"][most]
+        text = f"{100 * share:.0f} % of the variance of {name} is between groups"
+        rows.append(["group", "", f"{groups['column']}: {text}"])
+    if "time" in report:
+        rows.append(["time", "", str(_time(report["time"])[0])])
+    fitted = [each for each in report["tried"] if each["seconds"]]
+    tried = [each["text"] for each in fitted]
+    others: dict[str, list[str]] = {}
+    for each in report["tried"]:
+        if not each["seconds"]:
+            others.setdefault(each["result"], []).append(each["setting"])
+    if "choice" in report:
+        choice = report["choice"]
+        listed = first_items(choice["n_components"], len(choice["n_components"]))
+        tried.insert(0, f"K = {listed}: {choice['chosen']} is used")
+    listed = "; ".join(f"{', '.join(them)} ({why})" for why, them in others.items())
+    tried += [f"not tried: {listed}"] * bool(others)
+    rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
+    rows.append(left_out_row(table))
+    if names := table.get("other_columns"):
+        listed = first_items(map(str, names), 6)
+        rows.append(["next", "", f"--label, --group or --time COLUMN: {listed}"])
+    return [*rows, ["open", "", f"{Path(folder, PAGE)}  viewer.html  alpha.csv"]]
+
+
+def _depth(model: dict[str, Any]) -> str:
+    """Return how well the depth is known, and which of the mirror images it is."""
+    error, mirror = model["depth_uncertainty"], model["mirror_certainty"]
+    if not model["depth"]:
+        return "affine cameras leave it open, and angles and proportions with it"
+    if not model["depth_determined"]:
+        return f"not determined (off by {100 * error:.0f} %): no angles and proportions"
+    text = f"known to {100 * error:.2g} %"
+    if not mirror or not math.isfinite(mirror):
+        return f"{text}; its mirror image is as likely"
+    least = min(math.floor(1000 * mirror) / 10, 99.9)
+    return f"{text}; the right one of two mirror images with {least:g} %"
+
+
+def _answer(label: dict[str, Any]) -> str:
+    """Return whether a label goes with coefficients."""
+    if label["untested"]:
+        return f"{label['column']} was not tested: {label['untested']}."
+    names = names_of_components(None, len(label["values"]))
+    related = np.asarray(names)[np.less(label["p_values"], 0.05)]
+    coefficients = ", ".join(related) or "no coefficient"
+    return f"{label['column']} goes with {coefficients} (p < 0.05)."
 
 
 def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
@@ -89,85 +159,57 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     sections["Alpha"] = _alpha(model)
     if "choice" in report:
         sections["Choice"] = _choice(report["choice"])
-    elif model["parameters"]["n_components"] == AUTO:
-        sections["Choice"] = [f"K = {model['n_components']}: found by {AUTO}"]
     sections["Fit"] = _fit(report)
-    sections["Cameras"] = _cameras(model, report.get("position_unit"))
     return sections | {"Table": table_section(report["table"])}
 
 
-def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
+def table_section(table: dict[str, Any]) -> Section:
     """Return the rows and columns of a table that are used, and the others."""
-    format, n_missing = table["format"], table["n_missing_points"]
+    format, out = table["format"], left_out_row(table)[2]
     listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
     parts: list[str | Cells] = [
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
+        f"{table['n_frames']} of {table['n_rows']} rows; left out: {out}",
     ]
-    if table["coordinates_not_used"]:
-        not_used = table["coordinates_not_used"].items()
-        listed = "; ".join(f"{pattern} ({n_points})" for pattern, n_points in not_used)
-        parts.append(f"coordinates not used: {listed}")
-    if table.get("other_columns"):
-        listed = first_items(map(str, table["other_columns"]), MOST_LISTED)
-        parts.append(
-            f"other columns: {listed}. Use --label COLUMN to see how coefficients "
-            "depend on one, --group COLUMN for people or videos, and --time COLUMN."
-        )
-    rows = [[f"{table['n_rows']}", "rows"]]
-    for out in table["rows_left_out"]:
-        result = "left out" if out["skipped_on_request"] else unusable
-        rows.append([f"{out['n_rows']}", f"{result}: {out['reason']}"])
-    parts.append(Cells([], [*rows, [f"{table['n_frames']}", "used"]]))
-    for number in table["missing_values"]:
-        parts.append(f"points at ({number:.15g}, {number:.15g}) count as missing")
-    if n_missing:
-        share = n_missing / (table["n_frames"] * table["n_points"])
-        parts.append(
-            f"{n_missing} points ({percent(share)}) are missing in "
-            f"{table['n_frames_with_missing_points']} of these rows"
-        )
+    others = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
+    for what, names in (
+        ("coordinates not used", others),
+        ("other columns", table.get("other_columns")),
+    ):
+        if names:
+            parts.append(f"{what}: {first_items(map(str, names), MOST_LISTED)}")
     return parts
 
 
-def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cells]:
-    """Return the quality of a fit, with a remark on its inverse SNR."""
-    weighted = ""
-    if quality["held_out_error_weighted"]:
-        weighted = (
-            " Points count by their weights here, and equally in the inverse SNR."
-        )
-    return [
-        f"inverse SNR {percent(quality['inverse_snr'])}{remark}: energy (sum of "
-        "squares) of the residuals, relative to that of the centred points.",
-        f"held-out error {percent(quality['held_out_error'])}: the same for points "
-        f"predicted from the other points of their frame.{weighted} Wrong points and "
-        "too many basis shapes make it much larger.",
-        f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
-        "square, in pixels or the unit of the table)",
-    ]
+def quality_row(quality: dict[str, Any]) -> list[str]:
+    """Return how well points are explained, as a row of a summary."""
+    off = f"points are off by {quality['rms_point_error']:.3g} in the unit of the table"
+    text = f"{percent(quality['held_out_error'])} of left-out points unexplained"
+    return ["fit", quality["fit"].upper(), f"{off}; {text}"]
 
 
-def text_of(title: str, sections: Sections) -> str:
-    """Return a report as text, with the name of each section beside its lines."""
-    blocks = [title] if title else []
-    for name, parts in sections.items():
-        lines = [line for part in parts for line in _lines(part)]
-        labels = [name] + [""] * (len(lines) - 1)
-        beside = zip(labels, lines, strict=True)
-        blocks.append("\n".join(f"{name:11}{line}".rstrip() for name, line in beside))
-    return "\n\n".join(blocks)
+def left_out_row(table: dict[str, Any]) -> list[str]:
+    """Return the rows that are left out, and missing points, as a row of a summary."""
+    reasons = table["rows_left_out"]
+    out = [f"{each['n_rows']} rows: {each['reason']}" for each in reasons]
+    numbers = [f"({n:.15g}, {n:.15g})" for n in table["missing_values"]]
+    out += [f"points at {place} count as missing" for place in numbers]
+    if n_missing := table["n_missing_points"]:
+        share = n_missing / (table["n_frames"] * table["n_points"])
+        rows = f"in {table['n_frames_with_missing_points']} of the others"
+        out.append(f"{n_missing} points ({percent(share)}) are missing {rows}")
+    return ["left out", "", "; ".join(out) or "no row"]
 
 
-def fit_text(report: dict[str, Any], folder: Path, more: Sections) -> str:
-    """Return the report of a fit as text, with more sections after it."""
-    described = [
-        [name, content.partition(";")[0].partition(": the image")[0]]
-        for name, content in (report["files"] | _DATA).items()
-    ]
-    listed: Section = [f"in {folder}", Cells([], described)]
-    sections = fit_sections(report) | {"Files": listed, **more}
-    return text_of(fit_title(report), sections | {"Open": [f"{folder / PAGE}"]})
+def text_of(title: str, rows: Sequence[Sequence[str]]) -> str:
+    """Return a summary as text: rows of a name, a mark, and a text that is wrapped."""
+    lines = [title] * bool(title)
+    for name, mark, text in rows:
+        first, *rest = WRAPPED.wrap(text) or [""]
+        lines.append(f"{name:9}{mark:6}{first}" if mark else f"{name:9}{first}")
+        lines += [f"{'':{15 if mark else 9}}{line}" for line in rest]
+    return "\n".join(lines)
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
@@ -200,6 +242,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     title = escape(fit_title(report))
     about = escape(f"{report['table']['path']}, {report['finished']}")
     parts = [f"<h1>{title}</h1>", f'<p class="quiet">{about}</p>']
+    parts += _markup("", [Cells([], report["summary"])])
     for warning in report["warnings"]:
         parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
     parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
@@ -225,29 +268,9 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     write_whole(folder / PAGE, page.encode(errors="replace"))
 
 
-def _lines(part: str | Cells) -> list[str]:
-    """Return the lines of a part: sentences, which end with a point, are wrapped.
-
-    Tables with a head end after `MOST_SHOWN`.
-    """
-    if isinstance(part, str):
-        if part.endswith("."):
-            return textwrap.wrap(part, 90, break_on_hyphens=False)
-        return [part]
-    columns = []
-    cells = zip(*part.lines, strict=True)
-    for column, is_number in zip(cells, part.numbers, strict=True):
-        align, width = ">" if is_number else "<", max(map(len, column))
-        columns.append([f"{cell:{align}{width}}" for cell in column])
-    rows = ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
-    if part.head and (more := len(rows[MOST_SHOWN:])):
-        rows[MOST_SHOWN:] = [f"... {more} more in {PAGE}"]
-    return [part.title, *rows] if part.title else rows
-
-
 def _markup(name: str, parts: Section) -> list[str]:
     """Return the HTML of a section, of an empty one nothing."""
-    found = [f"<h2>{name}</h2>"] if parts else []
+    found = [f"<h2>{name}</h2>"] if parts and name else []
     for part in parts:
         if isinstance(part, str):
             found.append(f"<p>{escape(part)}</p>")
@@ -267,108 +290,70 @@ def _markup(name: str, parts: Section) -> list[str]:
 
 
 def _fit(report: dict[str, Any]) -> Section:
-    """Return the quality of the fit, its noise and its time."""
-    model, seconds = report["model"], report["seconds"]
-    remark = ""
-    if model["parameters"]["loss"] != "linear":
-        remark = " (outliers count fully)"
-    elif (model["rank_floor"] or 0) > np.finfo(float).eps and "prior" not in report:
-        floor = percent(model["rank_floor"])
-        remark = f" (no model with {_shapes(model)} is below {floor})"
-    parts = quality_section(model, remark)
-    worst = model["largest_error"]
-    parts.append(f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}")
-    if model["noise_variance"] is not None:
-        noise = math.sqrt(model["noise_variance"])
-        size = f"{percent(noise)} of the frame's size"
-        if not model["frames_scaled"]:
-            size = f"{noise:.3g} in the units of the table"
-        parts.append(f"noise in the fit {size} (standard deviation of a coordinate)")
+    """Return the numbers of the fit and its cameras, with what they mean."""
+    model, table = report["model"], report["table"]
+    worst, camera = model["largest_error"], _CAMERAS[model["camera"]]
+    square, mirror = model["noise_variance"], model["mirror_certainty"]
+    parts = [
+        f"held-out error {percent(model['held_out_error'])}: energy of the errors of "
+        "points that are predicted from the other points of their frame, relative to "
+        "that of the centred points."
+        + " Points count by their weights."
+        * model["held_out_error_weighted"],
+        f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}",
+    ]
+    if square is not None:
+        noise = f"{math.sqrt(square):.3g} in the units of the table"
+        if model["frames_scaled"]:
+            noise = f"{percent(math.sqrt(square))} of the frame's size"
+        parts.append(f"noise in the fit {noise} (standard deviation of a coordinate)")
     if "prior" in report:
-        parts.append(_prior(report["prior"]))
-    fit = seconds["fit"] + seconds.get("choose", 0.0)
-    parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
-    if model["skeleton"] is not None:
-        parts.append(f"points recognised as {model['skeleton']}")
-    elif model["n_edges"] == 0 or model["spanning_tree"]:
-        drawn = "join them by a minimal spanning tree; give lines"
-        if not model["spanning_tree"]:
-            drawn = "have no lines between them; give these"
-        n_points = report["table"]["n_points"]
-        alike = [s.name for s in SKELETONS.values() if s.n_points == n_points]
+        name, (width, _) = report["prior"]["name"], report["prior"]["std"]
         parts.append(
-            f"points of no known layout: figures and viewer {drawn} with --edges FILE "
-            "or --skeleton LAYOUT"
-            + (f" (of {n_points} points: {', '.join(alike)})" if alike else "")
-            + ". If they are upside down, y points up in the table: use --origin lower."
+            f"prior {name}: the mean shape differs by {100 * width:.2g} % of the size "
+            "of the object from that of the prior (standard deviation of a coordinate)."
+            " Coefficients are those of the prior, so that studies with the same prior "
+            "can be compared."
         )
+    if model["skeleton"] is None and (model["n_edges"] == 0 or model["spanning_tree"]):
+        parts.append(
+            f"{table['n_points']} points of no known layout: give lines of figures and "
+            "viewer with --edges FILE or --skeleton LAYOUT. If they are upside down, "
+            "use --origin lower."
+        )
+    if model["camera"] != "affine" and not model["depth_determined"]:
+        camera = f"{camera.partition(':')[0]}: the depth is not determined. cameras.csv"
+        camera += " has no angles, and proportions in viewer.html are not true."
+    elif mirror and math.isfinite(mirror):
+        which = "missing points are farther away"
+        if model["mirror_decided_by_perspective"]:
+            which = "perspective fits"
+        elif model["parameters"]["prior"] is not None:
+            which = "the prior is alike"
+        parts.append(f"mirror image in depth: the one for which {which}")
+    parts += [camera, *_perspective(model, report.get("position_unit"))]
+    if model["depth_determined"] and model["camera_meaning"]:
+        parts.append(_sentence(model["camera_meaning"]))
     return parts
 
 
-def _prior(prior: dict[str, Any]) -> str:
-    """Return how far the shapes are from those of the prior, and what that means."""
-    return (
-        f"prior {prior['name']}: the mean shape differs by {100 * prior['std'][0]:.2g} "
-        "% of the size of the object from that of the prior (standard deviation of a "
-        "coordinate). Coefficients are those of the prior, so that studies with the "
-        "same prior can be compared."
-    )
-
-
-def _cameras(model: dict[str, Any], unit: dict[str, Any] | None) -> Section:
-    """Return the camera model, the certainty of the depth, and what the noise means."""
-    title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
-    if model["camera"] != "affine" and not model["depth_determined"]:
-        return [
-            f"{title.partition(':')[0]}: the depth is not determined. cameras.csv has "
-            "no angles, and proportions in viewer.html are not true.",
-            *_perspective(model, unit),
-        ]  # the ratio of the noise means nothing
-    if model["camera"] == "perspective" and not model["mirror_decided_by_perspective"]:
-        title += " and a mirror image in depth"
-    parts = [title, *_perspective(model, unit)]
-    if uncertainty and math.isfinite(uncertainty):
-        parts.append(
-            f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
-            "square)"
-        )
-    mirror = model["mirror_certainty"]
-    if mirror and math.isfinite(mirror):
-        least = min(math.floor(1000 * mirror) / 10, 99.9)
-        probability = f"right with a probability of at least {least:g} %"
-        which = (
-            f"one in which missing points are farther away, {probability} if the "
-            "object hides them. If it does not, use --no-hidden-points."
-        )
-        if model["mirror_decided_by_perspective"]:
-            which = f"one that fits perspective, {probability}"
-        elif model["parameters"]["prior"] is not None:
-            which = f"one of the prior, {probability}"
-        parts.append(f"mirror image in depth: the {which}")
-    meaning = model["camera_meaning"]
-    return [*parts, _sentence(meaning)] if meaning else parts
-
-
 def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str]:
-    """Return comparison, focal length and unit of positions of perspective cameras."""
-    focal, deviation = model["focal_length"], model["focal_length_std"]
-    compared = [_sentence(model["perspective"])] if model["perspective"] else []
+    """Return focal length and unit of positions of perspective cameras."""
+    focal = model["focal_length"]
     if focal is None:
-        return compared
+        return []
     if not math.isfinite(focal):
         return ["no perspective: the focal length is too long to estimate it"]
-    shown = "given"
+    shown, length = "given", "in units of the shapes"
     if model["parameters"]["focal_length"] is None:
-        shown = f"estimated, standard deviation {deviation:.2g}"
+        shown = f"estimated, standard deviation {model['focal_length_std']:.2g}"
     x, y = model["principal_point"]
-    length = "in units of the shapes"
     if unit is not None:
         a, b = unit["points"]
         length = f"points {a} and {b} of the mean shape are {unit['length']:g} apart"
     return [
         f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})",
         f"positions in cameras.csv: {length}",
-        *compared,
     ]
 
 
@@ -380,7 +365,7 @@ def _alpha(model: dict[str, Any]) -> Section:
         [
             row["name"],
             f"{100 * row['energy_share']:.1f} %",
-            *(f"{row[key]:z.2f}" for key in ("mean", "std", "min")),
+            f"{row['min']:z.2f}",
             f"{row['row_of_min']}",
             f"{row['max']:z.2f}",
             f"{row['row_of_max']}",
@@ -389,15 +374,15 @@ def _alpha(model: dict[str, Any]) -> Section:
         ]
         for row, share in zip(coefficients, shares, strict=True)
     ]
-    head = ["", "energy", "mean", "std", "min", "row", "max", "row", "pose", "again"]
-    shown = [True] * 8 + [any(row[k] for row in rows) for k in (8, 9)]
-    is_posed = shown[8]
+    head = ["", "energy", "min", "row", "max", "row", "pose", "again"]
+    shown = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
+    is_posed = shown[6]
     head, *rows = [[*compress(line, shown)] for line in (head, *rows)]
     parts: list[str | Cells] = [
         Cells(head, rows),
         "energy: share of the deformation in the images (sum of squares)",
     ]
-    if shown[9]:
+    if shown[7]:
         parts.append(
             "again: whether a fit of other people has the coefficient, with a "
             "correlation of at least .85"
@@ -411,17 +396,6 @@ def _alpha(model: dict[str, Any]) -> Section:
             f"--remove-pose: what yaw predicts was removed, up to {share}. It assumes "
             "that the objects move alike in all views"
         )
-    correlations = np.triu(np.nan_to_num(np.array(model["correlations"], float)), 1)
-    if correlations.any():
-        place = np.unravel_index(abs(correlations).argmax(), correlations.shape)
-        first, second = (coefficients[k]["name"] for k in place)
-        found = (
-            f"largest correlation: {correlations[place]:.2f}, of {first} and {second}"
-        )
-        others = "; --independence coefficients lowers it"
-        given, is_joint = model["parameters"], model["noise_variance"] is not None
-        is_open = given["independence"] == "shapes" and given["prior"] is None
-        parts.append(found + others * (is_joint and is_open))
     return parts
 
 
@@ -434,7 +408,7 @@ def _choice(choice: dict[str, Any]) -> Section:
             f"{k}",
             f"{_digits(100 * error, 3)} %",
             f"{_digits(100 * deviation, 2)} %",
-            "the least" * (k == choice["chosen"]),
+            "used" * (k == choice["chosen"]),
         ]
         for k, error, deviation in zip(tried, errors, deviations, strict=True)
     ]
@@ -444,13 +418,11 @@ def _choice(choice: dict[str, Any]) -> Section:
         from isa_nrsfm._selection import NO_SHAPE
 
         return [cells, NO_SHAPE]
-    parts: list[str | Cells] = [cells, "as under Fit, in frames left out of the fit"]
-    if choice["larger_may_be_better"]:
-        more = f"three more take at least {3 * choice['seconds'][-1]:.0f} s"
-        parts.append(
-            f"larger K may be better: this is the largest of those tried; {more}"
-        )
-    return parts
+    return [
+        cells,
+        "As under Fit, in frames left out of the fit. The fewest basis shapes within "
+        "one standard error of the least are used.",
+    ]
 
 
 def _label(label: dict[str, Any]) -> Section:
@@ -475,23 +447,18 @@ def _label(label: dict[str, Any]) -> Section:
         for row, value in zip(rows, label["corrected"], strict=True):
             row.append(f"{value:z.2f}")
         meaning += "; corrected: without the errors of the coefficients"
-    answer = f"{label['column']} was not tested: {label['untested']}."
     test = "no p-values"
     means: list[str] = []
     if not label["untested"]:
-        related = np.asarray(names)[np.less(label["p_values"], 0.05)]
-        coefficients = ", ".join(related) or "no coefficient"
-        answer = f"{label['column']} goes with {coefficients} (p < 0.05)."
         test = f"corrected p-values: permutations of {label['permuted']}"
-        if "class_means" in label and len(related):
+        if "class_means" in label and np.less(label["p_values"], 0.05).any():
             means = _class_means(label, names)
     return [
-        answer,
+        _answer(label),
         Cells(head, rows, title),
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),
-        *_many(label),
     ]
 
 
@@ -516,21 +483,6 @@ def _score(label: dict[str, Any]) -> str:
     if classes:
         parts.append(f"largest class {100 * label['largest_class']:.1f} %")
     return f"cross-validated {parts[0]} {', '.join(parts[1:])}"
-
-
-def _many(label: dict[str, Any]) -> list[str]:
-    """Return that classes have too many coefficients for their frames, if they have.
-
-    From .4 coefficients a frame: docs/benchmarks/README.md, "Thresholds".
-    """
-    n_frames, n_components = label["n_frames"], len(label["values"])
-    if label["score"] != "accuracy" or n_components < 0.4 * n_frames:
-        return []
-    return [
-        f"{n_components} coefficients are many for {n_frames} frames: fewer predict "
-        "classes better. Keep this fit for shapes and depths; for classes, fit again "
-        f"without --prior, with -k {max(n_frames // 6, 1)} or less."
-    ]
 
 
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
@@ -576,12 +528,6 @@ def _time(time: dict[str, Any]) -> Section:
         f"{name}: {'; '.join(found)}",
         f"smoothed coefficients differ by {time['changed_by']:.2f} (root mean square)",
     ]
-
-
-def _shapes(model: dict[str, Any]) -> str:
-    """Return how many basis shapes a model has."""
-    n_components = model["n_components"]
-    return f"{n_components} basis shape{'s' * (n_components != 1)}"
 
 
 def _sentence(text: str) -> str:

@@ -18,9 +18,8 @@ from isa_nrsfm.cli._outputs import (
     write_alpha,
 )
 from isa_nrsfm.cli._report import quality_report, table_report
-from isa_nrsfm.cli._sections import quality_section, table_section, text_of
+from isa_nrsfm.cli._sections import left_out_row, quality_row, text_of
 from isa_nrsfm.io._tables import table_suffix
-from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 
@@ -44,15 +43,13 @@ def run(args: Namespace, warned: list[str]) -> str:
         refuse_replacing(outputs)
     X, n_components = _reading.as_fitted(estimator, frames.X), len(estimator.basis_)
     alpha = std = np.empty((0, n_components))
-    quality: Any = ["no frame was fitted"]
+    quality = ["fit", "", "no frame was fitted"]
     if len(X):
         motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
         explained = estimator.inverse_transform(alpha, motion, translation)
         square = np.nanmean((explained - np.asarray(X)) ** 2)
         found = quality_report(estimator, X, square, frames.weighting)
-        layout, scaled = estimator.layout, estimator.frames_scaled_
-        snr = inverse_snr(X, explained, layout=layout, scale_frames=scaled)
-        quality = quality_section(found | {"inverse_snr": snr})
+        quality = quality_row(found)
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting
@@ -61,13 +58,14 @@ def run(args: Namespace, warned: list[str]) -> str:
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
-    sections = {
-        "Table": table_section(table_report(args, frames), "without coefficients"),
-        "Model": [args.model],
-        "Quality": quality,
-        "Output": [*map(str, outputs), f"{len(frames.points)} rows"],
-    }
-    return text_of(f"{n_components} coefficients of {len(X)} frames", sections)
+    files = "  ".join(map(str, outputs))
+    rows = [
+        ["model", "", args.model],
+        quality,
+        left_out_row(table_report(args, frames)),
+        ["output", "", f"{files}  {len(frames.points)} rows"],
+    ]
+    return text_of(f"{n_components} coefficients of {len(X)} frames", rows)
 
 
 def _write_viewer(path: Path, estimator: Any, **options: Any) -> None:

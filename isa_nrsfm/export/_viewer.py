@@ -6,6 +6,7 @@ import json
 import os
 import struct
 from collections.abc import Sequence
+from html import escape
 from importlib.resources import files
 from numbers import Integral, Real
 from typing import Any, cast
@@ -62,6 +63,21 @@ MATERIALS = [
 ]
 
 
+class ViewerPage(str):
+    """The page that was written, which a notebook shows."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        """Return that this is a page, and its size."""
+        return f"<page of {len(self):,} characters>"
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame."""
+        frame = 'width="100%" height="520" style="border: 0"'
+        return f'<iframe srcdoc="{escape(self)}" {frame}></iframe>'
+
+
 def write_viewer(
     model: Any,
     path: str | os.PathLike[str],
@@ -76,9 +92,9 @@ def write_viewer(
     names: Sequence[str] | None = None,
     camera: Camera = "weak_perspective",
     origin: Origin = "auto",
-) -> None:
+) -> ViewerPage:
     """
-    Write a page that shows a shape model in any browser.
+    Write a page that shows a shape model in any browser, and in a notebook.
 
     The page is one file that needs no network and no other program. It shows the mean
     shape in 3D, turned by 20 degrees at first, with a slider for each basis shape. It
@@ -128,6 +144,11 @@ def write_viewer(
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" if a face or a body would otherwise be
         upside down.
+
+    Returns
+    -------
+    ViewerPage
+        The page as text. A notebook shows it.
 
     Raises
     ------
@@ -203,7 +224,9 @@ def write_viewer(
         "deviations": _encoded(deviations[rows] / size, "<f4"),
         "times": _encoded(seconds - seconds[:1], "<f8"),
     }
-    write_whole(path, _page(content).encode("utf-8"))
+    page = ViewerPage(_page(content))
+    write_whole(path, page.encode("utf-8"))
+    return page
 
 
 def _seconds(times: ArrayLike, n_rows: int) -> NDArray:

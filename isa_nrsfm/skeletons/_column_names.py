@@ -123,9 +123,9 @@ def point_names(x_columns: Iterable[str]) -> tuple[str, ...]:
     return points if len(set(points)) == len(x_columns) else tuple(x_columns)
 
 
-def names_of_points(model: Any) -> tuple[str, ...]:
+def names_of_points(model: Any, n_points: int | None = None) -> tuple[str, ...]:
     """Return the names of a model's points, or their numbers."""
-    n_points = len(model.mean_shape_)
+    n_points = len(model.mean_shape_) if n_points is None else n_points
     columns = getattr(model, "feature_names_in_", None)
     if columns is None:
         return tuple(map(str, range(n_points)))

@@ -1,0 +1,491 @@
+"""AutoNRSfM: camera, refinement, loss, prior and K that held-out points prefer.
+
+The first fit has weak-perspective cameras and all directions of deformation. Each
+further one changes one setting, in the order of its time, and is skipped where it
+cannot win. It starts from the best fit so far.
+"""
+
+import time
+import warnings
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from sklearn.base import BaseEstimator, clone
+from sklearn.utils.validation import validate_data
+
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import (
+    HasMethods,
+    StrOptions,
+    fit_context,
+    taken_rows,
+)
+from isa_nrsfm._compat.texts import percent
+from isa_nrsfm._estimator import AffineNRSfM, check_class
+from isa_nrsfm._other_tables import fitted_prior
+from isa_nrsfm._parameters import choices
+from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
+from isa_nrsfm._tables.blocks import spread
+from isa_nrsfm._tables.sources import StoredTable, is_on_dask
+from isa_nrsfm.analysis._advice import (
+    COMPARE,
+    OTHER_CAMERAS,
+    gross_residuals,
+    layout_of,
+)
+from isa_nrsfm.analysis._diagnostics import MOST_ROWS, unexplained
+from isa_nrsfm.datasets import load_face_prior
+
+AUTO = "auto"
+# Components of the face prior: docs/depth.md has figures of nine and of forty.
+FACE_COMPONENTS = 9
+# Rows of rough fits, and basis shapes of fits with perspective, at most.
+ROUGH_ROWS, MOST_SHAPES = 50, 4
+# All of these: docs/benchmarks/README.md, "Thresholds".
+# Share of gross errors of held-out points above which robust losses are tried.
+MOST_WRONG = 1e-3
+# Largest variation of the scales of frames for which one scale is tried.
+EQUAL_SCALES = 0.1
+# A setting is used if it lowers the error of held-out points to this share; perspective
+# to the second one.
+LOWER, MUCH_LOWER = 0.97, 0.9
+# Shapes that determine the depth may have an error of held-out points so much larger.
+LARGER = 1.5
+
+
+class Trial(NamedTuple):
+    """
+    A setting that was tried, or the reason why it was not.
+
+    Attributes
+    ----------
+    setting : str
+        What was tried: parameters that differ from those of the best fit before it.
+    held_out_error : float
+        As minus `AffineNRSfM.score`, of at most 300 rows; the median over points if the
+        table has outliers. NaN if it was not fitted.
+    depth_uncertainty : float
+        As `AffineNRSfM.depth_uncertainty_`; NaN if it is not known.
+    seconds : float
+        Time of the fit.
+    result : str
+        "used", "less good", "not better", or the reason why it was not tried.
+    """
+
+    setting: str
+    held_out_error: float
+    depth_uncertainty: float
+    seconds: float
+    result: str
+
+    def __repr__(self) -> str:
+        """Return the trial in words."""
+        if np.isnan(self.held_out_error):
+            return f"{self.setting}: {self.result}"
+        text = f"{self.setting}: {percent(self.held_out_error)} unexplained"
+        if np.isfinite(self.depth_uncertainty):
+            text += f", depth known to {100 * self.depth_uncertainty:.2g} %"
+        return f"{text}, {self.result}"
+
+
+class AutoNRSfM(ChosenMixin, BaseEstimator):
+    """
+    `AffineNRSfM` with the settings that held-out points of the table prefer.
+
+    The first fit has weak-perspective cameras. Robust losses are tried if the table has
+    outliers, orthographic cameras if all frames have one scale, affine ones if images
+    are stretched, and perspective if the size of the images is known. If the depth is
+    not determined, the face prior is tried for layouts of faces, and the consensus of
+    groups of points for others.
+
+    Parameters
+    ----------
+    estimator : AffineNRSfM, default=None
+        All other parameters, such as `random_state`. None is ``AffineNRSfM()``. A clone
+        is fitted.
+    n_components : int or "auto", default="auto"
+        As in `AffineNRSfM`. Here and below, all but "auto" is kept.
+    camera : str, default="auto"
+        As in `AffineNRSfM`.
+    refinement : str or None, default="auto"
+        As in `AffineNRSfM`.
+    loss : str, default="auto"
+        As in `AffineNRSfM`.
+    prior : AffineNRSfM, None or "auto", default="auto"
+        As in `AffineNRSfM`. "auto" tries that of `isa_nrsfm.datasets.load_face_prior`.
+    image_size : tuple of float (width, height), default=None
+        Size of the images, in the units of the table. Perspective cameras need it.
+
+    Attributes
+    ----------
+    best_estimator_ : AffineNRSfM
+        The fit that is kept.
+    n_components_ : int
+        Its number of coefficients.
+    trials_ : list of Trial
+        What was tried, in order: held-out errors, errors of depths, and results.
+    n_features_in_ : int
+        Number of columns.
+    feature_names_in_ : ndarray of shape (`n_features_in_`,)
+        Names of the columns, where the table is a dataframe with string names.
+
+    See Also
+    --------
+    AffineNRSfM : The fit with given settings.
+    AffineNRSfMCV : The number of basis shapes by cross-validation.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AutoNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> faces = make_face_tracks(n_frames=60, n_components=2, random_state=0)
+    >>> auto = AutoNRSfM().fit(faces.data)
+    >>> auto.n_components_, auto.best_estimator_.camera
+    (2, 'weak_perspective')
+    >>> auto.transform(faces.data).shape
+    (60, 2)
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        "estimator": [None, HasMethods(["fit", "get_params", "set_params"])],
+        "n_components": AffineNRSfM._parameter_constraints["n_components"],
+        "camera": [StrOptions({AUTO, *choices.CAMERA_NAMES})],
+        "refinement": [StrOptions({AUTO, *choices.REFINEMENTS}), None],
+        "loss": [StrOptions({AUTO, *choices.LOSSES})],
+        "prior": [None, StrOptions({AUTO}), HasMethods(["fit", "get_params"])],
+        "image_size": [None, "array-like"],
+    }
+
+    def __init__(
+        self,
+        estimator: Any = None,
+        *,
+        n_components: Any = AUTO,
+        camera: str = AUTO,
+        refinement: str | None = AUTO,
+        loss: str = AUTO,
+        prior: Any = AUTO,
+        image_size: Any = None,
+    ):
+        self.estimator = estimator
+        self.n_components = n_components
+        self.camera = camera
+        self.refinement = refinement
+        self.loss = loss
+        self.prior = prior
+        self.image_size = image_size
+
+    @fit_context(nested=False)
+    def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
+        """
+        Fit a table with the settings that its held-out points prefer.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            The table, one frame a row, in memory or a memory map.
+        y : None
+            Ignored.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `AffineNRSfM.fit`.
+
+        Returns
+        -------
+        AutoNRSfM
+            The fitted estimator.
+
+        Raises
+        ------
+        ValueError
+            If the table is not in memory, or as in `AffineNRSfM.fit`.
+
+        Warns
+        -----
+        UserWarning
+            As in `AffineNRSfM.fit`, for the fit that is kept.
+        """
+        if is_on_dask(X) or isinstance(X, StoredTable):
+            raise ValueError(
+                "AutoNRSfM needs a table in memory or a memory map; got a "
+                f"{type(X).__name__}: take some thousand of its frames"
+            )
+        estimator = AffineNRSfM() if self.estimator is None else self.estimator
+        check_class(estimator, "estimator")
+        given = {name: getattr(self, name) for name in FIRST}
+        given = {name: each for name, each in given.items() if not _is_auto(each)}
+        params, free = first_settings(given)
+        estimator = clone(estimator).set_params(**params)
+        point = None if self.image_size is None else np.divide(self.image_size, 2)
+        if estimator.camera == "perspective" and estimator.principal_point is None:
+            estimator.set_params(principal_point=point)
+        weights = {} if point_weight is None else {"point_weight": point_weight}
+        self.best_estimator_, self.trials_ = decided(
+            estimator, X, free, principal_point=point, **weights
+        )
+        self.n_components_ = self._n_features_out = self.best_estimator_.n_components_
+        validate_data(self, X, skip_check_array=True)  # number and names of columns
+        return self
+
+    def score(self, X: Any, y: Any = None) -> float:
+        """
+        Return minus the inverse SNR of points held out of the fit of their frame.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        float
+            As in `AffineNRSfM.score`.
+        """
+        return self._fitted().score(X)
+
+
+# Parameters of the first fit.
+FIRST = {
+    "n_components": AUTO,
+    "camera": "weak_perspective",
+    "refinement": "joint",
+    "loss": "linear",
+    "prior": None,
+}
+
+
+def _is_auto(value: Any) -> bool:
+    """Return whether a parameter is to be decided."""
+    return isinstance(value, str) and value == AUTO
+
+
+def first_settings(given: dict[str, Any]) -> tuple[dict[str, Any], set[str]]:
+    """Return parameters of the first fit, and those that may change: none is given.
+
+    A prior determines the camera and the refinement. Without the joint refinement
+    nothing is compared.
+    """
+    params, free = FIRST | given, {*FIRST} - {*given}
+    if params["refinement"] not in choices.JOINT_REFINEMENTS:
+        return FIRST | {"n_components": 3, "camera": "affine"} | given, set()
+    if params["prior"] is not None:
+        camera = getattr(fitted_prior(params["prior"]), "camera_", params["camera"])
+        params |= {"camera": given.get("camera", camera)}
+        free -= {"camera", "refinement"}
+    return params, free
+
+
+class _Rows(NamedTuple):
+    """Rows of a table on which fits are compared, their weights, what else is known."""
+
+    X: Any
+    weights: dict[str, Any]
+    principal_point: Any
+    face_layout: str | None
+
+    def error(self, model: AffineNRSfM, robust: bool) -> float:
+        """Return the error of held-out points."""
+        table, weights = model._opened(self.X, **self.weights, judged=False)
+        return unexplained(model._model, table.whole(), *weights, robust=robust)
+
+    def outlier_share(self, model: AffineNRSfM) -> float:
+        """Return the share of gross errors among held-out points.
+
+        Fits with all directions of deformation follow outliers, held-out points cannot.
+        """
+        table, _ = model._opened(self.X, judged=False)
+        error = table.joined(model._model.held_out)[..., 0]
+        return gross_residuals(np.sqrt(error))[0]
+
+
+class _Fit(NamedTuple):
+    """A fit, its error of held-out points, warnings, and seconds."""
+
+    model: AffineNRSfM
+    error: float
+    caught: list[warnings.WarningMessage]
+    seconds: float
+
+    @property
+    def depth(self) -> float:
+        """Expected error of the depth, NaN for affine cameras."""
+        return float(getattr(self.model, "depth_uncertainty_", np.nan))
+
+    @property
+    def determined(self) -> bool:
+        """Whether the depth is determined."""
+        known = self.model._model.frames.certainty.determined
+        return bool(known and self.model.camera != "affine")
+
+
+# Each proposal: why a setting cannot win, otherwise the changes of the best fit.
+Proposal = str | dict[str, Any]
+
+
+def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
+    """Outliers have their full influence on a fit with the linear loss."""
+    if rows.weights:
+        return "points have weights"
+    if not rows.outlier_share(best.model) > MOST_WRONG:
+        return "no outliers"
+    return {"loss": "cauchy"}
+
+
+def _perspective(best: _Fit, rows: _Rows) -> Proposal:
+    """Compare rough fits, with a focal length that is too long for most cameras."""
+    model, point = best.model, rows.principal_point
+    if point is None:
+        return "image size not known"
+    if model.refinement != "joint":
+        return "not with the consensus"
+    near: dict[str, Any] = {"camera": "perspective"}
+    near["principal_point"] = tuple(map(float, point))
+    # More basis shapes would explain the perspective.
+    few = {"n_components": min(len(model.basis_), MOST_SHAPES)}
+    near |= few if model.n_components == AUTO else {}
+    params = model.get_params(deep=False) | few | {"prior": None}
+    trials: Sequence[dict[str, Any]] = ({}, near | {"focal_length": 5 * max(point)})
+    some = spread(np.arange(rows.X.shape[0]), ROUGH_ROWS)
+    X, weights = taken_rows(rows.X, some), {n: w[some] for n, w in rows.weights.items()}
+    fits = [StartedNRSfM(**params | each).fit(X, **weights) for each in trials]
+    weak, perspective = (-fit.score(X, **weights) for fit in fits)
+    return near if perspective < weak else "held-out points do not show it"
+
+
+def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
+    """The prior of faces supplies depths that a table does not determine."""
+    layout, K = rows.face_layout, best.model.n_components
+    if best.determined:
+        return "the depth is known"
+    if best.model.camera != "weak_perspective":
+        return f"not with {best.model.camera} cameras"
+    layout = layout or getattr(layout_of(best.model), "name", None)
+    if layout not in choices.FACE_PRIORS:
+        return "no layout of faces"
+    prior = load_face_prior(FACE_COMPONENTS if K == AUTO else K, layout=layout)
+    return {"prior": prior, "n_components": AUTO}
+
+
+def _consensus(best: _Fit, rows: _Rows) -> Proposal:
+    """Groups of points determine depths that all points together do not."""
+    if best.determined:
+        return "the depth is known"
+    if best.model.camera not in ("weak_perspective", "orthographic") or rows.weights:
+        return "not with these cameras or weights"
+    return {"refinement": "consensus"}
+
+
+def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
+    """One scale for all frames has fewer unknowns."""
+    model = best.model
+    if model.camera != "weak_perspective" or model.prior or not best.determined:
+        return "scales not known"
+    if model.refinement != "joint":
+        return "the depth needs groups"
+    if model.scales_.std() > EQUAL_SCALES * model.scales_.mean():
+        return "scales differ"
+    return {"camera": "orthographic"}
+
+
+def _affine(best: _Fit, rows: _Rows) -> Proposal:
+    """Affine cameras absorb the stretch of images."""
+    ratio = best.model.camera_noise_ratio_
+    if best.model.prior or not ratio >= OTHER_CAMERAS:
+        return "not stretched"
+    return {"camera": "affine", "refinement": "joint"}
+
+
+def _lower(found: _Fit, best: _Fit) -> bool:
+    """Return whether held-out points prefer a fit."""
+    return found.error < LOWER * best.error
+
+
+# What is tried, in this order: the parameter that changes, words, the proposal, and
+# whether the fit with the changes is better.
+PROPOSALS: tuple[tuple[str, str, Callable, Callable], ...] = (
+    ("loss", "robust loss", _robust_loss, _lower),
+    (
+        *("camera", "perspective", _perspective),
+        lambda found, best: found.error < MUCH_LOWER * best.error,
+    ),
+    ("prior", "face prior", _face_prior, lambda found, _: found.determined),
+    (
+        *("refinement", "consensus", _consensus),
+        lambda found, best: found.determined and found.error < LARGER * best.error,
+    ),
+    ("camera", "orthographic", _orthographic, _lower),
+    ("camera", "affine", _affine, _lower),
+)
+
+
+def decided(
+    estimator: AffineNRSfM,
+    X: Any,
+    free: Collection[str],
+    *,
+    principal_point: Any = None,
+    face_layout: str | None = None,
+    show: Callable[[str], Any] = str,
+    groups: Any = None,
+    **weights: Any,
+) -> tuple[AffineNRSfM, list[Trial]]:
+    """Fit a table with the settings that its held-out points prefer.
+
+    The estimator may be fitted already. `free` are the parameters that may change.
+    Layouts of faces are recognised if None is given. `show` gets the names of trials;
+    groups and weights are those of `AffineNRSfM.fit`.
+    Returns the fit that is kept, with warnings, and what was tried.
+    """
+
+    def fitted(model: AffineNRSfM, robust: bool) -> _Fit:
+        since = time.perf_counter()
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            if not hasattr(model, "_model"):
+                model.fit(X, groups=groups, **weights)
+        seconds = time.perf_counter() - since
+        return _Fit(model, rows.error(model, robust), caught, seconds)
+
+    some = spread(np.arange(X.shape[0]), MOST_ROWS)
+    few = {name: np.asarray(each)[some] for name, each in weights.items()}
+    rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
+    best, robust = fitted(estimator, False), False
+    trials: list[Trial] = []
+    trials.append(
+        Trial(_words(estimator), best.error, best.depth, best.seconds, "used")
+    )
+    used, joint = 0, estimator.refinement in choices.JOINT_REFINEMENTS
+    for name, setting, proposal, wins in PROPOSALS if joint else ():
+        if name not in free:
+            continue
+        changes, found = proposal(best, rows), None
+        if not isinstance(changes, str):
+            show(setting)
+            if name == "loss":  # outliers have no influence on medians
+                best, robust = best._replace(error=rows.error(best.model, True)), True
+            try:
+                found = fitted(clone(best.model).set_params(**changes), robust)
+            except ValueError as error:  # such as points that too few frames show
+                changes = str(error)
+        if found is None:
+            trials.append(Trial(setting, np.nan, np.nan, 0.0, str(changes)))
+            continue
+        result = "not better"
+        if wins(found, best):
+            best, result = found, "used"
+            trials[used] = trials[used]._replace(result="less good")
+            used = len(trials)
+        trials.append(Trial(setting, found.error, found.depth, found.seconds, result))
+    model = best.model
+    if model.prior is not None:
+        model.set_params(n_components=model.n_components_)
+    for each in best.caught:  # made before the comparison
+        warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
+    model._trials = trials
+    return model, trials
+
+
+def _words(estimator: AffineNRSfM) -> str:
+    """Return the name of a camera model in words."""
+    return f"{estimator.camera.replace('_p', ' p')} cameras"

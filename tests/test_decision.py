@@ -1,0 +1,243 @@
+"""Settings that held-out points prefer, and advice that ends."""
+
+import pickle
+import re
+import warnings
+
+import numpy as np
+import pytest
+from layers import slow_after
+from refusals import refused
+from sklearn.base import clone
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
+
+from isa_nrsfm import AffineNRSfM, AutoNRSfM
+from isa_nrsfm._decision import FIRST, first_settings
+from isa_nrsfm._prepare.coordinates import still_points
+from isa_nrsfm.analysis._advice import COMPARE
+from isa_nrsfm.analysis._frame_columns import runs_between_gaps
+from isa_nrsfm.datasets import (
+    load_face_prior,
+    make_body_tracks,
+    make_face_tracks,
+    make_nonrigid_tracks,
+)
+from isa_nrsfm.export import write_viewer
+
+
+def with_outliers(X):
+    """Return a table with a wrong point in every tenth number."""
+    rng = np.random.default_rng(0)
+    wrong = rng.random((len(X), X.shape[1] // 2)) < 0.01
+    return X + np.repeat(wrong, 2, axis=1) * X.std() * rng.normal(size=X.shape)
+
+
+def frontal():
+    """Return faces that do not turn."""
+    faces = make_face_tracks(60, n_components=3, random_state=0)
+    return faces.shapes[..., :2].reshape(60, -1)
+
+
+def walks():
+    """Return points that are no body."""
+    rng = np.random.default_rng(0)
+    return 300 + rng.normal(size=(80, 16, 2)).cumsum(axis=0).reshape(80, -1)
+
+
+GIVEN = {"n_components": 2, "random_state": 0}
+TABLES = {
+    "bodies": lambda: make_body_tracks(80, random_state=0).data,
+    "frontal faces": frontal,
+    "walks": walks,
+    "one scale": lambda: (
+        make_nonrigid_tracks(60, 16, noise=0.02, camera="orthographic", **GIVEN).data
+    ),
+    "stretched": lambda: (
+        make_nonrigid_tracks(
+            60, 16, noise=0.005, camera="weak_perspective", **GIVEN
+        ).data
+        * np.tile([1.0, 0.5], 16)
+    ),
+    "few frames": lambda: make_nonrigid_tracks(14, 24, noise=0.02, **GIVEN).data,
+    "outliers": lambda: with_outliers(make_nonrigid_tracks(50, 16, **GIVEN).data),
+}
+
+
+def fitted(estimator, X):
+    """Return a fitted estimator, its messages and its error of held-out points."""
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        estimator.fit(X)
+    model = getattr(estimator, "best_estimator_", estimator)
+    found = model.diagnostics(X)
+    texts = [str(each.message) for each in caught]
+    return model, [*found.messages, *texts], found
+
+
+@pytest.mark.parametrize("name", slow_after(4, [*TABLES]))
+def test_advice_ends_after_one_more_fit_which_is_not_worse(name):
+    X = TABLES[name]()
+    model, messages, before = fitted(AffineNRSfM(random_state=0), X)
+    text = " | ".join(messages)
+    if "AutoNRSfM" in text:
+        start = AffineNRSfM(random_state=0, remove_pose="remove_pose" in text)
+        model, messages, after = fitted(AutoNRSfM(start), X)
+    elif advised := re.findall('(remove_pose=True|n_components="auto")', text):
+        values = dict(each.split("=") for each in advised)
+        options = {name: eval(value) for name, value in values.items()}
+        model, messages, after = fitted(clone(model).set_params(**options), X)
+    else:
+        return
+    text = " | ".join(messages)
+    assert COMPARE not in text
+    assert not re.search("(camera|loss|refinement|prior|n_components|pose)=", text)
+    if model.loss == before.fit == "linear" and model.prior is None:
+        assert after.held_out_error <= 1.001 * before.held_out_error
+
+
+def tried(X, **options):
+    """Return the trials by their settings, and the fit."""
+    start = AffineNRSfM(random_state=0)
+    auto = AutoNRSfM(start, **options)
+    with warnings.catch_warnings(action="ignore"):
+        auto.fit(X)
+    return {each.setting: each for each in auto.trials_}, auto.best_estimator_
+
+
+def test_robust_losses_are_tried_if_there_are_outliers():
+    found, model = tried(TABLES["outliers"]())
+    assert (found["robust loss"].result, model.loss) == ("used", "cauchy")
+    found, model = tried(make_nonrigid_tracks(60, 20, **GIVEN).data)
+    assert (found["robust loss"].result, model.loss) == ("no outliers", "linear")
+    assert np.isnan(found["robust loss"].held_out_error)
+
+
+def test_faces_that_do_not_turn_have_the_prior():
+    found, model = tried(frontal())
+    assert found["face prior"].result == "used"
+    assert (model.n_components, len(model.prior.basis_)) == (9, 9)
+    assert found["weak perspective cameras"].depth_uncertainty > 0.55
+    found, model = tried(frontal(), prior=None)
+    assert "face prior" not in found
+    assert model.prior is None
+
+
+def test_one_scale_is_found():
+    found, model = tried(TABLES["one scale"]())
+    one, many = found["orthographic"], found["weak perspective cameras"]
+    assert one.held_out_error < many.held_out_error
+    assert (model.camera, one.result, many.result) == (
+        "orthographic",
+        "used",
+        "less good",
+    )
+
+
+@pytest.mark.slow
+def test_perspective_needs_the_size_of_images():
+    faces = make_face_tracks(60, camera="perspective", **GIVEN)
+    found, model = tried(faces.data, image_size=2 * np.array(faces.principal_point))
+    assert (found["perspective"].result, model.camera) == ("used", "perspective")
+    found, model = tried(faces.data)
+    assert found["perspective"].result == "image size not known"
+
+
+def test_given_settings_are_kept():
+    X = make_nonrigid_tracks(60, 20, **GIVEN).data
+    given = {"camera": "affine", "loss": "huber", "n_components": 1}
+    found, model = tried(X, **given, refinement="joint", prior=None)
+    assert len(found) == 1
+    assert {name: getattr(model, name) for name in given} == given
+    params, free = first_settings({"refinement": None})
+    assert (params["camera"], params["n_components"], free) == ("affine", 3, set())
+    prior = load_face_prior(3)
+    params, free = first_settings({"prior": prior})
+    assert (params["camera"], free) == ("weak_perspective", {"loss", "n_components"})
+    assert first_settings({}) == (FIRST, {*FIRST})
+
+
+def test_is_an_estimator_of_scikit_learn():
+    X = make_nonrigid_tracks(40, 16, noise=0.01, **GIVEN).data
+    auto = AutoNRSfM(AffineNRSfM(random_state=0), loss="linear")
+    pipeline = make_pipeline(FunctionTransformer(), clone(auto))
+    alpha = pipeline.fit_transform(X)
+    again = pickle.loads(pickle.dumps(pipeline))[-1]
+    np.testing.assert_array_equal(again.transform(X), alpha)
+    assert alpha.shape == (40, again.n_components_)
+    assert again.get_feature_names_out()[0] == "alpha_1"
+    assert again.score(X) == again.best_estimator_.score(X)
+    assert again.get_params()["loss"] == "linear"
+
+
+def arena(n_still, jitter=0.7):
+    """Return tracks (150, 15 + n_still, 2) of a body that walks between points."""
+    rng = np.random.default_rng(0)
+    body = make_nonrigid_tracks(150, 15, noise=0.01, **GIVEN).data.reshape(150, 15, 2)
+    body = 40 * body + 300 + 12 * rng.normal(size=(150, 1, 2)).cumsum(axis=0)
+    still = rng.uniform(50, 600, (n_still, 2)) + jitter * rng.normal(
+        size=(150, n_still, 2)
+    )
+    return np.concatenate([body, still], axis=1)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.7])
+def test_points_that_stand_still_are_found(jitter):
+    assert still_points(arena(4, jitter)).tolist() == [15, 16, 17, 18]
+    assert not len(still_points(arena(0)))
+    aligned = arena(0) - arena(0)[:, :1]  # the first point is the origin
+    assert not len(still_points(aligned))
+    in_place = arena(0) - arena(0).mean(axis=1, keepdims=True)
+    in_place[:, :3] = in_place[:1, :3]  # parts of an object that stays in place
+    assert not len(still_points(in_place))
+
+
+def test_the_command_line_leaves_them_out(fits, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    names = [f"{axis}_{j}" for j in range(19) for axis in "xy"]
+    table = pandas.DataFrame(arena(4).reshape(150, -1), columns=names)
+    table.to_csv(tmp_path / "maze.csv", index=False)
+    options = [tmp_path / "maze.csv", "--no-figures", "--refinement", "none", "-k", 1]
+    found = fits(*options)
+    assert "4 points stand still while the others move through the image" in found.err
+    assert len(found.model.mean_shape_) == 15
+    found = fits(*options, "--points", "0-18", "--force")
+    assert len(found.model.mean_shape_) == 19
+
+
+@pytest.mark.parametrize("option", [None, "--keep-zeros"])
+def test_zeros_to_one_side_of_all_points_are_missing(fits, tmp_path, option):
+    pandas = pytest.importorskip("pandas")
+    X = make_nonrigid_tracks(40, 16, noise=0.01, **GIVEN).data
+    X += 0.1 - X.min()  # nearer to (0, 0) than points are spread
+    X[[3, 8, 20], 4:6] = 0.0
+    names = [f"{axis}_{j}" for j in range(16) for axis in "xy"]
+    pandas.DataFrame(X, columns=names).to_csv(tmp_path / "a.csv", index=False)
+    options = "--no-figures --refinement none -k 1".split() + [option] * bool(option)
+    table = fits(tmp_path / "a.csv", *options).report["table"]
+    assert table["n_missing_points"] == (0 if option else 3)
+
+
+def test_runs_between_gaps_are_groups():
+    time = np.arange(100.0)
+    assert runs_between_gaps(time) is None
+    kept = (time < 30) | (time > 55)
+    order = np.random.default_rng(0).permutation(kept.sum())
+    runs = runs_between_gaps(time[kept][order])
+    np.testing.assert_array_equal(runs, time[kept][order] > 40)
+    assert runs_between_gaps(np.random.default_rng(0).random(100).cumsum() ** 3) is None
+
+
+def test_pages_are_shown_in_notebooks(tmp_path):
+    X = make_nonrigid_tracks(30, 16, noise=0.01, **GIVEN).data
+    model = AffineNRSfM(2, camera="weak_perspective", random_state=0).fit(X)
+    page = write_viewer(model, tmp_path / "a.html")
+    assert page == (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert page._repr_html_().startswith("<iframe srcdoc=")
+    assert "<script" not in page._repr_html_()
+    assert len(repr(page)) < 50
+
+
+def test_strategies_without_components_are_refused():
+    X = make_nonrigid_tracks(30, 16, **GIVEN).data
+    model = AffineNRSfM(1, isa=StandardScaler(), refinement=None)
+    refused("isa must give components_ of shape", model.fit, X)
