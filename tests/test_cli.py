@@ -728,7 +728,7 @@ def test_interruption_ends_with_code_130(run, table, tmp_path, monkeypatch):
 def test_warnings_are_shown_once_with_options(fits, table, monkeypatch):
     fit = AffineNRSfM.fit
 
-    def warn_and_fit(self, X, y=None):
+    def warn_and_fit(self, X, y=None, groups=None):
         given = "got camera='affine';\n  n_components=2 of a/camera=1.csv, layout='x'"
         given += ". Use refinement=None"
         for _ in range(2):
