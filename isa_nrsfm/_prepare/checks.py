@@ -258,8 +258,8 @@ def check_arrangement(
                     f"X seems to have {n} numbers for each point (x, y, z, or a "
                     f"visibility); x and y are needed. Give {two_of(n)}"
                 )
-    # Of real tables the right layout leaves 0.05 to 0.61 of the energy of the other, the
-    # wrong one at least 0.72 times that of the right one.
+    # On real tables the right layout leaves 0.05 to 0.61 of the energy of the wrong
+    # one, and the wrong one at least 0.72 of that of the right one.
     with_basis = _noise_ratio(given, swapped, scale_frames, 6)
     if with_basis < 0.65:
         warn_caller(
