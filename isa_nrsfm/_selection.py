@@ -26,12 +26,14 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
+    N_JOBS,
     CoefficientsMixin,
     HasMethods,
     Interval,
     StrOptions,
     fit_context,
     taken_rows,
+    with_numpy_defaults,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._fitted_model import TableModel
@@ -66,6 +68,7 @@ class StartedNRSfM(AffineNRSfM):
         return self
 
 
+@with_numpy_defaults
 class AffineNRSfMCV(
     CoefficientsMixin, TransformerMixin, MetaEstimatorMixin, BaseEstimator
 ):
@@ -171,7 +174,7 @@ class AffineNRSfMCV(
         "cv": ["cv_object"],
         "scoring": [None, str, callable],
         "select": [StrOptions({"best", "one_standard_error"})],
-        "n_jobs": [None, Integral],
+        "n_jobs": N_JOBS,
         "verbose": ["verbose"],
     }
 

@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 
 import joblib
+import numpy as np
 import sklearn
 
 # Files whose frames are skipped on the way from the warning up to the user's line.
@@ -13,6 +14,7 @@ INSIDE = (
     *(str(Path(inner).parent) for inner in (sklearn.__file__, joblib.__file__)),
     str(Path(__file__).parents[1]),
     contextlib.__file__,
+    np.errstate.__call__.__code__.co_filename,
 )
 
 
