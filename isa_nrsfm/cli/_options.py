@@ -94,7 +94,7 @@ def _share_or_number(text: str) -> float:
 
 def _image_size(text: str) -> tuple[int, int] | None:
     """Read WIDTHxHEIGHT."""
-    match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
+    match = re.fullmatch(r"([1-9]\d{0,6})[xX]([1-9]\d{0,6})", text.strip())
     return (int(match[1]), int(match[2])) if match else None
 
 

@@ -218,7 +218,14 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
     """Return entries by their identifiers, or raise."""
     if not all(isinstance(entry.get("id"), int | str) for entry in entries):
         raise ValueError(f"each of the {what} needs an id")
-    return {entry["id"]: entry for entry in entries}
+    found = {entry["id"]: entry for entry in entries}
+    twice = next((each for each in entries if each != found[each["id"]]), None)
+    if twice is not None:
+        raise ValueError(
+            f"two of the {what} have the id {twice['id']!r}, as in files that were "
+            "joined: give each an id of its own, and its annotations as well"
+        )
+    return found
 
 
 def _keypoints(

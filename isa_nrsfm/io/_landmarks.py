@@ -113,8 +113,8 @@ def assemble(
     the points determine.
     """
     n_frames, n_points, _ = tracks.shape
-    if n_frames == 0:
-        raise ValueError("there are no frames in it")
+    if n_frames == 0 or n_points == 0:
+        raise ValueError(f"there are no {'points' if n_frames else 'frames'} in it")
     if point_names is None:
         point_names = [str(j) for j in range(n_points)]
         columns = [f"{axis}_{j}" for j in point_names for axis in "xy"]
@@ -221,7 +221,7 @@ def checked_sizes(name: str, sizes: Any, n_images: int) -> NDArray[np.float64]:
     except (TypeError, ValueError):
         found = np.array(np.nan)
     fits = found.shape in ((2,), (n_images, 2))
-    if not (fits and np.isfinite(found).all() and (found > 0).all()):
+    if not (fits and ((found > 0) & (found < 1e7)).all()):
         raise ValueError(
             f"{name} must be a width and a height in pixels, such as (1920, 1080), for "
             f"all images or for each of the {n_images}; got {sizes!r:.60}"

@@ -30,6 +30,8 @@ from isa_nrsfm.skeletons._column_names import (
 SEPARATORS = {".csv": ",", ".tsv": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
+# Bytes at the end of a file that show how its numbers are written.
+_TAIL = 2**16
 # Numbers with a decimal comma, and with commas between thousands.
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
@@ -446,6 +448,30 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
             yield row
     if n_rows == 1:
         raise ValueError("it has a header but no rows")
+    _refuse_cut_number(path, separator)
+
+
+def _refuse_cut_number(path: Path, separator: str) -> None:
+    """Raise if the last number of a text was cut off: it ends before all others do.
+
+    Numbers of a program have as many digits after the point or exponent, or nearly so.
+    """
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - _TAIL, 0))
+        lines = file.read().decode("utf-8", "replace").splitlines(keepends=True)[1:]
+    if len(lines) < 11 or lines[-1].endswith(("\n", "\r")):
+        return
+    cells = [line.strip().rpartition(separator)[2] for line in lines]
+    parts = [re.split(r"[.eE][+-]?", cell) for cell in cells]
+    *others, last = [100 * len(p) + len(p[-1]) * (len(p) > 1) for p in parts]
+    fewest = min(others)
+    equal = len(others) > 19 and fewest == max(others)
+    if last < fewest - (not equal):
+        raise ValueError(
+            f"it ends in the middle of a number, {cells[-1]!r} in its last line: the "
+            "file is truncated, or is still being written. If it is complete, end the "
+            "line with a line break"
+        )
 
 
 def read_parquet(path: Path) -> "pd.DataFrame":
