@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.io._landmarks import Landmarks, assemble_individuals
+from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
 from isa_nrsfm.io._tables import SEPARATORS, header_rows, read_columns
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
@@ -372,6 +372,32 @@ def read_sleap(path: Path) -> Landmarks:
         format="sleap",
         confidence=scores.get("point_scores"),
         skeleton=skeleton,
+    )
+
+
+def is_facemap(path: Path) -> bool:
+    """Return whether a file has the group of Facemap."""
+    return is_hdf5(path) and "Facemap" in root_groups(path)
+
+
+def read_facemap(path: Path) -> Landmarks:
+    """Read an h5 file of Facemap: x, y and likelihood of each body part in a group.
+
+    Body parts are in the order of their names, frames are counted from 0.
+    """
+    h5py = import_optional("h5py", extra="h5")
+    with h5py.File(path, "r") as file:
+        group = own_member(file, "Facemap")
+        parts = [own_member(group, name) for name in group]
+        values = [[numbers_of(part, name) for name in _VALUES] for part in parts]
+        names = list(group)
+    points = np.moveaxis(np.array(values), 2, 0)
+    return assemble(
+        points[..., :2],
+        names,
+        {"frame": range(len(points))},
+        format="facemap",
+        confidence=points[..., 2],
     )
 
 

@@ -3,7 +3,10 @@
 Readers are imported when a file is read: the help of the command line must not wait.
 """
 
+import contextlib
 import os
+import re
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -11,7 +14,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
+from isa_nrsfm._compat.texts import as_utf8, by_number, first_items
 
 if TYPE_CHECKING:
     from isa_nrsfm.io._landmarks import Landmarks
@@ -20,7 +25,6 @@ if TYPE_CHECKING:
 TABLE = "table"
 # Stands for a folder where others have the suffix of a file.
 _FOLDER = "/"
-_TABLES = (".csv", ".tsv", ".parquet")
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,8 @@ class LandmarkFormat:
                 + (f"it has {', '.join(self.options)}" if self.options else "")
             )
         _check_exists(path)
+        if path.is_dir() and _FOLDER not in self.suffixes:
+            return _joined(path, self, **options)
         if _suffix(path) not in self.suffixes:
             raise ValueError(
                 f"{path} cannot be read as {self.name} ({self.title}): expected "
@@ -244,6 +250,8 @@ def find_format(path: str | os.PathLike[str]) -> str:
     possible = [found for found in FORMATS.values() if _suffix(path) in found.suffixes]
     others = [each for each in possible if each.name != TABLE]
     matching = [each.name for each in others if each.matches(path)]
+    if path.is_dir() and not matching:
+        matching = [*{form.name: form for _, form in _members(path)}]
     if len(matching) > 1:
         raise ValueError(
             f"{path} matches more than one format: {', '.join(matching)}. Choose with "
@@ -251,23 +259,67 @@ def find_format(path: str | os.PathLike[str]) -> str:
         )
     if matching:
         return matching[0]
-    if len(others) < len(possible):
+    if len(others) < len(possible) and not path.is_dir():
         return TABLE
     if _suffix(path) in (".xlsx", ".xls", ".ods"):
         raise ValueError(f"{path} is a file of a spreadsheet: save it as .csv there")
+    known = (f"{f.name}: {f.expected}, in {_listed(f.suffixes)}" for f in possible)
     if not possible:
         known = (f"{each.name} ({_listed(each.suffixes)})" for each in FORMATS.values())
-        raise ValueError(
-            f"{path} is of no known format: {'; '.join(known)}. Unpack compressed "
-            "files. Save tables and arrays as .csv, in pandas: "
-            "pd.DataFrame(array, columns=names).to_csv('new.csv', index=False)"
-        )
     raise ValueError(
-        f"{path} is of no known format. Expected "
-        + "; ".join(
-            f"{found.name}: {found.expected}, in {_listed(found.suffixes)}"
-            for found in (*possible, FORMATS[TABLE])
+        f"{path} is of no known format: {_seen(path)}. Expected {'; '.join(known)}. "
+        "Unpack compressed files. Files of SLEAP's projects, NWB and Label Studio are "
+        "read with sleap-io and from_sleap_io. Save other tables and arrays as .csv, in "
+        "pandas: pd.DataFrame(array, columns=names).to_csv('new.csv', index=False)"
+    )
+
+
+def _members(folder: Path) -> list[tuple[Path, LandmarkFormat]]:
+    """Return the files of a folder that are of a format, by their names and numbers."""
+    found = []
+    for file in sorted(folder.iterdir(), key=by_number):
+        if file.is_file() and not file.name.startswith("."):
+            with contextlib.suppress(ValueError):
+                found.append((file, FORMATS[find_format(file)]))
+    return found
+
+
+def _joined(folder: Path, form: LandmarkFormat, **options: Any) -> "Landmarks":
+    """Read all files of a folder of one format, with the column ``file``."""
+    from isa_nrsfm.io._landmarks import joined
+
+    parts = {}
+    for file, _ in [each for each in _members(folder) if each[1] == form]:
+        parts[as_utf8(file.name)] = form.read(file, **options)
+    if not parts:
+        raise ValueError(
+            f"{folder} has no files of {form.name}: expected {form.expected}"
         )
+    left = {p.name for p in folder.glob("[!.]*") if p.suffix.lower() in form.suffixes}
+    if left := left.difference(parts):
+        warn_caller(
+            f"files that are not of {form.name} are left out: {first_items(left)}"
+        )
+    return joined(parts)
+
+
+def _seen(path: Path) -> str:
+    """Return what an unknown file has: names of entries, its first line or bytes."""
+    if path.is_dir():
+        return f"a folder with {first_items(sorted(p.name for p in path.iterdir()))}"
+    with path.open("rb") as file:
+        start = file.read(2**12)
+    if start.startswith(b"\x89HDF"):
+        groups = import_module("isa_nrsfm.io._animals").root_groups(path)
+        return f"an HDF5 file with {first_items(sorted(groups)) or 'nothing'}"
+    if start.lstrip()[:1] in (b"{", b"["):
+        names = re.findall(r'"([^"]*)"\s*:', start.decode("utf-8", "replace"))
+        return f"json with {first_items(dict.fromkeys(names)) or 'no names'}"
+    line = start.partition(b"\n")[0][:60]
+    return (
+        f"it begins with {line.decode()!r}"
+        if line.isascii()
+        else f"it begins with {line[:8]!r}"
     )
 
 
@@ -290,100 +342,12 @@ def _listed(suffixes: tuple[str, ...]) -> str:
     return " or ".join(words)
 
 
-_ALL = (
-    LandmarkFormat(
-        "openface",
-        "OpenFace",
-        "the columns frame, timestamp, confidence, success (face, confidence for an "
-        "image), x_0, ... and y_0, ...",
-        _TABLES,
-        "_face_tables.openface",
-    ),
-    LandmarkFormat(
-        "pyfeat",
-        "py-feat",
-        "the columns FaceRectX, FaceRectY, FaceRectWidth, FaceRectHeight, x_0, ... and "
-        "y_0, ...",
-        _TABLES,
-        "_face_tables.pyfeat",
-    ),
-    LandmarkFormat(
-        "mediapipe",
-        "MediaPipe",
-        "named columns x and y of each point (468 or 478, where it is recognised)",
-        _TABLES,
-        "_face_tables.mediapipe",
-        ("image_size", "columns", "missing"),
-    ),
-    LandmarkFormat(
-        "pts",
-        "iBUG, 300-W",
-        "'version: 1', 'n_points: N' and N lines 'x y' between braces",
-        (".pts", _FOLDER),
-        "_keypoints.pts",
-    ),
-    LandmarkFormat(
-        "wflw",
-        "WFLW lists",
-        "lines of 196 coordinates, 4 of a box, 6 attributes and the image",
-        (".txt",),
-        "_keypoints.wflw",
-    ),
-    LandmarkFormat(
-        "deeplabcut",
-        "DeepLabCut, Lightning Pose",
-        "columns of the levels scorer, (individuals,) bodyparts, coords",
-        (".csv", ".tsv", ".h5", ".hdf5"),
-        "_animals.deeplabcut",
-    ),
-    LandmarkFormat(
-        "sleap",
-        "SLEAP analysis",
-        "the datasets tracks, node_names and track_names",
-        (".h5", ".hdf5"),
-        "_animals.sleap",
-    ),
-    LandmarkFormat(
-        "coco",
-        "COCO keypoints",
-        "images, annotations and categories with keypoints, or a list of results; "
-        "write json of other programs as a table",
-        (".json",),
-        "_keypoints.coco",
-        ("part",),
-    ),
-    LandmarkFormat(
-        "openpose",
-        "OpenPose",
-        "people with pose_keypoints_2d, face_keypoints_2d, ...; a folder has a file "
-        "..._keypoints.json for each frame",
-        (".json", _FOLDER),
-        "_keypoints.openpose",
-        ("part",),
-    ),
-    LandmarkFormat(
-        "mmpose",
-        "MMPose predictions",
-        "instances with keypoints and keypoint_scores, or frames with such instances",
-        (".json", _FOLDER),
-        "_keypoints.mmpose",
-        ("part",),
-    ),
-    LandmarkFormat(
-        "tps",
-        "tps of morphometrics",
-        "LM=N, N lines 'x y', and lines such as IMAGE=a.jpg, for each specimen",
-        (".tps",),
-        "_keypoints.tps",
-    ),
-    LandmarkFormat(
-        TABLE,
-        "a table with named columns",
-        "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
-        _TABLES,
-        "_tables.named_columns",
-        ("columns", "missing", "individuals"),
-    ),
+_FILE = Path(__file__).with_name("formats.toml")
+FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
+    {
+        name: LandmarkFormat(
+            name, **{k: v if isinstance(v, str) else tuple(v) for k, v in entry.items()}
+        )
+        for name, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
+    }
 )
-
-FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType({f.name: f for f in _ALL})

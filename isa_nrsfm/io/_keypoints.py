@@ -44,6 +44,8 @@ _MMPOSE = re.compile(
 )
 # An image without instances has an empty list.
 _MMPOSE_ALSO = re.compile(_MMPOSE.pattern + rb"|\s*\[\s*\]")
+# Ultralytics, and labelme.
+_OTHERS = re.compile(rb'"keypoints"\s*:\s*\{|"shapes"\s*:')
 _TPS = re.compile(r"(?i)LM\s*=\s*\d+")
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
@@ -62,7 +64,9 @@ _WFLW_LENGTHS = (197, 207)
 def is_coco(path: Path) -> bool:
     """Return whether a file begins as a json object or list, of no other format."""
     begins = _beginning(path)[:1] in (b"{", b"[")
-    return begins and not is_openpose(path) and not is_mmpose(path)
+    with path.open("rb") as file:
+        of_others = _OTHERS.search(file.read(2**16))
+    return begins and not (is_openpose(path) or is_mmpose(path) or of_others)
 
 
 def _beginning(path: Path) -> bytes:
@@ -84,13 +88,13 @@ def read_coco(path: Path, part: str | None = None) -> Landmarks:
     content = _read_json(path)
     if isinstance(content, list):
         entries = _results(content)
-        return _landmarks(entries, None, part, "coco", "result")
+        return entries_as_rows(entries, None, part, "coco", "result")
     entries, names = _annotations(content)
-    found = _landmarks(entries, names, part, "coco", "annotation")
+    found = entries_as_rows(entries, names, part, "coco", "annotation")
     return replace(found, confidence=None)
 
 
-def _landmarks(
+def entries_as_rows(
     entries: Sequence[dict[str, Any]],
     names: list[str] | None,
     part: str | None,
@@ -359,7 +363,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             if part in each
         ]
         entries += shown or [of_file]
-    found = _landmarks(entries, None, None, "openpose", "person")
+    found = entries_as_rows(entries, None, None, "openpose", "person")
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
@@ -437,7 +441,7 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     files, absent = _files_of(path, _JSON, _MMPOSE_ALSO), "no file of it is of MMPose"
     _, contents = _each_file(path, files, absent, _instances_in)
     entries = [entry for found in contents for entry in found]
-    return _landmarks(entries, None, part, "mmpose", "instance")
+    return entries_as_rows(entries, None, part, "mmpose", "instance")
 
 
 def _instances_in(file: Path) -> list[dict[str, Any]]:
@@ -506,7 +510,7 @@ def read_tps(path: Path) -> Landmarks:
         with errors_of(f"specimen {number} (counted from 0)"):
             count, *lines = filter(None, map(str.strip, part.splitlines()))
             points = " ".join(lines[: int(count)]).replace("NA", "nan")
-            tracks.append({0: _floats(points.split()).reshape(int(count), 2)})
+            tracks.append({0: floats_of(points.split()).reshape(int(count), 2)})
             entries = [line.partition("=") for line in lines[int(count) :]]
             if entries and not entries[0][1]:
                 raise ValueError(f"there are more than {count} landmarks")
@@ -523,7 +527,7 @@ def is_wflw(path: Path) -> bool:
     """Return whether the first line has the fields of a WFLW list."""
     fields = "".join(first_lines(path, 1)).split()
     try:
-        _floats(fields[: 2 * _N_WFLW])
+        floats_of(fields[: 2 * _N_WFLW])
     except ValueError:
         return False
     return len(fields) in _WFLW_LENGTHS
@@ -543,7 +547,7 @@ def read_wflw(path: Path) -> Landmarks:
             f"the lines have {n_fields} fields; all must have "
             f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
         )
-    numbers = np.stack([_floats(row) for row in fields[:, :-1].tolist()])
+    numbers = np.stack([floats_of(row) for row in fields[:, :-1].tolist()])
     frames: dict[str, object] = {"image": fields[:, -1]}
     points, box, attributes = np.split(numbers, [196, 200], axis=1)
     if n_fields == _WFLW_LENGTHS[1]:
@@ -563,7 +567,7 @@ def _points_of(file: Path) -> NDArray[np.float64]:
             "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
             f"got {text[:40]!r}"
         )
-    coordinates = _floats(match["points"].split())
+    coordinates = floats_of(match["points"].split())
     n_points = int(match["n_points"])
     if len(coordinates) != 2 * n_points or n_points == 0:
         raise ValueError(
@@ -572,7 +576,7 @@ def _points_of(file: Path) -> NDArray[np.float64]:
     return coordinates.reshape(n_points, 2)
 
 
-def _floats(fields: list[str]) -> NDArray[np.float64]:
+def floats_of(fields: list[str]) -> NDArray[np.float64]:
     """Return the numbers that fields hold."""
     # Python reads 1_0 as a number.
     bad = next((field for field in fields if "_" in field), None)

@@ -144,6 +144,30 @@ def assemble(
     )
 
 
+def joined(parts: Mapping[str, Landmarks]) -> Landmarks:
+    """Put landmarks of files below each other, with the name of each as column file."""
+    (first, found), *_ = parts.items()
+    for name, each in parts.items():
+        if [*each.points] != [*found.points]:
+            raise ValueError(
+                f"{first} has {len(found.point_names)} points, {name} has "
+                f"{len(each.point_names)}: all files must have the same, in one order"
+            )
+
+    def below(tables: Iterable[Any]) -> Any:
+        return pd.concat(tables, ignore_index=True)
+
+    shown = [p.frames.assign(file=name) for name, p in parts.items()]
+    sure = [p.confidence for p in parts.values() if p.confidence is not None]
+    return replace(
+        found,
+        points=below(p.points for p in parts.values()),
+        frames=below(shown),
+        confidence=below(sure) if len(sure) == len(parts) else None,
+        failed=np.concatenate([p.failed for p in parts.values()]),
+    )
+
+
 def assemble_individuals(
     tracks: NDArray[np.float64],
     names: Sequence[Any] | None,

@@ -27,7 +27,7 @@ from isa_nrsfm.skeletons._column_names import (
     point_names,
 )
 
-SEPARATORS = {".csv": ",", ".tsv": "\t"}
+SEPARATORS = {".csv": ",", ".tsv": "\t", ".txt": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
 # Bytes at the end of a file that show how its numbers are written.
@@ -345,7 +345,7 @@ def table_suffix(path: str | os.PathLike[str]) -> str:
     suffix = Path(path).suffix
     if suffix.lower() not in TABLE_SUFFIXES:
         raise ValueError(
-            f"{path}: a table is a .csv, .tsv or .parquet file; got {suffix!r}"
+            f"{path}: a table is a .csv, .tsv, .txt or .parquet file; got {suffix!r}"
         )
     return suffix.lower()
 
@@ -375,12 +375,13 @@ def separator_of(path: Path) -> str:
     usual, lines = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 2)
 
     def better(sign: str) -> tuple[bool, float]:
-        """Return whether rows have as many cells, and separators; half for commas."""
+        """Return whether rows have as many cells, and separators, fewer for commas."""
         lengths = [len(row) for row in csv.reader(lines, delimiter=sign) if row]
-        return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / (1 + (sign == ","))
+        weight = {",": 2, " ": 4}.get(sign, 1)
+        return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / weight
 
     try:
-        return max((usual, *";\t,|"), key=better)
+        return max((usual, *";\t,| "), key=better)
     except (csv.Error, ValueError):
         return usual
 
@@ -458,7 +459,7 @@ def _refuse_cut_number(path: Path, separator: str) -> None:
     """
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - _TAIL, 0))
-        lines = file.read().decode("utf-8", "replace").splitlines(keepends=True)[1:]
+        lines = file.read().decode("utf-8", "replace").splitlines(True)[1:]
     if len(lines) < 11 or lines[-1].endswith(("\n", "\r")):
         return
     cells = [line.strip().rpartition(separator)[2] for line in lines]
