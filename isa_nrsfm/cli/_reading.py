@@ -229,9 +229,12 @@ def _format(args: Namespace) -> str:
             continue
         near = args.command == "fit" and args.camera not in ("affine", "orthographic")
         if name != "image_size" or not near:
-            having = [each.name for each in FORMATS.values() if name in each.options]
+            having = [each for each in FORMATS.values() if name in each.options]
+            suffix = Path(args.table).suffix.lower()
+            having = [each for each in having if suffix in each.suffixes] or having
+            names = " or ".join(each.name for each in having)
             raise ValueError(
-                f"{flag_of(name)} needs --format {' or '.join(having)}; {args.table} "
+                f"{flag_of(name)} needs --format {names}; {args.table} "
                 f"has format {found}"
             )
     return found

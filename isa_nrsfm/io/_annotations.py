@@ -97,8 +97,8 @@ def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmark
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     values = np.array([floats_of(line.split()) for line in lines if line.strip()])
     size = [1, 1] if image_size is None else checked_sizes("image_size", image_size, 1)
-    parts = product((3, 2), range(3))  # numbers of a point, and after all points
-    fits = [(n, k) for n, k in parts if (values.shape[1] - _N_BOX - k) % n == 0]
+    parts = product(range(3), (3, 2))  # numbers after all points, and of a point
+    fits = [(n, k) for k, n in parts if (values.shape[1] - _N_BOX - k) % n == 0]
     n, k = max(fits, key=lambda part: _share_inside(values, *part))
     points, after = _points_of_yolo(values, n, k), values[:, values.shape[1] - k :]
     numbers = dict(zip(("score", "track_id"), after.T.tolist(), strict=False))
@@ -215,10 +215,9 @@ def read_places(path: Path) -> Landmarks:
     lines = path.read_text(encoding="utf-8-sig").replace(",", " ").splitlines()
     rows = [line.split() for line in lines if line.strip()]
     image = " ".join(rows.pop(0)) if len(rows[0]) != 2 else ""
-    if any(len(row) != 2 for row in rows) or image not in (
-        image.strip("0123456789"),
-        str(len(rows)),
+    if any(len(row) != 2 for row in rows) or image.isdigit() > (
+        image == str(len(rows))
     ):
-        raise ValueError("expected a line x y for each point, or as many as it says")
+        raise ValueError("the lines are not x and y of as many points as it says")
     tracks = np.array([floats_of(row) for row in rows])[None]
     return assemble(tracks, None, pd.DataFrame({"image": [image]}), format="places")

@@ -268,9 +268,9 @@ def find_format(path: str | os.PathLike[str]) -> str:
         known = (f"{each.name} ({_listed(each.suffixes)})" for each in FORMATS.values())
     raise ValueError(
         f"{path} is of no known format: {_seen(path)}. Expected {'; '.join(known)}. "
-        "Unpack compressed files. Files of SLEAP's projects, NWB and Label Studio are "
-        "read with sleap-io and from_sleap_io. Save other tables and arrays as .csv, in "
-        "pandas: pd.DataFrame(array, columns=names).to_csv('new.csv', index=False)"
+        "Unpack compressed files. Projects of SLEAP, NWB and others are read with "
+        "sleap-io and from_sleap_io. Save other tables and arrays as .csv, in pandas: "
+        "pd.DataFrame(array, columns=names).to_csv('new.csv', index=False)"
     )
 
 

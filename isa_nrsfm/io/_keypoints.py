@@ -150,11 +150,12 @@ def _results(entries: list[Any]) -> list[dict[str, Any]]:
 def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
     """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
+    seen = first_items(content) if isinstance(content, dict) else content
     content = {"categories": []} | content if isinstance(content, dict) else {}
     if not all(isinstance(content.get(part), list) for part in lists):
         raise ValueError(
             "expected an object with the lists images, annotations and categories, or "
-            "a list of results"
+            f"a list of results; got {seen!r:.60}"
         )
     for part in lists:
         _refuse_non_objects(content[part], part)

@@ -372,7 +372,8 @@ def separator_of(path: Path) -> str:
     The header and the first row have as many cells, and the most; numbers and names may
     have a comma each.
     """
-    usual, lines = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 2)
+    suffix, lines = path.suffix.lower(), first_lines(path, 2)
+    usual = SEPARATORS.get(suffix, ",")
 
     def better(sign: str) -> tuple[bool, float]:
         """Return whether rows have as many cells, and separators, fewer for commas."""
@@ -381,7 +382,7 @@ def separator_of(path: Path) -> str:
         return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / weight
 
     try:
-        return max((usual, *";\t,| "), key=better)
+        return max((usual, *";\t,|", *" " * (suffix == ".txt")), key=better)
     except (csv.Error, ValueError):
         return usual
 
@@ -415,7 +416,7 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     lines.
     """
     n_lines, n_rows, n_columns = 0, 0, 0
-    if separator != SEPARATORS.get(path.suffix.lower()):
+    if separator != SEPARATORS.get(path.suffix.lower()) and path.suffix != ".txt":
         warn_caller(f"the cells of {path.name} end with {separator!r}")
     with path.open(encoding="utf-8-sig", newline="") as file:
 
