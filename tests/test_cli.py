@@ -588,7 +588,7 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
     faces.assign(x_3="?").to_csv(tmp_path / "text.csv", index=False)
     for name, expected in (
         ("absent.csv", "absent.csv: No such file"),
-        ("folder.csv", "folder.csv is of no known format. Expected pts"),
+        ("folder.csv", "folder.csv is of no known format: a folder with"),
         ("ragged.csv", "line 2"),
         ("other.csv", "no landmark columns"),
         ("text.csv", "'x_3' should hold"),

@@ -23,7 +23,7 @@ __all__ = ["number_of_rows", "taken_rows", "threadpool_controller"]
 Function = TypeVar("Function", bound=Callable[..., Any])
 Class = TypeVar("Class", bound=type)
 # NumPy's defaults: `numpy.seterr` of a user does not change results.
-numpy_defaults = np.errstate(divide="warn", over="warn", invalid="warn", under="ignore")
+NUMPY_DEFAULTS = np.errstate(divide="warn", over="warn", invalid="warn", under="ignore")
 
 
 class Interval(_param_validation.Interval):
@@ -68,7 +68,7 @@ def with_numpy_defaults(cls: Class) -> Class:
     """Give the public methods of a class NumPy's own handling of rounding errors."""
     for name, method in vars(cls).copy().items():
         if inspect.isfunction(method) and not name.startswith("_"):
-            setattr(cls, name, numpy_defaults(method))
+            setattr(cls, name, NUMPY_DEFAULTS(method))
     return cls
 
 

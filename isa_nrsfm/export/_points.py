@@ -2,6 +2,7 @@
 
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -170,13 +171,17 @@ def write_points(
 
 
 def _netcdf(
-    points: FramePoints, names: list[str], fps: float | None, sign: float
+    points: FramePoints, names: Sequence[str], fps: float | None, sign: float
 ) -> bytes:
     """Return a dataset of movement, as classic netCDF."""
     content, n_frames = io.BytesIO(), len(points.position)
     file = netcdf_file(content, "w")
     times = np.arange(n_frames) / (fps or 1.0)
-    texts = {"space": list("xyz"), "keypoints": names, "individuals": ["individual_0"]}
+    texts = {
+        "space": list("xyz"),
+        "keypoints": [*names],
+        "individuals": ["individual_0"],
+    }
     file.createDimension("time", n_frames)
     file.createVariable("time", "f8", ("time",))[:] = times
     for name, words in texts.items():
@@ -207,7 +212,7 @@ def _netcdf(
 
 
 def _write_deeplabcut(
-    path: Path, values: NDArray, names: list[str], coords: tuple[str, ...]
+    path: Path, values: NDArray, names: Sequence[str], coords: tuple[str, ...]
 ) -> None:
     """Write values (n_frames, n_points, n_coords) as DeepLabCut does."""
     levels = ["scorer", "bodyparts", "coords"]
@@ -220,7 +225,7 @@ def _write_deeplabcut(
         frame.to_hdf(path, key=_KEY, format="table", mode="w")
 
 
-def _write_trc(path: Path, values: NDArray, names: list[str], fps: Any) -> None:
+def _write_trc(path: Path, values: NDArray, names: Sequence[str], fps: Any) -> None:
     """Write values (n_frames, n_points, 3) as OpenSim reads them, NaN as blanks."""
     n_frames, n_points, _ = values.shape
     axes = "\t".join(f"X{j}\tY{j}\tZ{j}" for j in range(1, n_points + 1))

@@ -1,17 +1,15 @@
 """Read landmarks in files of arrays: NumPy, MATLAB and TRC."""
 
-import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.stored_arrays import array_in, read_arrays
-from isa_nrsfm.io._animals import is_hdf5, numbers_of
+from isa_nrsfm.io._animals import content_of, is_hdf5, own_member
+from isa_nrsfm.io._keypoints import floats_of
 from isa_nrsfm.io._landmarks import Landmarks, assemble
 from isa_nrsfm.io._tables import first_lines
 
@@ -27,10 +25,10 @@ def read_array(path: Path) -> Landmarks:
     It is (n_frames, n_points, 2), (n_frames, 2, n_points), or a table (n_frames,
     2 * n_points) of x and y in turn. A warning says how it is read.
     """
-    fitting = {n: a for n, a in _arrays_in(path).items() if a.ndim in (2, 3)}
-    fitting = {n: a for n, a in fitting.items() if a.size > 2 and a.dtype.kind in "fiu"}
-    most = max((array.ndim for array in fitting.values()), default=0)
-    found = {name: a for name, a in fitting.items() if a.ndim == most}
+    found = {n: a for n, a in _arrays_in(path).items() if a.dtype.kind in "fiu"}
+    found = {n: a for n, a in found.items() if a.ndim in (2, 3) and a.size > 2}
+    if len(found) > 1:
+        found = {name: array for name, array in found.items() if array.ndim == 3}
     if len(found) != 1:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in found.items())
         raise ValueError(
@@ -70,10 +68,8 @@ def _arrays_in(path: Path) -> dict[str, NDArray]:
         return {n: a for n, a in loadmat(path).items() if isinstance(a, np.ndarray)}
     h5py = import_optional("h5py", extra="h5")
     with h5py.File(path, "r") as file:  # MATLAB 7.3, whose axes are turned round
-        names = [
-            n for n in file if getattr(file[n], "dtype", np.dtype(str)).kind in "fiu"
-        ]
-        return {name: numbers_of(file, name).T for name in names}
+        names = [name for name in file if hasattr(own_member(file, name), "dtype")]
+        return {name: np.asarray(content_of(file, name)).T for name in names}
 
 
 def is_trc(path: Path) -> bool:
@@ -90,16 +86,11 @@ def read_trc(path: Path) -> Landmarks:
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     names = [name.strip() for name in lines[3].split("\t")[2:] if name.strip()]
     rows = [line.split("\t") for line in lines[5:] if line.strip()]
-    n_cells = 2 + 3 * len(names)
-    if any(
-        len(row[:n_cells]) != n_cells or "".join(row[n_cells:]).strip() for row in rows
-    ):
-        raise ValueError(f"rows should have {n_cells} cells: frame, time, x, y, z, ...")
-    cells = pd.DataFrame(rows).iloc[:, :n_cells].replace(r"^\s*$", None, regex=True)
-    values = cells.astype(float).to_numpy()
+    cells = [[c.strip() or "nan" for c in row[: 2 + 3 * len(names)]] for row in rows]
+    values = np.reshape([floats_of(row) for row in cells], (len(rows), -1))
     points = values[:, 2:].reshape(len(rows), -1, 3)
-    z: Any = points[..., 2][~np.isnan(points[..., 2])]
-    if len(z) and not math.isclose(z.min(), z.max(), abs_tol=1e-9):
+    z = points[..., 2][~np.isnan(points[..., 2])]
+    if len(z) and np.ptp(z) > 1e-9:
         raise ValueError("its points have different z: they are in space, not an image")
     frames = {"frame": values[:, 0].astype(int), "time": values[:, 1]}
     return assemble(points[..., :2], names, frames, format="trc")

@@ -5,7 +5,6 @@ Readers are imported when a file is read: the help of the command line must not 
 
 import contextlib
 import os
-import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,7 +13,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items
 
@@ -143,7 +141,8 @@ def read_landmarks(
     Parameters
     ----------
     path : str or path-like
-        The file, or a folder of ``.pts`` files or of json files of OpenPose or MMPose.
+        The file, or a folder of files of one format, which are put below each other,
+        with the column ``file``.
     format : str, default="auto"
         The format, one of `FORMATS`. With "auto", it is the one whose files begin like
         this one, which must be a single one. Files of separated values that no other
@@ -152,7 +151,7 @@ def read_landmarks(
         Points with a lower confidence become NaN, where the format has confidences.
     **options : dict
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
-        pixels, for coordinates in shares of the image's size; ``part`` of "openpose",
+        pixels, and of "yolo", for shares of the image's size; ``part`` of "openpose",
         one of "pose", "face", "hand_left" and "hand_right"; ``part`` of whole bodies of
         "coco" and "mmpose", one of "body", "feet", "face", "left_hand", "right_hand"
         and "all"; ``columns`` and ``missing`` of "table" and "mediapipe", and
@@ -259,7 +258,8 @@ def find_format(path: str | os.PathLike[str]) -> str:
         )
     if matching:
         return matching[0]
-    if len(others) < len(possible) and not path.is_dir():
+    names = import_module("isa_nrsfm.io._tables").header_names
+    if len(others) < len(possible) and (path.suffix != ".txt" or len(names(path)) > 1):
         return TABLE
     if _suffix(path) in (".xlsx", ".xls", ".ods"):
         raise ValueError(f"{path} is a file of a spreadsheet: save it as .csv there")
@@ -286,41 +286,34 @@ def _members(folder: Path) -> list[tuple[Path, LandmarkFormat]]:
 
 def _joined(folder: Path, form: LandmarkFormat, **options: Any) -> "Landmarks":
     """Read all files of a folder of one format, with the column ``file``."""
+    from isa_nrsfm._compat.caller import warn_caller
     from isa_nrsfm.io._landmarks import joined
 
-    parts = {}
-    for file, _ in [each for each in _members(folder) if each[1] == form]:
-        parts[as_utf8(file.name)] = form.read(file, **options)
-    if not parts:
-        raise ValueError(
-            f"{folder} has no files of {form.name}: expected {form.expected}"
-        )
-    left = {p.name for p in folder.glob("[!.]*") if p.suffix.lower() in form.suffixes}
-    if left := left.difference(parts):
-        warn_caller(
-            f"files that are not of {form.name} are left out: {first_items(left)}"
-        )
-    return joined(parts)
+    files = [file for file, found in _members(folder) if found == form]
+    if not files:
+        raise ValueError(f"{folder} has no {form.name} files: expected {form.expected}")
+    suffixes = {file.suffix for file in files}
+    beside = {f.name for f in folder.glob("[!.]*") if f.suffix in suffixes}
+    others = sorted(beside.difference(file.name for file in files))
+    with errors_of(str(folder)):
+        if others and suffixes != {".txt"}:
+            raise ValueError(f"{first_items(others)} cannot be read as {form.name}")
+        if others:  # such as classes.txt
+            warn_caller(f"not of {form.name}, and left out: {first_items(others)}")
+        return joined({as_utf8(f.name): form.read(f, **options) for f in files})
 
 
 def _seen(path: Path) -> str:
-    """Return what an unknown file has: names of entries, its first line or bytes."""
+    """Return what an unknown file has: names of entries, or its first bytes."""
     if path.is_dir():
         return f"a folder with {first_items(sorted(p.name for p in path.iterdir()))}"
     with path.open("rb") as file:
-        start = file.read(2**12)
+        start = file.read(40)
     if start.startswith(b"\x89HDF"):
         groups = import_module("isa_nrsfm.io._animals").root_groups(path)
         return f"an HDF5 file with {first_items(sorted(groups)) or 'nothing'}"
-    if start.lstrip()[:1] in (b"{", b"["):
-        names = re.findall(r'"([^"]*)"\s*:', start.decode("utf-8", "replace"))
-        return f"json with {first_items(dict.fromkeys(names)) or 'no names'}"
-    line = start.partition(b"\n")[0][:60]
-    return (
-        f"it begins with {line.decode()!r}"
-        if line.isascii()
-        else f"it begins with {line[:8]!r}"
-    )
+    line = start.partition(b"\n")[0]
+    return f"it begins with {line.decode() if line.isascii() else line!r}"
 
 
 def _suffix(path: Path) -> str:
@@ -343,11 +336,17 @@ def _listed(suffixes: tuple[str, ...]) -> str:
 
 
 _FILE = Path(__file__).with_name("formats.toml")
+_ENTRIES: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {
         name: LandmarkFormat(
-            name, **{k: v if isinstance(v, str) else tuple(v) for k, v in entry.items()}
+            name,
+            entry["title"],
+            entry["expected"],
+            tuple(entry["suffixes"]),
+            entry["reader"],
+            tuple(entry.get("options", ())),
         )
-        for name, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
+        for name, entry in _ENTRIES.items()
     }
 )

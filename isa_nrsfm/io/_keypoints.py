@@ -53,7 +53,6 @@ _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
     r"\{(?P<points>[^{}]*)\}\s*"
 )
-_PTS_NAME = re.compile(r"(?is)(?!\.).*\.pts")
 _N_WFLW = 98
 _WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
 _WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
@@ -471,23 +470,18 @@ def _instances_in(file: Path) -> list[dict[str, Any]]:
 
 
 def is_pts(path: Path) -> bool:
-    """Return whether a file begins as .pts files do, or a folder has such files."""
-    if path.is_dir():
-        return bool(_files_of(path, _PTS_NAME))
+    """Return whether a file begins as .pts files do."""
     return "".join(first_lines(path, 1)).lstrip().startswith("version")
 
 
 def read_pts(path: Path) -> Landmarks:
-    """Read a .pts file, or all of a folder in the order of their names and numbers.
+    """Read a .pts file, with the points of one image.
 
-    A file has the points of one image: ``version: 1``, ``n_points: 68`` and, between
-    braces, a line ``x y`` for each point. Other files of the folder are ignored.
-    Coordinates are as they are written; iBUG counts pixels from 1.
+    It has ``version: 1``, ``n_points: 68`` and, between braces, a line ``x y`` for each
+    point. Coordinates are as they are written; iBUG counts pixels from 1.
     """
-    absent = "there are no .pts files in the folder"
-    names, points = _each_file(path, _files_of(path, _PTS_NAME), absent, _points_of)
-    *_, tracks = stacked([{0: each} for each in points], names)
-    return assemble(tracks, None, {"file": [*map(as_utf8, names)]}, format="pts")
+    frames = {"file": [as_utf8(path.name)]}
+    return assemble(_points_of(path)[None], None, frames, format="pts")
 
 
 def is_tps(path: Path) -> bool:

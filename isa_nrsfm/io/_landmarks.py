@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -154,17 +155,14 @@ def joined(parts: Mapping[str, Landmarks]) -> Landmarks:
                 f"{len(each.point_names)}: all files must have the same, in one order"
             )
 
-    def below(tables: Iterable[Any]) -> Any:
-        return pd.concat(tables, ignore_index=True)
-
-    shown = [p.frames.assign(file=name) for name, p in parts.items()]
-    sure = [p.confidence for p in parts.values() if p.confidence is not None]
+    below = partial(pd.concat, ignore_index=True)
+    sure = [each.confidence for each in parts.values() if each.confidence is not None]
     return replace(
         found,
-        points=below(p.points for p in parts.values()),
-        frames=below(shown),
+        points=below(each.points for each in parts.values()),
+        frames=below(each.frames.assign(file=name) for name, each in parts.items()),
         confidence=below(sure) if len(sure) == len(parts) else None,
-        failed=np.concatenate([p.failed for p in parts.values()]),
+        failed=np.concatenate([each.failed for each in parts.values()]),
     )
 
 

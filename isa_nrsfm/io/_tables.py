@@ -460,7 +460,7 @@ def _refuse_cut_number(path: Path, separator: str) -> None:
     """
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - _TAIL, 0))
-        lines = file.read().decode("utf-8", "replace").splitlines(True)[1:]
+        lines = file.read().decode("utf-8", "replace").splitlines(True)[4:]  # header
     if len(lines) < 11 or lines[-1].endswith(("\n", "\r")):
         return
     cells = [line.strip().rpartition(separator)[2] for line in lines]
