@@ -445,9 +445,10 @@ class PosteriorFrames:
         image = self.certainty.images[1] * leverages(fit.alpha) + 1 / weights.sum(
             axis=1
         )
-        image = np.repeat(self.noise_variance * image[:, None], seen.shape[1], axis=1)
+        image = self.noise_variance * image[:, None]
         depth = self.certainty.variances(fit.alpha)
-        covariances += np.stack([image, image, depth], axis=2)[..., None] * np.eye(3)
+        for axis, variance in enumerate((image, image, depth)):
+            covariances[..., axis, axis] += variance
         # Frames that the model explains less well than those of the fit
         excess = self.squares(fit, weights.sum(axis=1))
         excess /= self.certainty.residual or np.nan
