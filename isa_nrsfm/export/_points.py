@@ -96,7 +96,7 @@ def frame_points(model: Any, X: Any, *, point_weight: Any = None) -> FramePoints
     """
     check_class(model, "model")
     check_is_fitted(model)
-    position, std = points_in_space(model, X, point_weight)
+    position, std = map(np.array, points_in_space(model, X, point_weight))
     if not frames_of(model).certainty.determined:
         warn_caller(depth_advice(facts_of(model)))
         position[..., 2] = std[..., 2] = np.nan
@@ -175,7 +175,7 @@ def _netcdf(
 ) -> bytes:
     """Return a dataset of movement, as classic netCDF."""
     content, n_frames = io.BytesIO(), len(points.position)
-    file = netcdf_file(content, "w")
+    file = netcdf_file(content, "w", version=2)
     times = np.arange(n_frames) / (fps or 1.0)
     texts = {
         "space": list("xyz"),

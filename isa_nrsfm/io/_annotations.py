@@ -25,8 +25,8 @@ from isa_nrsfm.io._landmarks import (
 )
 from isa_nrsfm.io._tables import first_lines, header_names, parse_table
 
-ULTRALYTICS = re.compile(rb'"keypoints"\s*:\s*\{')
-LABELME = re.compile(rb'"shapes"\s*:')
+_ULTRALYTICS = re.compile(rb'"keypoints"\s*:\s*\{')
+_LABELME = re.compile(rb'"shapes"\s*:')
 _IMGLAB = re.compile(rb"<dataset\b")
 _PLACE = re.compile(r"\s*[-+.\deE]+\s*[\s,]\s*[-+.\deE]+\s*")
 # Fields of a line of YOLO before its points: class and box.
@@ -38,17 +38,16 @@ _SIDES = ("left", "top", "width", "height")
 Row = tuple[dict[str, Any], dict[str, NDArray]]
 
 
-def begins_with(path: Path, *expressions: re.Pattern[bytes]) -> bool:
-    """Return whether one of the expressions is at the beginning of a file."""
+def begins_with(path: Path, expression: re.Pattern[bytes]) -> bool:
+    """Return whether an expression is at the beginning of a file."""
     with path.open("rb") as file:
-        start = file.read(2**16)
-    return any(each.search(start) for each in expressions)
+        return expression.search(file.read(2**16)) is not None
 
 
 def is_ultralytics(path: Path) -> bool:
     """Return whether keypoints are objects, or a column beside the box."""
     if path.suffix.lower() == ".json":
-        return begins_with(path, ULTRALYTICS)
+        return begins_with(path, _ULTRALYTICS)
     return {"class", "box", "keypoints"}.issubset(header_names(path))
 
 
@@ -128,7 +127,7 @@ def _share_inside(values: NDArray, n: int, k: int) -> float:
 
 def is_labelme(path: Path) -> bool:
     """Return whether a json file, or one of a folder, has shapes."""
-    return any(begins_with(file, LABELME) for file in _json_files(path))
+    return any(begins_with(file, _LABELME) for file in _json_files(path))
 
 
 def read_labelme(path: Path) -> Landmarks:

@@ -6,7 +6,7 @@ Readers are imported when a file is read: the help of the command line must not 
 import contextlib
 import os
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -38,22 +38,22 @@ class LandmarkFormat:
         Which program or data set it belongs to.
     expected : str
         Required content of such a file.
-    suffixes : tuple of str
+    suffixes : sequence of str
         Suffixes of its files in lower case; "/" for a folder of files.
     reader : str
         Module and name of its two functions, such as ``_keypoints.coco``. ``is_coco``
         takes the path and returns whether the file begins like this format.
         ``read_coco`` returns its `Landmarks`, or raises a ValueError without the path.
-    options : tuple of str
+    options : sequence of str
         Names of the options that `read` takes.
     """
 
     name: str
     title: str
     expected: str
-    suffixes: tuple[str, ...]
+    suffixes: Sequence[str]
     reader: str = field(repr=False)
-    options: tuple[str, ...] = ()
+    options: Sequence[str] = ()
 
     def matches(self, path: str | os.PathLike[str]) -> bool:
         """
@@ -329,7 +329,7 @@ def _check_exists(path: Path) -> None:
             pass
 
 
-def _listed(suffixes: tuple[str, ...]) -> str:
+def _listed(suffixes: Sequence[str]) -> str:
     """List suffixes in words."""
     words = ["a folder" if suffix == _FOLDER else suffix for suffix in suffixes]
     return " or ".join(words)
@@ -338,15 +338,5 @@ def _listed(suffixes: tuple[str, ...]) -> str:
 _FILE = Path(__file__).with_name("formats.toml")
 _ENTRIES: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
-    {
-        name: LandmarkFormat(
-            name,
-            entry["title"],
-            entry["expected"],
-            tuple(entry["suffixes"]),
-            entry["reader"],
-            tuple(entry.get("options", ())),
-        )
-        for name, entry in _ENTRIES.items()
-    }
+    {name: LandmarkFormat(name, **entry) for name, entry in _ENTRIES.items()}
 )
