@@ -57,6 +57,7 @@ DAMAGES = {
     ".csv": text(","),
     ".tsv": text("\t"),
     ".json": of_tree,
+    ".mat": damage.damaged_bytes,
     ".npy": damage.damaged_npy,
     ".npz": damage.damaged_archive,
     ".parquet": damage.damaged_parquet,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import errors_of
+from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm.io._keypoints import entries_as_rows, floats_of
 from isa_nrsfm.io._landmarks import (
@@ -138,7 +138,7 @@ def read_labelme(path: Path) -> Landmarks:
     """
     rows: list[Row] = []
     for file in _json_files(path):
-        with errors_of(file.name):
+        with reading(file, "labelme"):
             content = json.loads(file.read_text(encoding="utf-8-sig"))
             if not isinstance(shapes := dict(content).get("shapes"), list):
                 raise ValueError("it has no list of shapes")
@@ -185,7 +185,10 @@ def _json_files(path: Path) -> list[Path]:
 def _named(places: Sequence[tuple[Any, Any]]) -> dict[str, NDArray]:
     """Return points by name, or raise if two have the same."""
     refuse_same_names([name for name, _ in places])
-    return {name: floats_of([str(v) for v in place]) for name, place in places}
+    found = {name: floats_of([str(v) for v in place]) for name, place in places}
+    if any(len(place) != 2 for place in found.values()):
+        raise ValueError("each point should have two numbers, x and y")
+    return found
 
 
 def _rows_of_names(rows: Sequence[Row], format: str) -> Landmarks:

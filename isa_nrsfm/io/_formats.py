@@ -5,6 +5,7 @@ Readers are imported when a file is read: the help of the command line must not 
 
 import contextlib
 import os
+import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -292,14 +293,19 @@ def _joined(folder: Path, form: LandmarkFormat, **options: Any) -> "Landmarks":
     files = [file for file, found in _members(folder) if found == form]
     if not files:
         raise ValueError(f"{folder} has no {form.name} files: expected {form.expected}")
-    suffixes = {file.suffix for file in files}
-    beside = {f.name for f in folder.glob("[!.]*") if f.suffix in suffixes}
-    others = sorted(beside.difference(file.name for file in files))
+    beside = sorted({*folder.glob(f"[!.]*{files[0].suffix}")}.difference(files))
+    others = first_items(file.name for file in beside)
+    known = {re.sub(r"\d+", "", file.name) for file in files}
+    # Others are such as classes.txt, or labels of an image without any.
+    damaged = files[0].suffix != ".txt" or any(
+        re.sub(r"\d+", "", file.name) in known and file.stat().st_size
+        for file in beside
+    )
     with errors_of(str(folder)):
-        if others and suffixes != {".txt"}:
-            raise ValueError(f"{first_items(others)} cannot be read as {form.name}")
-        if others:  # such as classes.txt
-            warn_caller(f"not of {form.name}, and left out: {first_items(others)}")
+        if beside and damaged:
+            raise ValueError(f"{others} cannot be read as {form.name}")
+        if beside:
+            warn_caller(f"not of {form.name}, and left out: {others}")
         return joined({as_utf8(f.name): form.read(f, **options) for f in files})
 
 
