@@ -20,6 +20,7 @@ from isa_nrsfm._compat.scikit_learn import (
     StrOptions,
     fit_context,
     taken_rows,
+    with_numpy_defaults,
 )
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
@@ -89,6 +90,7 @@ class Trial(NamedTuple):
         return f"{text}, {self.result}"
 
 
+@with_numpy_defaults
 class AutoNRSfM(ChosenMixin, BaseEstimator):
     """
     `AffineNRSfM` with the settings that held-out points of the table prefer.

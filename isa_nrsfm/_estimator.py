@@ -17,10 +17,12 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
+    N_JOBS,
     HasMethods,
     Interval,
     StrOptions,
     fit_context,
+    with_numpy_defaults,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
@@ -74,6 +76,7 @@ _OTHER_NAMES = {
 }
 
 
+@with_numpy_defaults
 class AffineNRSfM(CallbackSupportMixin, DiagnosedMixin, BaseEstimator):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
@@ -412,7 +415,7 @@ default="affine"
         "keep_frames": ["boolean"],
         "frames_folder": [None, str, HasMethods("__fspath__")],
         "working_memory": [None, Interval(Real, 0, None, closed="neither")],
-        "n_jobs": [None, Integral],
+        "n_jobs": N_JOBS,
         "verbose": ["verbose"],
     }
 
@@ -557,11 +560,10 @@ default="affine"
         groups: Any = None,
     ) -> None:
         """Fit a table, from a start if given; `errors`: with those of the depths."""
-        opened = copy.copy(self)  # a fit that fails sets no attribute
-        source, weights, settings = opened._ready(X, point_weight)
+        source, weights, settings = self._ready(X, point_weight)
         if groups is not None:
             settings = settings._replace(groups=group_numbers(groups, source.n_frames))
-        warn_of_rows(source, opened, getattr(X, "attrs", {}))
+        warn_of_rows(source, self, getattr(X, "attrs", {}))
         isa = ready_strategy(
             self.isa, settings.joint, self.random_state, self.n_jobs, self.verbose
         )
@@ -598,8 +600,8 @@ default="affine"
         }
         reported = leading(frames, model.n_components)
         if self.remove_pose:
-            opened.pose_effect_ = pose_effect(frames.motion, reported.alpha)
-            left = reported.alpha - removed_part(opened, frames.motion)
+            self.pose_effect_ = pose_effect(frames.motion, reported.alpha)
+            left = reported.alpha - removed_part(self, frames.motion)
             reported = reported._replace(alpha=left)
         if self.keep_frames:
             for name, part in keep(reported._asdict()).items():
@@ -616,12 +618,11 @@ default="affine"
                 attributes["positions_"] = source.as_collected(place)
         else:
             del attributes["_frame_sizes"]
-        opened.__dict__.update(attributes)
+        self.__dict__.update(attributes)
         if errors and not model.frames.certainty.determined:
             parts = frames[:3] if weights is None else (*frames[:3], weights)
             _, energy, _ = gross_residuals(source.joined(model.distances, *parts))
-            warn_caller(depth_advice(facts_of(opened, outlier_energy=energy)))
-        self.__dict__.update(vars(opened))
+            warn_caller(depth_advice(facts_of(self, outlier_energy=energy)))
 
     def _ready(
         self, X: Any, point_weight: Any = None

@@ -241,11 +241,35 @@ class TableModel(NamedTuple):
         weak = self._replace(pinhole=None)
         fit = weak.decompose(rows, weights, deviations=False, dtype=dtype)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
-        deviations = self.frames.depth_deviations(centred, sizes, weights)
-        deviations = of_all_rows(deviations, usable).astype(dtype, copy=False)
+        covariances = self.frames.point_covariances(centred, sizes, weights)
+        deviations = of_all_rows(np.sqrt(covariances[..., 2, 2]), usable)
+        deviations = deviations.astype(dtype, copy=False)
         _, scales = full_rotations(fit.motion)
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         return shapes, deviations / scales[:, None]
+
+    def points_in_space(
+        self, rows: NDArray, weights: NDArray | None = None
+    ) -> tuple[NDArray, NDArray]:
+        """Return points and standard deviations (n, J, 3) in the axes of their camera.
+
+        x and y are places in the table, z is the depth beyond the origin of the shape,
+        in the same units.
+        """
+        assert isinstance(self.frames, PosteriorFrames)
+        fit = self.decompose(rows, weights, deviations=False, dtype=np.float64)
+        straight = self.straightened(rows, weights)
+        virtual = self._replace(pinhole=None).decompose(straight, weights, False)
+        rotations, scales = full_rotations(fit.motion)
+        shapes = scales[:, None, None] * compose(self.mean_shape, self.basis, fit.alpha)
+        points = shapes @ rotations.mT
+        points[..., :2] += fit.translation[:, None]
+        usable, centred, _, sizes, weights = self._ready(straight, weights)
+        covariances = self.frames.point_covariances(centred, sizes, weights)
+        # Turned from the virtual camera to that of the table, if it is another one.
+        turns = (rotations @ full_rotations(virtual.motion)[0].mT)[usable, None]
+        variances = np.diagonal(turns @ covariances @ turns.mT, axis1=2, axis2=3)
+        return points, of_all_rows(np.sqrt(variances), usable)
 
     def reproject(
         self, rows: NDArray, *by_frame: NDArray, weighted: bool = False
@@ -377,6 +401,16 @@ class TableModel(NamedTuple):
 def frames_of(estimator: Any) -> Any:
     """Return the fitted model of single frames of an estimator."""
     return estimator._model.frames
+
+
+def points_in_space(
+    estimator: Any, X: Any, point_weight: Any = None
+) -> tuple[NDArray, NDArray]:
+    """Return points of a table and deviations (n, J, 3) of `TableModel`."""
+    table, weights = estimator._opened(X, point_weight)
+    estimator._jointly_fitted("points in space", calibrated=True)
+    points, deviations = table.collect(estimator._model.points_in_space, *weights)
+    return points, deviations
 
 
 def sees_perspective(estimator: Any) -> bool:

@@ -26,12 +26,14 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
+    N_JOBS,
     CoefficientsMixin,
     HasMethods,
     Interval,
     StrOptions,
     fit_context,
     taken_rows,
+    with_numpy_defaults,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._fitted_model import TableModel
@@ -121,6 +123,7 @@ class ChosenMixin(CoefficientsMixin, TransformerMixin, MetaEstimatorMixin):
         return self.best_estimator_
 
 
+@with_numpy_defaults
 class AffineNRSfMCV(ChosenMixin, BaseEstimator):
     """
     `AffineNRSfM` with the number of basis shapes chosen by cross-validation.
@@ -224,7 +227,7 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
         "cv": ["cv_object"],
         "scoring": [None, str, callable],
         "select": [StrOptions({"best", "one_standard_error"})],
-        "n_jobs": [None, Integral],
+        "n_jobs": N_JOBS,
         "verbose": ["verbose"],
     }
 

@@ -27,6 +27,11 @@ def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     )
 
 
+def depth_deviations(frames, *args):
+    """Return the standard deviations (n, J) of depths."""
+    return np.sqrt(frames.point_covariances(*args)[..., 2, 2])
+
+
 def assert_same_model(got, expected):
     """Compare models of the same table that was read in different ways."""
     single = {"inverse_snr_": 1e-8, "noise_variance_": 1e-8, "rank_floor_": 1e-6}

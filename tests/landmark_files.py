@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.io import savemat
 
 IMAGE_SIZE = (640, 480)
 BODYPARTS = ["snout", "ear_L", "ear_R", "neck", "hip", "tail_1", "tail_2", "tail_3"]
@@ -65,6 +66,12 @@ def saved_again(path, suffix):
     else:
         frame.to_csv(new, sep="\t", index=False)
     return new
+
+
+def saved(path, frame, **options):
+    """Save a table with pandas."""
+    frame.to_csv(path, index=False, **options)
+    return path
 
 
 def by_pandas(path, index):
@@ -286,7 +293,105 @@ def write_tps(path, tracks):
     return path
 
 
+def write_text(path, *lines):
+    """Write lines of a text."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("".join(f"{line}\n" for line in lines))
+    return path
+
+
+def detection(points, **further):
+    """Return a person as Ultralytics' `Results.summary` does."""
+    x, y = points.T.tolist()
+    box = dict(zip(("x1", "y1", "x2", "y2"), (1.0, 2.0, 3.0, 4.0), strict=True))
+    known = {"name": "person", "class": 0, "confidence": 0.9, "box": box}
+    return known | further | {"keypoints": {"x": x, "y": y, "visible": [0.7] * len(x)}}
+
+
+def write_yolo(folder, tracks, *thirds, after=(), size=(500, 500)):
+    """Write labels as Ultralytics does, with the third number of a point, if any."""
+    for i, points in enumerate(tracks / size):
+        middle, width = (points.max(0) + points.min(0)) / 2, np.ptp(points, axis=0)
+        points = [n for point in points for n in (*point, *thirds)]
+        numbers = [*middle, *width, *points, *after]
+        write_text(folder / f"video_{i}.txt", " ".join(map(str, [0, *numbers])))
+    return folder
+
+
+def labelme(i, points):
+    """Return the content of a file of labelme for one image."""
+    shapes = [
+        {"label": name, "points": [point], "group_id": None, "shape_type": "point"}
+        for name, point in zip(BODYPARTS, points.tolist(), strict=True)
+    ]
+    known = {"version": "5.4.1", "flags": {}, "shapes": shapes, "imageData": None}
+    return known | {"imagePath": f"{i}.jpg", "imageHeight": 480, "imageWidth": 640}
+
+
+def write_imglab(path, tracks):
+    """Write parts of boxes as dlib's imglab does."""
+    images = [
+        f"<image file='{i}.jpg'><box top='1' left='2' width='3' height='4'>"
+        + "".join(
+            f"<part name='{j:02}' x='{x}' y='{y}'/>" for j, (x, y) in enumerate(p)
+        )
+        + "</box></image>"
+        for i, p in enumerate(tracks)
+    ]
+    head = "<?xml version='1.0' encoding='ISO-8859-1'?>", "<dataset><images>"
+    return write_text(path, *head, *images, "</images></dataset>")
+
+
+def write_trc(path, tracks, z=0.0):
+    """Write points in pixels as Sports2D does."""
+    n, J, _ = tracks.shape
+    rates = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate"
+    head = [f"{rates} OrigDataStartFrame OrigNumFrames".replace(" ", "\t")]
+    head += ["\t".join(map(str, [30, 30, n, J, "px", 30, 0, n]))]
+    head += ["Frame#\tTime\t" + "\t\t\t".join(BODYPARTS) + "\t\t"]
+    head += ["\t\t" + "\t".join(f"X{j}\tY{j}\tZ{j}" for j in range(1, J + 1))]
+    spatial = np.concatenate([tracks, np.broadcast_to(z, (n, J, 1))], axis=2)
+    rows = [
+        "\t".join(map(str, [i, i / 30, *each]))
+        for i, each in enumerate(spatial.reshape(n, -1).tolist())
+    ]
+    return write_text(path, f"PathFileType\t4\t(X/Y/Z)\t{path.name}", *head, *rows)
+
+
+def write_facemap(path, tracks):
+    """Write key points as Facemap does."""
+    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
+    with h5py.File(path, "w") as file:
+        for name, points in zip(BODYPARTS, tracks.swapaxes(0, 1), strict=True):
+            values = dict(zip("xy", points.T, strict=True))
+            for key, value in (
+                values | {"likelihood": np.full(len(points), 0.9)}
+            ).items():
+                file[f"Facemap/{name}/{key}"] = value
+    return path
+
+
+def write_array(path, **arrays):
+    """Write arrays for NumPy or MATLAB."""
+    if path.suffix == ".mat":
+        savemat(path, arrays)
+    elif path.suffix == ".npz":
+        np.savez(path, **arrays)
+    else:
+        np.save(path, *arrays.values())
+    return path
+
+
+def write_each(folder, suffix, write, tracks):
+    """Write a file for each frame."""
+    folder.mkdir()
+    for i, points in enumerate(tracks):
+        write(folder / f"image_{i}{suffix}", i, points)
+    return folder
+
+
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
+XY = [f"{axis}{j}" for j in range(8) for axis in "xy"]
 FRAME = deeplabcut_frame(TRACKS)
 SCORED = np.dstack([TRACKS, np.full((12, 8), 0.7)])
 RESULTS = [
@@ -346,10 +451,62 @@ WRITERS = {
         d / "a.json", {"predictions": [frame["instances"] for frame in VIDEO]}
     ),
     "tps": lambda d: write_tps(d / "a.tps", TRACKS),
+    "ultralytics": lambda d: write_json(
+        d / "a.json", [[detection(points)] for points in TRACKS]
+    ),
+    "ultralytics-csv": lambda d: saved(
+        d / "a.csv",
+        pd.DataFrame([detection(p, track_id=i) for i, p in enumerate(TRACKS)]),
+    ),
+    "ultralytics-folder": lambda d: write_each(
+        d / "a",
+        ".json",
+        lambda p, _, points: write_json(p, [detection(points)]),
+        TRACKS,
+    ),
+    "yolo": lambda d: write_yolo(d / "a", TRACKS, 2),
+    "yolo-two": lambda d: write_yolo(d / "a", TRACKS),
+    "yolo-score": lambda d: write_yolo(d / "a", TRACKS, 0.7, after=[0.9]),
+    "yolo-track": lambda d: write_yolo(d / "a", TRACKS, 0.7, after=[0.9, 3]),
+    "labelme": lambda d: write_each(
+        d / "a", ".json", lambda p, *each: write_json(p, labelme(*each)), TRACKS
+    ),
+    "imglab": lambda d: write_imglab(d / "a.xml", TRACKS),
+    "places": lambda d: write_each(
+        d / "a",
+        ".txt",
+        lambda p, _, xy: write_text(p, *(f"  {x} {y}" for x, y in xy)),
+        TRACKS,
+    ),
+    "places-helen": lambda d: write_each(
+        d / "a",
+        ".txt",
+        lambda p, i, xy: write_text(p, f"{i}_1", *(f"{x} , {y}" for x, y in xy)),
+        TRACKS,
+    ),
+    "facemap": lambda d: write_facemap(d / "a.h5", TRACKS),
+    "trc": lambda d: write_trc(d / "a.trc", TRACKS),
+    "array": lambda d: write_array(d / "a.npy", xy=TRACKS),
+    "array-columns": lambda d: write_array(d / "a.npz", xy=TRACKS.reshape(12, -1)),
+    "array-planar": lambda d: write_array(d / "a.mat", xy=TRACKS.mT, fps=30.0),
+    "table-txt": lambda d: saved_again(
+        write_mesh(d / "a.csv", TRACKS, shares=False), ".txt"
+    ),
+    "table-blanks": lambda d: saved(
+        d / "a.txt", pd.DataFrame(TRACKS.reshape(12, -1), columns=XY), sep=" "
+    ),
+    "table-folder": lambda d: write_each(
+        d / "a",
+        ".csv",
+        lambda p, _, points: saved(p, pd.DataFrame(points.reshape(1, -1), columns=XY)),
+        TRACKS,
+    ),
     "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
 IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
 EXPECTED = dict.fromkeys(IN_MESH, MESH)
 EXPECTED |= dict.fromkeys(["pts-file", "openpose-file", "mmpose-image"], TRACKS[:1])
+EXPECTED |= {n: TRACKS / 500 for n in WRITERS if n.startswith("yolo")}
+EXPECTED |= {"facemap": TRACKS[:, np.argsort(BODYPARTS)]}
 EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}

@@ -574,7 +574,7 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
     faces.assign(x_3="?").to_csv(tmp_path / "text.csv", index=False)
     for name, expected in (
         ("absent.csv", "absent.csv: No such file"),
-        ("folder.csv", "folder.csv is of no known format. Expected pts"),
+        ("folder.csv", "folder.csv is of no known format: a folder with"),
         ("ragged.csv", "line 2"),
         ("other.csv", "no landmark columns"),
         ("text.csv", "'x_3' should hold"),
@@ -597,8 +597,8 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
     absent, output = tmp_path / "absent.npz", ["-o", tmp_path / "alpha.csv"]
     assert f"{absent}: No such file" in fails("transform", absent, table, *output)
     assert "cannot be read as a model" in fails("transform", table, table, *output)
-    message = fails("transform", fitted.path, table, "-o", tmp_path / "a.txt")
-    assert "a.txt: a table is a .csv, .tsv or .parquet file" in message
+    message = fails("transform", fitted.path, table, "-o", tmp_path / "a.xls")
+    assert "a.xls: a table is a .csv, .tsv, .txt or .parquet file" in message
 
 
 def test_bad_outputs_are_refused(fails, table, fitted, faces, tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from frame_parts import fit_posterior
+from frame_parts import depth_deviations, fit_posterior
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import warned
@@ -261,7 +261,9 @@ class TestDepthDeviations:
         certainty = DepthCertainty(residual=RESIDUAL)
         frames = replace(frames, camera=camera, certainty=certainty)
         tracks = with_gaps(tracks, missing)
-        found = frames.depth_deviations(tracks.transpose(0, 2, 1), np.ones(len(tracks)))
+        found = depth_deviations(
+            frames, tracks.transpose(0, 2, 1), np.ones(len(tracks))
+        )
         fit = frames.posterior(tracks.transpose(0, 2, 1))
         n_pose = CAMERAS[camera].n_parameters
         prior = np.diag([0.0] * n_pose + [1.0] * 2)
@@ -292,13 +294,13 @@ class TestDepthDeviations:
         frames = replace(frames, camera="weak_perspective")
         sizes = np.linspace(1.0, 2.0, len(tracks))
         rows = (sizes[:, None, None] * tracks).transpose(0, 2, 1)
-        alone = frames.depth_deviations(rows, sizes)
+        alone = depth_deviations(frames, rows, sizes)
         certainty = DepthCertainty(points=np.linspace(0.0, 1e-2, 20), leverage=3.0)
         frames = replace(frames, certainty=certainty)
         alpha = frames.posterior(tracks.transpose(0, 2, 1)).alpha
         leverage = 1.0 + np.sum(alpha**2, axis=1)
         expected = alone**2 + np.outer(sizes**2 * leverage / 3.0, certainty.points)
-        found = frames.depth_deviations(rows, sizes)
+        found = depth_deviations(frames, rows, sizes)
         assert_allclose(found**2, expected, rtol=1e-9)
         assert np.ptp(leverage) > 1.0
 

@@ -85,7 +85,7 @@ def test_wrong_encodings_and_formats_are_refused(write, tmp_path):
         refused("as a table: its text is not in UTF-8", read_table, path)
     path = write("x0,y0\n1,2\n", name="table.parquet")
     refused("as a table: .*magic bytes", read_table, path)
-    message = r"is a \.csv, \.tsv or \.parquet.*got '.xlsx'"
+    message = r"is a \.csv, \.tsv, \.txt or \.parquet.*got '.xlsx'"
     refused(message, read_table, tmp_path / "table.xlsx")
     refused("got ''", write_table, pd.DataFrame({"a": [1]}), tmp_path / "table")
     empty = tmp_path / "empty.parquet"

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import sklearn
+from frame_parts import depth_deviations
 from layers import slow_after, start_may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -220,8 +221,8 @@ class TestMethods:
             found_here, here = getattr(found, name), getattr(expected, name)
             assert_allclose(found_here, here, rtol=1e-5, atol=1e-7 * np.abs(here).max())
         if camera != "affine":
-            found = frames.depth_deviations(rows, sizes, weights)
-            expected = repeated.depth_deviations(rows[:, :, many], sizes)
+            found = depth_deviations(frames, rows, sizes, weights)
+            expected = depth_deviations(repeated, rows[:, :, many], sizes)
             assert_allclose(found[:, many], expected, rtol=1e-5)
 
     def test_all_methods_leave_out_points_of_weight_zero(self):

@@ -3,16 +3,24 @@
 import contextlib
 import sys
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 
-import joblib
-import sklearn
+import numpy as np
+
+from isa_nrsfm._compat.texts import printable
 
 # Files whose frames are skipped on the way from the warning up to the user's line.
 INSIDE = (
-    *(str(Path(inner).parent) for inner in (sklearn.__file__, joblib.__file__)),
+    # They are not imported: reading a file does not need scikit-learn.
+    *(
+        str(Path(s.origin or "").parent)
+        for s in map(find_spec, ("sklearn", "joblib"))
+        if s
+    ),
     str(Path(__file__).parents[1]),
     contextlib.__file__,
+    np.errstate.__call__.__code__.co_filename,
 )
 
 
@@ -21,4 +29,4 @@ def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(INSIDE):
         level, frame = level + 1, frame.f_back
-    warnings.warn(message, category, stacklevel=level)
+    warnings.warn(printable(message), category, stacklevel=level)

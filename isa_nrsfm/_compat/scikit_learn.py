@@ -1,6 +1,10 @@
 """The private names of scikit-learn that are used. All supported versions have them."""
 
+import copy
+import inspect
 from collections.abc import Callable
+from functools import wraps
+from numbers import Integral
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,6 +21,9 @@ from sklearn.utils.validation import _num_samples as number_of_rows
 __all__ = ["number_of_rows", "taken_rows", "threadpool_controller"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Class = TypeVar("Class", bound=type)
+# NumPy's defaults: `numpy.seterr` of a user does not change results.
+NUMPY_DEFAULTS = np.errstate(divide="warn", over="warn", invalid="warn", under="ignore")
 
 
 class Interval(_param_validation.Interval):
@@ -27,9 +34,42 @@ class Interval(_param_validation.Interval):
         return not isinstance(value, bool) and bool(super().is_satisfied_by(value))
 
 
+N_JOBS = [
+    None,
+    Interval(Integral, None, -1, closed="right"),
+    Interval(Integral, 1, None, closed="left"),
+]
+
+
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:
-    """Return a decorator of `fit` that checks parameters, nested ones included."""
-    return _fit_context(prefer_skip_nested_validation=not nested)
+    """Return a decorator of `fit` that checks parameters, nested ones included.
+
+    A fit is made in a copy: after an error or an interruption the former fit is still
+    there, and other threads see the former fit or the new one.
+    """
+
+    def decorated(fit: Any) -> Any:
+        """Return `fit` as a whole or not at all."""
+        checked = _fit_context(prefer_skip_nested_validation=not nested)(fit)
+
+        @wraps(checked)
+        def whole(estimator: Any, *args: Any, **params: Any) -> Any:
+            new = copy.copy(estimator)
+            checked(new, *args, **params)
+            estimator.__dict__ = vars(new)
+            return estimator
+
+        return whole
+
+    return decorated
+
+
+def with_numpy_defaults(cls: Class) -> Class:
+    """Give the public methods of a class NumPy's own handling of rounding errors."""
+    for name, method in vars(cls).copy().items():
+        if inspect.isfunction(method) and not name.startswith("_"):
+            setattr(cls, name, NUMPY_DEFAULTS(method))
+    return cls
 
 
 def checked_parameters(

@@ -1,5 +1,6 @@
 """Texts of messages, and names of files."""
 
+import html
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -20,10 +21,32 @@ _TIME = re.compile(
     re.IGNORECASE,
 )
 
+# Characters that a terminal obeys, but line breaks and tabs, and those that turn the
+# direction of writing.
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]"
+)
+
+
+def printable(text: str) -> str:
+    r"""
+    Return a text of a stranger's file with control characters written out.
+
+    >>> from isa_nrsfm._compat.texts import printable
+    >>> print(printable("nose\x1b[2J"))
+    nose\x1b[2J
+    """
+    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def escape(text: str) -> str:
+    """Return a text for a page of HTML."""
+    return html.escape(printable(text))
+
 
 def first_items(items: Iterable[Any], most: int = 4) -> str:
     """Return the first items with commas between them, and dots if there are more."""
-    texts = [str(item) for item in items]
+    texts = [printable(str(item)) for item in items]
     return ", ".join(texts[:most]) + ", ..." * (len(texts) > most)
 
 

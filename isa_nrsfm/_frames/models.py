@@ -416,22 +416,22 @@ class PosteriorFrames:
             motion, translation, fit.alpha, covariance, precision / ratio, slope
         )
 
-    def depth_deviations(
+    def point_covariances(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
     ) -> NDArray:
-        """Compute the standard deviations (n, J) of depths with calibrated cameras.
+        """Compute the covariances (n, J, 3, 3) of points in the axes of their camera.
 
-        The variance of a depth is the sum of that of the shapes and that of the frame,
-        ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
-        depths by rotation vector, logarithm of the scale (if free) and coefficients.
-        Weights (n, J) multiply the squares. The variance of a frame is multiplied by
-        its squared residual over that of the fit, if it is larger.
+        They are the sum of those of the shapes and that of the frame, ``Z (T^T T / s2 +
+        diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and points by
+        rotation vector, logarithm of the scale (if free) and coefficients. Weights (n,
+        J) multiply the squares. The covariance of a frame is multiplied by its squared
+        residual over that of the fit, if it is larger.
         """
         unit = rows / sizes[:, None, None]
         fit = self.posterior(unit, covariances=False, weights=weights)
         seen, free = seen_points(rows), CAMERAS[self.camera].scaled
         weights = seen.astype(float) if weights is None else weights
-        variances = np.full(seen.shape, np.nan)
+        covariances = np.full((*seen.shape, 3, 3), np.nan)
         rotations, scales = full_rotations(fit.motion)
         prior = np.diag([0.0] * (3 + free) + [1.0] * fit.alpha.shape[1])
         for i in np.flatnonzero(np.isfinite(scales)):
@@ -445,14 +445,21 @@ class PosteriorFrames:
             T = (changes[:, :2, seen[i]] * np.sqrt(w)).reshape(len(changes), -1)
             information = T @ T.T / self.noise_variance + prior
             covariance = np.linalg.pinv(information, hermitian=True)
-            Z = changes[:, 2]
-            variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
-        variances += self.certainty.variances(fit.alpha)
+            Z = changes.transpose(2, 1, 0)
+            covariances[i] = Z @ covariance @ Z.mT
+        # Errors of the shapes, in the image and in depth, and of the middle of frames.
+        image = self.certainty.images[1] * leverages(fit.alpha) + 1 / weights.sum(
+            axis=1
+        )
+        image = self.noise_variance * image[:, None]
+        depth = self.certainty.variances(fit.alpha)
+        for axis, variance in enumerate((image, image, depth)):
+            covariances[..., axis, axis] += variance
         # Frames that the model explains less well than those of the fit
         excess = self.squares(fit, weights.sum(axis=1))
         excess /= self.certainty.residual or np.nan
-        excess = np.fmax(excess, 1.0)
-        return sizes[:, None] * np.sqrt(variances * excess[:, None])
+        excess = sizes**2 * np.fmax(excess, 1.0)
+        return excess[:, None, None, None] * covariances
 
     def squares(self, fit: FramePosterior, weight: NDArray) -> NDArray:
         """Return mean squared residuals (n,) of points; weight (n,): of all points."""

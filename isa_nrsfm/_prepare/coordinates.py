@@ -201,12 +201,13 @@ def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
         return False
     known = tracks[~np.isnan(tracks)]
     inside = np.mean((known >= 0) & (known <= 1))
+    reader = "mediapipe" if format == "table" else format
     way = (
-        ": isa_nrsfm.io.read_landmarks with format='mediapipe' and "
-        "image_size=(WIDTH, HEIGHT) does it (command line: --format mediapipe "
+        f": isa_nrsfm.io.read_landmarks with format={reader!r} and "
+        f"image_size=(WIDTH, HEIGHT) does it (command line: --format {reader} "
         "--image-size WIDTHxHEIGHT)"
     )
-    if format not in ("table", "mediapipe"):
+    if reader not in ("mediapipe", "yolo"):
         way = (
             f". In Python: points = landmarks.points * ([WIDTH, HEIGHT] * "
             f"{tracks.shape[1]}), and isa_nrsfm.io.write_table(points, 'new.csv')"

@@ -1,11 +1,13 @@
 """Frames aligned in the image, for comparison with coefficients."""
 
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, OneToOneFeatureMixin, TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
+
+from isa_nrsfm._compat.scikit_learn import fit_context
 
 
 class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
@@ -25,6 +27,9 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         Number of columns.
     """
 
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {}
+
+    @fit_context(nested=False)
     def fit(self, X: Any, y: Any = None) -> Self:
         """
         Find the mean of the frames.

@@ -1,6 +1,6 @@
 """Coefficients relative to a person, and their variance between persons."""
 
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from sklearn.utils import check_array
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import fit_context
 from isa_nrsfm._tables.sources import CHECKS
 from isa_nrsfm.analysis._frame_columns import checked_column, group_names, group_numbers
 from isa_nrsfm.analysis._permutations import between_shares, indicators
@@ -46,6 +47,9 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
            [ 0.,  1.]])
     """
 
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {}
+
+    @fit_context(nested=False)
     def fit(
         self, X: Any, y: Any = None, *, groups: Any = None, neutral: Any = None
     ) -> Self:

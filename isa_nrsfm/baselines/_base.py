@@ -21,7 +21,12 @@ from sklearn.base import (
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
+from isa_nrsfm._compat.scikit_learn import (
+    Interval,
+    StrOptions,
+    fit_context,
+    with_numpy_defaults,
+)
 from isa_nrsfm._frames.camera_models import compose, project
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._gauge import canonical_rotation
@@ -41,6 +46,7 @@ from isa_nrsfm._tables.tracks import (
 )
 
 
+@with_numpy_defaults
 class ShapeSequenceNRSfM(
     ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
 ):

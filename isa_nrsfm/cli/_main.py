@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import TextIO
 
+from isa_nrsfm._compat.texts import printable
 from isa_nrsfm.cli._options import NONE, PROGRAM, build_parser, flag_of
 from isa_nrsfm.cli._progress import show_stage, shown_progress
 
@@ -31,6 +32,7 @@ def run(argv: Sequence[str] | None = None) -> int:
             command = importlib.import_module(f"isa_nrsfm.cli._{args.command}")
             report = command.run(args, warned)
         encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+        report = printable(report)
         print(report.encode(encoding, "backslashreplace").decode(encoding), flush=True)
     except BrokenPipeError:
         _silence(sys.stdout)
@@ -83,7 +85,7 @@ def _with_options(text: str, args: Namespace) -> str:
 def _say(text: str) -> None:
     """Write a line to the standard error, if that is possible."""
     try:
-        print(f"{PROGRAM}: {text}", file=sys.stderr, flush=True)
+        print(printable(f"{PROGRAM}: {text}"), file=sys.stderr, flush=True)
     except OSError:
         _silence(sys.stderr)
 

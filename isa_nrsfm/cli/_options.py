@@ -94,7 +94,7 @@ def _share_or_number(text: str) -> float:
 
 def _image_size(text: str) -> tuple[int, int] | None:
     """Read WIDTHxHEIGHT."""
-    match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
+    match = re.fullmatch(r"([1-9]\d{0,6})[xX]([1-9]\d{0,6})", text.strip())
     return (int(match[1]), int(match[2])) if match else None
 
 
@@ -159,8 +159,8 @@ SHORT = {"output": ["-o"], "n_components": ["-k"]}
 HELP = {
     "model MODEL": "model.npz, written by fit",
     # The table.
-    "table TABLE": "a .csv, .tsv or .parquet file, or a file or folder of another "
-    "format",
+    "table TABLE": "a .csv, .tsv, .txt or .parquet file, a file of another format, "
+    "or a folder of files",
     "format FORMAT": "the program that wrote the table: "
     f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for any table "
     "with named columns (default: auto, recognised by the beginning of the file)",
@@ -181,10 +181,10 @@ HELP = {
     "min_confidence CONFIDENCE": "treat points with a lower confidence as missing",
     "weights WEIGHTS": "weight the points of the joint refinement by their confidences "
     "in the file (confidence); points of confidence zero are missing",
-    "image_size WIDTHxHEIGHT": "size of the images for MediaPipe, in pixels, such as "
-    "1920x1080",
+    "image_size WIDTHxHEIGHT": "size of the images for MediaPipe and YOLO, in pixels, "
+    "such as 1920x1080",
     "fit.image_size WIDTHxHEIGHT": "size of the images in pixels, such as 1920x1080: "
-    "for MediaPipe, and for perspective cameras, which are then compared with "
+    "for MediaPipe and YOLO, and for perspective cameras, which are then compared with "
     "weak_perspective ones",
     "part PART": "the points to read, if the files have several: of OpenPose "
     f"{', '.join(choices.OPENPOSE_PARTS)}; of whole bodies of COCO and MMPose "

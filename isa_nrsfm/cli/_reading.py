@@ -102,7 +102,7 @@ def read_frames(
     found = chosen = layout = sure = None
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
-    if args.format != TABLE:
+    if args.format != TABLE or (table is None and Path(args.table).is_dir()):
         given = {name: getattr(args, name) for name in _OF_FORMATS}
         given["missing"] = args.missing_value
         known = FORMATS[args.format].options
@@ -249,9 +249,12 @@ def _format(args: Namespace) -> str:
             continue
         near = args.command == "fit" and args.camera not in ("affine", "orthographic")
         if name != "image_size" or not near:
-            having = [each.name for each in FORMATS.values() if name in each.options]
+            having = [each for each in FORMATS.values() if name in each.options]
+            suffix = Path(args.table).suffix.lower()
+            having = [each for each in having if suffix in each.suffixes] or having
+            names = " or ".join(each.name for each in having)
             raise ValueError(
-                f"{flag_of(name)} needs --format {' or '.join(having)}; {args.table} "
+                f"{flag_of(name)} needs --format {names}; {args.table} "
                 f"has format {found}"
             )
     return found

@@ -9,7 +9,6 @@ import math
 import shlex
 import textwrap
 from collections.abc import Sequence
-from html import escape
 from importlib.resources import files
 from itertools import compress
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isa_nrsfm._compat import pandas as pd
-from isa_nrsfm._compat.texts import as_utf8, first_items, percent
+from isa_nrsfm._compat.texts import as_utf8, escape, first_items, percent
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.analysis._frame_columns import STATISTICS
 from isa_nrsfm.cli._options import PROGRAM

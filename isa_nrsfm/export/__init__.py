@@ -1,8 +1,9 @@
 """Fitted models as files for other programs.
 
 Shape models for MATLAB, OpenFace and other code, animated shapes in glTF, a page that
-shows them in any browser, head poses and distances. Shapes are Euclidean if the cameras
-determine them (`isa_nrsfm.calibration`), upright and frontal.
+shows them in any browser, points in space with deviations, head poses and distances.
+Shapes are Euclidean if the cameras determine them (`isa_nrsfm.calibration`), upright
+and frontal.
 """
 
 from typing import TYPE_CHECKING
@@ -10,6 +11,11 @@ from typing import TYPE_CHECKING
 from isa_nrsfm._compat.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from isa_nrsfm.export._points import (
+        FramePoints as FramePoints,
+        frame_points as frame_points,
+        write_points as write_points,
+    )
     from isa_nrsfm.export._poses import (
         FramePoses as FramePoses,
         frame_poses as frame_poses,

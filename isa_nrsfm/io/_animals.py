@@ -5,14 +5,14 @@ holds. Here only numbers, texts, tuples and lists are. The layouts are those of
 `DataFrame.to_hdf` with ``format="table"`` and ``format="fixed"``.
 """
 
-import io
 import json
 import pickle
+import pickletools
 import re
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.io._landmarks import Landmarks, assemble_individuals
+from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
 from isa_nrsfm.io._tables import SEPARATORS, header_rows, read_columns
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
@@ -44,6 +44,10 @@ _DIMS = ("frame", "track", "node", "xy")
 # for Python. They differ where there are more than two points.
 _ORDERS = (("track", "xy", "node", "frame"), ("frame", "node", "xy", "track"))
 _NEEDED = frozenset({"tracks", "node_names", "track_names"})
+
+# What pickled labels may hold, and the instructions of pickle that move it.
+_PLAIN = ("list", "tuple", "str", "bytes_or_str", "int", "int_or_bool", "float", "mark")
+_PICKLED = re.compile("PROTO|FRAME|STOP|MEMOIZE|(LONG_)?(BIN)?(GET|PUT)")
 
 Columns = list[tuple[str, ...]]
 
@@ -264,8 +268,7 @@ def _table_blocks(group: Any) -> tuple[list[tuple[NDArray, Columns]], list[Any]]
     for name in rows.dtype.names or ():
         is_number = rows.dtype[name].base.kind in "fiu"
         if name.startswith("values_block_") and is_number:
-            labels = _plain(table.attrs[f"{name}_kind"])
-            columns = [tuple(map(str, label)) for label in labels]
+            columns = _labels(table.attrs[f"{name}_kind"])
             blocks.append((rows[name].reshape(len(rows), -1), columns))
     return blocks, [_label(label) for label in rows["index"]]
 
@@ -309,17 +312,22 @@ def _text(value: Any) -> str:
     return value.decode("utf-8") if isinstance(value, bytes) else str(value)
 
 
-class _PlainUnpickler(pickle.Unpickler):
-    """Unpickles numbers, texts, tuples, lists and dictionaries, and nothing else."""
+def _labels(pickled: Any) -> Columns:
+    """Return pickled labels of columns, tuples of texts or numbers.
 
-    def find_class(self, module_name: str, global_name: str, /) -> NoReturn:
-        """Refuse everything that has to be imported."""
-        raise pickle.UnpicklingError(f"{module_name}.{global_name} is not allowed")
-
-
-def _plain(pickled: Any) -> Any:
-    """Return the plain object that was pickled."""
-    return _PlainUnpickler(io.BytesIO(bytes(pickled)), encoding="utf-8").load()
+    Nothing else is unpickled: objects, and containers that grow when they are compared
+    or written.
+    """
+    content = bytes(pickled)
+    for code, *_ in pickletools.genops(content):
+        made = [each.name for each in code.stack_after]
+        if not _PICKLED.fullmatch(code.name) and (not made or made[0] not in _PLAIN):
+            raise ValueError(f"its labels should be texts; pickled with {code.name}")
+    labels = pickle.loads(content, encoding="utf-8")
+    for label in labels:
+        if not all(isinstance(part, str | int | float) for part in label):
+            raise ValueError("its labels should be texts; got nested labels")
+    return [tuple(map(str, label)) for label in labels]
 
 
 def is_sleap(path: Path) -> bool:
@@ -364,6 +372,32 @@ def read_sleap(path: Path) -> Landmarks:
         format="sleap",
         confidence=scores.get("point_scores"),
         skeleton=skeleton,
+    )
+
+
+def is_facemap(path: Path) -> bool:
+    """Return whether a file has the group of Facemap."""
+    return is_hdf5(path) and "Facemap" in root_groups(path)
+
+
+def read_facemap(path: Path) -> Landmarks:
+    """Read an h5 file of Facemap: x, y and likelihood of each body part in a group.
+
+    Body parts are in the order of their names, frames are counted from 0.
+    """
+    h5py = import_optional("h5py", extra="h5")
+    with h5py.File(path, "r") as file:
+        group = own_member(file, "Facemap")
+        parts = [own_member(group, name) for name in group]
+        values = [[numbers_of(part, name) for name in _VALUES] for part in parts]
+        names = list(group)
+    points = np.moveaxis(np.array(values), 2, 0)
+    return assemble(
+        points[..., :2],
+        names,
+        {"frame": range(len(points))},
+        format="facemap",
+        confidence=points[..., 2],
     )
 
 

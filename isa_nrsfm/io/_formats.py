@@ -3,8 +3,11 @@
 Readers are imported when a file is read: the help of the command line must not wait.
 """
 
+import contextlib
 import os
-from collections.abc import Callable, Mapping
+import re
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
+from isa_nrsfm._compat.texts import as_utf8, by_number, first_items
 
 if TYPE_CHECKING:
     from isa_nrsfm.io._landmarks import Landmarks
@@ -20,7 +24,6 @@ if TYPE_CHECKING:
 TABLE = "table"
 # Stands for a folder where others have the suffix of a file.
 _FOLDER = "/"
-_TABLES = (".csv", ".tsv", ".parquet")
 
 
 @dataclass(frozen=True)
@@ -36,22 +39,22 @@ class LandmarkFormat:
         Which program or data set it belongs to.
     expected : str
         Required content of such a file.
-    suffixes : tuple of str
+    suffixes : sequence of str
         Suffixes of its files in lower case; "/" for a folder of files.
     reader : str
         Module and name of its two functions, such as ``_keypoints.coco``. ``is_coco``
         takes the path and returns whether the file begins like this format.
         ``read_coco`` returns its `Landmarks`, or raises a ValueError without the path.
-    options : tuple of str
+    options : sequence of str
         Names of the options that `read` takes.
     """
 
     name: str
     title: str
     expected: str
-    suffixes: tuple[str, ...]
+    suffixes: Sequence[str]
     reader: str = field(repr=False)
-    options: tuple[str, ...] = ()
+    options: Sequence[str] = ()
 
     def matches(self, path: str | os.PathLike[str]) -> bool:
         """
@@ -115,6 +118,8 @@ class LandmarkFormat:
                 + (f"it has {', '.join(self.options)}" if self.options else "")
             )
         _check_exists(path)
+        if path.is_dir() and _FOLDER not in self.suffixes:
+            return _joined(path, self, **options)
         if _suffix(path) not in self.suffixes:
             raise ValueError(
                 f"{path} cannot be read as {self.name} ({self.title}): expected "
@@ -137,7 +142,8 @@ def read_landmarks(
     Parameters
     ----------
     path : str or path-like
-        The file, or a folder of ``.pts`` files or of json files of OpenPose or MMPose.
+        The file, or a folder of files of one format, which are put below each other,
+        with the column ``file``.
     format : str, default="auto"
         The format, one of `FORMATS`. With "auto", it is the one whose files begin like
         this one, which must be a single one. Files of separated values that no other
@@ -146,7 +152,7 @@ def read_landmarks(
         Points with a lower confidence become NaN, where the format has confidences.
     **options : dict
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
-        pixels, for coordinates in shares of the image's size; ``part`` of "openpose",
+        pixels, and of "yolo", for shares of the image's size; ``part`` of "openpose",
         one of "pose", "face", "hand_left" and "hand_right"; ``part`` of whole bodies of
         "coco" and "mmpose", one of "body", "feet", "face", "left_hand", "right_hand"
         and "all"; ``columns`` and ``missing`` of "table" and "mediapipe", and
@@ -244,6 +250,8 @@ def find_format(path: str | os.PathLike[str]) -> str:
     possible = [found for found in FORMATS.values() if _suffix(path) in found.suffixes]
     others = [each for each in possible if each.name != TABLE]
     matching = [each.name for each in others if each.matches(path)]
+    if path.is_dir() and not matching:
+        matching = [*{form.name: form for _, form in _members(path)}]
     if len(matching) > 1:
         raise ValueError(
             f"{path} matches more than one format: {', '.join(matching)}. Choose with "
@@ -251,25 +259,67 @@ def find_format(path: str | os.PathLike[str]) -> str:
         )
     if matching:
         return matching[0]
-    if len(others) < len(possible):
+    names = import_module("isa_nrsfm.io._tables").header_names
+    if len(others) < len(possible) and (path.suffix != ".txt" or len(names(path)) > 1):
         return TABLE
     if _suffix(path) in (".xlsx", ".xls", ".ods"):
         raise ValueError(f"{path} is a file of a spreadsheet: save it as .csv there")
+    known = (f"{f.name}: {f.expected}, in {_listed(f.suffixes)}" for f in possible)
     if not possible:
         known = (f"{each.name} ({_listed(each.suffixes)})" for each in FORMATS.values())
-        raise ValueError(
-            f"{path} is of no known format: {'; '.join(known)}. Unpack compressed "
-            "files. Save tables and arrays as .csv, in pandas: "
-            "pd.DataFrame(array, columns=names).to_csv('new.csv', index=False)"
-        )
     raise ValueError(
-        f"{path} is of no known format. Expected "
-        + "; ".join(
-            f"{found.name}: {found.expected}, in {_listed(found.suffixes)}"
-            for found in (*possible, FORMATS[TABLE])
-        )
-        + ". Rename tables of separated values to .csv"
+        f"{path} is of no known format: {_seen(path)}. Expected {'; '.join(known)}. "
+        "Unpack compressed files. Projects of SLEAP, NWB and others are read with "
+        "sleap-io and from_sleap_io. Save other tables and arrays as .csv, in pandas: "
+        "pd.DataFrame(array, columns=names).to_csv('new.csv', index=False)"
     )
+
+
+def _members(folder: Path) -> list[tuple[Path, LandmarkFormat]]:
+    """Return the files of a folder that are of a format, by their names and numbers."""
+    found = []
+    for file in sorted(folder.iterdir(), key=by_number):
+        if file.is_file() and not file.name.startswith("."):
+            with contextlib.suppress(ValueError):
+                found.append((file, FORMATS[find_format(file)]))
+    return found
+
+
+def _joined(folder: Path, form: LandmarkFormat, **options: Any) -> "Landmarks":
+    """Read all files of a folder of one format, with the column ``file``."""
+    from isa_nrsfm._compat.caller import warn_caller
+    from isa_nrsfm.io._landmarks import joined
+
+    files = [file for file, found in _members(folder) if found == form]
+    if not files:
+        raise ValueError(f"{folder} has no {form.name} files: expected {form.expected}")
+    beside = sorted({*folder.glob(f"[!.]*{files[0].suffix}")}.difference(files))
+    others = first_items(file.name for file in beside)
+    known = {re.sub(r"\d+", "", file.name) for file in files}
+    # Others are such as classes.txt, or labels of an image without any.
+    damaged = files[0].suffix != ".txt" or any(
+        re.sub(r"\d+", "", file.name) in known and file.stat().st_size
+        for file in beside
+    )
+    with errors_of(str(folder)):
+        if beside and damaged:
+            raise ValueError(f"{others} cannot be read as {form.name}")
+        if beside:
+            warn_caller(f"not of {form.name}, and left out: {others}")
+        return joined({as_utf8(f.name): form.read(f, **options) for f in files})
+
+
+def _seen(path: Path) -> str:
+    """Return what an unknown file has: names of entries, or its first bytes."""
+    if path.is_dir():
+        return f"a folder with {first_items(sorted(p.name for p in path.iterdir()))}"
+    with path.open("rb") as file:
+        start = file.read(40)
+    if start.startswith(b"\x89HDF"):
+        groups = import_module("isa_nrsfm.io._animals").root_groups(path)
+        return f"an HDF5 file with {first_items(sorted(groups)) or 'nothing'}"
+    line = start.partition(b"\n")[0]
+    return f"it begins with {line.decode() if line.isascii() else line!r}"
 
 
 def _suffix(path: Path) -> str:
@@ -285,106 +335,14 @@ def _check_exists(path: Path) -> None:
             pass
 
 
-def _listed(suffixes: tuple[str, ...]) -> str:
+def _listed(suffixes: Sequence[str]) -> str:
     """List suffixes in words."""
     words = ["a folder" if suffix == _FOLDER else suffix for suffix in suffixes]
     return " or ".join(words)
 
 
-_ALL = (
-    LandmarkFormat(
-        "openface",
-        "OpenFace",
-        "the columns frame, timestamp, confidence, success (face, confidence for an "
-        "image), x_0, ... and y_0, ...",
-        _TABLES,
-        "_face_tables.openface",
-    ),
-    LandmarkFormat(
-        "pyfeat",
-        "py-feat",
-        "the columns FaceRectX, FaceRectY, FaceRectWidth, FaceRectHeight, x_0, ... and "
-        "y_0, ...",
-        _TABLES,
-        "_face_tables.pyfeat",
-    ),
-    LandmarkFormat(
-        "mediapipe",
-        "MediaPipe",
-        "named columns x and y of each point (468 or 478, where it is recognised)",
-        _TABLES,
-        "_face_tables.mediapipe",
-        ("image_size", "columns", "missing"),
-    ),
-    LandmarkFormat(
-        "pts",
-        "iBUG, 300-W",
-        "'version: 1', 'n_points: N' and N lines 'x y' between braces",
-        (".pts", _FOLDER),
-        "_keypoints.pts",
-    ),
-    LandmarkFormat(
-        "wflw",
-        "WFLW lists",
-        "lines of 196 coordinates, 4 of a box, 6 attributes and the image",
-        (".txt",),
-        "_keypoints.wflw",
-    ),
-    LandmarkFormat(
-        "deeplabcut",
-        "DeepLabCut, Lightning Pose",
-        "columns of the levels scorer, (individuals,) bodyparts, coords",
-        (".csv", ".tsv", ".h5", ".hdf5"),
-        "_animals.deeplabcut",
-    ),
-    LandmarkFormat(
-        "sleap",
-        "SLEAP analysis",
-        "the datasets tracks, node_names and track_names",
-        (".h5", ".hdf5"),
-        "_animals.sleap",
-    ),
-    LandmarkFormat(
-        "coco",
-        "COCO keypoints",
-        "images, annotations and categories with keypoints, or a list of results; "
-        "write json of other programs as a table",
-        (".json",),
-        "_keypoints.coco",
-        ("part",),
-    ),
-    LandmarkFormat(
-        "openpose",
-        "OpenPose",
-        "people with pose_keypoints_2d, face_keypoints_2d, ...; a folder has a file "
-        "..._keypoints.json for each frame",
-        (".json", _FOLDER),
-        "_keypoints.openpose",
-        ("part",),
-    ),
-    LandmarkFormat(
-        "mmpose",
-        "MMPose predictions",
-        "instances with keypoints and keypoint_scores, or frames with such instances",
-        (".json", _FOLDER),
-        "_keypoints.mmpose",
-        ("part",),
-    ),
-    LandmarkFormat(
-        "tps",
-        "tps of morphometrics",
-        "LM=N, N lines 'x y', and lines such as IMAGE=a.jpg, for each specimen",
-        (".tps",),
-        "_keypoints.tps",
-    ),
-    LandmarkFormat(
-        TABLE,
-        "a table with named columns",
-        "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
-        _TABLES,
-        "_tables.named_columns",
-        ("columns", "missing", "individuals", "row_per_point"),
-    ),
+_FILE = Path(__file__).with_name("formats.toml")
+_ENTRIES: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
+    {name: LandmarkFormat(name, **entry) for name, entry in _ENTRIES.items()}
 )
-
-FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType({f.name: f for f in _ALL})

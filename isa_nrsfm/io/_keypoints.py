@@ -43,6 +43,8 @@ _OPENPOSE = frozenset({b"people"})
 _MMPOSE = frozenset(
     {b"instance_info", b"instances", b"keypoint_scores", b"predictions"}
 )
+# Ultralytics, and labelme.
+_OTHERS = re.compile(rb'"keypoints"\s*:\s*\{|"shapes"\s*:')
 _TPS = re.compile(r"(?i)LM\s*=\s*\d+")
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
@@ -50,7 +52,6 @@ _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
     r"\{(?P<points>[^{}]*)\}\s*"
 )
-_PTS_NAME = re.compile(r"(?is)(?!\.).*\.pts")
 _N_WFLW = 98
 _WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
 _WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
@@ -61,7 +62,10 @@ _WFLW_LENGTHS = (197, 207)
 def is_coco(path: Path) -> bool:
     """Return whether a file begins as a json object or list, of no other format."""
     names = _entry_names(path)
-    return names is not None and not names & (_OPENPOSE | _MMPOSE)
+    if names is None or names & (_OPENPOSE | _MMPOSE):
+        return False
+    with path.open("rb") as file:
+        return _OTHERS.search(file.read(2**16)) is None
 
 
 def _entry_names(path: Path) -> frozenset[bytes] | None:
@@ -84,13 +88,13 @@ def read_coco(path: Path, part: str | None = None) -> Landmarks:
     content = _read_json(path)
     if isinstance(content, list):
         entries = _results(content)
-        return _landmarks(entries, None, part, "coco", "result")
+        return entries_as_rows(entries, None, part, "coco", "result")
     entries, names = _annotations(content)
-    found = _landmarks(entries, names, part, "coco", "annotation")
+    found = entries_as_rows(entries, names, part, "coco", "annotation")
     return replace(found, confidence=None)
 
 
-def _landmarks(
+def entries_as_rows(
     entries: Sequence[dict[str, Any]],
     names: list[str] | None,
     part: str | None,
@@ -146,11 +150,12 @@ def _results(entries: list[Any]) -> list[dict[str, Any]]:
 def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
     """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
+    seen = first_items(content) if isinstance(content, dict) else content
     content = {"categories": []} | content if isinstance(content, dict) else {}
     if not all(isinstance(content.get(part), list) for part in lists):
         raise ValueError(
             "expected an object with the lists images, annotations and categories, or "
-            "a list of results"
+            f"a list of results; got {seen!r:.60}"
         )
     for part in lists:
         _refuse_non_objects(content[part], part)
@@ -218,7 +223,14 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
     """Return entries by their identifiers, or raise."""
     if not all(isinstance(entry.get("id"), int | str) for entry in entries):
         raise ValueError(f"each of the {what} needs an id")
-    return {entry["id"]: entry for entry in entries}
+    found = {entry["id"]: entry for entry in entries}
+    twice = next((each for each in entries if each != found[each["id"]]), None)
+    if twice is not None:
+        raise ValueError(
+            f"two of the {what} have the id {twice['id']!r}, as in files that were "
+            "joined: give each an id of its own, and its annotations as well"
+        )
+    return found
 
 
 def _keypoints(
@@ -352,7 +364,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             if part in each
         ]
         entries += shown or [of_file]
-    found = _landmarks(entries, None, None, "openpose", "person")
+    found = entries_as_rows(entries, None, None, "openpose", "person")
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
@@ -440,7 +452,7 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     files, absent = _files_of(path, _JSON, _MMPOSE, True), "no file of it is of MMPose"
     _, contents = _each_file(path, files, absent, _instances_in)
     entries = [entry for found in contents for entry in found]
-    return _landmarks(entries, None, part, "mmpose", "instance")
+    return entries_as_rows(entries, None, part, "mmpose", "instance")
 
 
 def _instances_in(file: Path) -> list[dict[str, Any]]:
@@ -474,23 +486,18 @@ def _instances_in(file: Path) -> list[dict[str, Any]]:
 
 
 def is_pts(path: Path) -> bool:
-    """Return whether a file begins as .pts files do, or a folder has such files."""
-    if path.is_dir():
-        return bool(_files_of(path, _PTS_NAME))
+    """Return whether a file begins as .pts files do."""
     return "".join(first_lines(path, 1)).lstrip().startswith("version")
 
 
 def read_pts(path: Path) -> Landmarks:
-    """Read a .pts file, or all of a folder in the order of their names and numbers.
+    """Read a .pts file, with the points of one image.
 
-    A file has the points of one image: ``version: 1``, ``n_points: 68`` and, between
-    braces, a line ``x y`` for each point. Other files of the folder are ignored.
-    Coordinates are as they are written; iBUG counts pixels from 1.
+    It has ``version: 1``, ``n_points: 68`` and, between braces, a line ``x y`` for each
+    point. Coordinates are as they are written; iBUG counts pixels from 1.
     """
-    absent = "there are no .pts files in the folder"
-    names, points = _each_file(path, _files_of(path, _PTS_NAME), absent, _points_of)
-    *_, tracks = stacked([{0: each} for each in points], names)
-    return assemble(tracks, None, {"file": [*map(as_utf8, names)]}, format="pts")
+    frames = {"file": [as_utf8(path.name)]}
+    return assemble(_points_of(path)[None], None, frames, format="pts")
 
 
 def is_tps(path: Path) -> bool:
@@ -517,7 +524,7 @@ def read_tps(path: Path) -> Landmarks:
         with errors_of(f"specimen {number} (counted from 0)"):
             count, *lines = filter(None, map(str.strip, part.splitlines()))
             points = " ".join(lines[: int(count)]).replace("NA", "nan")
-            tracks.append({0: _floats(points.split()).reshape(int(count), 2)})
+            tracks.append({0: floats_of(points.split()).reshape(int(count), 2)})
             entries = [line.partition("=") for line in lines[int(count) :]]
             if entries and not entries[0][1]:
                 raise ValueError(f"there are more than {count} landmarks")
@@ -540,7 +547,7 @@ def is_wflw(path: Path) -> bool:
     """Return whether the first line has the fields of a WFLW list."""
     fields = "".join(first_lines(path, 1)).split()
     try:
-        _floats(fields[: 2 * _N_WFLW])
+        floats_of(fields[: 2 * _N_WFLW])
     except ValueError:
         return False
     return len(fields) in _WFLW_LENGTHS
@@ -560,7 +567,7 @@ def read_wflw(path: Path) -> Landmarks:
             f"the lines have {n_fields} fields; all must have "
             f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
         )
-    numbers = np.stack([_floats(row) for row in fields[:, :-1].tolist()])
+    numbers = np.stack([floats_of(row) for row in fields[:, :-1].tolist()])
     frames: dict[str, object] = {"image": fields[:, -1]}
     points, box, attributes = np.split(numbers, [196, 200], axis=1)
     if n_fields == _WFLW_LENGTHS[1]:
@@ -580,7 +587,7 @@ def _points_of(file: Path) -> NDArray[np.float64]:
             "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
             f"got {text[:40]!r}"
         )
-    coordinates = _floats(match["points"].split())
+    coordinates = floats_of(match["points"].split())
     n_points = int(match["n_points"])
     if len(coordinates) != 2 * n_points or n_points == 0:
         raise ValueError(
@@ -589,7 +596,7 @@ def _points_of(file: Path) -> NDArray[np.float64]:
     return coordinates.reshape(n_points, 2)
 
 
-def _floats(fields: list[str]) -> NDArray[np.float64]:
+def floats_of(fields: list[str]) -> NDArray[np.float64]:
     """Return the numbers that fields hold."""
     # Python reads 1_0 as a number.
     bad = next((field for field in fields if "_" in field), None)

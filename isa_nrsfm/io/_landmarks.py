@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -125,8 +126,8 @@ def assemble(
     the points determine.
     """
     n_frames, n_points, _ = tracks.shape
-    if n_frames == 0:
-        raise ValueError("there are no frames in it")
+    if n_frames == 0 or n_points == 0:
+        raise ValueError(f"there are no {'points' if n_frames else 'frames'} in it")
     if point_names is None:
         point_names = [str(j) for j in range(n_points)]
         columns = [f"{axis}_{j}" for j in point_names for axis in "xy"]
@@ -153,6 +154,27 @@ def assemble(
         format=format,
         point_names=tuple(point_names),
         skeleton=skeleton,
+    )
+
+
+def joined(parts: Mapping[str, Landmarks]) -> Landmarks:
+    """Put landmarks of files below each other, with the name of each as column file."""
+    (first, found), *_ = parts.items()
+    for name, each in parts.items():
+        if [*each.points] != [*found.points]:
+            raise ValueError(
+                f"{first} has {len(found.point_names)} points, {name} has "
+                f"{len(each.point_names)}: all files must have the same, in one order"
+            )
+
+    below = partial(pd.concat, ignore_index=True)
+    sure = [each.confidence for each in parts.values() if each.confidence is not None]
+    return replace(
+        found,
+        points=below(each.points for each in parts.values()),
+        frames=below(each.frames.assign(file=name) for name, each in parts.items()),
+        confidence=below(sure) if len(sure) == len(parts) else None,
+        failed=np.concatenate([each.failed for each in parts.values()]),
     )
 
 
@@ -233,7 +255,7 @@ def checked_sizes(name: str, sizes: Any, n_images: int) -> NDArray[np.float64]:
     except (TypeError, ValueError):
         found = np.array(np.nan)
     fits = found.shape in ((2,), (n_images, 2))
-    if not (fits and np.isfinite(found).all() and (found > 0).all()):
+    if not (fits and ((found > 0) & (found < 1e7)).all()):
         raise ValueError(
             f"{name} must be a width and a height in pixels, such as (1920, 1080), for "
             f"all images or for each of the {n_images}; got {sizes!r:.60}"

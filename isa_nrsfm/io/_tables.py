@@ -28,9 +28,11 @@ from isa_nrsfm.skeletons._column_names import (
     point_names,
 )
 
-SEPARATORS = {".csv": ",", ".tsv": "\t"}
+SEPARATORS = {".csv": ",", ".tsv": "\t", ".txt": "\t"}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
+# Bytes at the end of a file that show how its numbers are written.
+_TAIL = 2**16
 # Numbers with a decimal comma, and with commas between thousands.
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
@@ -355,7 +357,7 @@ def table_suffix(path: str | os.PathLike[str]) -> str:
     suffix = Path(path).suffix
     if suffix.lower() not in TABLE_SUFFIXES:
         raise ValueError(
-            f"{path}: a table is a .csv, .tsv or .parquet file; got {suffix!r}"
+            f"{path}: a table is a .csv, .tsv, .txt or .parquet file; got {suffix!r}"
         )
     return suffix.lower()
 
@@ -382,15 +384,17 @@ def separator_of(path: Path) -> str:
     The header and the first row have as many cells, and the most; numbers and names may
     have a comma each.
     """
-    usual, lines = SEPARATORS.get(path.suffix.lower(), ","), first_lines(path, 2)
+    suffix, lines = path.suffix.lower(), first_lines(path, 2)
+    usual = SEPARATORS.get(suffix, ",")
 
     def better(sign: str) -> tuple[bool, float]:
-        """Return whether rows have as many cells, and separators; half for commas."""
+        """Return whether rows have as many cells, and separators, fewer for commas."""
         lengths = [len(row) for row in csv.reader(lines, delimiter=sign) if row]
-        return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / (1 + (sign == ","))
+        weight = {",": 2, " ": 4}.get(sign, 1)
+        return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / weight
 
     try:
-        return max((usual, *";\t,|"), key=better)
+        return max((usual, *";\t,|", *" " * (suffix == ".txt")), key=better)
     except (csv.Error, ValueError):
         return usual
 
@@ -424,7 +428,7 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
     lines.
     """
     n_lines, n_rows, n_columns = 0, 0, 0
-    if separator != SEPARATORS.get(path.suffix.lower()):
+    if separator != SEPARATORS.get(path.suffix.lower()) and path.suffix != ".txt":
         warn_caller(f"the cells of {path.name} end with {separator!r}")
     with path.open(encoding="utf-8-sig", newline="") as file:
 
@@ -458,6 +462,30 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
             yield row
     if n_rows == 1:
         raise ValueError("it has a header but no rows")
+    _refuse_cut_number(path, separator)
+
+
+def _refuse_cut_number(path: Path, separator: str) -> None:
+    """Raise if the last number of a text was cut off: it ends before all others do.
+
+    Numbers of a program have as many digits after the point or exponent, or nearly so.
+    """
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - _TAIL, 0))
+        lines = file.read().decode("utf-8", "replace").splitlines(True)[4:]  # header
+    if len(lines) < 11 or lines[-1].endswith(("\n", "\r")):
+        return
+    cells = [line.strip().rpartition(separator)[2] for line in lines]
+    parts = [re.split(r"[.eE][+-]?", cell) for cell in cells]
+    *others, last = [100 * len(p) + len(p[-1]) * (len(p) > 1) for p in parts]
+    fewest = min(others)
+    equal = len(others) > 19 and fewest == max(others)
+    if last < fewest - (not equal):
+        raise ValueError(
+            f"it ends in the middle of a number, {cells[-1]!r} in its last line: the "
+            "file is truncated, or is still being written. If it is complete, end the "
+            "line with a line break"
+        )
 
 
 def read_parquet(path: Path) -> "pd.DataFrame":

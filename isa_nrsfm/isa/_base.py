@@ -20,11 +20,12 @@ from sklearn.utils import gen_batches
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._compat.scikit_learn import Interval
+from isa_nrsfm._compat.scikit_learn import Interval, with_numpy_defaults
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
 from isa_nrsfm._tables.sources import unmasked
 
 
+@with_numpy_defaults
 class BaseSubspaceAnalysis(
     ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator, metaclass=ABCMeta
 ):

@@ -1,7 +1,6 @@
 """The strategies: FastISA with many starts (ISA1), and FastICA with pooling (ISA2)."""
 
 import warnings
-from numbers import Integral
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -13,7 +12,7 @@ from sklearn.utils import check_array, check_random_state
 from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import fit_context
+from isa_nrsfm._compat.scikit_learn import N_JOBS, fit_context
 from isa_nrsfm.isa._base import (
     BaseSubspaceAnalysis,
     Values,
@@ -109,7 +108,7 @@ class FastISA(BaseSubspaceAnalysis):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **BaseSubspaceAnalysis._parameter_constraints,
-        "n_jobs": [None, Integral],
+        "n_jobs": N_JOBS,
         "verbose": ["verbose"],
     }
 

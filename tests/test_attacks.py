@@ -1,0 +1,262 @@
+"""What strangers, other programs and impatient users do: refused, or without harm."""
+
+import json
+import pickle
+import threading
+from contextlib import suppress
+
+import landmark_files as files
+import numpy as np
+import pandas as pd
+import pytest
+from landmark_files import FRAME, TRACKS, XY
+from numpy.testing import assert_array_equal
+from refusals import refused, warned
+
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm.analysis import AlignedFrames, WithinGroups
+from isa_nrsfm.baselines import BlockMatrixNRSfM, CompressibleNRSfM, PseudoInverseNRSfM
+from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.io import read_landmarks
+from isa_nrsfm.isa import FastISA, PooledFastICA
+
+X = make_nonrigid_tracks(40, 12, 1, noise=0.01, random_state=0).data
+HOLES = np.where(np.random.default_rng(0).random((40, 12, 1)) < 0.1, np.nan, 1.0)
+SIGNALS = np.random.default_rng(0).laplace(size=(300, 6))
+WEAK = {"camera": "weak_perspective", "random_state": 0}
+METHODS = "reconstruct reproject score diagnostics smooth rotation_covariance".split()
+MODELS = {
+    "affine": (AffineNRSfM(1, random_state=0), X),
+    "holes": (AffineNRSfM(1, **WEAK), (HOLES * X.reshape(40, 12, 2)).reshape(40, -1)),
+    "paper": (AffineNRSfM(1, refinement=None, random_state=0), X),
+    "cauchy": (AffineNRSfM("auto", loss="cauchy", **WEAK), X),
+    "cv": (AffineNRSfMCV([1], cv=2), X),
+    "low rank": (PseudoInverseNRSfM(1), X),
+    "blocks": (BlockMatrixNRSfM(1), X),
+    "compressible": (CompressibleNRSfM(1), X),
+    "groups": (WithinGroups(), X),
+    "aligned": (AlignedFrames(), X),
+    "FastISA": (FastISA(random_state=0), SIGNALS),
+    "FastICA": (PooledFastICA(random_state=0), SIGNALS),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.filterwarnings("ignore")
+def test_a_refit_that_fails_keeps_the_fit_and_numpys_settings_do_not_matter(name):
+    model, table = MODELS[name]
+    with np.errstate(all="raise"):
+        expected = model.fit(table).transform(table)
+        for method in METHODS if isinstance(model, AffineNRSfM) else ():
+            with suppress(ValueError):  # of other cameras
+                getattr(model, method)(table)
+    before = vars(model).copy()
+    for bad, error in (
+        (np.full_like(table, np.nan), ValueError),
+        (Stop(table), Stopped),
+    ):
+        with pytest.raises(error):
+            model.fit(bad)
+        assert vars(model).keys() == before.keys()
+        assert all(vars(model)[key] is value for key, value in before.items())
+    assert_array_equal(model.transform(table), expected)
+
+
+class Stopped(BaseException):
+    """An interruption."""
+
+
+class Stop(pd.DataFrame):
+    """A table at which the user interrupts."""
+
+    def __array__(self, *_, **__):
+        raise Stopped
+
+
+def test_threads_see_the_old_or_the_new_fit():
+    model = AffineNRSfM(1, refinement=None, random_state=0).fit(X)
+    seen, thread = [], threading.Thread(target=lambda: [model.fit(X) for _ in range(3)])
+    thread.start()
+    while thread.is_alive():
+        seen.append(model.transform(X))
+    assert all(np.array_equal(each, seen[0]) for each in seen)
+
+
+@pytest.mark.parametrize("model", [AffineNRSfM(1), AffineNRSfMCV(), FastISA()])
+def test_no_jobs_are_refused(model):
+    refused("'n_jobs' parameter of .* Got 0", model.set_params(n_jobs=0).fit, X)
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("images", {"file_name": "other.jpg"}),
+        ("images", {"width": 1}),
+        ("images", {"video": "b"}),
+        ("categories", {"name": "other"}),
+        ("categories", {"keypoints": files.BODYPARTS, "skeleton": []}),
+        ("images", None),
+    ],
+)
+def test_files_of_coco_that_were_joined(part, change, tmp_path):
+    content = files.coco_annotations(TRACKS)
+    content[part].append(content[part][0] | (change or {}))
+    path = files.write_json(tmp_path / "a.json", content)
+    if change is None:  # the same entry twice
+        assert len(read_landmarks(path).points) == len(TRACKS)
+    else:
+        refused(f"two of the {part} have the id", read_landmarks, path)
+
+
+TABLE = pd.DataFrame(np.random.default_rng(0).normal(300, 50, (30, 16)), columns=XY)
+
+
+@pytest.mark.parametrize("digits", ["%.3f", "%.17g", "%.6e", "%.1f", "%.10f"])
+@pytest.mark.parametrize("format", ["table", "deeplabcut"])
+def test_csv_files_that_end_in_a_number(digits, format, tmp_path):
+    frame = pd.concat([FRAME] * 3) * 1.23456789 if format == "deeplabcut" else TABLE
+    text = frame.to_csv(index=format != "table", float_format=digits).rstrip("\n")
+    text = (
+        text
+        if format == "table"
+        else "\n".join(
+            line.rpartition(",")[0]
+            for line in text.split("\n")  # ends with y
+        )
+    )
+    (path := tmp_path / "a.csv").write_text(text)
+    whole = read_landmarks(path).points
+    path.write_text(text[: -{"%.1f": 2, "%.17g": 8}.get(digits, 3)])
+    refused("ends in the middle of a number", read_landmarks, path)
+    path.write_text(text[:-30])
+    refused("truncated|should hold numbers", read_landmarks, path)
+    path.write_text(text + "\n")
+    assert_array_equal(read_landmarks(path).points, whole)
+
+
+@pytest.mark.parametrize("name", ["table", "pts-file", "coco", "tps", "trc", "yolo"])
+@pytest.mark.filterwarnings("ignore")
+def test_files_that_grow_while_they_are_read(name, tmp_path, monkeypatch):
+    path = files.WRITERS[name](tmp_path)
+    path = next(path.iterdir()) if path.is_dir() else path
+    called = np.array
+
+    def grows(*args, **options):
+        with path.open("a") as file:
+            file.write(" ")
+        return called(*args, **options)
+
+    monkeypatch.setattr(np, "array", grows)
+    for module, function in ((json, "load"), (pd, "read_csv"), (np, "reshape")):
+        real = getattr(module, function)
+        again = lambda *a, real=real, **k: (grows([]), real(*a, **k))[1]  # noqa: E731
+        monkeypatch.setattr(module, function, again)
+    refused("was changed while|in the middle of a", read_landmarks, path)
+
+
+NESTED = "l"
+for _ in range(9):
+    NESTED = (NESTED,) * 10
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        [("s", b, c) for b in ("a", NESTED) for c in ("x", "y", "likelihood")],
+        [("s", "a", NESTED)],
+        {("s", "a", "x"): 1},
+        [("s", "a", b"x" * 9)],
+        [["s", ["a"], "x"]],
+        [None],
+        [frozenset("ax")],
+    ],
+)
+def test_labels_of_h5_files_are_texts(labels, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
+    path = files.write_deeplabcut(tmp_path / "a.h5", FRAME)
+    for protocol in (0, 2, 5):
+        with h5py.File(path, "a") as file:
+            pickled = np.void(pickle.dumps(labels, protocol))
+            file["df_with_missing/table"].attrs["values_block_0_kind"] = pickled
+        message = "its labels should be texts|not (iterable|a sequence)|no columns"
+        refused(message, read_landmarks, path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["\x1b]0;a\x07", "\x1b[2J", "\x9b2J", "\x08\x7f", "\u202egpj.exe", "\u2028"],
+)
+def test_control_characters_reach_neither_terminal_nor_report(text, tmp_path, capsys):
+    frame = pd.DataFrame(np.round(X[:16] * 100 + 300, 2))
+    frame.columns = [f"{axis}_{j}" for j in range(12) for axis in "xy"]
+    frame = frame.assign(**{f"{text}note": "a", "who": [f"{text}a", f"{text}b"] * 8})
+    frame.to_csv(path := tmp_path / "a.csv", index=False)
+    options = ["fit", str(path), "-k1", "--no-figures", "-o", str(tmp_path / "b")]
+    assert main([*options, "--label", "who"]) == 0
+    assert (
+        main(["fit", str(path), "--group", f"{text}x", "-o", str(tmp_path / "c")]) == 1
+    )
+    frame.assign(x_3=text).to_csv(path, index=False)
+    assert main(options) == 1
+    shown = "".join(capsys.readouterr()) + (tmp_path / "b/report.html").read_text()
+    assert not {*text} - {*"]0;a[2Jgpj.exe"} & {*shown}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.tps", "LM=0\nID=1\nLM=0\nID=2\n", "there are no points in it"),
+        ("a.csv", f"x0,y0,note\n1,2,{'b' * 140_000}\n", "more than 131,072 characters"),
+        ("a.csv", 'x0,y0,n\n1,2,"' + "b\n" * 99_000, "or a quotation mark no end"),
+        ("a.tsv", f"x0\ty0\tn\n1\t2\t{'b' * 140_000}\n", "more than 131,072"),
+        ("a.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><dataset/>", "it has declarations"),
+        ("a.txt", "3\n1 2\n3 4\n", "as many points as it says"),
+    ],
+)
+def test_odd_files_are_refused_in_a_line(name, text, message, tmp_path):
+    (tmp_path / name).write_text(text)
+    told = str(refused(message, read_landmarks, tmp_path / name))
+    assert "\n" not in told
+
+
+def test_sizes_of_images_have_a_limit(tmp_path, capsys):
+    path = files.write_mesh(tmp_path / "a.csv", files.MESH)
+    refused("image_size must be", read_landmarks, path, image_size=(10**21, 10**21))
+    with pytest.raises(SystemExit):
+        main(["fit", str(path), "--image-size", f"{'1' * 22}x1080"])
+    assert "expected WIDTHxHEIGHT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("shape", "way"),
+    [
+        ((12, 8, 3), r"array\[\.\.\., :2\]"),
+        ((2, 12, 8), r"array\.transpose"),
+        ((12, 7), r"array\.transpose"),
+        ((12,), "none of numbers"),
+    ],
+)
+def test_arrays_of_other_orders_are_told_the_way(shape, way, tmp_path):
+    np.save(path := tmp_path / "a.npy", np.zeros(shape))
+    refused(way, read_landmarks, path)
+
+
+def test_folders_of_several_kinds(tmp_path):
+    folder = files.write_yolo(tmp_path / "a", TRACKS, 2)
+    files.write_text(folder / "classes.txt", "person")
+    found = warned(
+        "not of yolo, and left out: cl",
+        read_landmarks,
+        folder,
+        "yolo",
+        image_size=(500, 500),
+    )
+    np.testing.assert_allclose(found.points, TRACKS.reshape(12, -1))
+    files.write_trc(folder / "a.trc", TRACKS)
+    refused("more than one format: trc, yolo", read_landmarks, folder)
+    refused(
+        "different z",
+        read_landmarks,
+        files.write_trc(tmp_path / "b.trc", TRACKS, np.arange(12.0)[:, None, None]),
+    )
