@@ -451,7 +451,7 @@ def error_of_depths(model, X, points):
 def frontal():
     X, *_ = faces_turned_by(2)
     model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
-    with pytest.warns(UserWarning, match="use prior=isa_nrsfm.datasets.load_f"):
+    with pytest.warns(UserWarning, match="AutoNRSfM"):
         return X, model.fit(X)
 
 
@@ -504,7 +504,7 @@ class TestFrontalFaces:
         assert frontal[1].depth_uncertainty_ > 0.2
         found = frontal[1].diagnostics()
         (message,) = found.messages
-        assert "prior=isa_nrsfm.datasets.load_face_prior(layout=" in message
+        assert "isa_nrsfm.AutoNRSfM().fit(X)" in message
         assert found.depth_uncertainty == frontal[1].depth_uncertainty_
 
     def test_angles_are_withheld(self, frontal):

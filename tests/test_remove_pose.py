@@ -59,7 +59,7 @@ def test_what_is_left_has_no_relation_to_the_yaw(model, plain, table):
     true = faces()[1]
     fits = (np.corrcoef(each.alpha_.T, true.T)[:2, 2:] for each in (model, plain))
     found, without = (np.abs(fit).max(axis=0).min() for fit in fits)
-    assert found > 0.95
+    assert found > 0.9
     assert without < 0.75
 
 

@@ -36,7 +36,7 @@ OF_JOINT_FIT = {
 # What is different with orthographic cameras where there is no joint refinement: it is
 # the covariance of what multiplies white signals, not shapes in the units of the table.
 OF_WHITE_SIGNALS = {"mode_covariance_": "unit^2"}
-NO_NUMBERS = {"isa_", "feature_names_in_", "camera_", "frames_scaled_"}
+NO_NUMBERS = {"isa_", "feature_names_in_", "camera_", "frames_scaled_", "stable_sets_"}
 # In words below the table
 OF_PERSPECTIVE = {"positions_", "focal_length_", "focal_length_std_", "prior_std_"}
 OF_PERSPECTIVE |= {"pose_effect_"}

@@ -68,7 +68,7 @@ from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 FIRST_COMPONENTS = 3, 12
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains are those of two fits of one minimum.
-HOPELESS, LEAST_GAIN = 5.0, 0.5
+HOPELESS, LEAST_GAIN = 5.0, 1.0
 
 
 def fit_jointly(
@@ -209,6 +209,8 @@ def steadiest(
     rows = W.reshape(problem.frames.n_frames, 2, -1)
     first, free = extended(problem, fit, n), replace(problem, penalty=0.0)
     limit, held = evidence(problem, first, None) + HOPELESS, AffineCameras(held=True)
+    if not np.isfinite(limit):  # nothing turns
+        return fit, widths, 0.0
     fit = fit._replace(widths=widths)
     found = [(evidence(problem, fit, widths) - LEAST_GAIN, fit)]
     latest = fit

@@ -165,6 +165,8 @@ def evidence(problem: JointProblem, fit: JointFit, widths: Widths | None) -> flo
     views = full_rotations(motion)[0][:, 2]
     spread = np.linalg.eigvalsh(np.cov(views.T))[1:]
     price += np.log(np.maximum(spread, OF_DISTANCES)).sum()
+    if not np.isfinite(price):  # images without extent
+        return np.inf
     if widths is not None:
         known = np.linalg.slogdet(regular(terms.shape_curvature) / noise)[1].mean()
         known -= len(shapes) * np.linalg.slogdet(camera_moments(motion))[1]

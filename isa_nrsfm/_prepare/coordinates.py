@@ -128,7 +128,7 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
     X = tracks.reshape(len(tracks), 2 * tracks.shape[1])
     X = X[:, np.isfinite(X).sum(axis=0) > max(len(X) / 2, 9)].astype(np.float64)
     largest = np.nanmax(np.abs(X), initial=0.0)
-    if X.shape[1] < 2 or not largest:
+    if X.shape[1] < 6 or not largest:  # fewer are alike by chance
         return False
     X /= largest  # squares stay in range
     low, first, median, third, high = np.nanpercentile(X, [0, 25, 50, 75, 100], axis=0)

@@ -279,6 +279,7 @@ def _members(folder: Path) -> list[tuple[Path, LandmarkFormat]]:
     """Return the files of a folder that are of a format, by their names and numbers."""
     found = []
     for file in sorted(folder.iterdir(), key=by_number):
+        refuse_special(file)
         if file.is_file() and not file.name.startswith("."):
             with contextlib.suppress(ValueError):
                 found.append((file, FORMATS[find_format(file)]))
