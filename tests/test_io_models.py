@@ -52,7 +52,7 @@ CASES = {
     "not refined": {"refinement": None, "keep_frames": False}
     | {"isa": PooledFastICA(n_init=2)},
     "single precision": {},
-    "single precision, alternating": ALTERNATING | {"block_recovery": "eigen"},
+    "single precision, alternating": ALTERNATING | {"block_recovery": "irls"},
     "missing points": {},
     "huber": {"loss": "huber", "independence": "coefficients"},
     "weak perspective": CALIBRATED | {"loss": "cauchy"},
