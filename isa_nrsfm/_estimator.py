@@ -1008,8 +1008,7 @@ default="affine"
             )
         mirror, signs = copy.copy(self), MIRROR.astype(self.mean_shape_.dtype)
         mirror._model = self._model.mirrored()
-        # Not in files of older versions
-        mirror.mirror_certainty_ = 1.0 - getattr(self, "mirror_certainty_", np.nan)
+        mirror.mirror_certainty_ = 1.0 - self.mirror_certainty_
         shapes_and_cameras = "mean_shape_", "basis_", "reference_motion_", "motion_"
         factors = dict.fromkeys(shapes_and_cameras, signs)
         factors["rotations_"] = np.outer(signs, signs)
