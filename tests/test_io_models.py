@@ -299,6 +299,7 @@ def with_entry(value, *place):
         (with_entry([1.0], "attributes", "n_iter_"), "value that is not known"),
         (with_entry(None, "attributes", "n_iter_"), "lacks attributes: n_iter_"),
         (with_entry("fish-eye", "frames", "camera"), "camera is not known: fish-eye"),
+        (with_entry(None, "frames", "certainty"), "TypeError"),
         (changed("frames.shapes", lambda x: x.astype("f2")), "shapes is of type"),
         (changed("frames.shapes", lambda x: x * np.nan), "shapes is not finite"),
         (changed("mean_shape_", lambda x: x * np.inf), "mean_shape_ is not finite"),
