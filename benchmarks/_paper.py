@@ -89,7 +89,7 @@ REPEATED = (*ISA, "joint")
 SEVERAL = ("flag", "faces_wild", "ict_68")
 NUMBERS = {"shark": (1, 2, 3), **dict.fromkeys(SEVERAL, (1, 3, 5, 7, 9))}
 STARTS = (1, 3, 10, 30)
-RECOVERIES = ("generalized_eigen", "eigen", "irls")
+RECOVERIES = ("generalized_eigen", "irls")
 TURNS = 20
 RANDOM = "random mixing"
 

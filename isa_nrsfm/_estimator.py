@@ -106,14 +106,12 @@ class AffineNRSfM(CallbackSupportMixin, DiagnosedMixin, BaseEstimator):
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
         result is only the start of the joint refinement. A clone is fitted. Its
         `random_state`, `n_jobs` and `verbose` are those of this estimator unless set.
-    block_recovery : {"generalized_eigen", "eigen", "irls"}, default=\
-"generalized_eigen"
+    block_recovery : {"generalized_eigen", "irls"}, default="generalized_eigen"
         Method for the 3x3 matrix of each subspace that brings its motion to the rigid
-        motion. "eigen" is the exact minimiser under a norm constraint, "irls" the
-        published iteration for the same cost. "generalized_eigen" maximises the
-        explained share of the motion. "eigen" and "irls" can collapse onto a direction
-        in which the subspace hardly moves, and "irls" depends on the first frame. With
-        a refinement all three lead to nearly the same result.
+        motion. "generalized_eigen" maximises the explained share of the motion. "irls"
+        is the published iteration for the least squared difference; it depends on the
+        first frame and explains less. With a refinement both lead to nearly the same
+        result.
     refinement : {"joint", "consensus", "alternating", None}, default="joint"
         "joint" finds the cameras, shapes and noise variance of greatest marginal
         likelihood, with normally distributed coefficients. It starts from the paper's
@@ -1010,8 +1008,7 @@ default="affine"
             )
         mirror, signs = copy.copy(self), MIRROR.astype(self.mean_shape_.dtype)
         mirror._model = self._model.mirrored()
-        # Not in files of older versions
-        mirror.mirror_certainty_ = 1.0 - getattr(self, "mirror_certainty_", np.nan)
+        mirror.mirror_certainty_ = 1.0 - self.mirror_certainty_
         shapes_and_cameras = "mean_shape_", "basis_", "reference_motion_", "motion_"
         factors = dict.fromkeys(shapes_and_cameras, signs)
         factors["rotations_"] = np.outer(signs, signs)

@@ -147,8 +147,7 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
             f"n_components must be that of the prior, {K}, or 'auto', which takes it; "
             f"got {n_components}"
         )
-    certainty = getattr(prior, "mirror_certainty_", np.nan)
-    return {"prior": model, "mirror_certainty": certainty}
+    return {"prior": model, "mirror_certainty": prior.mirror_certainty_}
 
 
 def prior_start(

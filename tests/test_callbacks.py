@@ -128,7 +128,7 @@ class TestInside:
         assert recorder.told[0] == ("setup", "Pipeline", "")
 
     def test_a_grid_search_with_several_workers(self):
-        grid = {"block_recovery": ["eigen", "generalized_eigen"]}
+        grid = {"block_recovery": ["irls", "generalized_eigen"]}
         search = GridSearchCV(estimator(refinement=None), grid, cv=2, n_jobs=2)
         with joblib.parallel_config("threading"):
             _, recorder = recorded(search)

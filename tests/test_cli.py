@@ -152,10 +152,10 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
     ("options", "expected"),
     [
         (
-            "--isa fast --n-init 3 --block-recovery eigen --refinement none -k 1 "
+            "--isa fast --n-init 3 --block-recovery irls --refinement none -k 1 "
             "--independence none --no-scale-frames --no-hidden-points "
             "--random-state 7 --n-jobs 1",
-            {"isa__n_init": 3, "block_recovery": "eigen", "refinement": None}
+            {"isa__n_init": 3, "block_recovery": "irls", "refinement": None}
             | {"n_components": 1, "independence": None, "scale_frames": False}
             | {"random_state": 7, "n_jobs": 1, "hidden_points": False},
         ),

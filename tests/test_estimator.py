@@ -99,7 +99,7 @@ VARIANTS = [
     {"camera": "weak_perspective", "refinement": None},
     {"n_components": 1},
     {"refinement": "alternating"},
-    {"refinement": "alternating", "block_recovery": "eigen", "n_components": 6},
+    {"refinement": "alternating", "block_recovery": "irls", "n_components": 6},
     {"refinement": None, "layout": "planar", "scale_frames": False},
     {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
 ]

@@ -305,7 +305,8 @@ def test_inner_points_are_a_layout(name, rest):
     # The points of the face begin at 23.
     body = get_skeleton("coco-wholebody-133")
     assert body.contour == tuple(j + 23 for j in range(17))
-    assert whole.subset(whole.inner).curves == inner.curves
+    pose = {"name": rest, "up": inner.up, "front": inner.front}
+    assert dataclasses.replace(whole.subset(whole.inner), **pose) == inner
     assert inner.edges.tolist() == [
         [whole.inner.tolist().index(j) for j in edge]
         for edge in whole.edges.tolist()
@@ -315,6 +316,25 @@ def test_inner_points_are_a_layout(name, rest):
     columns = table[:, whole.inner_columns].reshape(-1, 2)
     assert columns[:, 0].tolist() == (2 * whole.inner).tolist()
     assert columns[:, 1].tolist() == (2 * whole.inner + 1).tolist()
+
+
+@pytest.mark.parametrize(
+    ("whole", "points", "name"),
+    [
+        ("muct-76", range(68), "xm2vts-68"),
+        ("mediapipe-face-478", range(468), "mediapipe-face-468"),
+        ("coco-wholebody-133", range(17), "coco-17"),
+        ("coco-wholebody-133", range(23, 91), "ibug-68"),
+        ("coco-wholebody-133", range(91, 112), "hand-21"),
+        ("coco-wholebody-133", range(112, 133), "hand-21"),
+    ],
+)
+def test_layouts_that_are_parts_of_others(whole, points, name):
+    part, alone = get_skeleton(whole).subset(points), get_skeleton(name)
+    assert (part.left, part.right) == (alone.left, alone.right)
+    assert part.contour == alone.contour
+    if name != "xm2vts-68":  # whose eyelids have fewer points
+        assert part.curves == alone.curves
 
 
 def test_parts_of_curves_and_sides_are_kept():

@@ -321,15 +321,11 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
             continue
         # m_i is M_ik^T M_0^i, row by row: <M_ik D, M_0^i> = m_i . vec(D).
         m = P.reshape(-1, 3, 3).mT.reshape(-1, 9)
-        moved = np.kron(gram, np.eye(3))  # sum_i ||M_ik D||^2 as a form in vec(D)
-        if method == "eigen":
-            # The exact minimiser under ||D|| = 1. It may be a direction in which the
-            # subspace hardly moves.
-            d = eigh(moved - _explained(m, energy))[1][:, 0]
-        elif method == "irls" and m[0].any():
+        if method == "irls" and m[0].any():
             # As published (appendix A): with alpha of the first frame fixed, D solves a
             # linear least squares problem, and alpha is divided by the norm of D. D is
             # proportional to the fixed alpha, so the iteration ends after one step.
+            moved = np.kron(gram, np.eye(3))  # sum_i ||M_ik D||^2 as a form in vec(D)
             d = np.linalg.lstsq(moved - _explained(m[1:], energy[1:]), m[0])[0]
         else:
             # The largest share of the motion M_k D that the rigid motion explains,

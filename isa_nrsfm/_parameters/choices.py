@@ -5,7 +5,7 @@ The help of the command line must not wait for NumPy or scikit-learn.
 
 from typing import Literal, get_args
 
-BlockRecovery = Literal["generalized_eigen", "eigen", "irls"]
+BlockRecovery = Literal["generalized_eigen", "irls"]
 Refinement = Literal["joint", "consensus", "alternating"]
 CalibratedCamera = Literal["weak_perspective", "orthographic"]
 Camera = Literal["affine", CalibratedCamera, "perspective"]

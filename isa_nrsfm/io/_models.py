@@ -47,7 +47,7 @@ ENTRIES = (
 NEEDED = (
     *("mean_shape_", "basis_", "inverse_snr_", "rank_floor_", "n_iter_"),
     *("energy_share_", "mode_covariance_", "singular_values_", "n_features_in_"),
-    *("reference_motion_", "reference_translation_"),
+    *("reference_motion_", "reference_translation_", "mirror_certainty_"),
 )
 Arrays = dict[str, NDArray]
 OUTPUTS = ["default", "pandas", "polars"]
@@ -60,8 +60,6 @@ FINITE = (
     "pose_effect_",
 )
 POSITIVE = ("noise_variance", "noise_variance_", "unit", "depth_variances", "leverage")
-# Parameters of older files, which a fitted model does not need.
-REMOVED = ("adapt", "density", "fun")
 # Attributes that the model of a frame implies.
 IMPLIED = ("n_components_", "camera_", "frames_scaled_")
 
@@ -198,11 +196,10 @@ def _read(path: Path) -> tuple[dict[str, Any], Arrays]:
     header = json.loads(arrays.pop(HEADER).tobytes())
     if type(header) is not dict or header.get("format") != FORMAT:
         raise ValueError("its header is not that of a model")
-    version = header.get("format_version")
-    if type(version) is not int or version > FORMAT_VERSION:
+    if (version := header.get("format_version")) != FORMAT_VERSION:
         raise ValueError(
             f"it was written by a newer isa_nrsfm (format {version}); this one reads "
-            f"formats up to {FORMAT_VERSION}"
+            f"format {FORMAT_VERSION}"
         )
     check_names(header, ENTRIES, "entries")
     check_names(arrays, header["arrays"], "arrays")
@@ -236,7 +233,7 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     estimator._model = TableModel(
         _frame_model(entries),
         estimator.mean_shape_,
-        _all_directions(entries, estimator.basis_),
+        np.concatenate([estimator.basis_, entries["further_basis"]]),
         len(estimator.basis_),
         entries["layout"],
         entries["unit"],
@@ -260,11 +257,12 @@ def _check_shapes(values: dict[str, Any]) -> None:
     if missing := [name for name in NEEDED if values.get(name) is None]:
         raise ValueError(f"it lacks attributes: {', '.join(missing)}")
     K, P = (*np.shape(values["basis_"]), 0, 0)[:2]
-    D = K + len(values.get("further_basis", ()))
+    D = K + len(values["further_basis"])
     N = (*np.shape(values.get("sizes", ())), 0)[0]
     single = "noise_variance unit n_features_in_ n_iter_ inverse_snr_ leverage".split()
     single += "noise_variance_ rank_floor_ camera_noise_ratio_ gradient_norm_".split()
-    single += "depth_uncertainty_ focal_length_std_".split()
+    single += "depth_uncertainty_ focal_length_std_ mirror_certainty_".split()
+    single += "certainty deformation residual".split()
     shapes: tuple[tuple[tuple[int | None, ...], list[str]], ...] = (
         ((K, P, 3), ["basis_", "basis"]),
         ((P, 3), ["mean_shape_", "mean_shape"]),
@@ -279,7 +277,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((2 * P,), ["feature_names_in_"]),
         ((2, 3), ["reference_motion_"]),
         ((2,), ["reference_translation_", "prior_std_"]),
-        ((2,), ["certainty", "image_errors"]),
+        ((2,), ["image_errors"]),
         ((5,), ["pinhole"]),
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_", "focal_length_"]),
@@ -291,7 +289,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((N, 3, 3), ["rotations_"]),
         ((N, 3), ["positions_"]),
         ((N,), ["scales_", "sizes"]),
-        ((), [*single, "deformation", "residual", "mirror_certainty_"]),
+        ((), single),
     )
     for shape, name in ((shape, name) for shape, names in shapes for name in names):
         if (value := values.get(name)) is None:
@@ -330,6 +328,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "layout": model.layout,
         "unit": model.unit,
         "sizes": vars(estimator).get("_frame_sizes"),
+        "further_basis": model.basis[model.n_components :],
     }
     if model.pinhole is not None:
         f, (x, y), *kinds = model.pinhole
@@ -340,12 +339,11 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         **entries,
         "loss": frames.loss,
         "shapes": frames.shapes,
-        "further_basis": model.basis[model.n_components :],
         "noise_variance": frames.noise_variance,
         "coefficient_starts": frames.starts,
         "mixing": frames.gauge.mixing,
         "space": frames.gauge.space,
-        "certainty": np.array([frames.certainty.total, np.nan]),
+        "certainty": frames.certainty.total,
         "deformation": frames.certainty.deformation,
         "turns": frames.certainty.turns,
         "depth_variances": frames.certainty.points,
@@ -354,11 +352,6 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "image_errors": np.array(frames.certainty.images),
         "weighted": frames.certainty.weighted,
     }
-
-
-def _all_directions(entries: dict[str, Any], basis: Any) -> Any:
-    """Return the basis of all directions of a shape, reported or not."""
-    return np.concatenate([basis, entries.get("further_basis", basis[:0])])
 
 
 def _pinhole(entries: dict[str, Any]) -> Pinhole | None:
@@ -373,9 +366,6 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
     """Return the model of a frame of `_frame_entries`."""
     if "loss" not in entries:
         return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
-    total, turning = entries["certainty"].tolist()
-    if np.isfinite(turning):  # of older versions, which judged the depth by rotations
-        total = max(total, np.trace(entries["turns"][:2, :2]) ** 0.5 / turning)
     return PosteriorFrames(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -384,14 +374,14 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
         gauge=FrameMap(entries["mixing"], entries["space"]),
         camera=entries["camera"],
         certainty=DepthCertainty(
-            total,
-            entries.get("deformation", np.nan),
+            float(entries["certainty"]),
+            float(entries["deformation"]),
             entries["turns"],
             entries["depth_variances"],
-            entries.get("leverage"),
-            entries.get("residual", np.nan),
-            tuple(entries.get("image_errors", (1.0, 0.0))),
-            entries.get("weighted") is True,
+            entries["leverage"],
+            float(entries["residual"]),
+            tuple(entries["image_errors"]),
+            entries["weighted"] is True,
         ),
     )
 
@@ -471,8 +461,6 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
             return tuple(numbers)
         case {"list": [*numbers]} if all(type(n) in (int, float) for n in numbers):
             return numbers
-        case {"random_state": _}:  # of older files
-            return None
         case {"object": {"class": str(name), **parts}} if name in STORED:
             return with_parts(STORED[name], parts, arrays)
         case {"model": model}:
@@ -484,10 +472,7 @@ def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     """Return an object with the parameters and attributes of `packed_parts`."""
     stored = parts["parameters"].items()
     parameters = {name: unpacked(value, arrays) for name, value in stored}
-    # Parameters that are newer than the file have their defaults.
-    parameters = {n: v for n, v in parameters.items() if n not in REMOVED}
-    defaults = kind().get_params(deep=False)
-    check_names({**defaults, **parameters}, defaults, "parameters")
+    check_names(parameters, kind().get_params(deep=False), "parameters")
     created = kind(**parameters)
     if hasattr(kind, "_parameter_constraints"):
         try:

@@ -1,13 +1,16 @@
 """Skeletons that other programs keep beside their points."""
 
 import os
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.skeletons._skeleton import Skeleton, named_skeleton
+from isa_nrsfm.skeletons._skeleton import Skeleton
+
+_RIGHT_OF = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
 
 
 def skeleton_of_names(
@@ -60,7 +63,19 @@ def skeleton_of_names(
                 f"{edge!r}"
             )
     curves = tuple((place[a], place[b]) for a, b in edges)
-    return named_skeleton(name, names, kind="other", curves=curves, source=source)
+    swapped = (re.sub("left|Left|LEFT", lambda m: _RIGHT_OF[m[0]], n) for n in names)
+    mirror = [place.get(point) for point in swapped]
+    pairs = [(j, k) for j, k in enumerate(mirror) if k is not None and k != j]
+    return Skeleton(
+        name,
+        "other",
+        len(names),
+        curves,
+        source,
+        tuple(names),
+        left=tuple(left for left, _ in pairs),
+        right=tuple(right for _, right in pairs),
+    )
 
 
 def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> Skeleton:

@@ -1,7 +1,9 @@
 """Which layout the points of a table have."""
 
 import re
+import tomllib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -9,27 +11,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import pdist
 
-from isa_nrsfm.skeletons._bodies import BODIES
-from isa_nrsfm.skeletons._faces import FACES
 from isa_nrsfm.skeletons._skeleton import Skeleton
 
-SKELETONS = MappingProxyType({each.name: each for each in (*FACES, *BODIES)})
 
+def _tuples(value: Any) -> Any:
+    """Return a value of a data file, with tuples in place of lists."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+_FILE = Path(__file__).with_name("layouts.toml")
+_TABLES: dict[str, dict[str, Any]] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+SKELETONS = MappingProxyType(
+    {
+        name: Skeleton(name, **{part: _tuples(entry[part]) for part in entry})
+        for name, entry in _TABLES["layouts"].items()
+    }
+)
 # The layouts in which the readers of `isa_nrsfm.io` find points without names.
 LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = {
-    "openface": ("ibug-68", "ibug-51"),
-    "pyfeat": ("ibug-68", "ibug-51", "mediapipe-face-478"),
-    "mediapipe": (
-        *("mediapipe-face-468", "mediapipe-face-478"),
-        *("hand-21", "mediapipe-pose-33"),
-    ),
-    "pts": ("ibug-68", "ibug-51"),
-    "wflw": ("wflw-98", "wflw-65"),
-    **dict.fromkeys(
-        ("coco", "mmpose"),
-        ("coco-17", "coco-wholebody-133", "ibug-68", "hand-21", "wflw-98"),
-    ),
-    "openpose": ("body-25", "hand-21"),
+    reader: tuple(names) for reader, names in _TABLES["readers"].items()
 }
 
 # Edges of a layout are short: so long at most is their mean, relative to the mean

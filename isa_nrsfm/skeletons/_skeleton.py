@@ -1,10 +1,9 @@
 """A layout of landmarks."""
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ KINDS: tuple[Kind, ...] = ("face", "hand", "body", "whole body", "other")
 MIDDLE, LEFT, RIGHT = 0, 1, 2
 
 Pairs = tuple[tuple[int, int], ...]
-_RIGHT_OF = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
 
 
 @dataclass(frozen=True)
@@ -231,35 +229,3 @@ class Skeleton:
             raise ValueError(f"these are not the names of the points of {self.name!r}")
         order = [self.point_names.index(name) for name in names]
         return replace(self.subset(order), name=self.name)
-
-
-def run(first: int, last: int, *, closed: bool = False) -> tuple[int, ...]:
-    """Return the points first to last, and first again where the curve is closed."""
-    return (*range(first, last + 1), *((first,) if closed else ()))
-
-
-def listed(points: NDArray) -> tuple[int, ...]:
-    """Return an array of points, of `numpy.r_` say, as a tuple."""
-    return tuple(points.tolist())
-
-
-def sides_of_names(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the points called left, and those called right otherwise by that name."""
-    place = {name: j for j, name in enumerate(names)}
-    swapped = (re.sub("left|Left|LEFT", lambda m: _RIGHT_OF[m[0]], n) for n in names)
-    mirror = [place.get(name) for name in swapped]
-    pairs = [(j, k) for j, k in enumerate(mirror) if k not in (j, None)]
-    return tuple(j for j, _ in pairs), tuple(k for _, k in pairs)
-
-
-def named_skeleton(name: str, names: Sequence[str], **parts: Any) -> Skeleton:
-    """Return a layout of points whose names have the sides."""
-    left, right = sides_of_names(names)
-    return Skeleton(
-        name=name,
-        n_points=len(names),
-        point_names=tuple(names),
-        left=left,
-        right=right,
-        **parts,
-    )
