@@ -116,7 +116,7 @@ class TableModel(NamedTuple):
         weak = self._replace(frames=self.frames.without_starts, pinhole=None)
         moving = np.arange(len(rows))
         for _ in range(MOST_FRAME_REPEATS if pinhole.near else 0):
-            moving = padded(moving) if len(rows) > 1 else moving
+            moving = padded(moving)
             own = None if weights is None else weights[moving]
             fit = weak.decompose(straight[moving], own, deviations=False)
             before = depths[moving]

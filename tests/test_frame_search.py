@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scenes
 from frame_parts import (
-    assert_calibrated,
     assert_same_fits,
     camera_and_alpha,
     fit_posterior,
@@ -18,12 +17,7 @@ from scenes import images, random_rotation, random_scene, with_gaps
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.models import (
-    FrameMap,
-    PosteriorFrames,
-    frame_search,
-    spread_starts,
-)
+from isa_nrsfm._frames.models import frame_search, spread_starts
 from isa_nrsfm._frames.newton import AffineSearch
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch, State, scale_of
@@ -233,72 +227,6 @@ class TestDegenerate:
         scene = scene_of(camera)
         fits = fitted(scene._replace(tracks=np.zeros((0, 20, 2))), camera)
         assert fits.motion.shape == (0, 2, 3)
-
-
-def model_and_tracks(camera, seed=0, *, extent=(1.0, 1.0, 0.5), n_components=3):
-    scene = scenes.random_scene(
-        seed, 25, 12, n_components, camera=camera, noise=NOISE, extent=extent
-    )
-    starts, gauge = np.zeros((0, n_components)), FrameMap.identity(n_components)
-    model = PosteriorFrames(scene.shapes, NOISE**2, starts, "linear", gauge, camera)
-    return model, scene.tracks
-
-
-def assert_same(alone, together, atol=1e-9):
-    for got, expected in zip(alone[:-1], together[:-1], strict=True):
-        scale = np.abs(expected).max(initial=0.0) if np.isfinite(expected).all() else 1
-        assert_allclose(got, expected, rtol=1e-6, atol=atol * scale)
-    assert alone.converged == together.converged
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize(
-    ("extent", "dtype", "share"),
-    [
-        ((1.0, 1.0, 0.5), np.float32, 0.7),
-        # Frames whose reversed camera is the better one are left to the other search.
-        ((1.0, 1.0, 0.02), float, 0.4),
-        ((3.0, 0.1, 1.0), float, 0.7),
-        ((1.0, 1.0, 0.0), float, 0.0),
-    ],
-)
-def test_is_the_fit_of_the_frame_among_others(camera, extent, dtype, share):
-    model, tracks = model_and_tracks(camera, extent=extent)
-    rows = np.ascontiguousarray(tracks.transpose(0, 2, 1), dtype=dtype)
-    together = model.posterior(rows)
-    for i in range(12):
-        assert_same(model.posterior(rows[[i]]), together.take([i]))
-    assert sum(
-        model.single_search.fit(row, NOISE**2) is not None for row in rows
-    ) >= share * len(rows)
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_is_a_minimum_of_the_documented_objective(camera):
-    model, tracks = model_and_tracks(camera, 1)
-    fit = model.single_search.fit(tracks[0].T, NOISE**2)
-    image = scenes.images(model.shapes, fit.motion, fit.translation, fit.alpha)
-    square = np.sum((tracks[:1] - image) ** 2) + NOISE**2 * np.sum(fit.alpha**2)
-    assert_allclose(fit.objective, square, rtol=1e-9)
-    if camera != "affine":
-        assert_calibrated(fit.motion, camera)
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_unusual_frames_are_those_of_the_search_for_many(camera):
-    model, tracks = model_and_tracks(camera)
-    tracks = tracks[:5].copy()
-    tracks[0, 3] = np.nan
-    tracks[1] += np.random.default_rng(0).normal(size=(12, 2))  # badly fitted
-    tracks[2] = 1.0
-    tracks[3] = np.nan
-    tracks[4] *= 1e100
-    rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
-    together = model.posterior(rows)
-    for i in range(5):
-        assert_same(model.posterior(rows[[i]]), together.take([i]))
-    for frame in rows[[0, 1, 3]]:
-        assert model.single_search.fit(frame, NOISE**2) is None
 
 
 @pytest.mark.parametrize(

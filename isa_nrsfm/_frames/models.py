@@ -24,7 +24,6 @@ from isa_nrsfm._frames.camera_models import (
 from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
-from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
@@ -328,11 +327,6 @@ class PosteriorFrames:
         return frame_search(self.camera, self.shapes)
 
     @cached_property
-    def single_search(self) -> SingleSearch:
-        """The search for one complete frame."""
-        return SingleSearch(self._search)
-
-    @cached_property
     def without_starts(self) -> "PosteriorFrames":
         """The model that fits each frame from zero only."""
         return replace(self, starts=self.starts[:0])
@@ -477,10 +471,6 @@ class PosteriorFrames:
         noise = self.noise_variance
         fitted = partial(self._search.fit_rows, noise=noise, covariances=covariances)
         if self.loss == "linear":
-            if len(rows) == 1 and weights is None:
-                alone = self.single_search.fit(rows[0], noise)
-                if alone is not None:
-                    return alone
             return fitted(rows, weights=weights, starts=self.starts)
         # Robust loss: outliers are no reason for further starts. The median of the
         # residuals hardly depends on them. The threshold is as in `largest_objective`.

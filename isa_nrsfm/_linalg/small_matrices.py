@@ -161,10 +161,10 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
     for i in range(first, k):
         inverse = _inverse_pivot(rows[i][0], least[i], positive)
         inverses[i - first] = inverse
-        column = packed[places[i]]
+        column = packed.take(places[i], 0)
         scaled = column * inverse
         if n <= FEW:  # calls cost more than numbers
-            packed -= scaled[second_of] * column[first_of]
+            packed -= scaled.take(second_of, 0) * column.take(first_of, 0)
         else:
             for j in range(k):
                 rows[j] -= np.multiply(scaled[j:], column[j], out=room[: k - j])

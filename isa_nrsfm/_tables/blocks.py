@@ -257,7 +257,7 @@ def in_threads(
 def block_slices(n_frames: int, block_frames: int) -> list[slice]:
     """Return slices of block_frames frames; the last one may have one more, or fewer.
 
-    A block of one frame would be fitted in another way.
+    Products with a single frame round differently.
     """
     starts = list(range(0, max(n_frames - 1, min(n_frames, 1)), block_frames))
     return list(map(slice, starts, [*starts[1:], n_frames]))
