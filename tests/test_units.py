@@ -194,7 +194,9 @@ def public_methods():
     """Return the methods that have results of their own."""
     inherited = {*dir(BaseEstimator), *dir(TransformerMixin)}
     names = {*dir(AffineNRSfM)} - inherited - {"fit", "set_callbacks"}
-    return {name for name in names if not re.search("^_|_$|_request$|_names_out$", name)}
+    return {
+        name for name in names if not re.search("^_|_$|_request$|_names_out$", name)
+    }
 
 
 def test_orthographic_cameras_do_not_scale_frames():
