@@ -27,10 +27,14 @@ from isa_nrsfm._compat.scikit_learn import (
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
-from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    compose,
+    full_rotations,
+    pose_effect,
+)
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
-from isa_nrsfm._frames.pose import pose_effect
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._other_tables import checked_prior, warn_if_foreign
 from isa_nrsfm._parameters import choices

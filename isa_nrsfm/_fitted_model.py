@@ -10,6 +10,7 @@ from isa_nrsfm._frames.camera_models import (
     compose,
     full_rotations,
     line_of_sight,
+    pose_part,
     project,
 )
 from isa_nrsfm._frames.models import (
@@ -21,7 +22,6 @@ from isa_nrsfm._frames.models import (
     leading,
 )
 from isa_nrsfm._frames.pinhole import Pinhole, zoomed
-from isa_nrsfm._frames.pose import pose_part
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
@@ -42,9 +42,6 @@ MIRROR_LEVEL = 0.01
 # Least distance of points from the fit, in sizes of frames, of `TableModel.misfit`:
 # docs/benchmarks/README.md, "Thresholds".
 LEAST_MISFIT = 0.005
-# Depths and fit of a perspective frame agree if a repeat changes depths by less than
-# this share: docs/benchmarks/README.md, "Thresholds".
-FRAME_SETTLED, MOST_FRAME_REPEATS = 1e-3, 30
 
 
 class TableModel(NamedTuple):
@@ -115,7 +112,7 @@ class TableModel(NamedTuple):
         assert isinstance(self.frames, PosteriorFrames)
         weak = self._replace(frames=self.frames.without_starts, pinhole=None)
         moving = np.arange(len(rows))
-        for _ in range(MOST_FRAME_REPEATS if pinhole.near else 0):
+        for _ in range(30 if pinhole.near else 0):
             moving = padded(moving)
             own = None if weights is None else weights[moving]
             fit = weak.decompose(straight[moving], own, deviations=False)
@@ -123,7 +120,7 @@ class TableModel(NamedTuple):
             depths[moving] = self.depths(fit.motion, fit.alpha)
             straight[moving] = pinhole.straight(images[moving], depths[moving])
             change = np.square(depths[moving] - before).sum(axis=1)
-            large = change > FRAME_SETTLED**2 * np.square(depths[moving]).sum(axis=1)
+            large = change > 1e-6 * np.square(depths[moving]).sum(axis=1)
             moving = np.unique(moving[large])
             if not len(moving):
                 break

@@ -23,9 +23,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import mean_view, stacked_motion
+from isa_nrsfm._frames.camera_models import (
+    mean_view,
+    pose_effect,
+    pose_part,
+    stacked_motion,
+)
 from isa_nrsfm._frames.models import Decomposition, FrameMap
-from isa_nrsfm._frames.pose import pose_effect, pose_part
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
 from isa_nrsfm._linalg.small_matrices import orientations, polar
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing

@@ -22,7 +22,6 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
-from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
@@ -374,10 +373,6 @@ class PosteriorFrames:
         ratio = (constant + slope * leverages(alpha))[:, None, None]
         rest = np.eye(alpha.shape[1]) + (ratio - 1.0) * covariance
         return np.linalg.solve(rest, ratio * covariance), ratio
-
-    def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
-        """Return the fit of prepared frames of size one, before the gauge."""
-        return self._search.fit(block, self.noise_variance, starts=self.starts)
 
     def linearised(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None

@@ -29,7 +29,7 @@ from isa_nrsfm._frames.camera_models import (
     residuals,
 )
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
-from isa_nrsfm._joint.prior import ROUNDS, TOL_SHARE, ShapePrior
+from isa_nrsfm._joint.prior import TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,
     FactorisedTable,
@@ -384,7 +384,7 @@ def _freedom_correction(
 
 def widened(problem: JointProblem, fit: JointFit) -> JointFit:
     """Return the fit with the widths of the prior that follow from the table."""
-    for _ in range(ROUNDS):
+    for _ in range(3):
         assert fit.prior is not None
         shapes, _, noise = fit.state
         curvature = problem.likelihood(*fit.state).shape_curvature

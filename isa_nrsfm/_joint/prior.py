@@ -35,8 +35,8 @@ from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
-# Width of the first fit, in sizes of frames, and rounds that estimate it.
-FIRST_WIDTH, ROUNDS = 0.05, 3
+# Width of the first fit, in sizes of frames.
+FIRST_WIDTH = 0.05
 # Floor of the noise variance, as a share of the mean square; share of the tolerance.
 LEAST_NOISE, TOL_SHARE = 5e-4, 0.1
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.cached import cached_property
-from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
+from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, line_of_sight
 from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
@@ -105,6 +105,11 @@ class JointState(NamedTuple):
     shapes: NDArray
     motion: NDArray
     noise: float
+
+    def depths(self, alpha: NDArray) -> NDArray:
+        """Return centred depths (I, J) of frames with coefficients (I, K)."""
+        z = np.einsum("ia,kaj->ikj", line_of_sight(self.motion), self.shapes)
+        return centred(z[:, 0] + np.einsum("ik,ikj->ij", alpha, z[:, 1:]))
 
 
 class Widths(NamedTuple):

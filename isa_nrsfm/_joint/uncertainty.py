@@ -15,7 +15,7 @@ These fits do not have the prior of the extents, which would hide uncertain dept
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from isa_nrsfm._frames.models import (
     Decomposition,
     DepthCertainty,
     PosteriorFrames,
+    frame_search,
     leverages,
 )
 from isa_nrsfm._frames.search import FramePosterior
@@ -101,8 +102,9 @@ def fitted_frames(
     sum of the squared residuals.
     """
     if model.loss == "linear":
-        model = replace(model, shapes=frames.coordinates(model.shapes))
-        posteriors = frames.blocks.derive(model.prepared_posterior)
+        search = frame_search(model.camera, frames.coordinates(model.shapes))
+        fitted = partial(search.fit, noise=model.noise_variance, starts=model.starts)
+        posteriors = frames.blocks.derive(fitted)
     else:
         posteriors = rows.derive(model.posterior)
     parts = posteriors.map(
@@ -310,10 +312,8 @@ def depth_certainty(
         ends: Any = {"least_noise": least, "max_iter": limits.error_steps, "tol": TOL}
         state = refine_joint(likelihood, start, camera, **ends).state
         terms = likelihood._replace(extent_weight=0.0)(*state)
-        rotations, scales = full_rotations(state.motion)
-        z = np.einsum("ia,kaj->ikj", rotations[:, 2], state.shapes)
-        z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", terms.alpha, z[:, 1:]))
-        return state, rotations, centred(z), terms.value / len(rows)
+        rotations, _ = full_rotations(state.motion)
+        return state, rotations, state.depths(terms.alpha), terms.value / len(rows)
 
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extents=extents)

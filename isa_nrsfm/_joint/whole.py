@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import (
     CalibratedCameras,
     full_rotations,
-    line_of_sight,
 )
 from isa_nrsfm._joint.problem import (
     FAR_FRAMES,
@@ -53,8 +52,6 @@ FIRST_SIZE = 0.03
 FIRST_NOISE = 1e-3
 # Floor of the noise variance, for tables without noise
 LEAST_NOISE = 1e-5
-# Directions with a smaller share of determined numbers are left out.
-LEAST_SHARE = 0.02
 
 
 def n_directions(problem: JointProblem, n_points: int, few: bool) -> int:
@@ -128,7 +125,7 @@ def determined(
     shares = np.clip(1.0 - uncertain / (variances * n_numbers), 1e-9, 1.0)
     variances = np.maximum(energy / (n_numbers * shares), least)
     # The large noise of the first round hides directions.
-    kept = (shares > LEAST_SHARE) | (widths is None)
+    kept = (shares > 0.02) | (widths is None)
     kept[0] = True
     shapes = state.shapes[np.append(True, kept)]
     widths = Widths(variances[kept], shares[kept], n_numbers)
@@ -193,8 +190,6 @@ def rival_depths(problem: JointProblem, fits: list[tuple[float, JointFit]]) -> f
 
 def depths_of(problem: JointProblem, fit: JointFit) -> NDArray:
     """Return the centred depths (I, J) of a fit of all directions."""
-    (shapes, motion, _), part = fit.state, replace(problem, widths=fit.widths)
-    alpha = part.likelihood(*fit.state).alpha
-    shapes = problem.frames.points(shapes)
-    z = np.einsum("ia,kaj->ikj", line_of_sight(motion), shapes)
-    return centred(z[:, 0] + np.einsum("ik,ikj->ij", alpha, z[:, 1:]))
+    state, part = fit.state, replace(problem, widths=fit.widths)
+    alpha = part.likelihood(*state).alpha
+    return state._replace(shapes=problem.frames.points(state.shapes)).depths(alpha)

@@ -17,7 +17,7 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
-MOST_ROWS, MOST_PLACES = 1000, 1_000_000
+MOST_ROWS = 1000
 # Points of a lower confidence are seldom where they are said to be.
 UNSURE = 0.6
 # Largest part of the coordinates of shares that are beyond all borders but one.
@@ -154,7 +154,7 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     """
     places = np.ascontiguousarray(tracks, dtype=float).view(complex)[..., 0]
     known = np.flatnonzero(~np.isnan(places))
-    shown = places.ravel()[known[:: -(-len(known) // MOST_PLACES) or 1]]
+    shown = places.ravel()[known[:: -(-len(known) // 1_000_000) or 1]]
     shown += 0  # -0.0 + 0.0 is 0.0
     found, warned = {0j}, False
     for some in (shown, shown[shown.real == shown.imag]):

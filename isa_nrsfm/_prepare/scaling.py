@@ -26,10 +26,6 @@ from isa_nrsfm.skeletons._column_names import names_layout
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
 LARGEST_WEIGHT = 1e30
-# Smallest weight of a point, as a share of the largest of its frame. Such points have
-# no effect on others, and curvatures of their shapes exceed rounding errors:
-# docs/benchmarks/README.md, "Thresholds".
-LEAST_WEIGHT = 1e-8
 
 
 class ScaledTable(NamedTuple):
@@ -236,7 +232,8 @@ def weighted_rows(
     shown = rows.derive(lambda r, w: np.where(w, r, nan), weights[:, None], kept=False)
     seen = shown.joined(seen_points)
     weights = np.where(seen, weights, 0.0)
-    least = LEAST_WEIGHT * weights.max(axis=1, keepdims=True, initial=0.0)
+    # Curvatures of the shapes must exceed rounding errors.
+    least = 1e-8 * weights.max(axis=1, keepdims=True, initial=0.0)
     weights = np.where(weights > 0, np.maximum(weights, least), 0.0)
     return shown, () if (weights == seen).all() else (weights,)
 

@@ -8,8 +8,8 @@ from scipy.optimize import linear_sum_assignment
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._frames.camera_models import pose_effect, pose_part
 from isa_nrsfm._frames.models import FrameMap
-from isa_nrsfm._frames.pose import pose_effect, pose_part
 from isa_nrsfm._gauge import independent_gauge
 from isa_nrsfm._joint.half_tables import HalfTables
 
