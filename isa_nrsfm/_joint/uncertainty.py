@@ -43,6 +43,7 @@ from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import FAR_FRAMES, JointState, Widths, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
+from isa_nrsfm._joint.starts import steadied
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
@@ -319,8 +320,11 @@ def depth_certainty(
     whole, rotations, depths, value = refit(every, extents=extents)
     deformation = rivals
     if prior is None:
-        *_, far_value = refit(every, far_state(whole, camera))
-        deformation += float(np.exp(-FAR_FRAMES * max(far_value - value, 0.0)))
+        # Some frames may be seen from behind: also from cameras that turn less.
+        still = whole._replace(motion=steadied(whole.motion))
+        starts = (far_state(state, camera) for state in (whole, still))
+        rise = min(refit(every, start)[-1] for start in starts) - value
+        deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept in parts:
         _, turned, z, _ = refit(kept)
