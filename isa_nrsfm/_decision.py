@@ -215,7 +215,7 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         estimator = AffineNRSfM() if self.estimator is None else self.estimator
         check_class(estimator, "estimator")
         given = {name: getattr(self, name) for name in FIRST}
-        given = {name: each for name, each in given.items() if not _is_auto(each)}
+        given = {n: v for n, v in given.items() if not isinstance(v, str) or v != AUTO}
         params, free = first_settings(given)
         estimator = clone(estimator).set_params(**params)
         point = None if self.image_size is None else np.divide(self.image_size, 2)
@@ -256,11 +256,6 @@ FIRST = {
     "loss": "linear",
     "prior": None,
 }
-
-
-def _is_auto(value: Any) -> bool:
-    """Return whether a parameter is to be decided."""
-    return isinstance(value, str) and value == AUTO
 
 
 def first_settings(given: dict[str, Any]) -> tuple[dict[str, Any], set[str]]:
@@ -399,27 +394,18 @@ def _affine(best: _Fit, rows: _Rows) -> Proposal:
     return {"camera": "affine", "refinement": "joint"}
 
 
-def _lower(found: _Fit, best: _Fit) -> bool:
-    """Return whether held-out points prefer a fit."""
-    return found.error < LOWER * best.error
-
-
-# What is tried, in this order: the parameter that changes, words, the proposal, and
-# whether the fit with the changes is better.
-PROPOSALS: tuple[tuple[str, str, Callable, Callable], ...] = (
-    ("loss", "robust loss", _robust_loss, _lower),
-    (
-        *("camera", "perspective", _perspective),
-        lambda found, best: found.error < MUCH_LOWER * best.error,
-    ),
-    ("prior", "face prior", _face_prior, lambda found, _: found.determined),
-    (
-        *("refinement", "consensus", _consensus),
-        lambda found, best: found.determined and found.error < LARGER * best.error,
-    ),
-    ("camera", "orthographic", _orthographic, _lower),
-    ("camera", "affine", _affine, _lower),
+# What is tried, in this order: the parameter that changes, words, the proposal, and the
+# largest error, relative to that of the best fit, with which it is used.
+PROPOSALS: tuple[tuple[str, str, Callable[..., Proposal], float], ...] = (
+    ("loss", "robust loss", _robust_loss, LOWER),
+    ("camera", "perspective", _perspective, MUCH_LOWER),
+    ("prior", "face prior", _face_prior, np.inf),
+    ("refinement", "consensus", _consensus, LARGER),
+    ("camera", "orthographic", _orthographic, LOWER),
+    ("camera", "affine", _affine, LOWER),
 )
+# Fits with other ones of these are for depths, which they must determine.
+FOR_DEPTH = ("prior", "refinement")
 
 
 def decided(
@@ -453,12 +439,10 @@ def decided(
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
     best, robust = fitted(estimator, False), False
-    trials: list[Trial] = []
-    trials.append(
-        Trial(_words(estimator), best.error, best.depth, best.seconds, "used")
-    )
+    setting = f"{estimator.camera.replace('_p', ' p')} cameras"
+    trials = [Trial(setting, best.error, best.depth, best.seconds, "used")]
     used, joint = 0, estimator.refinement in choices.JOINT_REFINEMENTS
-    for name, setting, proposal, wins in PROPOSALS if joint else ():
+    for name, setting, proposal, share in PROPOSALS if joint else ():
         if name not in free:
             continue
         changes, found = proposal(best, rows), None
@@ -474,7 +458,8 @@ def decided(
             trials.append(Trial(setting, np.nan, np.nan, 0.0, str(changes)))
             continue
         result = "not better"
-        if wins(found, best):
+        better = np.isinf(share) or found.error < share * best.error
+        if better and (found.determined or name not in FOR_DEPTH):
             best, result = found, "used"
             trials[used] = trials[used]._replace(result="less good")
             used = len(trials)
@@ -486,8 +471,3 @@ def decided(
         warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
     model._trials = trials
     return model, trials
-
-
-def _words(estimator: AffineNRSfM) -> str:
-    """Return the name of a camera model in words."""
-    return f"{estimator.camera.replace('_p', ' p')} cameras"

@@ -27,7 +27,6 @@ from isa_nrsfm.io._tables import first_lines, header_names, parse_table
 
 _ULTRALYTICS = re.compile(rb'"keypoints"\s*:\s*\{')
 _LABELME = re.compile(rb'"shapes"\s*:')
-_IMGLAB = re.compile(rb"<dataset\b")
 _PLACE = re.compile(r"\s*[-+.\deE]+\s*[\s,]\s*[-+.\deE]+\s*")
 # Fields of a line of YOLO before its points: class and box.
 _N_BOX = 5
@@ -151,11 +150,6 @@ def read_labelme(path: Path) -> Landmarks:
                 places = [(str(s["label"]), s["points"][0]) for s in own]
                 rows.append(({"image": image, "individual": group}, _named(places)))
     return _rows_of_names(rows, "labelme")
-
-
-def is_imglab(path: Path) -> bool:
-    """Return whether a file begins as those of dlib's imglab."""
-    return begins_with(path, _IMGLAB)
 
 
 def read_imglab(path: Path) -> Landmarks:

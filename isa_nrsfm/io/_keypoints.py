@@ -45,7 +45,6 @@ _MMPOSE = frozenset(
 )
 # Ultralytics, and labelme.
 _OTHERS = re.compile(rb'"keypoints"\s*:\s*\{|"shapes"\s*:')
-_TPS = re.compile(r"(?i)LM\s*=\s*\d+")
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
@@ -485,11 +484,6 @@ def _instances_in(file: Path) -> list[dict[str, Any]]:
     return entries
 
 
-def is_pts(path: Path) -> bool:
-    """Return whether a file begins as .pts files do."""
-    return "".join(first_lines(path, 1)).lstrip().startswith("version")
-
-
 def read_pts(path: Path) -> Landmarks:
     """Read a .pts file, with the points of one image.
 
@@ -498,11 +492,6 @@ def read_pts(path: Path) -> Landmarks:
     """
     frames = {"file": [as_utf8(path.name)]}
     return assemble(_points_of(path)[None], None, frames, format="pts")
-
-
-def is_tps(path: Path) -> bool:
-    """Return whether a file begins with a number of landmarks."""
-    return _TPS.match("".join(first_lines(path, 1)).strip()) is not None
 
 
 def read_tps(path: Path) -> Landmarks:

@@ -295,11 +295,6 @@ def tracks_in(
     return tracks
 
 
-def is_named_columns(_path: Path) -> bool:
-    """Return True: the format is chosen by its suffix."""
-    return True
-
-
 def read_named_columns(
     path: Path,
     columns: str | None = None,
