@@ -298,17 +298,12 @@ class _Rows(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """A fit, its error of held-out points, warnings, and seconds."""
+    """A fit, its figures, warnings, and the error with which others are compared."""
 
     model: AffineNRSfM
-    error: float
+    trial: Trial
     caught: list[warnings.WarningMessage]
-    seconds: float
-
-    @property
-    def depth(self) -> float:
-        """Expected error of the depth, NaN for affine cameras."""
-        return float(getattr(self.model, "depth_uncertainty_", np.nan))
+    error: float
 
     @property
     def determined(self) -> bool:
@@ -427,22 +422,23 @@ def decided(
     Returns the fit that is kept, with warnings, and what was tried.
     """
 
-    def fitted(model: AffineNRSfM, robust: bool) -> _Fit:
+    def fitted(model: AffineNRSfM, setting: str, robust: bool) -> _Fit:
         since = time.perf_counter()
         with warnings.catch_warnings(record=True, action="always") as caught:
             if not hasattr(model, "_model"):
                 model.fit(X, groups=groups, **weights)
-        seconds = time.perf_counter() - since
-        return _Fit(model, rows.error(model, robust), caught, seconds)
+        seconds, error = time.perf_counter() - since, rows.error(model, robust)
+        depth = float(getattr(model, "depth_uncertainty_", np.nan))
+        trial = Trial(setting, error, depth, seconds, "used")
+        return _Fit(model, trial, caught, error)
 
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    best, robust = fitted(estimator, False), False
     setting = f"{estimator.camera.replace('_p', ' p')} cameras"
-    trials = [Trial(setting, best.error, best.depth, best.seconds, "used")]
-    used, joint = 0, estimator.refinement in choices.JOINT_REFINEMENTS
-    for name, setting, proposal, share in PROPOSALS if joint else ():
+    best, robust = fitted(estimator, setting, False), False
+    trials, used = [best.trial], 0
+    for name, setting, proposal, share in PROPOSALS:
         if name not in free:
             continue
         changes, found = proposal(best, rows), None
@@ -451,19 +447,20 @@ def decided(
             if name == "loss":  # outliers have no influence on medians
                 best, robust = best._replace(error=rows.error(best.model, True)), True
             try:
-                found = fitted(clone(best.model).set_params(**changes), robust)
+                model = clone(best.model).set_params(**changes)
+                found = fitted(model, setting, robust)
             except ValueError as error:  # such as points that too few frames show
                 changes = str(error)
         if found is None:
             trials.append(Trial(setting, np.nan, np.nan, 0.0, str(changes)))
             continue
-        result = "not better"
+        trials.append(found.trial)
         better = np.isinf(share) or found.error < share * best.error
         if better and (found.determined or name not in FOR_DEPTH):
-            best, result = found, "used"
             trials[used] = trials[used]._replace(result="less good")
-            used = len(trials)
-        trials.append(Trial(setting, found.error, found.depth, found.seconds, result))
+            best, used = found, len(trials) - 1
+        else:
+            trials[-1] = found.trial._replace(result="not better")
     model = best.model
     if model.prior is not None:
         model.set_params(n_components=model.n_components_)

@@ -295,13 +295,8 @@ DEFAULTS = {
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
 TABLE_OPTIONS = (
     *("format", "columns", "individuals", "row_per_point", "skip_rows"),
-    *(
-        ("zeros_missing", "keep_zeros"),
-        "missing_value",
-        "min_confidence",
-        "image_size",
-        "part",
-    ),
+    *(("zeros_missing", "keep_zeros"), "missing_value", "min_confidence"),
+    *("image_size", "part"),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 
