@@ -74,8 +74,8 @@ def fit_table(
     """
     prior = args.prior
     _check_options(args)
-    if prior not in FACE_PRIORS:
-        _load_prior(args)
+    if prior not in (None, NONE, *FACE_PRIORS):
+        args.prior = load_model(prior)
     folder = Path(args.output)
     frames = _moving_points(args, read_frames(args, table=table), table)
     if prior in FACE_PRIORS:
@@ -86,7 +86,8 @@ def fit_table(
                 f"not one of {', '.join(LAYOUTS)}. Name it with --skeleton, "
                 "or give --prior the model.npz of a table in which the objects turn"
             )
-        _load_prior(args, layout)
+        K = None if args.n_components in (None, (AUTO,)) else args.n_components[0]
+        args.prior = load_face_prior(K, layout=layout)
     frames.points.attrs[TOLD] = True
     X = frames.X
     if X.empty:
@@ -174,15 +175,6 @@ def fit_table(
             report |= {"files": results | captions}
             report = write_report(new, report)
     return report, estimator
-
-
-def _load_prior(args: Namespace, layout: str = "ibug-68") -> None:
-    """Load the prior that the options name, for a layout of faces."""
-    if args.prior in FACE_PRIORS:
-        K = None if args.n_components in (None, (AUTO,)) else args.n_components[0]
-        args.prior = load_face_prior(K, layout=layout)
-    elif args.prior not in (None, NONE):
-        args.prior = load_model(args.prior)
 
 
 def _moving_points(args: Namespace, frames: Frames, table: Any) -> Frames:

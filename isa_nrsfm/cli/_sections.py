@@ -410,16 +410,10 @@ def _label(label: dict[str, Any]) -> Section:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
     statistic, meaning = STATISTICS[label["kind"]]
-    found = zip(names, label["values"], label["p_values"], strict=True)
-    rows = [
-        [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
-        for name, value, p in found
-    ]
-    head = ["", statistic, "p"]
+    columns = {"": names, statistic: [f"{value:z.2f}" for value in label["values"]]}
+    columns["p"] = ["" if label["untested"] else f"{p:.3f}" for p in label["p_values"]]
     if label["corrected"] is not None:
-        head.append("corrected")
-        for row, value in zip(rows, label["corrected"], strict=True):
-            row.append(f"{value:z.2f}")
+        columns["corrected"] = [f"{value:z.2f}" for value in label["corrected"]]
         meaning += "; corrected: without the errors of the coefficients"
     test = "no p-values"
     means: list[str] = []
@@ -429,7 +423,7 @@ def _label(label: dict[str, Any]) -> Section:
             means = _class_means(label, names)
     return [
         _answer(label),
-        Cells(head, rows, title),
+        Cells([*columns], [*zip(*columns.values(), strict=True)], title),
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),
