@@ -28,7 +28,7 @@ from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
 from isa_nrsfm._tables.blocks import spread
-from isa_nrsfm._tables.sources import StoredTable, is_on_dask
+from isa_nrsfm._tables.sources import refuse_stored
 from isa_nrsfm.analysis._advice import (
     COMPARE,
     OTHER_CAMERAS,
@@ -207,11 +207,7 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         UserWarning
             As in `AffineNRSfM.fit`, for the fit that is kept.
         """
-        if is_on_dask(X) or isinstance(X, StoredTable):
-            raise ValueError(
-                "AutoNRSfM needs a table in memory or a memory map; got a "
-                f"{type(X).__name__}: take some thousand of its frames"
-            )
+        refuse_stored(X, "AutoNRSfM")
         estimator = AffineNRSfM() if self.estimator is None else self.estimator
         check_class(estimator, "estimator")
         given = {name: getattr(self, name) for name in FIRST}

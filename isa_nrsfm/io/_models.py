@@ -233,10 +233,11 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     if "focal_length_" in values:
         values["focal_length_"] = np.ravel(values["focal_length_"])
     _check_shapes(values)
+    basis = estimator.basis_
     estimator._model = TableModel(
         _frame_model(entries),
         estimator.mean_shape_,
-        _all_directions(entries, estimator.basis_),
+        np.concatenate([basis, entries.get("further_basis", basis[:0])]),
         len(estimator.basis_),
         entries["layout"],
         entries["unit"],
@@ -354,11 +355,6 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "image_errors": np.array(frames.certainty.images),
         "weighted": frames.certainty.weighted,
     }
-
-
-def _all_directions(entries: dict[str, Any], basis: Any) -> Any:
-    """Return the basis of all directions of a shape, reported or not."""
-    return np.concatenate([basis, entries.get("further_basis", basis[:0])])
 
 
 def _pinhole(entries: dict[str, Any]) -> Pinhole | None:
