@@ -28,7 +28,7 @@ from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
 from isa_nrsfm._tables.blocks import spread
-from isa_nrsfm._tables.sources import StoredTable, is_on_dask
+from isa_nrsfm._tables.sources import refuse_stored
 from isa_nrsfm.analysis._advice import (
     COMPARE,
     OTHER_CAMERAS,
@@ -207,15 +207,11 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         UserWarning
             As in `AffineNRSfM.fit`, for the fit that is kept.
         """
-        if is_on_dask(X) or isinstance(X, StoredTable):
-            raise ValueError(
-                "AutoNRSfM needs a table in memory or a memory map; got a "
-                f"{type(X).__name__}: take some thousand of its frames"
-            )
+        refuse_stored(X, "AutoNRSfM")
         estimator = AffineNRSfM() if self.estimator is None else self.estimator
         check_class(estimator, "estimator")
         given = {name: getattr(self, name) for name in FIRST}
-        given = {name: each for name, each in given.items() if not _is_auto(each)}
+        given = {n: v for n, v in given.items() if not isinstance(v, str) or v != AUTO}
         params, free = first_settings(given)
         estimator = clone(estimator).set_params(**params)
         point = None if self.image_size is None else np.divide(self.image_size, 2)
@@ -258,11 +254,6 @@ FIRST = {
 }
 
 
-def _is_auto(value: Any) -> bool:
-    """Return whether a parameter is to be decided."""
-    return isinstance(value, str) and value == AUTO
-
-
 def first_settings(given: dict[str, Any]) -> tuple[dict[str, Any], set[str]]:
     """Return parameters of the first fit, and those that may change: none is given.
 
@@ -303,17 +294,12 @@ class _Rows(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """A fit, its error of held-out points, warnings, and seconds."""
+    """A fit, its figures, warnings, and the error with which others are compared."""
 
     model: AffineNRSfM
-    error: float
+    trial: Trial
     caught: list[warnings.WarningMessage]
-    seconds: float
-
-    @property
-    def depth(self) -> float:
-        """Expected error of the depth, NaN for affine cameras."""
-        return float(getattr(self.model, "depth_uncertainty_", np.nan))
+    error: float
 
     @property
     def determined(self) -> bool:
@@ -399,27 +385,18 @@ def _affine(best: _Fit, rows: _Rows) -> Proposal:
     return {"camera": "affine", "refinement": "joint"}
 
 
-def _lower(found: _Fit, best: _Fit) -> bool:
-    """Return whether held-out points prefer a fit."""
-    return found.error < LOWER * best.error
-
-
-# What is tried, in this order: the parameter that changes, words, the proposal, and
-# whether the fit with the changes is better.
-PROPOSALS: tuple[tuple[str, str, Callable, Callable], ...] = (
-    ("loss", "robust loss", _robust_loss, _lower),
-    (
-        *("camera", "perspective", _perspective),
-        lambda found, best: found.error < MUCH_LOWER * best.error,
-    ),
-    ("prior", "face prior", _face_prior, lambda found, _: found.determined),
-    (
-        *("refinement", "consensus", _consensus),
-        lambda found, best: found.determined and found.error < LARGER * best.error,
-    ),
-    ("camera", "orthographic", _orthographic, _lower),
-    ("camera", "affine", _affine, _lower),
+# What is tried, in this order: the parameter that changes, words, the proposal, and the
+# largest error, relative to that of the best fit, with which it is used.
+PROPOSALS: tuple[tuple[str, str, Callable[..., Proposal], float], ...] = (
+    ("loss", "robust loss", _robust_loss, LOWER),
+    ("camera", "perspective", _perspective, MUCH_LOWER),
+    ("prior", "face prior", _face_prior, np.inf),
+    ("refinement", "consensus", _consensus, LARGER),
+    ("camera", "orthographic", _orthographic, LOWER),
+    ("camera", "affine", _affine, LOWER),
 )
+# Fits with other ones of these are for depths, which they must determine.
+FOR_DEPTH = ("prior", "refinement")
 
 
 def decided(
@@ -441,24 +418,23 @@ def decided(
     Returns the fit that is kept, with warnings, and what was tried.
     """
 
-    def fitted(model: AffineNRSfM, robust: bool) -> _Fit:
+    def fitted(model: AffineNRSfM, setting: str, robust: bool) -> _Fit:
         since = time.perf_counter()
         with warnings.catch_warnings(record=True, action="always") as caught:
             if not hasattr(model, "_model"):
                 model.fit(X, groups=groups, **weights)
-        seconds = time.perf_counter() - since
-        return _Fit(model, rows.error(model, robust), caught, seconds)
+        seconds, error = time.perf_counter() - since, rows.error(model, robust)
+        depth = float(getattr(model, "depth_uncertainty_", np.nan))
+        trial = Trial(setting, error, depth, seconds, "used")
+        return _Fit(model, trial, caught, error)
 
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    best, robust = fitted(estimator, False), False
-    trials: list[Trial] = []
-    trials.append(
-        Trial(_words(estimator), best.error, best.depth, best.seconds, "used")
-    )
-    used, joint = 0, estimator.refinement in choices.JOINT_REFINEMENTS
-    for name, setting, proposal, wins in PROPOSALS if joint else ():
+    setting = f"{estimator.camera.replace('_p', ' p')} cameras"
+    best, robust = fitted(estimator, setting, False), False
+    trials, used = [best.trial], 0
+    for name, setting, proposal, share in PROPOSALS:
         if name not in free:
             continue
         changes, found = proposal(best, rows), None
@@ -467,18 +443,20 @@ def decided(
             if name == "loss":  # outliers have no influence on medians
                 best, robust = best._replace(error=rows.error(best.model, True)), True
             try:
-                found = fitted(clone(best.model).set_params(**changes), robust)
+                model = clone(best.model).set_params(**changes)
+                found = fitted(model, setting, robust)
             except ValueError as error:  # such as points that too few frames show
                 changes = str(error)
         if found is None:
             trials.append(Trial(setting, np.nan, np.nan, 0.0, str(changes)))
             continue
-        result = "not better"
-        if wins(found, best):
-            best, result = found, "used"
+        trials.append(found.trial)
+        better = np.isinf(share) or found.error < share * best.error
+        if better and (found.determined or name not in FOR_DEPTH):
             trials[used] = trials[used]._replace(result="less good")
-            used = len(trials)
-        trials.append(Trial(setting, found.error, found.depth, found.seconds, result))
+            best, used = found, len(trials) - 1
+        else:
+            trials[-1] = found.trial._replace(result="not better")
     model = best.model
     if model.prior is not None:
         model.set_params(n_components=model.n_components_)
@@ -486,8 +464,3 @@ def decided(
         warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
     model._trials = trials
     return model, trials
-
-
-def _words(estimator: AffineNRSfM) -> str:
-    """Return the name of a camera model in words."""
-    return f"{estimator.camera.replace('_p', ' p')} cameras"

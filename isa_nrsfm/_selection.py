@@ -40,7 +40,7 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._joint.settings import JOINT_TOL
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.sources import StoredTable, is_on_dask
+from isa_nrsfm._tables.sources import refuse_stored
 
 # For held-out errors of 100 % and more.
 NO_SHAPE = (
@@ -289,11 +289,7 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
         """
         plain, candidates = self._plain_search(), checked_candidates(self.n_components)
         estimator, scorer = plain.estimator, plain.scoring
-        if is_on_dask(X) or isinstance(X, StoredTable):
-            raise ValueError(
-                "choosing n_components needs a table in memory or a memory map; got a "
-                f"{type(X).__name__}: take some thousand of its frames"
-            )
+        refuse_stored(X, "choosing n_components")
         X, y = indexable(X, y)
         for_splitter, for_scorer = self._routed("fit", params)
         splits = list(plain.cv.split(X, y, **for_splitter))

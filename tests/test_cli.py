@@ -636,7 +636,7 @@ def test_a_figure_that_fails_costs_no_results(
     assert found.err.endswith(f"\nisa-nrsfm: warning: {warning}\n")
     # All results were there, and only they, when figures began.
     assert set(seen) == FIT_FILES
-    left = FIT_FILES | FIGURES - {"mode_covariance.png"} | {"choice.png"}
+    left = FIT_FILES | FIGURES - {"mode_covariance.png"}
     assert {path.name for path in folder.iterdir()} == left
     assert "mode_covariance" not in found.out
     assert set(report["files"]) == set(report["sha256"]) == left - {"report.json"}

@@ -10,14 +10,11 @@ import numpy as np
 
 from isa_nrsfm._compat.texts import printable
 
+# They are not imported: reading a file does not need scikit-learn.
+LIBRARIES = [find_spec(name) for name in ("sklearn", "joblib")]
 # Files whose frames are skipped on the way from the warning up to the user's line.
 INSIDE = (
-    # They are not imported: reading a file does not need scikit-learn.
-    *(
-        str(Path(s.origin or "").parent)
-        for s in map(find_spec, ("sklearn", "joblib"))
-        if s
-    ),
+    *(str(Path(s.origin or "").parent) for s in LIBRARIES if s),
     str(Path(__file__).parents[1]),
     contextlib.__file__,
     np.errstate.__call__.__code__.co_filename,

@@ -2,7 +2,7 @@
 
 import html
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +55,11 @@ def percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def aligned(rows: Iterable[Sequence[str]]) -> str:
-    """Return the rows of a table as lines, with columns of one width."""
-    columns = list(zip(*rows, strict=True))
-    widths = [max(map(len, column)) for column in columns]
-    lines = zip(*columns, strict=True)
+def aligned(columns: Mapping[str, Iterable[str]]) -> str:
+    """Return a table as lines, with columns of one width, by their titles."""
+    cells = [(title, *column) for title, column in columns.items()]
+    widths = [max(map(len, column)) for column in cells]
+    lines = zip(*cells, strict=True)
     return "\n".join("  ".join(map(str.rjust, line, widths)) for line in lines)
 
 

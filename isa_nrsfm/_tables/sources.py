@@ -107,6 +107,15 @@ def is_on_dask(X: Any) -> bool:
     return type(X).__module__.startswith("dask.array")
 
 
+def refuse_stored(X: Any, what: str) -> None:
+    """Raise if a table is not in memory, nor a memory map."""
+    if is_on_dask(X) or isinstance(X, StoredTable):
+        raise ValueError(
+            f"{what} needs a table in memory or a memory map; got a "
+            f"{type(X).__name__}: take some thousand of its frames"
+        )
+
+
 def checked_rows(rows: Any) -> NDArray:
     """Return rows of a table as float32 or float64, without infinite values."""
     X = check_array(unmasked(rows), input_name="X", ensure_min_features=0, **CHECKS)

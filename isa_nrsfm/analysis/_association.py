@@ -81,18 +81,16 @@ class Association(NamedTuple):
     def __repr__(self) -> str:
         """Return the results as a table and what they are."""
         name, meaning = STATISTICS[self.kind]
-        rows = [["", name, "p"]]
-        for value, p in zip(self.statistic, self.p_value, strict=True):
-            known = "" if self.untested else f"{p:.3f}"
-            rows.append([f"alpha_{len(rows)}", f"{value:.2f}", known])
+        values = {name: self.statistic}
         if self.corrected is not None:
-            shown = [f"{value:.2f}" for value in self.corrected]
-            for row, text in zip(rows, ["corrected", *shown], strict=True):
-                row.insert(2, text)
+            values["corrected"] = self.corrected
+        columns = {"": [f"alpha_{k + 1}" for k in range(len(self.p_value))]}
+        columns |= {name: [f"{v:.2f}" for v in each] for name, each in values.items()}
+        columns["p"] = ["" if self.untested else f"{p:.3f}" for p in self.p_value]
         test = f"p-values: permutations of {self.permuted}"
         if self.untested:
             test = f"no p-values: {self.untested}"
-        return f"{aligned(rows)}\n{name}: {meaning}; {test}; {self.n_frames} frames"
+        return f"{aligned(columns)}\n{name}: {meaning}; {test}; {self.n_frames} frames"
 
     def to_frame(self) -> "pd.DataFrame":
         """

@@ -138,15 +138,15 @@ class Diagnostics(NamedTuple):
         if math.isfinite(self.depth_uncertainty):
             certainty = f"{percent(self.depth_uncertainty)} of the depth"
         shares = first_items((f"{share:.2f}" for share in self.reliability), 12)
-        rows = [["", "effective frames", "pose share"]]
-        for frames, share in zip(self.effective_frames, self.pose_share, strict=True):
-            known = "" if math.isnan(share) else percent(max(share, 0.0))
-            rows.append([f"alpha_{len(rows)}", f"{frames:.1f}", known])
+        shown = ["" if math.isnan(s) else percent(max(s, 0.0)) for s in self.pose_share]
+        columns: dict[str, Sequence[str]] = {
+            "": [f"alpha_{k + 1}" for k in range(len(shown))],
+            "effective frames": [f"{n:.1f}" for n in self.effective_frames],
+            "pose share": shown,
+        }
         if self.pose_removed.any():
-            for row, share in zip(rows, ["removed", *self.pose_removed], strict=True):
-                row.append(share if isinstance(share, str) else percent(share))
-        for row, word in zip(rows, ["in another fit", *self.stability], strict=True):
-            row.append(word)
+            columns["removed"] = [*map(percent, self.pose_removed)]
+        columns["in another fit"] = self.stability
         known = "" if not self.fit else f"{self.fit.upper()}, "
         known += f"{percent(self.held_out_error)} of left-out points unexplained"
         lines = [
@@ -157,7 +157,7 @@ class Diagnostics(NamedTuple):
             f"depth error: {certainty}",
             f"deformation: {percent(self.deformation_amplitude)} of the mean shape",
             f"reliability, along uncorrelated directions: {shares}",
-            aligned(rows),
+            aligned(columns),
         ]
         return "\n".join(lines)
 

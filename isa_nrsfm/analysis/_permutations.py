@@ -357,7 +357,7 @@ def _studentised(
 
 def _ratio(above: NDArray, below: NDArray) -> NDArray:
     """Return a ratio, zero where the divisor is."""
-    above = np.broadcast_to(above, below.shape)
+    above, below = np.broadcast_arrays(above, below)
     return np.divide(above, below, where=below > 0, out=np.zeros(below.shape))
 
 
@@ -372,10 +372,8 @@ def _signed(
     found = []
     for a in alpha.T:
         covariances = (by_group @ labels.multiply(a[:, None])).toarray()
-        sums = (signs @ covariances) ** 2
-        found.append(
-            _ratio(sums, 0 * sums + np.sum(covariances**2, axis=0)).sum(axis=1)
-        )
+        shares = _ratio((signs @ covariances) ** 2, np.sum(covariances**2, axis=0))
+        found.append(shares.sum(axis=1))
     energies = np.stack(found, axis=1)
     return np.asarray(energies / (energies.mean() or 1.0))
 

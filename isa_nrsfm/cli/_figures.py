@@ -1,7 +1,6 @@
 """The figures of a fit."""
 
 import io
-from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -54,8 +53,8 @@ ALWAYS: Figures = {
 }
 
 
-def figures_of(args: Namespace, frames: Frames) -> Figures:
-    """Return the figures that the options ask for, answers first."""
+def figures_of(frames: Frames) -> Figures:
+    """Return the figures of a fit, answers to the options first."""
     figures: Figures = {}
     for number, label in enumerate(frames.labels, 1):
         caption = f"coefficients by {label.name}"
@@ -67,13 +66,7 @@ def figures_of(args: Namespace, frames: Frames) -> Figures:
     if frames.times is not None:
         caption = "coefficients in time, with a band of one standard deviation"
         figures["time.png"] = caption, _in_time
-    figures |= ALWAYS
-    if args.n_components and len(args.n_components) > 1:
-        figures["choice.png"] = (
-            "held-out error by the number of basis shapes, with one standard error",
-            _choice,
-        )
-    return figures
+    return figures | ALWAYS
 
 
 def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
@@ -95,20 +88,6 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
         except Exception as error:  # results do not depend on it
             warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
     return drawn
-
-
-def _choice(fit: Fit) -> Any:
-    """Draw the held-out errors by the number of basis shapes."""
-    choice = fit.choice
-    assert choice is not None
-    numbers, error = choice["n_components"], 100 * choice["held_out_error"]
-    deviation = 100 * choice["held_out_error_standard_error"]
-    (axes,) = _axes.grid(1, 1, figsize=(5.2, 3.2))
-    axes.errorbar(numbers, error, deviation, fmt="o-", capsize=3)
-    axes.set(
-        xlabel="number of basis shapes", ylabel="held-out error, %", xticks=numbers
-    )
-    return axes
 
 
 def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:

@@ -74,8 +74,8 @@ def fit_table(
     """
     prior = args.prior
     _check_options(args)
-    if prior not in FACE_PRIORS:
-        _load_prior(args)
+    if prior not in (None, NONE, *FACE_PRIORS):
+        args.prior = load_model(prior)
     folder = Path(args.output)
     frames = _moving_points(args, read_frames(args, table=table), table)
     if prior in FACE_PRIORS:
@@ -86,7 +86,8 @@ def fit_table(
                 f"not one of {', '.join(LAYOUTS)}. Name it with --skeleton, "
                 "or give --prior the model.npz of a table in which the objects turn"
             )
-        _load_prior(args, layout)
+        K = None if args.n_components in (None, (AUTO,)) else args.n_components[0]
+        args.prior = load_face_prior(K, layout=layout)
     frames.points.attrs[TOLD] = True
     X = frames.X
     if X.empty:
@@ -100,7 +101,7 @@ def fit_table(
             "the camera, with --principal-point X Y (0 0 and --focal-length 1 for "
             "normalised coordinates)"
         )
-    figures = {} if args.no_figures else figures_of(args, frames)
+    figures = {} if args.no_figures else figures_of(frames)
     drawn = drawing(args, frames.columns.points, frames.skeleton)
     results, inputs = _outputs.RESULTS, drawing_files(args)
     if table is None:
@@ -124,7 +125,7 @@ def fit_table(
         used |= {label.name for label in frames.labels}
         unused = [name for name in frames.other if name and name not in used]
         unused.sort(key=lambda name: not LABEL.search(str(name)))
-        estimator, trials, search, diagnostics = _fitted(args, frames)
+        estimator, trials, choice, diagnostics = _fitted(args, frames)
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
@@ -143,8 +144,7 @@ def fit_table(
             explained = estimator.reproject(X, **frames.weighting)
             energy, error, _ = frame_energies(X, explained, estimator.layout)
             snr = error / energy
-            choice = None if search is None else choice_report(search)
-            fit = Fit(estimator, frames, choice, smooth, drawn, explained, snr)
+            fit = Fit(estimator, frames, smooth, drawn, explained, snr)
             _outputs.write_results(new, fit, unit, **shown)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
                 answers["prior"] = {"name": prior or FACE_PRIOR, "std": std}
@@ -153,7 +153,7 @@ def fit_table(
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args, frames) | {"other_columns": unused},
-                **({} if choice is None else {"choice": choice}),
+                **choice,
                 "model": model_report(fit, diagnostics),
                 "tried": [{**each._asdict(), "text": repr(each)} for each in trials],
                 **answers,
@@ -175,15 +175,6 @@ def fit_table(
             report |= {"files": results | captions}
             report = write_report(new, report)
     return report, estimator
-
-
-def _load_prior(args: Namespace, layout: str = "ibug-68") -> None:
-    """Load the prior that the options name, for a layout of faces."""
-    if args.prior in FACE_PRIORS:
-        K = None if args.n_components in (None, (AUTO,)) else args.n_components[0]
-        args.prior = load_face_prior(K, layout=layout)
-    elif args.prior not in (None, NONE):
-        args.prior = load_model(args.prior)
 
 
 def _moving_points(args: Namespace, frames: Frames, table: Any) -> Frames:
@@ -236,10 +227,10 @@ def _check_options(args: Namespace) -> None:
 
 def _fitted(
     args: Namespace, frames: Frames
-) -> tuple[AffineNRSfM, list[Trial], AffineNRSfMCV | None, Diagnostics | None]:
+) -> tuple[AffineNRSfM, list[Trial], dict[str, Any], Diagnostics | None]:
     """Return the model that held-out points prefer, and what was tried.
 
-    Also the search for its K and the diagnostics. Options that are given are kept.
+    Also the report on its K and the diagnostics. Options that are given are kept.
     """
     isa = None
     if args.isa == "fast" or args.n_init is not None:
@@ -261,7 +252,8 @@ def _fitted(
     )
     if estimator.camera == "perspective":
         estimator.set_params(principal_point=frames.principal_point)
-    search, X, groups = None, frames.X, frames.groups
+    choice: dict[str, Any] = {}
+    X, groups = frames.X, frames.groups
     if args.n_components and len(args.n_components) > 1:
         show_stage("choice of the number of basis shapes")
         splitter: Any = N_PARTS
@@ -277,7 +269,7 @@ def _fitted(
         search = AffineNRSfMCV(args.n_components, estimator=estimator, **options)
         with contextlib.redirect_stdout(sys.stderr):  # results are printed at once
             search.fit(X, groups=groups)
-        estimator = search.best_estimator_
+        estimator, choice["choice"] = search.best_estimator_, choice_report(search)
     else:  # for `shown_progress`; the model that is written does not have it
         estimator.set_params(verbose=2)
     estimator, trials = decided(
@@ -292,7 +284,7 @@ def _fitted(
     diagnostics = None
     if estimator.refinement in JOINT_REFINEMENTS:
         diagnostics = estimator.diagnostics(X, **frames.weighting)
-    return estimator, trials, search, diagnostics
+    return estimator, trials, choice, diagnostics
 
 
 def choice_report(search: AffineNRSfMCV) -> dict[str, Any]:

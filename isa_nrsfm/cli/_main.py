@@ -76,7 +76,6 @@ def _with_options(text: str, args: Namespace) -> str:
         value = r"=(?P<quote>['\"]?)(?P<value>[\w.-]*\w)(?P=quote)"
         option = rf"{flag_of(name)} \g<value>"
         text = re.sub(rf"(?<![\w/\\-]){name}{value}", option, text)
-    text = re.sub(r"(--[\w-]+ [^\s,]+), (?=--)", r"\1 ", text)  # as they are typed
     if hasattr(args, "n_components"):
         text = re.sub(r"(?<![\w'\"-])n_components\b", "--n-components", text)
     return text

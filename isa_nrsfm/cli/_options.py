@@ -295,13 +295,8 @@ DEFAULTS = {
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
 TABLE_OPTIONS = (
     *("format", "columns", "individuals", "row_per_point", "skip_rows"),
-    *(
-        ("zeros_missing", "keep_zeros"),
-        "missing_value",
-        "min_confidence",
-        "image_size",
-        "part",
-    ),
+    *(("zeros_missing", "keep_zeros"), "missing_value", "min_confidence"),
+    *("image_size", "part"),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 
@@ -425,9 +420,8 @@ def build_parser() -> Parser:
     for command, (line, description, examples, groups) in _COMMANDS.items():
         own = commands.add_parser(command, help=line, **_manners(description, examples))
         # For commands without these
-        own.set_defaults(
-            weights=None, points=None, principal_point=None, missing_value=()
-        )
+        absent = dict.fromkeys(("weights", "points", "principal_point"))
+        own.set_defaults(**absent, missing_value=())
         for title, entries in groups.items():
             group = own.add_argument_group(title)
             for entry in entries:

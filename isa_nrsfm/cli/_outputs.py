@@ -39,14 +39,13 @@ RESULTS = {
 
 
 class Fit(NamedTuple):
-    """A fit to write and draw: model, frames, choice of K, smoothing, lines.
+    """A fit to write and draw: model, frames, smoothing, lines.
 
     ``explained`` is the table of the model, ``inverse_snr`` (n_frames,) that of frames.
     """
 
     estimator: AffineNRSfM
     frames: Frames
-    choice: dict[str, Any] | None
     smooth: Any
     drawn: dict[str, Any]
     explained: NDArray
@@ -107,7 +106,7 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
     The cameras have a row for each frame, empty if it could not be fitted. `unit` is
     the length of a unit of the shapes, for positions.
     """
-    estimator, frames, _, smooth, drawn, *_ = fit
+    estimator, frames, smooth, drawn, *_ = fit
     X, motion = frames.X, estimator.motion_
     cameras = pd.DataFrame(
         np.hstack([motion.reshape(-1, 6), estimator.translation_]),

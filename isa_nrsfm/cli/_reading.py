@@ -26,6 +26,7 @@ from isa_nrsfm._tables.tracks import (
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
 from isa_nrsfm.cli._times import image_numbers
+from isa_nrsfm.export._names import point_places
 from isa_nrsfm.io import FORMATS, find_format, read_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
@@ -468,8 +469,7 @@ def _kept_points(
                 f"--skeleton ({known})"
             )
         return layout.inner.tolist()
-    numbers = {str(j): j for j in range(len(names))}
-    numbers |= {name: j for j, name in enumerate(names)}
+    numbers = point_places(names)
     named: set[int] = set()
     for part in text.removeprefix(WITHOUT).split(","):
         named.update(_range(part.strip(), numbers, names))
@@ -535,8 +535,9 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
     with reading(path, "a list of edges"):
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     edges: list[list[int]] = []
-    numbers = {str(j): j for j in range(len(names))} if numbered else {}
-    numbers |= {name: j for j, name in enumerate(names)}
+    numbers = point_places(names)
+    if not numbered:
+        numbers = {name: numbers[name] for name in names}
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue

@@ -84,11 +84,10 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
     model, table = report["model"], report["table"]
     rows = [quality_row(model), ["depth", model["depth"].upper(), _depth(model)]]
     for row in model["alpha"][:MOST_SHOWN]:
-        pose, share = "", row["pose_share"]
-        if share is not None and share == share:
-            pose = f"pose explains {100 * max(share, 0):.0f} %; "
-        rows_of = f"from row {row['row_of_min']} to row {row['row_of_max']}"
-        rows.append([row["name"], f"{100 * row['energy_share']:.0f} %", pose + rows_of])
+        text = f"from row {row['row_of_min']} to row {row['row_of_max']}"
+        if share := _pose_share(row):
+            text = f"pose explains {share}; {text}"
+        rows.append([row["name"], f"{100 * row['energy_share']:.0f} %", text])
     if more := len(model["alpha"][MOST_SHOWN:]):
         rows.append(["", "", f"{more} more in {PAGE}"])
     rows += [["label", "", _answer(label)] for label in report.get("labels", ())]
@@ -100,16 +99,13 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
         rows.append(["group", "", f"{groups['column']}: {text}"])
     if "time" in report:
         rows.append(["time", "", str(_time(report["time"])[0])])
-    fitted = [each for each in report["tried"] if each["seconds"]]
-    tried = [each["text"] for each in fitted]
+    tried = [each["text"] for each in report["tried"] if each["seconds"]]
     others: dict[str, list[str]] = {}
     for each in report["tried"]:
         if not each["seconds"]:
             others.setdefault(each["result"], []).append(each["setting"])
     if "choice" in report:
-        choice = report["choice"]
-        listed = first_items(choice["n_components"], len(choice["n_components"]))
-        tried.insert(0, f"K = {listed}: {choice['chosen']} is used")
+        tried.insert(0, _choice(report["choice"]))
     listed = "; ".join(f"{', '.join(them)} ({why})" for why, them in others.items())
     tried += [f"not tried: {listed}"] * bool(others)
     rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
@@ -118,6 +114,12 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
         listed = first_items(map(str, names), 6)
         rows.append(["next", "", f"--label, --group or --time COLUMN: {listed}"])
     return [*rows, ["open", "", f"{Path(folder, PAGE)}  viewer.html  alpha.csv"]]
+
+
+def _pose_share(row: dict[str, Any]) -> str:
+    """Return the share of a coefficient that the pose explains, if it is known."""
+    share = row["pose_share"]
+    return f"{100 * max(share, 0):.0f} %" if pd.notna(share) else ""
 
 
 def _depth(model: dict[str, Any]) -> str:
@@ -156,8 +158,6 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     if "time" in report:
         sections["Time"] = _time(report["time"])
     sections["Alpha"] = _alpha(model)
-    if "choice" in report:
-        sections["Choice"] = _choice(report["choice"])
     sections["Fit"] = _fit(report)
     return sections | {"Table": table_section(report["table"])}
 
@@ -358,8 +358,7 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
 
 def _alpha(model: dict[str, Any]) -> Section:
     """Return the distribution of the coefficients, and what the pose predicts."""
-    coefficients = model["alpha"]
-    shares = [row["pose_share"] for row in coefficients]
+    head = ["", "energy", "min", "row", "max", "row", "pose", "again"]
     rows = [
         [
             row["name"],
@@ -368,28 +367,22 @@ def _alpha(model: dict[str, Any]) -> Section:
             f"{row['row_of_min']}",
             f"{row['max']:z.2f}",
             f"{row['row_of_max']}",
-            f"{100 * max(share, 0):.0f} %" if pd.notna(share) else "",
+            _pose_share(row),
             row["stability_word"] or "",
         ]
-        for row, share in zip(coefficients, shares, strict=True)
+        for row in model["alpha"]
     ]
-    head = ["", "energy", "min", "row", "max", "row", "pose", "again"]
     shown = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
-    is_posed = shown[6]
     head, *rows = [[*compress(line, shown)] for line in (head, *rows)]
-    parts: list[str | Cells] = [
-        Cells(head, rows),
+    notes = [
         "energy: share of the deformation in the images (sum of squares)",
+        "pose: variance that yaw, pitch and roll predict, cross-validated",
+        "again: whether a fit of other people has the coefficient, with a correlation "
+        "of at least .85",
     ]
-    if shown[7]:
-        parts.append(
-            "again: whether a fit of other people has the coefficient, with a "
-            "correlation of at least .85"
-        )
-    if is_posed:
-        parts.append("pose: variance that yaw, pitch and roll predict, cross-validated")
+    parts: list[str | Cells] = [Cells(head, rows), *compress(notes, shown[5:])]
     if model["parameters"]["remove_pose"]:
-        most = max(coefficients, key=lambda row: row["pose_removed"] or 0.0)
+        most = max(model["alpha"], key=lambda row: row["pose_removed"] or 0.0)
         share = f"{100 * (most['pose_removed'] or 0.0):.0f} % of {most['name']}"
         parts.append(
             f"--remove-pose: what yaw predicts was removed, up to {share}. It assumes "
@@ -398,30 +391,12 @@ def _alpha(model: dict[str, Any]) -> Section:
     return parts
 
 
-def _choice(choice: dict[str, Any]) -> Section:
-    """Return the held-out error of each number of basis shapes."""
-    tried, errors = choice["n_components"], choice["held_out_error"]
-    deviations = choice["held_out_error_standard_error"]
-    rows = [
-        [
-            f"{k}",
-            f"{_digits(100 * error, 3)} %",
-            f"{_digits(100 * deviation, 2)} %",
-            "used" * (k == choice["chosen"]),
-        ]
-        for k, error, deviation in zip(tried, errors, deviations, strict=True)
-    ]
-    cells = Cells(["K", "held-out error", "standard error", ""], rows)
-    if min(errors) >= 1:
-        # Other reports do not wait for scikit-learn's model selection.
-        from isa_nrsfm._selection import NO_SHAPE
-
-        return [cells, NO_SHAPE]
-    return [
-        cells,
-        "As under Fit, in frames left out of the fit. The fewest basis shapes within "
-        "one standard error of the least are used.",
-    ]
+def _choice(choice: dict[str, Any]) -> str:
+    """Return the held-out error of each number of basis shapes, in percent."""
+    names = ("n_components", "held_out_error", "held_out_error_standard_error")
+    each = zip(*(choice[name] for name in names), strict=True)
+    listed = (f"{k} ({100 * error:.3g} +- {100 * s:.2g} %)" for k, error, s in each)
+    return f"K = {first_items(listed, 12)}: {choice['chosen']} is used"
 
 
 def _label(label: dict[str, Any]) -> Section:
@@ -435,16 +410,10 @@ def _label(label: dict[str, Any]) -> Section:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
     statistic, meaning = STATISTICS[label["kind"]]
-    found = zip(names, label["values"], label["p_values"], strict=True)
-    rows = [
-        [name, f"{value:z.2f}", "" if label["untested"] else f"{p:.3f}"]
-        for name, value, p in found
-    ]
-    head = ["", statistic, "p"]
+    columns = {"": names, statistic: [f"{value:z.2f}" for value in label["values"]]}
+    columns["p"] = ["" if label["untested"] else f"{p:.3f}" for p in label["p_values"]]
     if label["corrected"] is not None:
-        head.append("corrected")
-        for row, value in zip(rows, label["corrected"], strict=True):
-            row.append(f"{value:z.2f}")
+        columns["corrected"] = [f"{value:z.2f}" for value in label["corrected"]]
         meaning += "; corrected: without the errors of the coefficients"
     test = "no p-values"
     means: list[str] = []
@@ -454,7 +423,7 @@ def _label(label: dict[str, Any]) -> Section:
             means = _class_means(label, names)
     return [
         _answer(label),
-        Cells(head, rows, title),
+        Cells([*columns], [*zip(*columns.values(), strict=True)], title),
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),
@@ -534,8 +503,3 @@ def _sentence(text: str) -> str:
     if text.partition(" ")[0].isalpha():
         text = text[:1].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else f"{text}."
-
-
-def _digits(number: float, n_digits: int) -> str:
-    """Write a number with so many digits, zeros at the end included."""
-    return f"{number:#.{n_digits}g}".removesuffix(".")

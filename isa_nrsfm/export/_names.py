@@ -18,6 +18,12 @@ def names_of_components(names: Any, n_components: int) -> list[str]:
     return checked_names("names", names, default)
 
 
+def point_places(names: Sequence[str]) -> dict[str, int]:
+    """Return the numbers of points by their names, or by their numbers."""
+    named = {name: j for j, name in enumerate(names)}
+    return {str(j): j for j in range(len(names))} | named
+
+
 def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:
     """Return the suffix of a path in lower case, which must be one of those given."""
     suffix = Path(path).suffix.lower()

@@ -177,11 +177,7 @@ def _netcdf(
     content, n_frames = io.BytesIO(), len(points.position)
     file = netcdf_file(content, "w", version=2)
     times = np.arange(n_frames) / (fps or 1.0)
-    texts = {
-        "space": list("xyz"),
-        "keypoints": [*names],
-        "individuals": ["individual_0"],
-    }
+    texts = {"space": "xyz", "keypoints": names, "individuals": ["individual_0"]}
     file.createDimension("time", n_frames)
     file.createVariable("time", "f8", ("time",))[:] = times
     for name, words in texts.items():

@@ -12,7 +12,7 @@ from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
-from isa_nrsfm.export._names import frames_of_table
+from isa_nrsfm.export._names import frames_of_table, point_places
 from isa_nrsfm.export._upright import (
     Camera,
     UprightSpace,
@@ -282,8 +282,7 @@ def point_numbers(pair: Sequence[Any], names: Sequence[str]) -> tuple[int, int]:
             "expected pairs of points, such as [(62, 66)] for the distance of points "
             f"62 and 66; got {pair!r} instead of a pair"
         )
-    places = {str(j): j for j in range(len(names))}
-    places |= {name: j for j, name in enumerate(names)}
+    places = point_places(names)
     for each in pair:
         if str(each) not in places:
             raise ValueError(

@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.texts import as_utf8, by_number
-from isa_nrsfm.io._keypoints import entries_as_rows, floats_of
+from isa_nrsfm._compat.texts import as_utf8
+from isa_nrsfm.io._keypoints import (
+    entries_as_rows,
+    floats_of,
+    json_files,
+    json_kind,
+    read_json,
+)
 from isa_nrsfm.io._landmarks import (
     Landmarks,
     assemble,
@@ -25,9 +31,6 @@ from isa_nrsfm.io._landmarks import (
 )
 from isa_nrsfm.io._tables import first_lines, header_names, parse_table
 
-_ULTRALYTICS = re.compile(rb'"keypoints"\s*:\s*\{')
-_LABELME = re.compile(rb'"shapes"\s*:')
-_IMGLAB = re.compile(rb"<dataset\b")
 _PLACE = re.compile(r"\s*[-+.\deE]+\s*[\s,]\s*[-+.\deE]+\s*")
 # Fields of a line of YOLO before its points: class and box.
 _N_BOX = 5
@@ -38,16 +41,10 @@ _SIDES = ("left", "top", "width", "height")
 Row = tuple[dict[str, Any], dict[str, NDArray]]
 
 
-def begins_with(path: Path, expression: re.Pattern[bytes]) -> bool:
-    """Return whether an expression is at the beginning of a file."""
-    with path.open("rb") as file:
-        return expression.search(file.read(2**16)) is not None
-
-
 def is_ultralytics(path: Path) -> bool:
     """Return whether keypoints are objects, or a column beside the box."""
     if path.suffix.lower() == ".json":
-        return begins_with(path, _ULTRALYTICS)
+        return json_kind(path) == "ultralytics"
     return {"class", "box", "keypoints"}.issubset(header_names(path))
 
 
@@ -58,7 +55,7 @@ def read_ultralytics(path: Path) -> Landmarks:
     list of such lists has the detections of an image each. A csv has Python's text.
     """
     if path.suffix.lower() == ".json":
-        images = json.loads(path.read_text(encoding="utf-8-sig"))
+        images = read_json(path)
         images = images if all(isinstance(i, list) for i in images) else [images]
     else:
         table = parse_table(path)
@@ -127,7 +124,7 @@ def _share_inside(values: NDArray, n: int, k: int) -> float:
 
 def is_labelme(path: Path) -> bool:
     """Return whether a json file, or one of a folder, has shapes."""
-    return any(begins_with(file, _LABELME) for file in _json_files(path))
+    return bool(json_files(path, "labelme"))
 
 
 def read_labelme(path: Path) -> Landmarks:
@@ -137,9 +134,9 @@ def read_labelme(path: Path) -> Landmarks:
     ``group_id`` the individual. A point without a shape is missing.
     """
     rows: list[Row] = []
-    for file in _json_files(path):
+    for file in json_files(path):
         with reading(file, "labelme"):
-            content = json.loads(file.read_text(encoding="utf-8-sig"))
+            content = read_json(file)
             if not isinstance(shapes := dict(content).get("shapes"), list):
                 raise ValueError("it has no list of shapes")
             points = [s for s in shapes if s.get("shape_type", "point") == "point"]
@@ -151,11 +148,6 @@ def read_labelme(path: Path) -> Landmarks:
                 places = [(str(s["label"]), s["points"][0]) for s in own]
                 rows.append(({"image": image, "individual": group}, _named(places)))
     return _rows_of_names(rows, "labelme")
-
-
-def is_imglab(path: Path) -> bool:
-    """Return whether a file begins as those of dlib's imglab."""
-    return begins_with(path, _IMGLAB)
 
 
 def read_imglab(path: Path) -> Landmarks:
@@ -175,11 +167,6 @@ def read_imglab(path: Path) -> Landmarks:
             ]
             rows.append(({"image": image.get("file"), **sides}, _named(parts)))
     return _rows_of_names(rows, "imglab")
-
-
-def _json_files(path: Path) -> list[Path]:
-    """Return a file, or the json files of a folder in the order of their names."""
-    return sorted(path.glob("[!.]*.json"), key=by_number) if path.is_dir() else [path]
 
 
 def _named(places: Sequence[tuple[Any, Any]]) -> dict[str, NDArray]:

@@ -11,12 +11,6 @@ from isa_nrsfm._compat.stored_arrays import array_in, read_arrays
 from isa_nrsfm.io._animals import content_of, is_hdf5, own_member
 from isa_nrsfm.io._keypoints import floats_of
 from isa_nrsfm.io._landmarks import Landmarks, assemble
-from isa_nrsfm.io._tables import first_lines
-
-
-def is_array(_path: Path) -> bool:
-    """Return True: the format is chosen by its suffix."""
-    return True
 
 
 def read_array(path: Path) -> Landmarks:
@@ -70,11 +64,6 @@ def _arrays_in(path: Path) -> dict[str, NDArray]:
     with h5py.File(path, "r") as file:  # MATLAB 7.3, whose axes are turned round
         names = [name for name in file if hasattr(own_member(file, name), "dtype")]
         return {name: np.asarray(content_of(file, name)).T for name in names}
-
-
-def is_trc(path: Path) -> bool:
-    """Return whether a file begins as TRC files do."""
-    return "".join(first_lines(path, 1)).startswith("PathFileType")
 
 
 def read_trc(path: Path) -> Landmarks:

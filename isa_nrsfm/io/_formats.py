@@ -45,6 +45,9 @@ class LandmarkFormat:
         Module and name of its two functions, such as ``_keypoints.coco``. ``is_coco``
         takes the path and returns whether the file begins like this format.
         ``read_coco`` returns its `Landmarks`, or raises a ValueError without the path.
+    begins : str
+        Regular expression for the beginning of its files, instead of the first of these
+        functions.
     options : sequence of str
         Names of the options that `read` takes.
     """
@@ -55,6 +58,7 @@ class LandmarkFormat:
     suffixes: Sequence[str]
     reader: str = field(repr=False)
     options: Sequence[str] = ()
+    begins: str | None = field(default=None, repr=False)
 
     def matches(self, path: str | os.PathLike[str]) -> bool:
         """
@@ -79,7 +83,10 @@ class LandmarkFormat:
         """
         path = Path(path)
         _check_exists(path)
-        return _suffix(path) in self.suffixes and self._function("is")(path)
+        if _suffix(path) not in self.suffixes or self.begins is None:
+            return _suffix(path) in self.suffixes and self._function("is")(path)
+        with path.open("rb") as file:
+            return re.match(self.begins.encode(), file.read(2**16)) is not None
 
     def _function(self, kind: str) -> Callable[..., Any]:
         """Return the function of the reader that begins with "is" or "read"."""

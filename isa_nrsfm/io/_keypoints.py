@@ -35,17 +35,14 @@ _PLACES = {
     133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
     136: [(0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)],
 }
-_JSON = re.compile(r"(?is)(?!\.).*\.json")
-_NAME = re.compile(r"(?is)(?!\.).*_keypoints\.json")
-# Names of entries by which json of these programs is known; others are of COCO.
-_ENTRY = re.compile(rb'"(\w+)"\s*:')
-_OPENPOSE = frozenset({b"people"})
-_MMPOSE = frozenset(
-    {b"instance_info", b"instances", b"keypoint_scores", b"predictions"}
-)
-# Ultralytics, and labelme.
-_OTHERS = re.compile(rb'"keypoints"\s*:\s*\{|"shapes"\s*:')
-_TPS = re.compile(r"(?i)LM\s*=\s*\d+")
+# What json of programs begins with; that of COCO has none of these.
+_KINDS = {
+    "openpose": rb'"people"\s*:',
+    "mmpose": rb'"(?:instance_info|instances|keypoint_scores|predictions)"\s*:',
+    "ultralytics": rb'"keypoints"\s*:\s*\{',
+    "labelme": rb'"shapes"\s*:',
+    "coco": rb'"\w+"\s*:',
+}
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
@@ -59,20 +56,25 @@ _WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
 _WFLW_LENGTHS = (197, 207)
 
 
-def is_coco(path: Path) -> bool:
-    """Return whether a file begins as a json object or list, of no other format."""
-    names = _entry_names(path)
-    if names is None or names & (_OPENPOSE | _MMPOSE):
-        return False
-    with path.open("rb") as file:
-        return _OTHERS.search(file.read(2**16)) is None
-
-
-def _entry_names(path: Path) -> frozenset[bytes] | None:
-    """Return names of entries at the beginning of a json file; None for other files."""
+def json_kind(path: Path) -> str:
+    """Return the program of a json file by its beginning; empty for other files."""
     with path.open("rb") as file:
         text = file.read(2**16).removeprefix(b"\xef\xbb\xbf").lstrip()
-    return frozenset(_ENTRY.findall(text)) if text[:1] in (b"{", b"[") else None
+    if text[:1] not in (b"{", b"["):
+        return ""
+    return next((kind for kind, e in _KINDS.items() if re.search(e, text)), "none")
+
+
+def json_files(path: Path, *kinds: str) -> list[Path]:
+    """Return a file, or the json files of a folder, of some programs or of any."""
+    files = sorted(path.glob("[!.]*"), key=by_number) if path.is_dir() else [path]
+    files = [file for file in files if file.suffix.lower() == ".json"]
+    return [f for f in files if not kinds or (f.is_file() and json_kind(f) in kinds)]
+
+
+def is_coco(path: Path) -> bool:
+    """Return whether a file begins as a json object or list, of no other format."""
+    return json_kind(path) in ("coco", "none")
 
 
 def read_coco(path: Path, part: str | None = None) -> Landmarks:
@@ -85,7 +87,7 @@ def read_coco(path: Path, part: str | None = None) -> Landmarks:
     without any has one without points, in the order of the numbers in their names.
     ``part`` is a part of whole bodies.
     """
-    content = _read_json(path)
+    content = read_json(path)
     if isinstance(content, list):
         entries = _results(content)
         return entries_as_rows(entries, None, part, "coco", "result")
@@ -124,7 +126,7 @@ def entries_as_rows(
     )
 
 
-def _read_json(path: Path) -> Any:
+def read_json(path: Path) -> Any:
     """Return the content of a json file, or raise a ValueError."""
     try:
         with path.open(encoding="utf-8-sig") as file:
@@ -389,37 +391,16 @@ def _each_file(
     return [file.name for file in files], contents
 
 
-def _files_of(
-    path: Path,
-    names: re.Pattern[str],
-    entries: frozenset[bytes] = frozenset(),
-    empty: bool = False,
-) -> list[Path]:
-    """Return a file, or those of a folder, that have such a name and any such entries.
-
-    `empty`: also those without entries.
-    """
-    files = sorted(path.iterdir(), key=by_number) if path.is_dir() else [path]
-    files = [file for file in files if names.fullmatch(file.name)]
-    if not entries:
-        return files
-    found = [(file, _entry_names(file)) for file in files if file.is_file()]
-    return [
-        file
-        for file, has in found
-        if has is not None and (has & entries or (empty and not has))
-    ]
-
-
 def _openpose_files(path: Path) -> list[Path]:
     """Return the files of OpenPose in a folder, by their names or entries."""
-    named = _files_of(path, _NAME) if path.is_dir() else []
-    return named or _files_of(path, _JSON, _OPENPOSE)
+    files = json_files(path) if path.is_dir() else []
+    named = [file for file in files if file.stem.lower().endswith("_keypoints")]
+    return named or json_files(path, "openpose")
 
 
 def _people_in(file: Path) -> list[dict[str, Any]]:
     """Return the visible parts (n_points, 3) of each person in a file, and its id."""
-    content = _read_json(file)
+    content = read_json(file)
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list) or not all(isinstance(p, dict) for p in people):
         raise ValueError("expected an object with a list of objects called people")
@@ -437,7 +418,7 @@ def _people_in(file: Path) -> list[dict[str, Any]]:
 
 def is_mmpose(path: Path) -> bool:
     """Return whether a file, or one of a folder, begins as predictions of MMPose."""
-    return bool(_files_of(path, _JSON, _MMPOSE))
+    return bool(json_files(path, "mmpose"))
 
 
 def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
@@ -449,15 +430,15 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     part of whole bodies. An image without instances has one row without points.
     """
     # An image without instances has an empty list.
-    files, absent = _files_of(path, _JSON, _MMPOSE, True), "no file of it is of MMPose"
-    _, contents = _each_file(path, files, absent, _instances_in)
+    files = json_files(path, "mmpose", "none")
+    _, contents = _each_file(path, files, "no file is of MMPose", _instances_in)
     entries = [entry for found in contents for entry in found]
     return entries_as_rows(entries, None, part, "mmpose", "instance")
 
 
 def _instances_in(file: Path) -> list[dict[str, Any]]:
     """Return the instances in a file as those of COCO; one without points if none."""
-    content = _read_json(file)
+    content = read_json(file)
     if isinstance(content, dict):
         content = content.get("instance_info", content.get("predictions"))
     if not isinstance(content, list):
@@ -485,11 +466,6 @@ def _instances_in(file: Path) -> list[dict[str, Any]]:
     return entries
 
 
-def is_pts(path: Path) -> bool:
-    """Return whether a file begins as .pts files do."""
-    return "".join(first_lines(path, 1)).lstrip().startswith("version")
-
-
 def read_pts(path: Path) -> Landmarks:
     """Read a .pts file, with the points of one image.
 
@@ -498,11 +474,6 @@ def read_pts(path: Path) -> Landmarks:
     """
     frames = {"file": [as_utf8(path.name)]}
     return assemble(_points_of(path)[None], None, frames, format="pts")
-
-
-def is_tps(path: Path) -> bool:
-    """Return whether a file begins with a number of landmarks."""
-    return _TPS.match("".join(first_lines(path, 1)).strip()) is not None
 
 
 def read_tps(path: Path) -> Landmarks:

@@ -429,10 +429,8 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
     whole = regular_expression(example.split(",")[0])
     inside = [p for p in candidates if "#" in p and whole.fullmatch(p.split(",")[0])]
     # Numbered points beside few others, such as their centroid
-    if (
-        inside
-        and 0 < candidates[example] - sum(candidates[p] for p in inside) < MIN_POINTS
-    ):
+    beside = candidates[example] - sum(candidates[pattern] for pattern in inside)
+    if inside and 0 < beside < MIN_POINTS:
         example = max(inside, key=lambda pattern: candidates[pattern])
     for pattern, n_points in candidates.items():
         x = list(_columns_matching(names, pattern.split(",")[0]).values())

@@ -178,14 +178,8 @@ def _points_apart(
             f"a frame has several rows for the point {texts[twice].iloc[0]!r}: name "
             "all columns that tell frames apart in row_per_point (--row-per-point)"
         )
-    parts: dict[str, Any] = {}
-    for axis, name in values.items():
-        numbers = pd.to_numeric(frame[name], errors="coerce")
-        are_numbers = numbers.notna().equals(frame[name].notna())
-        shape, dtype = (row.max() + 1, len(labels)), float if are_numbers else object
-        wide = np.full(shape, np.nan, dtype)
-        wide[row, point] = numbers if are_numbers else frame[name]
-        parts |= zip(_names(labels, [axis]), wide.T, strict=True)
+    wide = frame.set_index([row, point])[[*values.values()]].unstack()
+    wide = wide.set_axis([n for a in values for n in _names(labels, [a])], axis=1)
     first = np.unique(row, return_index=True)[1]
     others = [name for name in frame if name not in {*values.values(), *by_point}]
     codes = {name: pd.factorize(frame[name])[0] for name in others}
@@ -202,7 +196,7 @@ def _points_apart(
         )
     kept = frame[of_frame].iloc[first].reset_index(drop=True)
     points = _names(labels, "xy") if len(by_point) < 2 else None
-    return pd.concat([kept, pd.DataFrame(parts)], axis=1), points
+    return pd.concat([kept, wide], axis=1), points
 
 
 def _names(labels: Iterable[Any], axes: Iterable[str]) -> list[str]:

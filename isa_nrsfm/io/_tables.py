@@ -295,11 +295,6 @@ def tracks_in(
     return tracks
 
 
-def is_named_columns(_path: Path) -> bool:
-    """Return True: the format is chosen by its suffix."""
-    return True
-
-
 def read_named_columns(
     path: Path,
     columns: str | None = None,
@@ -341,9 +336,8 @@ def confidences_in(
             raise ValueError(
                 f"{names[0]}, ... are no confidences: they are not all from 0 to 1"
             )
-        if (
-            names and len(known) and not known.any()
-        ):  # as MediaPipe writes for faces and hands
+        # MediaPipe writes zeros for faces and hands.
+        if names and len(known) and not known.any():
             raise ValueError(f"{names[0]}, ... are no confidences: they are all 0")
         return values
     except ValueError:
