@@ -289,7 +289,7 @@ def articulated(n_frames=80, noise=1e-4, seed=0, n_points=6):
     return tracks.reshape(n_frames, -1), shapes
 
 
-X, SHAPES = articulated(n_points=4)
+X, SHAPES = articulated(60, n_points=4)
 
 
 def consensus_fit(table=X, n_components=8, kind=AffineNRSfM, **parameters):

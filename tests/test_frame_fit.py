@@ -447,9 +447,9 @@ class TestTurnedFaces:
         _, error = error_of_depths(model, X, points)
         assert error / 3 < model.depth_uncertainty_ < 3 * error
 
-    @pytest.mark.parametrize("missing", slow_after(1, [0.2, 0.0]))
+    @pytest.mark.parametrize("missing", slow_after(1, [0.0, 0.2]))
     def test_deviations_of_depths_are_the_errors(self, missing):
-        X, points, _ = faces_turned_by(20, missing=missing)
+        X, points, _ = faces_turned_by(20, n_frames=80, missing=missing)
         model = fitted(X)
         shapes, deviation = model.reconstruct(X, return_std=True)
         assert_allclose(shapes, model.reconstruct(X))
@@ -520,7 +520,7 @@ def test_uncertainty_of_a_consensus_has_the_share_of_deformation():
 
 
 def test_depth_of_an_animal_seen_from_the_side_is_withheld():
-    X, points = animal_seen_from_the_side()
+    X, points = animal_seen_from_the_side(n_frames=80)
     model = AffineNRSfM(4, camera="weak_perspective", random_state=0)
     with pytest.warns(UserWarning, match="deformation explains the images as well"):
         model.fit(X)
