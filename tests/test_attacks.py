@@ -30,7 +30,7 @@ MODELS = {
     "affine": (AffineNRSfM(1, random_state=0), X),
     "holes": (AffineNRSfM(1, **WEAK), (HOLES * X.reshape(40, 12, 2)).reshape(40, -1)),
     "paper": (AffineNRSfM(1, refinement=None, random_state=0), X),
-    "cauchy": (AffineNRSfM("auto", loss="cauchy", **WEAK), X),
+    "cauchy": (AffineNRSfM(1, loss="cauchy", **WEAK), X),
     "cv": (AffineNRSfMCV([1], cv=2), X),
     "low rank": (PseudoInverseNRSfM(1), X),
     "blocks": (BlockMatrixNRSfM(1), X),
@@ -183,11 +183,8 @@ def test_labels_of_h5_files_are_texts(labels, tmp_path):
         refused(message, read_landmarks, path)
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["\x1b]0;a\x07", "\x1b[2J", "\x9b2J", "\x08\x7f", "\u202egpj.exe", "\u2028"],
-)
-def test_control_characters_reach_neither_terminal_nor_report(text, tmp_path, capsys):
+def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
+    text = "\x1b]0;a\x07\x1b[2J\x9b2J\x08\x7f\u202egpj.exe\u2028"
     frame = pd.DataFrame(np.round(X[:16] * 100 + 300, 2))
     frame.columns = [f"{axis}_{j}" for j in range(12) for axis in "xy"]
     frame = frame.assign(**{f"{text}note": "a", "who": [f"{text}a", f"{text}b"] * 8})

@@ -6,7 +6,6 @@ from functools import cache, partial
 import numpy as np
 import pandas as pd
 import pytest
-from estimator_contract import EXTRA_CHECKS, assert_only_narrow_tables_fail
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
@@ -79,18 +78,6 @@ class TestContract:
     )
     def test_on_landmark_tables(self, estimator, check, landmark_tables):
         check(estimator)
-
-    @deterministic
-    def test_raw(self, method):
-        assert_only_narrow_tables_fail(METHODS[method](1))
-
-    @pytest.mark.filterwarnings("ignore:layout=:UserWarning", "ignore:X (does|has)")
-    @pytest.mark.parametrize(
-        "name", [n for n in EXTRA_CHECKS if "global" not in n and "polars" not in n]
-    )
-    def test_extra_checks_on_landmark_tables(self, name, landmark_tables):
-        model = PseudoInverseNRSfM(1)
-        getattr(estimator_checks, name)(type(model).__name__, model)
 
     @each
     def test_parameters(self, method, landmark_tables):

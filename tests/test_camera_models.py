@@ -15,11 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
-    AffineCameras,
     full_rotations,
     mean_view,
     nearest_calibrated,
-    reference_camera,
     rotated,
 )
 from isa_nrsfm._frames.newton import (
@@ -123,15 +121,6 @@ class TestInverseCurvature:
             assert_allclose(found, found.T, rtol=1e-12)
             assert_allclose(found, np.linalg.inv(expected[i]), rtol=1e-5, atol=1e-8)
 
-    def test_product_by_loops(self, name):
-        M, (_, packed) = random_cameras(name=name), random_curvatures()
-        cameras = CAMERAS[name]
-        inverse = cameras.inverse_curvature(M, packed)
-        vector = np.random.default_rng(2).normal(size=(cameras.n_parameters, N))
-        got = cameras.product(inverse, vector)
-        for i in range(N):
-            assert_allclose(got[:, i], inverse[..., i] @ vector[:, i], rtol=1e-12)
-
     @pytest.mark.parametrize("rank", [0, 1, 2])
     def test_shapes_that_are_flat(self, name, rank):
         factors = np.random.default_rng(1).normal(size=(N, 3, rank))
@@ -149,49 +138,6 @@ class TestInverseCurvature:
         M, cameras = np.zeros((2, 3, N)), CAMERAS[name]
         inverse = cameras.inverse_curvature(M, random_curvatures()[1])
         assert np.isfinite(inverse).all()
-
-
-class TestLargestLength:
-    @CALIBRATED
-    def test_no_camera_turns_by_more_than_a_radian(self, name):
-        cameras = CAMERAS[name]
-        step = np.random.default_rng(2).normal(size=(cameras.n_parameters, N))
-        turned = cameras.largest_length(step) * np.linalg.norm(step[:3], axis=0)
-        assert turned.max() == pytest.approx(1.0)
-
-    @CALIBRATED
-    def test_scales_count_by_their_logarithm(self, name):
-        cameras = CAMERAS[name]
-        step = np.zeros((cameras.n_parameters, N))
-        step[3:] = 100.0
-        expected = 0.01 if cameras.scaled else np.inf
-        assert cameras.largest_length(step) == pytest.approx(expected)
-
-    @CALIBRATED
-    def test_limited_steps_are_shortened_one_by_one(self, name):
-        cameras = CAMERAS[name]
-        rng = np.random.default_rng(0)
-        step = rng.normal(size=(cameras.n_parameters, N)) * np.linspace(0.1, 3, N)
-        for before, after in zip(step.T, cameras.limited(step).T, strict=True):
-            size = np.linalg.norm(before[:3])
-            if cameras.scaled:
-                size = max(size, abs(before[3]))
-            assert_allclose(after, before / max(size, 1.0))
-
-    def test_other_cameras_have_none(self):
-        assert AffineCameras().largest_length(np.full((6, N), 1e9)) == np.inf
-        assert AffineCameras(held=True).largest_length(np.zeros((0, N))) == np.inf
-
-
-def test_held_cameras_stay():
-    M, cameras = random_cameras(), AffineCameras(held=True)
-    assert (cameras.name, cameras.n_parameters) == ("held", 0)
-    nothing = cameras.gradient(M, np.ones_like(M))
-    assert nothing.shape == (0, N)
-    assert cameras.tangents(M).shape == (0, 2, 3, N)
-    inverse = cameras.inverse_curvature(M, random_curvatures()[1])
-    assert cameras.product(inverse, nothing).shape == (0, N)
-    assert_array_equal(cameras.moved(M, nothing), M)
 
 
 class TestNearestCalibrated:
@@ -242,21 +188,6 @@ class TestFullRotations:
 
 
 class TestMeanView:
-    def test_is_the_mean(self, rng):
-        motion = np.eye(2, 3) + 0.1 * rng.normal(size=(20, 2, 3))
-        assert_allclose(mean_view(motion), motion.mean(axis=0))
-
-    def test_uniform_rotations_have_none(self):
-        motion = np.array([random_rotation(seed)[:2] for seed in range(400)])
-        assert mean_view(motion) is None
-
-    def test_in_plane_rotations_have_none(self):
-        angle = np.arange(8) * np.pi / 4
-        motion = np.zeros((8, 2, 3))
-        motion[:, 0, 0] = motion[:, 1, 1] = np.cos(angle)
-        motion[:, 0, 1], motion[:, 1, 0] = -np.sin(angle), np.sin(angle)
-        assert mean_view(motion) is None
-
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_where_the_limit_is(self, unit):
         # Mirrored y in a share p of the frames: the mean of y is 1 - 2 p.
@@ -270,30 +201,6 @@ class TestMeanView:
         R, Q = random_rotation(1), random_rotation(2, 2)
         view = mean_view(motion)
         assert_allclose(mean_view(Q @ motion @ R), Q @ view @ R, atol=1e-14)
-
-
-class TestReferenceCamera:
-    def test_common_view(self, rng):
-        motion = np.eye(2, 3) + 0.1 * rng.normal(size=(20, 2, 3))
-        sizes = rng.uniform(1, 3, 20)
-        expected = motion.mean(axis=0) * np.sqrt(np.mean(sizes**2))
-        assert_allclose(reference_camera(motion, sizes), expected)
-
-    def test_no_common_view(self):
-        motion = np.array([random_rotation(seed)[:2] for seed in range(400)])
-        motion = motion * [3.0, 2.0, 1.0]
-        camera = reference_camera(motion, np.full(400, 5.0))
-        # The image of a unit vector along an axis has the mean square length 2/3.
-        expected = 5 * np.sqrt(2 / 3) * np.array([[3.0, 0, 0], [0, 2.0, 0]])
-        assert_allclose(camera, expected, rtol=0.1, atol=1e-12)
-
-    def test_sizes_are_those_of_the_table(self):
-        # Cameras divided by the size of their frame, sizes given apart: the view of
-        # a table in other units is the same view in other units.
-        motion = np.array([random_rotation(seed)[:2] for seed in range(50)])
-        sizes = np.random.default_rng(0).uniform(1, 3, 50)
-        camera = reference_camera(motion, sizes)
-        assert_allclose(reference_camera(motion, 1e9 * sizes), 1e9 * camera)
 
 
 NOISE = 0.02

@@ -58,12 +58,6 @@ def documented_names():
     return sorted(set(names))
 
 
-def source_files():
-    """Return the paths of the modules, relative to the root."""
-    files = sorted(PACKAGE.rglob("*.py"))
-    return [str(file.relative_to(ROOT)) for file in files]
-
-
 def run(*command):
     """Return the exit status and the output of a command at the root."""
     done = subprocess.run(
@@ -105,44 +99,59 @@ def test_docstrings_are_complete(name):
     assert errors == []
 
 
-@pytest.mark.parametrize("file", source_files())
-def test_functions_have_docstrings(file):
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    assert ast.get_docstring(tree), "the module has no docstring"
-    inner = {
-        id(child)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef)
-        for child in ast.walk(node)
-        if child is not node and isinstance(child, ast.FunctionDef)
-    }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ClassDef):
-            assert ast.get_docstring(node), node.name
-        if not isinstance(node, ast.FunctionDef):
+def undocumented(tree):
+    """Return what has no docstring, or "the module"."""
+    if not ast.get_docstring(tree):
+        yield "the module"
+    inner = set()
+    for node in ast.walk(tree):  # breadth first: outer functions come before inner ones
+        if isinstance(node, ast.FunctionDef):
+            inner |= {id(child) for child in ast.walk(node) if child is not node}
+            exempt = (
+                node.name in ("__init__", "__call__")
+                or node.name == "_unmix"  # documented where it is declared
+                or id(node) in inner
+                or any(ast.unparse(d) == "overload" for d in node.decorator_list)
+            )
+        elif isinstance(node, ast.ClassDef):
+            exempt = False
+        else:
             continue
-        where = f"{file}:{node.lineno} {node.name}"
-        exempt = (
-            node.name in ("__init__", "__call__")
-            or node.name == "_unmix"  # documented where it is declared
-            or id(node) in inner
-            or any(ast.unparse(d) == "overload" for d in node.decorator_list)
-        )
-        assert exempt or ast.get_docstring(node), where
+        if not exempt and not ast.get_docstring(node):
+            yield f"{node.lineno} {node.name}"
 
 
-@pytest.mark.parametrize("file", source_files())
-def test_modules_keep_no_state(file):
-    # The names that a module assigns are constants and types, and no function
-    # assigns them anew.
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    assert not [node for node in ast.walk(tree) if isinstance(node, ast.Global)]
+def state_of(tree):
+    """Return names of a module that are neither constants nor types."""
+    yield from (node for node in ast.walk(tree) if isinstance(node, ast.Global))
     for node in tree.body:
         for target in node.targets if isinstance(node, ast.Assign) else ():
             for name in ast.walk(target):
-                if isinstance(name, ast.Name):
-                    is_dunder = name.id.startswith("__")
-                    assert is_dunder or name.id.strip("_")[0].isupper(), name.id
+                if isinstance(name, ast.Name) and not name.id.startswith("__"):
+                    if not name.id.strip("_")[0].isupper():
+                        yield name.id
+
+
+def private_imports(tree):
+    """Return private names that are taken of other modules."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
+            "isa_nrsfm"
+        ):
+            folder = ROOT / str(node.module).replace(".", "/")
+            names = {a.name for a in node.names if a.name.startswith("_")}
+            modules = {name for name in names if (folder / f"{name}.py").is_file()}
+            yield from names - modules - {"__version__"}
+
+
+@pytest.mark.parametrize("faults_of", [undocumented, state_of, private_imports])
+def test_modules_have_docstrings_no_state_and_public_names_of_each_other(faults_of):
+    faults = {
+        (str(file.relative_to(ROOT)), str(fault))
+        for file in PACKAGE.rglob("*.py")
+        for fault in faults_of(ast.parse(file.read_text(encoding="utf-8")))
+    }
+    assert faults == set()
 
 
 @pytest.mark.subprocess
@@ -158,31 +167,23 @@ def test_every_module_can_be_imported_without_optional_libraries():
     assert status == 0, output
 
 
-@pytest.mark.parametrize("file", source_files())
-def test_modules_take_public_names_of_each_other(file):
-    for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
-            "isa_nrsfm"
-        ):
-            folder = ROOT / str(node.module).replace(".", "/")
-            names = {a.name for a in node.names if a.name.startswith("_")}
-            modules = {name for name in names if (folder / f"{name}.py").is_file()}
-            assert names - modules <= {"__version__"}, names
-
-
 def test_the_top_of_the_package_is_short():
     assert len(list(PACKAGE.glob("*.py"))) <= 10
 
 
-@pytest.mark.parametrize("file", source_files())
-def test_no_module_is_long(file):
-    assert len((ROOT / file).read_text(encoding="utf-8").splitlines()) <= 1200
+def test_no_module_is_long():
+    lengths = {
+        file.name: len(file.read_text(encoding="utf-8").splitlines())
+        for file in PACKAGE.rglob("*.py")
+    }
+    assert {name for name, length in lengths.items() if length > 1200} == set()
 
 
-@pytest.mark.parametrize("file", sorted(TESTS.glob("*.py")), ids=lambda path: path.name)
-def test_tests_patch_no_constant_and_import_no_other_test(file):
-    code = file.read_text(encoding="utf-8")
-    # Limits are arguments: no constant, a name in capitals, is patched.
-    patched = r"(\.setattr|mock\.patch[.\w]*)\([^)]*\b_?[A-Z][A-Z0-9_]+\""
-    assert not re.search(patched, code)
-    assert not re.search(r"^\s*(from|import) (tests\.)?test_", code, re.MULTILINE)
+def test_tests_patch_no_constant_and_import_no_other_test():
+    for file in TESTS.glob("*.py"):
+        code = file.read_text(encoding="utf-8")
+        # Limits are arguments: no constant, a name in capitals, is patched.
+        patched = r"(\.setattr|mock\.patch[.\w]*)\([^)]*\b_?[A-Z][A-Z0-9_]+\""
+        assert not re.search(patched, code), file
+        imported = r"^\s*(from|import) (tests\.)?test_"
+        assert not re.search(imported, code, re.MULTILINE), file

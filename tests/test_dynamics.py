@@ -272,14 +272,14 @@ def waving():
 
 class TestSmooth:
     def test_cameras_are_smoothed(self):
-        rng, t = np.random.default_rng(0), np.arange(150)
-        shapes = waving_scene(150, 20, [0.1, 0.07])[0].shapes
+        rng, t = np.random.default_rng(0), np.arange(100)
+        shapes = waving_scene(100, 20, [0.1, 0.07])[0].shapes
         turns = np.stack([0.3 * np.sin(0.1 * t), 0.05 * t, 0.2 * np.cos(0.05 * t)], 1)
         R = Rotation.from_rotvec(turns).as_matrix()
         truth = shapes @ R.transpose(0, 2, 1)
-        tracks = truth[..., :2] + 0.1 * truth.std() * rng.normal(size=(150, 20, 2))
+        tracks = truth[..., :2] + 0.1 * truth.std() * rng.normal(size=(100, 20, 2))
         options = {"camera": "orthographic", "scale_frames": False, "random_state": 0}
-        model = AffineNRSfM(2, **options).fit(tracks.reshape(150, -1))
+        model = AffineNRSfM(2, **options).fit(tracks.reshape(100, -1))
 
         def error(fit):
             turned, _ = full_rotations(fit.motion)
@@ -288,7 +288,7 @@ class TestSmooth:
                 mean_shape_error_3d(truth, seen * [1, 1, sign]) for sign in (1, -1)
             )
 
-        table = tracks.reshape(150, -1)
+        table = tracks.reshape(100, -1)
         smooth = model.smooth(table).decomposition
         assert error(smooth) < 0.7 * error(model.decompose(table))
 

@@ -1,8 +1,6 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
-from dataclasses import dataclass, field
-from functools import cache, partial
-from types import SimpleNamespace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +14,7 @@ from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, _line_search, refine_joint
+from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, refine_joint
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpack3
 
 DEVIATION = 0.03
@@ -303,75 +301,6 @@ class TestLeastNoise:
             == result.state.noise
             > end.residual / likelihood.frames.totals[0]
         )
-
-    def test_misfit_is_the_noise_or_the_mean_square_residual(self):
-        scene = random_scene()
-        result = refined(scene)
-        rest = scene.tracks.swapaxes(1, 2) - images(scene, result)
-        largest = max(np.mean(rest**2), result.state.noise)
-        assert result.misfit == pytest.approx(largest)
-
-
-def test_search_starts_at_the_floor_where_the_start_has_no_noise():
-    scene, start = scene_and_start()
-    start = start._replace(noise=0.0)
-    state = refined(scene, start, max_iter=0).state
-    assert state.noise == pytest.approx(NOISE_FLOOR * np.mean(scene.tracks**2))
-
-
-@dataclass(frozen=True)
-class Parabola:
-    """An iterate on the line ``a t^2 / 2 - t``, whose noise has the floor 1/2."""
-
-    a: float
-    state: SimpleNamespace = field(
-        default_factory=lambda: SimpleNamespace(t=0.0, noise=1.0)
-    )
-    gradient = np.array([-1.0, 0.0])
-    cameras = SimpleNamespace(largest_length=lambda step: np.inf)
-
-    @property
-    def value(self):
-        return self.a * self.state.t**2 / 2 - self.state.t
-
-    def split(self, step):
-        return None, step[:1], step[1]
-
-    def moved(self, step):
-        return SimpleNamespace(t=step[0], noise=max(np.exp(step[1]), 0.5))
-
-
-def searched(a, direction):
-    return _line_search(Parabola(a), direction, partial(Parabola, a))
-
-
-class TestLineSearch:
-    @pytest.mark.parametrize(
-        ("a", "expected"),
-        [(1.0, 1.0), (1.99, 1.0), (2.0, 0.5), (4.0, 0.25), (40, 1 / 40)],
-    )
-    def test_takes_the_whole_step_or_the_minimum_of_the_parabola(self, a, expected):
-        reached, step = searched(a, np.array([1.0, 0.0]))
-        assert reached.state.t == pytest.approx(expected)
-        assert_allclose(step, [expected, 0.0])
-
-    def test_noise_changes_by_a_limited_factor_and_not_below_its_floor(self):
-        reached, step = searched(0.5, np.array([1.0, -3.0]))
-        assert reached.state.t == pytest.approx(0.5)
-        assert_allclose(step, [0.5, np.log(0.5)])
-
-    def test_no_step_where_the_objective_rises(self):
-        direction = np.array([-1.0, 0.0])
-        reached, step = searched(1.0, direction)
-        assert reached is None
-        assert step is direction
-
-    @pytest.mark.parametrize(("noise", "most"), [(0.0, 2.5), (DEVIATION, 1.5)])
-    def test_mostly_takes_the_first_step(self, noise, most):
-        scene, start = scene_and_start(noise=noise)
-        likelihood = counted(scene)
-        result = refine_joint(likelihood, start, AFFINE, max_iter=1000, tol=1e-6)
-        assert likelihood.n_calls < most * len(result.history)
 
 
 class TestDegenerate:

@@ -392,6 +392,9 @@ class TestCommandLine:
             assert_allclose(cameras[name], getattr(poses, name), atol=1e-6)
         table = pd.read_csv(tmp_path / "out" / "alpha.csv")
         assert_allclose(table[["alpha_1", "alpha_2"]], model.alpha_, atol=1e-6)
+        report = json.loads((tmp_path / "out" / "report.json").read_text())["model"]
+        expected = -model.score(X, **weights)
+        assert report["held_out_error"] == pytest.approx(expected, rel=1e-4)
         smooth = model.smooth(X, time=np.arange(N_FRAMES) / 25, **weights)
         assert_allclose(table["alpha_1_smooth"], smooth.alpha[:, 0], atol=1e-6)
         assert_allclose(frame_poses(model).yaw, poses.yaw, atol=1e-6)
@@ -409,3 +412,8 @@ class TestCommandLine:
         pd.DataFrame(noisy().X, columns=names).to_csv(table, index=False)
         message = fails("fit", table, *options, "-k", "2")
         assert "has no confidences of all points. Their columns need" in message
+        frame = pd.DataFrame(noisy().X, columns=names)
+        scores = {f"c_{j}": "good" if j == 3 else 1.0 for j in range(N_POINTS)}
+        frame.assign(**scores).to_csv(table, index=False)
+        message = fails("fit", table, *options, "-k", "2")
+        assert "column 'c_3' should hold numbers, but in row 0" in message

@@ -1,7 +1,5 @@
 """Tables made ready for a fit: blocks, robust scales, gross outliers, completion."""
 
-import threading
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -13,11 +11,8 @@ from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare import robust
 from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._prepare.robust import (
-    DISTANT,
     TUNING,
     WEIGHTS,
-    distant_points,
-    frame_weights,
     median_noise,
     robust_sizes,
     robustly_centred,
@@ -67,24 +62,6 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
     assert calls == [10, 10, 3] * 3
 
 
-@pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
-def test_small_blocks_are_regrouped(array, n_frames, lengths):
-    larger = FrameBlocks.of_array(array, 3).regrouped(np.concatenate, n_frames)
-    assert larger.lengths == lengths
-    assert_array_equal(larger.whole(), array)
-
-
-@pytest.mark.parametrize(
-    ("n_threads", "length", "others"), [(3, 5, True), (1, 5, False), (3, 23, False)]
-)
-@pytest.mark.parametrize("make", [FrameBlocks.of_array, stored])
-def test_threads_are_used_for_several_blocks(array, make, n_threads, length, others):
-    blocks = make(array, length, n_threads=n_threads).derive(lambda block: block)
-    for each in (blocks, blocks.subset(np.full(N_FRAMES, True))):
-        threads = set(each.map(lambda block: threading.get_ident()))
-        assert (threading.get_ident() not in threads) == others
-
-
 def test_an_error_in_a_thread_is_raised_and_no_further_block_is_begun(array):
     begun = []
 
@@ -95,15 +72,6 @@ def test_an_error_in_a_thread_is_raised_and_no_further_block_is_begun(array):
     with pytest.raises(ValueError, match="no good"):
         list(FrameBlocks.of_array(array, 2, n_threads=2).map(fail))
     assert len(begun) <= 3
-
-
-def test_threads_have_few_results_ahead(array):
-    begun = []
-    found = FrameBlocks.of_array(array, 2, n_threads=2).map(begun.append)
-    for number in range(1, 6):
-        next(found)
-        assert len(begun) <= number + 2
-    found.close()
 
 
 # --- robust losses: weights, scales that outliers hardly change, gross outliers -------
@@ -135,12 +103,6 @@ def efficiency(weight):
     return slope**2 / (normal_mean(lambda r: (weight(r) * r) ** 2) / 2)
 
 
-def turned(rows, angle):
-    """Return each image (2, n_points) turned by its angle."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s], [s, c]]).transpose(2, 0, 1) @ rows
-
-
 def random_rows():
     """Return rows of different sizes, one of them with missing points."""
     rng = np.random.default_rng(0)
@@ -150,14 +112,6 @@ def random_rows():
 
 
 class TestWeights:
-    @pytest.mark.parametrize("loss", LOSSES)
-    def test_fall_from_one(self, loss):
-        weights = WEIGHTS[loss](np.linspace(0, 30, 400))
-        assert weights[0] == 1.0
-        assert (np.diff(weights) <= 0).all()
-        assert (weights > 0).all()
-        assert (weights[-1] < 0.1) == (loss != "linear")
-
     def test_are_the_slope_of_the_loss_over_the_distance(self):
         # rho'(r) / r for rho = r^2 / 2, then c r - c^2 / 2; and c^2/2 log(1 + (r/c)^2).
         c = TUNING["huber"]
@@ -171,19 +125,6 @@ class TestWeights:
     @pytest.mark.parametrize("loss", ROBUST)
     def test_have_95_percent_of_the_efficiency_of_least_squares(self, loss):
         assert efficiency(WEIGHTS[loss]) == pytest.approx(0.95, abs=1e-4)
-
-
-class TestFrameWeights:
-    def test_each_loss_has_weights(self):
-        assert tuple(WEIGHTS) == LOSSES
-
-    @pytest.mark.parametrize("loss", ROBUST)
-    def test_points_that_do_not_belong_to_their_frame_have_none(self, loss):
-        distance = [[0.0, 3.0, 11.9, 12.1, np.inf], [0.0, 3.0, 5.9, 6.1, 1e200]]
-        distance = np.array(distance)
-        weights = frame_weights(loss, distance, 0.5, np.array([2.0, 1.0]))
-        expected = WEIGHTS[loss](distance[:, :3] / 0.5)
-        assert_array_equal(weights, np.pad(expected, ((0, 0), (0, 2))))
 
 
 def test_median_noise_of_normal_noise_is_its_deviation():
@@ -203,12 +144,6 @@ class TestSpatialMedian:
 
             assert cost(middle) < 1.001 * minimize(cost, middle).fun
             assert cost(middle) < cost(np.nanmean(frame, axis=1))
-
-    def test_moves_and_turns_with_the_image(self):
-        rows, angle = random_rows(), np.linspace(0, np.pi, 20)
-        expected = turned(10 * spatial_median(rows)[..., None], angle)[..., 0] + 3.0
-        got = spatial_median(turned(10 * rows, angle) + 3.0)
-        assert_allclose(got, expected, atol=1e-9)
 
     @pytest.mark.parametrize(("n_points", "far"), [(5, 2e153), (31, 1e9)])
     def test_a_point_at_any_distance_costs_no_digits_of_the_others(self, n_points, far):
@@ -234,24 +169,6 @@ class TestSpatialMedian:
         centred, middle = robustly_centred(rows)
         assert_array_equal(middle, places)
         assert_allclose(robust_sizes(centred), np.sqrt(1 / 68 / 2))
-
-
-def test_sizes_by_definition():
-    rows, _ = robustly_centred(random_rows())
-    for frame, size in zip(rows, robust_sizes(rows), strict=True):
-        square = np.sum(frame[:, np.isfinite(frame[0])] ** 2, axis=0)
-        assert size == pytest.approx(np.sqrt(np.median(square) / 2))
-
-
-def test_distant_points_by_definition(rng):
-    rows = rng.normal(size=(10, 2, 15))
-    rows[3, :, :4] = np.nan
-    expected = np.isnan(rows[:, 0])
-    expected[5, 2] = expected[6, 3] = True
-    rows[5, :, 2] += 8 * DISTANT
-    rows[6, 1, 3] -= 8 * DISTANT
-    for moved in rows, 0.1 * rows + 5.0:
-        assert_array_equal(distant_points(robustly_centred(moved)[0]), expected)
 
 
 LARGEST_SHARE = 0.4  # of the points of a frame that may be outliers
@@ -331,15 +248,6 @@ class TestGrossOutliers:
         assert not found[4].any()
         assert found[9, :some].mean() > 0.8
         assert found[9, some:].mean() < 0.1
-
-    def test_place_unit_and_order(self):
-        tracks, _ = spoilt(rigid_tracks(), 2.0)
-        rng = np.random.default_rng(2)
-        frames, points = (rng.permutation(n) for n in tracks.shape[:2])
-        expected = gross_outliers(tracks)
-        moved = 10 * tracks + rng.normal(size=(len(tracks), 1, 2))
-        got = gross_outliers(moved[frames][:, points])
-        assert_array_equal(got, expected[frames][:, points])
 
 
 # --- completion by a low-rank model --------------------------------------------------
