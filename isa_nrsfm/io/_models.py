@@ -230,7 +230,6 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     if "focal_length_" in values:
         values["focal_length_"] = np.ravel(values["focal_length_"])
     _check_shapes(values)
-    basis = estimator.basis_
     estimator._model = TableModel(
         _frame_model(entries),
         estimator.mean_shape_,
