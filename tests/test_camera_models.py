@@ -140,6 +140,23 @@ class TestInverseCurvature:
         assert np.isfinite(inverse).all()
 
 
+class TestLargestLength:
+    @CALIBRATED
+    def test_no_camera_turns_by_more_than_a_radian(self, name):
+        cameras = CAMERAS[name]
+        step = np.random.default_rng(2).normal(size=(cameras.n_parameters, N))
+        turned = cameras.largest_length(step) * np.linalg.norm(step[:3], axis=0)
+        assert turned.max() == pytest.approx(1.0)
+
+    @CALIBRATED
+    def test_scales_count_by_their_logarithm(self, name):
+        cameras = CAMERAS[name]
+        step = np.zeros((cameras.n_parameters, N))
+        step[3:] = 100.0
+        expected = 0.01 if cameras.scaled else np.inf
+        assert cameras.largest_length(step) == pytest.approx(expected)
+
+
 class TestNearestCalibrated:
     def test_is_nearest(self):
         rng = np.random.default_rng(0)

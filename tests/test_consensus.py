@@ -16,11 +16,17 @@ from isa_nrsfm._joint.common_depths import (
     common_coordinates,
 )
 from isa_nrsfm._joint.consensus import (
+    COVER,
     Group,
     Scene,
     centred,
     group_fit,
+    interpolation,
     merge,
+    neighbour_distances,
+    neighbourhoods,
+    principal_shapes,
+    weighted,
 )
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -48,6 +54,34 @@ def scene_of(first, rows=None):
     """Return a scene whose other entries do not matter to a merge."""
     rows = first[:, :2].copy() if rows is None else rows
     return Scene(rows, first, np.zeros((len(first), 2, 3)), 1.0, 1e-6)
+
+
+class TestNeighbours:
+    """Which points are in a group."""
+
+    def test_distances_are_deviations_and_means(self):
+        """They are the standard deviation of the distances and 0.15 of their mean."""
+        shapes = np.random.default_rng(0).standard_normal((30, 3, 5))
+        between = np.linalg.norm(shapes[..., None] - shapes[:, :, None], axis=1)
+        expected = between.std(axis=0) + 0.15 * between.mean(axis=0)
+        assert_allclose(neighbour_distances(shapes), expected, atol=1e-12)
+
+    @pytest.mark.parametrize("size", [2, 5, 12])
+    def test_each_point_is_in_a_group(self, size):
+        """Groups have the given size, cover all points, and are counted."""
+        points = np.random.default_rng(2).standard_normal((40, 2))
+        distances = np.linalg.norm(points[:, None] - points, axis=2)
+        groups = neighbourhoods(distances, size)
+        assert all(len(points) == size for points, _ in groups)
+        assert set(np.concatenate([points for points, _ in groups])) == set(range(40))
+        assert sum(count for _, count in groups) >= min(COVER * 40 // size, 40)
+        assert len({tuple(points) for points, _ in groups}) == len(groups)
+
+    def test_one_group_of_few_points(self):
+        """Fewer points than the size are one group, as often as there are points."""
+        ((points, count),) = neighbourhoods(np.ones((6, 6)) - np.eye(6), 12)
+        assert_array_equal(points, np.arange(6))
+        assert count == 2  # COVER * 6 / 12
 
 
 class TestMerge:
@@ -89,6 +123,63 @@ class TestMerge:
         assert_allclose(half[seen], ((rows + fitted) / 2)[seen])
         assert_allclose(half[1, :, 2], fitted[1, :, 2])
 
+    def test_weights_are_inverse_disagreements_of_sizes(self):
+        """Groups of a size share one factor, its inverse mean square disagreement."""
+        rng = np.random.default_rng(7)
+        first = rng.standard_normal((5, 3, 8))
+        groups = random_groups(rng, rng.standard_normal((5, 8)), sizes=(5, 5, 5, 6))
+        for group in groups:
+            group.coordinates[:, 2] += rng.standard_normal((5, len(group.points)))
+        scene = scene_of(first)
+        found = weighted(scene, groups)
+        same = groups[:3]
+        z = merge(scene, same)[:, 2]
+        off = [
+            np.mean((centred(g.coordinates[:, 2]) - centred(z[:, g.points])) ** 2)
+            for g in same
+        ]
+        square = np.average(off, weights=[g.weight for g in same])
+        for before, after in zip(same, found[:3], strict=True):
+            assert_allclose(after.weight, before.weight / (5 * square), rtol=1e-9)
+
+
+class TestPrincipalShapes:
+    """From the shapes of frames to a model."""
+
+    def test_fewer_components_leave_a_mean_square(self):
+        """The third result is the mean square of the rest."""
+        S = np.random.default_rng(9).standard_normal((20, 3, 5))
+        shapes, alpha, left = principal_shapes(S, 4)
+        rest = S - shapes[0] - np.tensordot(alpha, shapes[1:], 1)
+        assert_allclose(left, np.mean(rest**2))
+
+    def test_components_below_the_noise_are_left_out(self):
+        """The smallest number of components leaves no more than the noise."""
+        S = np.random.default_rng(10).standard_normal((20, 3, 5))
+        by_number = [principal_shapes(S, k)[2] for k in range(1, 12)]
+        shapes, _, left = principal_shapes(S, 11, 1.01 * by_number[5])
+        assert len(shapes) == 7
+        assert_allclose(left, by_number[5])
+
+    def test_surplus_components_are_zero(self):
+        """More components than frames are filled with zeros."""
+        S = np.random.default_rng(11).standard_normal((4, 3, 5))
+        shapes, alpha, _ = principal_shapes(S, 9)
+        assert shapes.shape == (10, 3, 5)
+        assert not shapes[5:].any()
+        assert not alpha[:, 4:].any()
+
+
+def test_interpolation_of_changes():
+    """Chosen points keep their changes; others have means of three of them."""
+    rng = np.random.default_rng(12)
+    chosen = np.array([0, 2, 5, 7])
+    weights = interpolation(rng.standard_normal((3, 9)), chosen)
+    assert_allclose(weights.sum(axis=0), 1.0)
+    assert_array_equal(weights[:, chosen], np.eye(4))
+    others = np.setdiff1d(np.arange(9), chosen)
+    assert ((weights[:, others] > 0).sum(axis=0) == 3).all()
+
 
 class TestGroupFit:
     """The fit of one group."""
@@ -122,6 +213,14 @@ class TestGroupFit:
         assert np.sqrt(np.mean((found[:, :2] - truth[frames, :2]) ** 2)) < 0.02
         assert noise >= 1e-5
 
+    def test_mirror_image_is_that_of_the_joint_fit(self):
+        """Depths have the sign of those of the joint fit."""
+        scene, truth = self.scene()
+        mirrored = scene.first * [[[1.0], [1.0], [-1.0]]]
+        frames, found, _ = group_fit(scene._replace(first=mirrored), 2, SETTINGS)
+        off = centred(found[:, 2]) + centred(truth[frames, 2])
+        assert np.sqrt(np.mean(off**2)) < 0.02
+
     def test_frames_with_few_points_are_left_out(self):
         """A group is fitted to the frames that show at least four of its points."""
         scene, _ = self.scene()
@@ -129,6 +228,12 @@ class TestGroupFit:
         frames, found, _ = group_fit(scene, 2, SETTINGS)
         assert_array_equal(frames, np.arange(5, 60))
         assert found.shape == (55, 3, 12)
+
+    def test_too_few_frames(self):
+        """There is no fit if no more frames than basis shapes show the group."""
+        scene, _ = self.scene()
+        scene.rows[2:, :, 3:] = np.nan
+        assert group_fit(scene, 2, SETTINGS) is None
 
 
 FLOOR = 1e-5

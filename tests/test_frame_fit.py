@@ -30,7 +30,10 @@ from isa_nrsfm._frames.models import (
 from isa_nrsfm._joint.likelihood import extent_penalty
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.uncertainty import (
+    N_GROUPS,
     depth_certainty,
+    neighbours,
+    shape_information,
 )
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
@@ -295,6 +298,23 @@ class TestDepthDeviations:
         found = depth_deviations(frames, rows, sizes)
         assert_allclose(found**2, expected, rtol=1e-9)
         assert np.ptp(leverage) > 1.0
+
+
+class TestSamplePosterior:
+    def test_information_on_the_shapes(self):
+        rng = np.random.default_rng(0)
+        motion, alpha = rng.normal(size=(12, 2, 3)), rng.normal(size=(12, 2))
+        root, share = rng.normal(size=(2, 2)), rng.uniform(0.5, 1.0, 12)
+        information = np.zeros((9, 9))
+        for M, a, weight in zip(motion, alpha, share, strict=True):
+            c = np.append(1.0, a)
+            moments = np.outer(c, c)
+            moments[1:, 1:] += root @ root.T
+            information += weight * np.kron(moments, M.T @ M)
+        found = shape_information(
+            motion, alpha, root @ root.T, share, [slice(0, 5), slice(5, 12)]
+        )
+        assert_allclose(found, information, rtol=1e-12, atol=1e-12)
 
 
 def faces_turned_by(degrees, seed=0, n_frames=150, noise=0.01, missing=0.0):
@@ -569,6 +589,15 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
     # Others are not, and with the linear loss none is.
     assert abs(error(complete) / expected - 1) > 0.02
     assert error(spoilt, "linear") > 1.1 * expected
+
+
+def test_neighbours_are_groups_of_equal_size(rng):
+    centres = 10 * rng.normal(size=(3, N_GROUPS))
+    points = np.repeat(centres, 4, axis=1) + rng.normal(size=(3, 4 * N_GROUPS))
+    groups = neighbours(points)
+    assert_array_equal(groups, np.repeat(groups[::4], 4))
+    assert_array_equal(np.unique(groups), range(N_GROUPS))
+    assert_array_equal(np.bincount(neighbours(points[:, :17])), [4, 4, 3, 3, 3])
 
 
 @pytest.mark.slow

@@ -330,6 +330,36 @@ class TestDensities:
         assert _shared_mixing._fit_densities(units, Z)[0] == pytest.approx(total)
 
 
+class TestSteps:
+    def test_few_samples_are_spread_from_the_smallest_to_the_largest(self, rng):
+        few = rng.normal(size=(2, 3000, 3))
+        assert _shared_mixing._few_samples(few) is few
+        many = rng.normal(size=(2, 6000, 3))
+        chosen = _shared_mixing._few_samples(many)
+        assert chosen.shape == (2, 1500, 3)
+        sizes = [np.sort(np.sum(Z**2, axis=(0, 2))) for Z in (chosen, many)]
+        place = np.searchsorted(sizes[1], sizes[0])
+        assert place[0] == 0
+        assert place[-1] == 5999
+        assert set(np.diff(place)) <= {3, 4, 5}
+
+    def test_ascent_maximises_the_quadratic_model_or_there_is_none(self, rng):
+        n, size, shift = 5, 3, 0.5
+        root, gradient = rng.normal(size=(n, n, n)), rng.normal(size=(n, n))
+        blocks = -(root @ root.transpose(0, 2, 1)) - 4.0 * np.eye(n)
+        E = _shared_mixing._ascent(gradient, blocks, shift, size)
+        slope = np.einsum("kab,kb->ka", blocks, E) - size * E.T - shift * E
+        assert_allclose(gradient + slope, 0, atol=1e-4 * np.linalg.norm(gradient))
+        # Weaker blocks than the coupling, and blocks without a maximum at all
+        for factor in (0.25, -1.0):
+            weak = -factor * 4.0 * np.tile(np.eye(n), (n, 1, 1))
+            assert _shared_mixing._ascent(gradient, weak, shift, size) is None
+        # A direction that the diagonals of the blocks do not show
+        one = np.ones((n, n))
+        blocks = np.tile(10.0 * one - 16.0 * np.eye(n), (n, 1, 1))
+        assert _shared_mixing._ascent(one, blocks, 0.0, size) is None
+
+
 class TestDegenerate:
     def test_one_signal(self):
         signals = 5.0 * sources(["product"], 0, 30, 3)

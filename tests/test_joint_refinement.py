@@ -1,6 +1,8 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, partial
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +16,7 @@ from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, refine_joint
+from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, _line_search, refine_joint
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpack3
 
 DEVIATION = 0.03
@@ -301,6 +303,48 @@ class TestLeastNoise:
             == result.state.noise
             > end.residual / likelihood.frames.totals[0]
         )
+
+
+@dataclass(frozen=True)
+class Parabola:
+    """An iterate on the line ``a t^2 / 2 - t``, whose noise has the floor 1/2."""
+
+    a: float
+    state: SimpleNamespace = field(
+        default_factory=lambda: SimpleNamespace(t=0.0, noise=1.0)
+    )
+    gradient = np.array([-1.0, 0.0])
+    cameras = SimpleNamespace(largest_length=lambda step: np.inf)
+
+    @property
+    def value(self):
+        return self.a * self.state.t**2 / 2 - self.state.t
+
+    def split(self, step):
+        return None, step[:1], step[1]
+
+    def moved(self, step):
+        return SimpleNamespace(t=step[0], noise=max(np.exp(step[1]), 0.5))
+
+
+def searched(a, direction):
+    return _line_search(Parabola(a), direction, partial(Parabola, a))
+
+
+class TestLineSearch:
+    @pytest.mark.parametrize(
+        ("a", "expected"),
+        [(1.0, 1.0), (1.99, 1.0), (2.0, 0.5), (4.0, 0.25), (40, 1 / 40)],
+    )
+    def test_takes_the_whole_step_or_the_minimum_of_the_parabola(self, a, expected):
+        reached, step = searched(a, np.array([1.0, 0.0]))
+        assert reached.state.t == pytest.approx(expected)
+        assert_allclose(step, [expected, 0.0])
+
+    def test_noise_changes_by_a_limited_factor_and_not_below_its_floor(self):
+        reached, step = searched(0.5, np.array([1.0, -3.0]))
+        assert reached.state.t == pytest.approx(0.5)
+        assert_allclose(step, [0.5, np.log(0.5)])
 
 
 class TestDegenerate:

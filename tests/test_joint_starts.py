@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from frame_parts import assert_calibrated
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_scene as random_model, with_gaps
 from scipy.spatial.transform import Rotation
@@ -21,7 +21,9 @@ from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState, Widths
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
+    affine_start,
     best_starts,
+    lifted_shapes,
     likely_basis,
     mixed_cameras,
     rigid_start,
@@ -112,6 +114,29 @@ class TestMixedCameras:
             assert_calibrated(motion, camera)
 
 
+class TestLiftedShapes:
+    @BOTH
+    @pytest.mark.parametrize("n_frames", [60, 200])
+    def test_basis_shapes_are_principal_directions(self, camera, n_frames):
+        # With more frames than coordinates, and with fewer.
+        scene = random_scene(camera, n_frames=n_frames)
+        shapes = lifted_shapes(scene.rows, scene.motion, 3)
+        pairs = zip(scene.rows, scene.motion, strict=True)
+        lifted = [(np.linalg.pinv(M) @ (W - M @ shapes[0])).ravel() for W, M in pairs]
+        _, S, Vt = np.linalg.svd(np.array(lifted), full_matrices=False)
+        flat = shapes[1:].reshape(3, -1)
+        assert_allclose(np.linalg.norm(flat, axis=1), S[:3] / np.sqrt(n_frames))
+        cosines = flat @ Vt[:3].T / np.linalg.norm(flat, axis=1)[:, None]
+        assert_allclose(np.abs(cosines), np.eye(3), atol=1e-6)
+
+    def test_zeros_where_there_are_not_as_many(self):
+        scene = random_scene(n_frames=4)
+        shapes = lifted_shapes(scene.rows, scene.motion, 6)
+        assert shapes.shape == (7, 3, N_POINTS)
+        assert_array_equal(shapes[5:], 0.0)
+        assert np.isfinite(shapes).all()
+
+
 def problem_of(scene, thorough=True):
     rows = FrameBlocks.of_array(scene.rows, 64)
     frames = JointFrames.from_points(rows, True)
@@ -152,6 +177,26 @@ class TestBestStarts:
             assert state.motion.shape == (450, 2, 3)
             assert_calibrated(state.motion, "orthographic")
             assert camera_error(state.motion, scene.motion) < 0.2
+
+
+class TestAffineStart:
+    def test_is_the_rigid_fit(self):
+        scene = random_scene(noise=0.02)
+        paper = paper_shapes(scene.factors)
+        state = affine_start(problem_of(scene), scene.W, paper)
+        assert_array_equal(state.shapes[0], paper[0])
+        left = 0.0
+        for i, W in enumerate(scene.rows):
+            M = W @ np.linalg.pinv(paper[0])
+            assert_allclose(state.motion[i], M, atol=1e-12)
+            left += np.sum((W - M @ paper[0]) ** 2)
+        assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
+        # Basis shapes are one deviation of their coefficients.
+        for before, after in zip(paper[1:], state.shapes[1:], strict=True):
+            images = state.motion @ before
+            norms = np.sum(images**2, axis=(1, 2))
+            alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
+            assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
 
 def random_frames(seed=0, n_frames=40, n_points=30, n_components=2):

@@ -1,5 +1,7 @@
 """Tables made ready for a fit: blocks, robust scales, gross outliers, completion."""
 
+import threading
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -60,6 +62,33 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
     again.whole()
     again.whole()
     assert calls == [10, 10, 3] * 3
+
+
+@pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
+def test_small_blocks_are_regrouped(array, n_frames, lengths):
+    larger = FrameBlocks.of_array(array, 3).regrouped(np.concatenate, n_frames)
+    assert larger.lengths == lengths
+    assert_array_equal(larger.whole(), array)
+
+
+@pytest.mark.parametrize(
+    ("n_threads", "length", "others"), [(3, 5, True), (1, 5, False), (3, 23, False)]
+)
+@pytest.mark.parametrize("make", [FrameBlocks.of_array, stored])
+def test_threads_are_used_for_several_blocks(array, make, n_threads, length, others):
+    blocks = make(array, length, n_threads=n_threads).derive(lambda block: block)
+    for each in (blocks, blocks.subset(np.full(N_FRAMES, True))):
+        threads = set(each.map(lambda block: threading.get_ident()))
+        assert (threading.get_ident() not in threads) == others
+
+
+def test_threads_have_few_results_ahead(array):
+    begun = []
+    found = FrameBlocks.of_array(array, 2, n_threads=2).map(begun.append)
+    for number in range(1, 6):
+        next(found)
+        assert len(begun) <= number + 2
+    found.close()
 
 
 def test_an_error_in_a_thread_is_raised_and_no_further_block_is_begun(array):
