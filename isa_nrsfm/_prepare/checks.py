@@ -292,6 +292,11 @@ def _noise_ratio(
     both = [r[n_seen >= FEWEST_POINTS] for r in both]
     if min(min(len(r), r.shape[2]) for r in both) < FEWEST_COMPARED:
         return np.inf
+    # Low rank explains any table with hardly more numbers than it has unknowns.
+    for r in both:
+        unknowns = rank * (2 * len(r) + r.shape[2] - rank)
+        if 2 * seen_points(r).sum() < 1.5 * unknowns:
+            return np.inf
     centred, reports = zip(*map(centred_frames, both), strict=True)
     # The size of a frame is the smaller of both orders, that of the right one.
     sizes = np.min([report.size for report in reports], axis=0)
