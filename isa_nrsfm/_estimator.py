@@ -27,12 +27,8 @@ from isa_nrsfm._compat.scikit_learn import (
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
-from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
-    compose,
-    full_rotations,
-    pose_effect,
-)
+from isa_nrsfm._frames import camera_models
+from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
@@ -602,7 +598,7 @@ default="affine"
         }
         reported = leading(frames, model.n_components)
         if self.remove_pose:
-            self.pose_effect_ = pose_effect(frames.motion, reported.alpha)
+            self.pose_effect_ = camera_models.pose_effect(frames.motion, reported.alpha)
             left = reported.alpha - removed_part(self, frames.motion)
             reported = reported._replace(alpha=left)
         if self.keep_frames:
@@ -671,9 +667,8 @@ default="affine"
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""
-        private = {"_model", "_frame_sizes", "_halves", "_stability", "_trials"}
-        private |= {"_n_features_out"}
-        names = [n for n in vars(self) if n not in private and not n.endswith("_")]
+        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
+        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
         self.__dict__ = {name: vars(self)[name] for name in names}
 
     def __sklearn_clone__(self) -> Any:

@@ -237,18 +237,17 @@ def _fitted(
         strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
         isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
     given = {name: getattr(args, name) for name in (*FIRST, *_PARAMETERS)}
-    given = {name: None if each == NONE else each for name, each in given.items()}
-    given["n_components"] = args.n_components and args.n_components[0]
-    kept = {n: given.pop(n) for n in FIRST}
-    unset = (None, (AUTO,))
-    kept = {n: each for n, each in kept.items() if getattr(args, n) not in unset}
-    params, free = first_settings(kept)
+    given = {name: v for name, v in given.items() if v not in (None, (AUTO,))}
+    given = {name: None if v == NONE else v for name, v in given.items()}
+    if "n_components" in given:
+        given["n_components"] = args.n_components[0]
+    params, free = first_settings(given)
     estimator = AffineNRSfM(
         isa=isa,
         scale_frames=not args.no_scale_frames,
         hidden_points=not args.no_hidden_points,
         remove_pose=args.remove_pose,
-        **params | given,
+        **params,
     )
     if estimator.camera == "perspective":
         estimator.set_params(principal_point=frames.principal_point)
