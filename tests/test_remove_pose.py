@@ -17,6 +17,8 @@ from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.io import load_model, save_model
 
+# The starts of users lead to the cameras that turn as far as the faces do.
+AS_USERS = ["few_frames", "widths"]
 CALIBRATED = {"camera": "weak_perspective", "random_state": 0}
 
 
@@ -59,7 +61,7 @@ def test_what_is_left_has_no_relation_to_the_yaw(model, plain, table):
     true = faces()[1]
     fits = (np.corrcoef(each.alpha_.T, true.T)[:2, 2:] for each in (model, plain))
     found, without = (np.abs(fit).max(axis=0).min() for fit in fits)
-    assert found > 0.9
+    assert found > 0.95
     assert without < 0.75
 
 

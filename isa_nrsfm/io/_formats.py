@@ -45,11 +45,11 @@ class LandmarkFormat:
         Module and name of its two functions, such as ``_keypoints.coco``. ``is_coco``
         takes the path and returns whether the file begins like this format.
         ``read_coco`` returns its `Landmarks`, or raises a ValueError without the path.
+    options : sequence of str
+        Names of the options that `read` takes.
     begins : str
         Regular expression for the beginning of its files, instead of the first of these
         functions.
-    options : sequence of str
-        Names of the options that `read` takes.
     """
 
     name: str
