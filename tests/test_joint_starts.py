@@ -368,7 +368,8 @@ def test_evidence_does_not_know_the_axes_of_the_object():
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
     turned = fit._replace(state=JointState(turn @ shapes, motion @ turn.T, noise))
     for own in (widths, None):
-        there, back = (evidence(problem, each, own) for each in (turned, fit))
+        fits = (each._replace(widths=own) for each in (turned, fit))
+        there, back = (evidence(problem, each) for each in fits)
         assert_allclose(there, back, rtol=1e-9)
 
 

@@ -47,9 +47,10 @@ class DepthCertainty(NamedTuple):
         RMS error of the depths, relative to their RMS. Its square is the sum of that of
         the jackknife and `deformation`.
     deformation : float
-        ``exp(-r)``, with the rise r of -2 log L of a frame if depths are a thousand
+        ``exp(-4 r)``, with the rise r of -2 log L of a frame if depths are a thousand
         times as large, and cameras hardly turn: near one if deformation explains the
-        images as well as rotations do.
+        images as well as rotations do. Plus the same of other fits with their evidence,
+        times the relative squared difference of their depths.
     turns : ndarray of shape (3, 3) or None
         Covariance of the rotation vectors, in radians squared, in the camera's axes.
     points : ndarray of shape (n_points,) or None
@@ -437,15 +438,14 @@ class PosteriorFrames:
             Z = changes.transpose(2, 1, 0)
             covariances[i] = Z @ covariance @ Z.mT
         # Errors of the shapes, in the image and in depth, and of the middle of frames.
-        image = self.certainty.images[1] * leverages(fit.alpha) + 1 / weights.sum(
-            axis=1
-        )
+        weight = weights.sum(axis=1)
+        image = self.certainty.images[1] * leverages(fit.alpha) + 1 / weight
         image = self.noise_variance * image[:, None]
         depth = self.certainty.variances(fit.alpha)
         for axis, variance in enumerate((image, image, depth)):
             covariances[..., axis, axis] += variance
         # Frames that the model explains less well than those of the fit
-        excess = self.squares(fit, weights.sum(axis=1))
+        excess = self.squares(fit, weight)
         excess /= self.certainty.residual or np.nan
         excess = sizes**2 * np.fmax(excess, 1.0)
         return excess[:, None, None, None] * covariances

@@ -109,7 +109,9 @@ def fit_jointly(
         most = n_directions(first, paper_shapes.shape[2], few)
         n = min(most, FEW_DIRECTIONS)
         fit, widths = whole_distribution(first, extended(first, fit, n))
-        fit, widths, rivals = steadiest(first, table, fit, widths, n)
+        fit = steadiest(first, table, fit._replace(widths=widths), n)
+        widths, rivals = fit.widths, fit.rivals
+        assert widths is not None
         if len(widths.variances) == n < most:  # the table supports all of them
             fit, widths = whole_distribution(first, extended(first, fit, most))
         # Directions that explain the table up to rounding leave no noise.
@@ -196,11 +198,9 @@ def _likeliest_fit(
 
 
 def steadiest(
-    problem: JointProblem, table: FactorisedTable, fit: JointFit, widths: Widths, n: int
-) -> tuple[JointFit, Widths, float]:
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, n: int
+) -> JointFit:
     """Return a fit of n directions, or a more evident one whose cameras turn less.
-
-    Also returns its widths and the `rival_depths`.
 
     Wings that beat look like a bird that rolls. The objective counts coefficients, but
     not rotations, and its minima lead there; `evidence` counts both.
@@ -208,12 +208,10 @@ def steadiest(
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
     first, free = extended(problem, fit, n), replace(problem, penalty=0.0)
-    limit, held = evidence(problem, first, None) + HOPELESS, AffineCameras(held=True)
+    limit, held = evidence(problem, first) + HOPELESS, AffineCameras(held=True)
     if not np.isfinite(limit):  # nothing turns
-        return fit, widths, 0.0
-    fit = fit._replace(widths=widths)
-    found = [(evidence(problem, fit, widths) - LEAST_GAIN, fit)]
-    latest = fit
+        return fit
+    found, latest = [(evidence(problem, fit) - LEAST_GAIN, fit)], fit
     for _ in range(4):
         motion, tried = steadied(latest.state.motion), len(found)
         for k in {min(FIRST_COMPONENTS[0], n), n}:
@@ -221,17 +219,15 @@ def steadiest(
             state = free.refined(state, held, max_iter=FIXED_STEPS).state
             other = extended(problem, fit._replace(state=state), k)
             other = extended(problem, other, n) if k < n else other
-            if evidence(problem, other, None) < limit:
-                other, own = whole_distribution(problem, other)
-                other = other._replace(widths=own)
-                found.append((evidence(problem, other, own), other))
+            if evidence(problem, other) < limit:
+                other, widths = whole_distribution(problem, other)
+                other = other._replace(widths=widths)
+                found.append((evidence(problem, other), other))
         if len(found) == tried:
             break
         latest = min(found[tried:], key=itemgetter(0))[1]
     found.sort(key=itemgetter(0))
-    best = found[0][1]
-    assert best.widths is not None
-    return best, best.widths, rival_depths(problem, found)
+    return found[0][1]._replace(rivals=rival_depths(problem, found))
 
 
 def count_components(

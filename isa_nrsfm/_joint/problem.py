@@ -37,10 +37,6 @@ NOISE_FLOOR = 1e-11
 # docs/benchmarks/README.md, "Thresholds".
 RELEVANT = 0.99
 
-# Number of frames whose likelihoods tell two explanations of a table apart:
-# docs/depth.md, "How it is estimated".
-FAR_FRAMES = 4
-
 # Steps, changes of the gradient, and their inner products.
 Memory = deque[tuple[NDArray, NDArray, float]]
 

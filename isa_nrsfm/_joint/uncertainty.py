@@ -41,9 +41,10 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.problem import FAR_FRAMES, JointState, Widths, refine_joint
+from isa_nrsfm._joint.problem import JointState, Widths, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import steadied
+from isa_nrsfm._joint.whole import FAR_FRAMES
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import FEWEST_POINTS

@@ -25,12 +25,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import (
-    CalibratedCameras,
-    full_rotations,
-)
+from isa_nrsfm._frames.camera_models import CalibratedCameras, full_rotations
 from isa_nrsfm._joint.problem import (
-    FAR_FRAMES,
     JointFit,
     JointProblem,
     JointState,
@@ -52,6 +48,9 @@ FIRST_SIZE = 0.03
 FIRST_NOISE = 1e-3
 # Floor of the noise variance, for tables without noise
 LEAST_NOISE = 1e-5
+# Number of frames whose likelihoods tell two explanations of a table apart:
+# docs/depth.md, "How it is estimated".
+FAR_FRAMES = 4
 
 
 def n_directions(problem: JointProblem, n_points: int, few: bool) -> int:
@@ -138,7 +137,7 @@ def image_moments(state: JointState) -> tuple[NDArray, NDArray]:
     return C, np.einsum("ab,kaj,lbj->kl", C, basis, basis, optimize=True)
 
 
-def evidence(problem: JointProblem, fit: JointFit, widths: Widths | None) -> float:
+def evidence(problem: JointProblem, fit: JointFit) -> float:
     """Return -2 log evidence of a fit for each frame, up to a constant.
 
     The objective has all coefficients integrated out, but takes cameras and shapes as
@@ -152,7 +151,7 @@ def evidence(problem: JointProblem, fit: JointFit, widths: Widths | None) -> flo
     turning has a price, as deforming has. det V is that along the two axes of
     largest spread. Without widths the shapes have no prior and do not count.
     """
-    part = replace(problem, penalty=0.0, widths=widths)
+    part, widths = replace(problem, penalty=0.0, widths=fit.widths), fit.widths
     shapes, motion, noise = fit.state
     cameras = problem.cameras
     assert isinstance(cameras, CalibratedCameras)
