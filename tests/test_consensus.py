@@ -587,3 +587,21 @@ def test_articulated_shapes_become_truer(seed):
         for name in ("joint", "consensus")
     )
     assert merged < joint
+
+
+@pytest.mark.slow
+def test_tables_whose_noise_is_at_the_floor_have_groups(load_data):
+    data = load_data("akhter_drink")
+    first = data["R"]
+    axes = np.concatenate([first, np.cross(first[:, 0], first[:, 1])[:, None]], axis=1)
+    truth, table = axes @ data["S3d"].mT, data["W2d"].reshape(len(first), -1)
+    joint, merged = (
+        mean_shape_error_3d(truth.mT, in_camera(model, table), convention="camera")
+        for model in (
+            AffineNRSfM(
+                "auto", camera="orthographic", refinement=name, random_state=0
+            ).fit(table)
+            for name in ("joint", "consensus")
+        )
+    )
+    assert merged < 0.8 * joint

@@ -126,8 +126,9 @@ def consensus(
     noise, S, certainty = model.noise_variance, shapes, model.certainty
     begun: Any = (), ()
     distances = neighbour_distances(shapes[:, :, chosen])
-    # Groups cannot improve a fit whose noise is below their floor.
-    if noise >= scene.floor:
+    # Groups, with their floor, cannot improve the fit of a table without noise. Fits of
+    # other tables end at this floor or above it, up to rounding.
+    if noise > 0.5 * scene.floor:
         n_components = min(len(model.shapes) - 1, MOST_FIRST)
         begun = group_fits(scene, distances, n_components, settings)
     if errors:
