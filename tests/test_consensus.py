@@ -1,5 +1,7 @@
 """The consensus of groups: neighbours, fits, merge, and the refinement as a whole."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -21,11 +23,13 @@ from isa_nrsfm._joint.consensus import (
     Scene,
     centred,
     group_fit,
+    hidden_residuals,
     interpolation,
     merge,
     neighbour_distances,
     neighbourhoods,
     principal_shapes,
+    share_of_first,
     weighted,
 )
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
@@ -179,6 +183,38 @@ def test_interpolation_of_changes():
     assert_array_equal(weights[:, chosen], np.eye(4))
     others = np.setdiff1d(np.arange(9), chosen)
     assert ((weights[:, others] > 0).sum(axis=0) == 3).all()
+
+
+class TestShareOfFirst:
+    """The share of the joint fit in the depths, from hidden points."""
+
+    @pytest.fixture
+    def fitted(self):
+        """Return rows of size one, the model that made them, and another one."""
+        tracks = make_nonrigid_tracks(60, 20, 2, camera="orthographic", random_state=0)
+        model = AffineNRSfM(2, camera="orthographic", random_state=0).fit(tracks.data)
+        frames = model._model.frames
+        rows = tracks.data.reshape(60, 20, 2).transpose(0, 2, 1) / model._model.unit
+        flat = replace(frames, shapes=frames.shapes * [[1.0], [1.0], [0.5]])
+        return rows, frames, flat
+
+    def test_hidden_points_of_the_true_model_are_predicted(self, fitted):
+        rows, frames, flat = fitted
+        assert np.abs(hidden_residuals(frames, rows)).max() < 1e-4
+        assert np.abs(hidden_residuals(flat, rows)).max() > 1e-2
+
+    def test_missing_points_do_not_count(self, fitted):
+        rows, frames, _ = fitted
+        rows = rows.copy()
+        rows[:5, :, 3] = np.nan
+        rest = hidden_residuals(frames, rows)
+        assert_array_equal(np.isnan(rest), np.isnan(rows))
+
+    def test_is_zero_for_a_worse_model_and_at_most_a_half(self, fitted):
+        rows, frames, flat = fitted
+        assert share_of_first(flat, frames, rows) < 0.01
+        assert share_of_first(frames, flat, rows) > 0.49
+        assert share_of_first(frames, frames, rows) == 0
 
 
 class TestGroupFit:

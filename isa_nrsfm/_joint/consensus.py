@@ -9,10 +9,11 @@ Neighbouring points have a simpler model, with rotations of their own:
    with the depths d_g of the fit of a group. P subtracts the mean.
 4. All groups are fitted together from there, with depths that are common to all
    (`common_depths`).
-5. The mean and the principal components of these shapes are the new model.
+5. The depths are a mean of these and of the joint fit, weighted by the errors of hidden
+   points. The mean and the principal components of the shapes are the new model.
 
-The mean squared difference of the depths of a point in its groups from the result of
-step 4 estimates its squared error: docs/benchmarks/consensus.md.
+The mean squared difference of the depths of a point in its groups from the result
+estimates its squared error: docs/benchmarks/consensus.md.
 """
 
 from collections.abc import Iterator
@@ -26,7 +27,12 @@ from scipy.spatial.distance import cdist
 from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, full_rotations
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    AffineCameras,
+    full_rotations,
+    residuals,
+)
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, spread_starts
 from isa_nrsfm._joint.common_depths import (
     LAST_SHARE,
@@ -62,6 +68,8 @@ FLOOR_SHARE = 0.2
 FREE_STEPS, MOST_STEPS = 30, 300
 # Largest numbers of frames and of points of the groups
 MOST_FRAMES, MOST_POINTS = 500, 100
+# Frames whose points are hidden
+HIDDEN_FRAMES = 60
 # Mean square that free numbers of components leave, as a share of the noise variance
 LEFT = 0.01
 # Largest number of basis shapes of first fits, and of the consensus
@@ -123,7 +131,7 @@ def consensus(
     price = 1.0 / (limits.basis_std**2 * mean_square)
     floor = FLOOR_SHARE * limits.least_noise * mean_square
     scene = Scene(part[:, :, chosen], first[:, :, chosen], fit.motion, price, floor)
-    noise, S, certainty = model.noise_variance, shapes, model.certainty
+    noise, certainty = model.noise_variance, model.certainty
     begun: Any = (), ()
     distances = neighbour_distances(shapes[:, :, chosen])
     # Groups, with their floor, cannot improve the fit of a table without noise. Fits of
@@ -141,33 +149,80 @@ def consensus(
             settings.on_step()
         if result is not None:
             groups.append(Group(points, count, *result))
-    if groups:
-        noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
-        share = 1.0 - scene.floor / noise
-        groups = weighted(scene, groups)
-        joined = together(scene, groups, distances, scales, noise)
-        noise -= (1.0 - LAST_SHARE) * scene.floor
-        weights = interpolation(model.shapes[0], chosen)
-        depths = centred(joined[:, 2] @ weights)
-        squares = disagreements(groups, joined[:, 2])
-        # Groups start from one fit and share a part of its errors.
-        nearer = squares.sum() / disagreements(groups, scene.first[:, 2]).sum()
-        squares, depths = squares @ weights, np.mean(depths**2, axis=0)
-        certainty = certainty.of_consensus(squares, depths, min(nearer, 1.0))
-        change = (joined - scene.first) @ weights
-        others = np.setdiff1d(np.arange(n_points), chosen)
-        off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
-        change[:, :2, others] = off[:, :, others]
-        # Shapes in the axes of the object
-        S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
-        S = aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S
-    # Their principal components
     possible = most_components(len(table.sizes), n_points, model.camera)
     most = min(possible, MOST_COMPONENTS)
-    shapes, alpha, rest = principal_shapes(S, most, LEFT * noise)
-    starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(shapes) - 1)
-    model = replace(model, shapes=shapes, noise_variance=noise + rest)
-    return replace(model, starts=starts, gauge=gauge, certainty=certainty)
+
+    def modelled(S: NDArray, noise: float) -> PosteriorFrames:
+        """Return the model of shapes (I, 3, J): their principal components."""
+        found, alpha, rest = principal_shapes(S, most, LEFT * noise)
+        starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(found) - 1)
+        noise += rest
+        return replace(
+            model, shapes=found, noise_variance=noise, starts=starts, gauge=gauge
+        )
+
+    if not groups:
+        return replace(modelled(shapes, noise), certainty=certainty)
+    noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
+    share = 1.0 - scene.floor / noise
+    groups = weighted(scene, groups)
+    joined = together(scene, groups, distances, scales, noise)
+    noise -= (1.0 - LAST_SHARE) * scene.floor
+    weights = interpolation(model.shapes[0], chosen)
+    others = np.setdiff1d(np.arange(n_points), chosen)
+    off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
+
+    def merged(joined: NDArray) -> PosteriorFrames:
+        """Return the model of coordinates (I, 3, n) in the axes of the cameras."""
+        change = (joined - scene.first) @ weights
+        change[:, :2, others] = off[:, :, others]
+        S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
+        return modelled(
+            aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S, noise
+        )
+
+    # The joint fit has a share of the depths.
+    some = spread(np.arange(len(part)), HIDDEN_FRAMES)
+    own = share_of_first(model, merged(joined), part[some])
+    joined[:, 2] += own * (centred(scene.first[:, 2]) - centred(joined[:, 2]))
+    depths = centred(joined[:, 2] @ weights)
+    squares = disagreements(groups, joined[:, 2])
+    # Groups start from one fit and share a part of its errors.
+    nearer = squares.sum() / disagreements(groups, scene.first[:, 2]).sum()
+    squares, depths = squares @ weights, np.mean(depths**2, axis=0)
+    certainty = certainty.of_consensus(squares, depths, min(nearer, 1.0))
+    return replace(merged(joined), certainty=certainty)
+
+
+def share_of_first(
+    first: PosteriorFrames, second: PosteriorFrames, rows: NDArray
+) -> float:
+    """Return the share of the first of two models in the mean of both, at most a half.
+
+    Half the share with which their mean predicts hidden points of rows (n, 2, J) best
+    (stacked regressions: Breiman, 1996), by least squares.
+    """
+    one, other = hidden_residuals(first, rows), hidden_residuals(second, rows)
+    change = other - one
+    square = np.nansum(change**2)
+    best = np.nansum(other * change) / square if square > 0 else 0.0
+    return float(0.5 * np.clip(best, 0.0, 1.0))
+
+
+def hidden_residuals(model: PosteriorFrames, rows: NDArray) -> NDArray:
+    """Return residuals (n, 2, J) of points from fits of their frames without them.
+
+    Every fifth point of rows (n, 2, J) is left out at a time.
+    """
+    rest = np.full(rows.shape, np.nan)
+    for first in range(5):
+        hidden = slice(first, None, 5)
+        visible = rows.copy()
+        visible[:, :, hidden] = np.nan
+        fit = model.posterior(visible, covariances=False)
+        off = residuals(rows, model.shapes, fit.motion, fit.alpha)
+        rest[:, :, hidden] = (off - fit.translation[:, :, None])[:, :, hidden]
+    return rest
 
 
 def together(
