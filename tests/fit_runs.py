@@ -19,6 +19,9 @@ FILES |= {"report.html", "report.json", "viewer.html"}
 
 # Options of fits that take no time.
 QUICK = "--isa fast --n-init 2 --refinement none --no-figures -k".split()
+# Options of joint fits that try no other settings.
+JOINT = "--camera weak_perspective --refinement joint --loss linear".split()
+JOINT.append("--no-figures")
 
 
 class Results:

@@ -1,12 +1,13 @@
 """The baselines as estimators: one contract over all, and what each recovers."""
 
 import pickle
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 from layers import slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 from scenes import random_cameras, with_gaps
@@ -34,14 +35,14 @@ deterministic = pytest.mark.parametrize("method", list(METHODS)[:2])
 scaled_or_not = pytest.mark.parametrize("scale_frames", [False, True])
 
 
-@cache
+@made_once
 def table(seed=0, noise=0.01, n_frames=60, **parameters):
     """Return a table of orthographic cameras with its truth, to be left as it is."""
     parameters |= {"camera": "orthographic", "noise": noise, "random_state": seed}
     return make_nonrigid_tracks(n_frames, 30, 2, **parameters)
 
 
-@cache
+@made_once
 def fitted(method, **parameters):
     """Return a model of the table, to be left as it is."""
     return METHODS[method](2, **parameters).fit(table().data)

@@ -13,7 +13,7 @@ from html import unescape
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import FIGURES, FILES as FIT_FILES, MODEL, Results, write_landmarks
+from fit_runs import FIGURES, FILES, JOINT, MODEL, Results, write_landmarks
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
@@ -76,7 +76,7 @@ def fitted(table, tmp_path_factory):
 def test_fit_writes_all_that_its_report_lists(fits, table, tmp_path):
     folder = tmp_path / "new" / "results"
     found = fits(table, *QUICK, folder=folder)
-    out, report, listed = found.out, found.report, FIT_FILES | FIGURES
+    out, report, listed = found.out, found.report, FILES | FIGURES
     assert found.err == ""
     assert {path.name for path in folder.iterdir()} == listed
     for name in FIGURES:
@@ -183,7 +183,7 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     save_model(prior, path)
     X = make_face_tracks(30, **options | {"random_state": 1}).data
     table = saved(pd.DataFrame(X, columns=LANDMARKS), tmp_path)
-    given = ["--prior", path, "--no-figures"]
+    given = ["--prior", path, *JOINT]
     found = fits(table, *given)
     model, alone = found.model, AffineNRSfM(**options, prior=prior)
     assert_array_equal(model.alpha_, alone.fit(X).alpha_)
@@ -360,13 +360,8 @@ def test_outliers_are_reported(fits, tmp_path):
         table.loc[row, f"x_{row}"] += 3.0
     table["name"] = np.where(np.arange(30) < 5, "skip", "keep")
     table.to_csv(tmp_path / "faces.csv", index=False)
-    options = [tmp_path / "faces.csv", "--no-figures", "-k", 1]
-    options += ["--camera", "weak_perspective", "--refinement", "joint"]
-    found = fits(*options, "--skip-rows", "name=skip")
-    robust = next(e for e in found.report["tried"] if e["setting"] == "robust loss")
-    assert (robust["result"], found.model.loss) == ("used", "cauchy")
-    assert "outliers" not in found.err
-    found = fits(*options, "--skip-rows", "name=skip", "--loss", "linear")
+    options = ["--skip-rows", "name=skip", "-k", 1, *JOINT]
+    found = fits(tmp_path / "faces.csv", *options)
     assert "warning: the table has outliers: " in found.err
     assert found.err.endswith("they bend the shapes. Correct them\n")
     outliers = found.report["model"]["outliers"]
@@ -407,7 +402,7 @@ def test_rows_that_cannot_be_fitted_are_empty(fits, transforms, faces, tmp_path)
     faces.loc[21, LANDMARKS] = np.nan
     faces.loc[21, LANDMARKS[:12]] = np.repeat(np.arange(6.0), 2)
     path, skipped = saved(faces, tmp_path), ["--skip-rows", "name=^ir"]
-    options = [*skipped, "--skip-rows", "code = 1$|^nothing", "--std", *NO_FIGURES]
+    options = [*skipped, "--skip-rows", "code = 1$|^nothing", "--std", *JOINT, *QUICK]
     found = fits(path, *options)
     assert found.err == ""
     left_out = found.report["table"]["rows_left_out"]
@@ -638,8 +633,8 @@ def test_a_figure_that_fails_costs_no_results(
     warning, report = "mode_covariance.png was not drawn: no axes", found.report
     assert found.err.endswith(f"\nisa-nrsfm: warning: {warning}\n")
     # All results were there, and only they, when figures began.
-    assert set(seen) == FIT_FILES
-    left = FIT_FILES | FIGURES - {"mode_covariance.png"}
+    assert set(seen) == FILES
+    left = FILES | FIGURES - {"mode_covariance.png"}
     assert {path.name for path in folder.iterdir()} == left
     assert "mode_covariance" not in found.out
     assert set(report["files"]) == set(report["sha256"]) == left - {"report.json"}
@@ -660,7 +655,7 @@ def test_figures_are_not_written_to_another_run(
     monkeypatch.setattr(shutil, "rmtree", and_write_another_run)
     message = fails("fit", table, "-o", tmp_path, *QUICK, "--refinement", "none")
     assert "another run has written to" in message
-    for name in FIT_FILES:
+    for name in FILES:
         assert (tmp_path / name).read_bytes() == (fitted.folder / name).read_bytes()
 
 
@@ -753,7 +748,7 @@ def test_demo_writes_a_table_and_finds_its_faces(succeeds, tmp_path, monkeypatch
     out, err = succeeds("demo", "--no-figures")
     assert "warning" not in err
     demo = Results(tmp_path / "isa-nrsfm-demo")
-    assert {path.name for path in demo.folder.iterdir()} == FIT_FILES | {"tracks.csv"}
+    assert {path.name for path in demo.folder.iterdir()} == FILES | {"tracks.csv"}
     report, before = demo.report, (demo.folder / "alpha.csv").read_bytes()
     error, of_mean = re.search(r"off by (\S+) % .* alone: (\S+) %", out).groups()
     assert float(error) < 0.3 * float(of_mean)
@@ -769,7 +764,7 @@ def test_demo_writes_a_table_and_finds_its_faces(succeeds, tmp_path, monkeypatch
 def test_progress_is_shown_on_a_terminal(table, tmp_path):
     reading, writing = pty.openpty()
     done = subprocess.run(
-        [*MODULE, "fit", str(table), "-o", str(tmp_path), *NO_FIGURES],
+        [*MODULE, "fit", str(table), "-o", str(tmp_path), *UNREFINED],
         stdout=subprocess.PIPE,
         stderr=writing,
         text=True,

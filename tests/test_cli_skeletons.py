@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from exported_files import Read, content_of
-from fit_runs import Results
+from fit_runs import JOINT, Results
 from layers import slow_after
 
 from isa_nrsfm import datasets
@@ -131,7 +131,7 @@ def test_where_y_is_zero_is_said(fits, transforms, succeeds, tmp_path):
         40, 12, 1, camera="weak_perspective", random_state=0
     )
     path = write(scene, tmp_path / "points.csv")
-    options = ["--camera", "weak_perspective", "-k", "1", "--no-figures", "--std"]
+    options = ["-k", "1", "--std", *JOINT]
     lower = ["--origin", "lower", "--viewer", tmp_path / "new.html"]
     fit = fits(path, *options, *lower[:2])
     exported = {name: tmp_path / f"{name}.html" for name in ("upper", "lower")}

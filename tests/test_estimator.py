@@ -3,7 +3,6 @@
 import inspect
 import warnings
 from copy import deepcopy
-from functools import cache
 from itertools import product
 
 import joblib
@@ -12,6 +11,7 @@ import pandas as pd
 import polars as pl
 import pytest
 from layers import may_not_converge, slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from sklearn.base import BaseEstimator, clone
@@ -38,7 +38,7 @@ def estimator(n_components=K, **params):
     return AffineNRSfM(n_components, **params)
 
 
-@cache
+@made_once
 def fitted(refinement="joint"):
     """Return a model of the table, to be left as it is."""
     return estimator(refinement=refinement).fit(TABLE)
@@ -133,7 +133,7 @@ def only(**required):
 only_joint = only(refinement=["joint"])
 
 
-@cache
+@made_once
 def fitted_variant(number):
     """Return a fitted model, its training table and another table."""
     fitted = estimator(**(VARIANTS + SLOW_VARIANTS)[number])
@@ -815,7 +815,7 @@ def test_another_refinement_leaves_nothing_of_the_joint_one():
 CALIBRATED = ("weak_perspective", "orthographic")
 
 
-@cache
+@made_once
 def calibrated(camera, refinement="joint"):
     """Return a model with calibrated cameras, to be left as it is, and its table."""
     options = {"camera": camera, "noise": 0.01, "missing": 0.05}

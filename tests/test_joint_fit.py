@@ -1,6 +1,5 @@
 """The joint fit of a table: cameras, samples, robust losses, noise."""
 
-from functools import cache
 from itertools import product
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -8,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from layers import may_not_converge, slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scenes import random_scene, with_gaps
@@ -88,7 +88,7 @@ class Fit(NamedTuple):
     model: AffineNRSfM
 
 
-@cache
+@made_once
 def fit_of(camera, gaps=False, deviation=DEVIATION):
     """Return a table of a camera model, and its fit."""
     tracks, truth = random_table(camera, deviation=deviation)

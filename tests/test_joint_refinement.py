@@ -1,7 +1,7 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ import pytest
 import scenes
 from frame_parts import assert_calibrated
 from layers import slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import likelihood_of
@@ -60,7 +61,7 @@ def refined(scene, start=None, *, penalty=0.0, max_iter=1000, tol=1e-3):
     return refine_joint(likelihood, start, AFFINE, max_iter=max_iter, tol=tol)
 
 
-@cache
+@made_once
 def optimum(kind="complete", penalty=0.0):
     """Return a minimum of the objective to many digits, and its table."""
     scene = random_scene(kind=kind)
@@ -187,7 +188,7 @@ def disturbed_by(cameras, state, seed=1, size=0.1):
     return other._replace(motion=moved(cameras, state.motion, step))
 
 
-@cache
+@made_once
 def optimum_of(camera, kind="complete"):
     """Return a minimum of the objective with cameras of a model."""
     _, likelihood, start = problem_of(camera, 1.0, kind=kind, K=1)

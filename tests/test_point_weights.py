@@ -2,15 +2,17 @@
 
 import json
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import pytest
 import sklearn
+from fit_runs import JOINT
 from frame_parts import depth_deviations
 from layers import slow_after, start_may_not_converge
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from refusals import refused, warned
@@ -43,7 +45,7 @@ class Noisy(NamedTuple):
     shapes: NDArray
 
 
-@cache
+@made_once
 def noisy(seed=0):
     """Return a table with 1 percent noise, and 30 percent at two of five points."""
     scene = make_nonrigid_tracks(N_FRAMES, N_POINTS, K, random_state=seed)
@@ -61,7 +63,7 @@ def estimator(**params):
     return AffineNRSfM(**({"n_components": K, "random_state": 0} | params))
 
 
-@cache
+@made_once
 def fitted(camera="affine"):
     """Return the weighted fit of `noisy`."""
     table = noisy()
@@ -361,7 +363,7 @@ class TestRefusals:
 
 
 class TestCommandLine:
-    QUICK = ("-k", "2", "--no-figures")
+    QUICK = ("-k", "2", *JOINT)
 
     @pytest.fixture
     def results(self, tmp_path):

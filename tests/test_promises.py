@@ -14,7 +14,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import QUICK
+from fit_runs import JOINT, QUICK
 from layers import slow_after
 from refusals import refused, warned
 
@@ -38,7 +38,7 @@ def table(tmp_path):
 
 def test_commands_replace_files_only_by_force(table, succeeds, fails, tmp_path):
     folder, page = tmp_path / "o", tmp_path / "thesis.html"
-    succeeds("fit", table, "-k", 1, "--no-figures", "-o", folder)
+    succeeds("fit", table, "-k", 1, *JOINT, "-o", folder)
     transform = ["transform", folder / "model.npz", table, "-o"]
     export = ["export", folder / "model.npz", "-o"]
     for argv in (

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from fit_runs import JOINT
 from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -111,7 +112,8 @@ def test_all_results_have_the_same_coefficients(model, table, tmp_path):
     single = AffineNRSfM(2, remove_pose=True, **CALIBRATED).fit(table.astype("f4"))
     assert single.alpha_.dtype == single.transform(table.astype("f4")).dtype == "f4"
     # A new fit without the option forgets it.
-    assert not hasattr(single.set_params(remove_pose=False).fit(table), "pose_effect_")
+    single.set_params(remove_pose=False, refinement=None)
+    assert not hasattr(single.fit(table), "pose_effect_")
 
 
 def test_a_prior_keeps_its_origin(plain):
@@ -155,7 +157,7 @@ def test_command_line_removes_it_in_fit_and_transform(table, tmp_path, capsys):
     path, out = tmp_path / "table.csv", tmp_path / "out"
     names = [f"{c}{j}" for j in range(51) for c in "xy"]
     pd.DataFrame(table, columns=names).to_csv(path, index=False)
-    given = [str(path), "-k", "2", "--remove-pose", "--no-figures", "-o", str(out)]
+    given = [str(path), "-k", "2", "--remove-pose", *JOINT, "-o", str(out)]
     assert main(["fit", *given]) == 0
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "--remove-pose: what yaw predicts was removed" in page

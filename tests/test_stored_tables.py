@@ -1,12 +1,12 @@
 """Tables that are read block by block, from files or on dask, fitted as in memory."""
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from frame_parts import OF_FRAMES, OF_SHAPES, assert_same_model
 from layers import slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused, warned
 
@@ -31,7 +31,7 @@ SAMPLED = ALL._replace(small_table=1000, sample=50, model_frames=100)
 KRYLOV = ALL._replace(dense=300)
 
 
-@cache
+@made_once
 def table(missing=0.0, n_points=20, n_frames=150, outliers=False, planar=False):
     scene = make_nonrigid_tracks(n_frames, n_points, K, noise=0.01, random_state=0)
     tracks = scene.data.reshape(n_frames, n_points, 2)
@@ -50,7 +50,7 @@ def estimator(limits=ALL, tol=1.0, **params):
     return limited(limits)(K, random_state=0, tol=tol, **params)
 
 
-@cache
+@made_once
 def in_memory(limits=ALL, params=(), given=()):
     """Return the fit of a table in memory."""
     return estimator(limits, **dict(params)).fit(table(**dict(given)))

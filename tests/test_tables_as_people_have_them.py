@@ -11,7 +11,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import QUICK
+from fit_runs import JOINT, QUICK
 from landmark_files import BODYPARTS, TRACKS
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
@@ -178,7 +178,7 @@ def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
     table = table_of("{part}_{axis}", POINTS).assign(age=np.arange(N) % 7 + 0.5)
     path = tmp_path / "b.csv"
     table.assign(t=0.04 * np.arange(N)).to_csv(path, sep=";", decimal=decimal)
-    found = fits(path, "-k", 1, "--no-figures", "--label", "age", "--time", "t").report
+    found = fits(path, "-k", 1, *JOINT, "--label", "age", "--time", "t").report
     assert found["labels"][0]["kind"] == "number"
 
 
