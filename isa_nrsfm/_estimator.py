@@ -32,7 +32,12 @@ from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._other_tables import checked_prior, warn_if_foreign
+from isa_nrsfm._other_tables import (
+    checked_prior,
+    fitted_prior,
+    warn_if_far,
+    warn_if_foreign,
+)
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (
@@ -59,6 +64,7 @@ from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
+from isa_nrsfm.analysis._mirrored_rows import mirrored_rows
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa._strategies import ready_strategy
@@ -617,6 +623,15 @@ default="affine"
         else:
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
+        if errors and settings.joint:
+            given = fitted_prior(self.prior)
+            if prior is not None:
+                warn_if_far(self.prior_std_[0])
+            rows, message = mirrored_rows(self, given, frames.motion)
+            if message:
+                warn_caller(message)
+            if prior is not None and len(rows) > len(frames.motion) / 2:
+                self.mirror_certainty_ = 1.0 - self.mirror_certainty_
         if errors and not model.frames.certainty.determined:
             parts = frames[:3] if weights is None else (*frames[:3], weights)
             _, energy, _ = gross_residuals(source.joined(model.distances, *parts))

@@ -203,7 +203,7 @@ def fit_table(
             table, model, fits, settings, wanted, widths, remove_pose
         )
         if fit.prior is not None:
-            attributes["prior_std_"] = np.array([fit.prior.width, 0.0])
+            attributes["prior_std_"] = np.array([fit.prior.distance, 0.0])
         if errors and camera != "affine":
             attributes["depth_uncertainty_"] = fitted.frames.certainty.total
         converged = fit.converged
