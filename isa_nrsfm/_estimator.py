@@ -50,7 +50,7 @@ from isa_nrsfm._prepare.checks import (
 )
 from isa_nrsfm._prepare.coordinates import warn_of_rows
 from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.sources import (
     CHECKS,
     StoredTable,
@@ -61,7 +61,12 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
+from isa_nrsfm.analysis._advice import (
+    depth_advice,
+    facts_of,
+    outlier_advice,
+    with_outliers,
+)
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
 from isa_nrsfm.analysis._mirrored_rows import mirrored_rows
@@ -632,10 +637,15 @@ default="affine"
                 warn_caller(message)
             if prior is not None and len(rows) > len(frames.motion) / 2:
                 self.mirror_certainty_ = 1.0 - self.mirror_certainty_
-        if errors and not model.frames.certainty.determined:
-            parts = frames[:3] if weights is None else (*frames[:3], weights)
-            _, energy, _ = gross_residuals(source.joined(model.distances, *parts))
-            warn_caller(depth_advice(facts_of(self, outlier_energy=energy)))
+        if errors and settings.joint:
+            facts = facts_of(self)
+            if settings.loss == "linear":
+                some = spread(np.arange(source.n_frames), 100)
+                few = source.take(some), *([] if weights is None else [weights[some]])
+                facts = with_outliers(facts, model.left_out(*few), some)
+            text = [*filter(None, (outlier_advice(facts), depth_advice(facts)))]
+            if text:
+                warn_caller(". ".join(text))
 
     def _ready(
         self, X: Any, point_weight: Any = None

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose
-from refusals import refused
+from refusals import refused, warned
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
@@ -206,6 +206,9 @@ class TestFigures:
         assert_allclose(mirrored, expected, rtol=0, atol=1e-15)
 
 
+OUTLIERS = "the table has outliers: .* % of the points .* they bend the shapes"
+
+
 def with_outliers(faces, share, seed=0):
     """Return a table of faces with wrong points, and which points are wrong."""
     rng = np.random.default_rng(seed)
@@ -294,7 +297,8 @@ class TestOutliers:
     def test_are_named_and_stand_for_what_they_cause(self):
         faces = make_face_tracks(100, n_components=2, noise=0.01, random_state=0)
         table, wrong = with_outliers(faces, 0.05)
-        found = AffineNRSfM(2, random_state=0).fit(table).diagnostics(table)
+        model = warned(OUTLIERS, AffineNRSfM(2, random_state=0).fit, table)
+        found = model.diagnostics(table)
         (message,) = found.messages
         assert message.startswith(f"the table has outliers: {len(found.outliers)} ")
         assert message.endswith(f"they bend the shapes. Correct them. {COMPARE}")
@@ -321,9 +325,36 @@ class TestOutliers:
         for point in range(5, 30, 2):
             table.loc[f"image{point + 2}", f"x_{point}"] += 400.0
             table.loc[f"image{90 - point}", "x_5"] += 400.0
-        model = AffineNRSfM(2, random_state=0).fit(table)
+        model = warned(OUTLIERS, AffineNRSfM(2, random_state=0).fit, table)
         (message,) = model.diagnostics(table).messages
         assert re.search(r"rows image9, .* points 7,", message)
+
+    def test_fit_names_a_few_that_directions_of_the_shapes_explain(self):
+        faces = make_face_tracks(60, camera="weak_perspective", random_state=0)
+        table, wrong = with_outliers(faces, 0.02)
+        given = AffineNRSfM("auto", camera="weak_perspective", random_state=0)
+        with pytest.warns(match=OUTLIERS) as caught:
+            given.fit(table)
+        rows = re.search("in the rows (.*), ...:", str(caught[0].message))[1]
+        assert wrong[[*map(int, rows.split(", "))]].any(axis=1).all()
+        given.fit(faces.data)
+
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    def test_distances_are_those_of_fits_without_the_point(self, camera):
+        faces = make_face_tracks(
+            40, camera="weak_perspective", noise=0.01, random_state=0
+        )
+        model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
+        rows = faces.tracks[:6].mT.copy()
+        rows[:, :, 9] += 30.0  # beyond the noise
+        found = model._model.left_out(rows)[:, 9]
+        others = rows.copy()
+        others[:, :, 9] = np.nan
+        left = model._model.decompose(others, deviations=False)
+        distance = model._model.distances(rows, *left[:3])[:, 9]
+        assert_allclose(found, distance, rtol=0.05)
+        weights = np.ones(rows[:, 0].shape)
+        assert_allclose(model._model.left_out(rows, 1.0 * weights)[:, 9], found)
 
 
 def test_outliers_are_named_by_rows_and_most_frequent_points():

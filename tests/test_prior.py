@@ -356,7 +356,7 @@ def test_the_prior_of_real_photos_from_five_cameras(load_data):
         assert mean_shape_error_3d(truth, found * signs, convention="frame") < 0.06
 
 
-# --- other objects and images that the prior does not have -----------------------------------
+# --- other objects and images ---------------------------------------------------------
 
 
 def stated_ratio(model, table):

@@ -28,6 +28,7 @@ from isa_nrsfm._frames.camera_models import (
     CameraModel,
     residuals,
 )
+from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.prior import SETTLED, STEP, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
@@ -64,6 +65,7 @@ from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
+from isa_nrsfm._tables.tracks import seen_points
 
 # Numbers of basis shapes of the fits that are compared: docs/benchmarks/README.md,
 # "Thresholds".
@@ -404,9 +406,9 @@ def deepened(problem: JointProblem, fit: JointFit) -> JointFit:
         found = [(_end(fit) / n + 0.5 * fit.prior.cost, fit)]
         for factor in (STEP, 1.0 / STEP):
             start, stretch = stretched(fit.state, problem.cameras, factor)
-            other = problem.with_prior(fit.prior.stretched(stretch))
-            trial = other.unreversed(start, problem.cameras)
-            found.append((_end(trial) / n + 0.5 * other.likelihood.prior.cost, trial))
+            other = fit.prior.stretched(stretch)
+            trial = problem.with_prior(other).unreversed(start, problem.cameras)
+            found.append((_end(trial) / n + 0.5 * other.cost, trial))
         best = min(found, key=itemgetter(0))[1]
         if best is fit:
             break
@@ -529,6 +531,30 @@ def own_unknowns(
         coefficients = np.arange(n_pose, A.shape[1])
         gram[:, coefficients, coefficients] += noise
         yield part, flat, weighed, np.linalg.inv(regular(gram))
+
+
+def left_out_distances(
+    model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
+) -> NDArray:
+    """Return distances (n, J) of points from fits of the others of their frame.
+
+    rows (n, 2, J): of size one. To first order, ``(I - H_jj)^-1 r_j`` with the residual
+    r_j of a point and the hat matrix H of its frame. Directions of the shapes that
+    follow a wrong point explain it, but not from the others. Times the roots of
+    weights.
+    """
+    fit = model.without_starts.posterior(rows, False, weights)
+    w = seen_points(rows) * 1.0 if weights is None else weights
+    state = JointState(model.shapes, fit.motion, model.noise_variance)
+    rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
+    distance, each = np.full(w.shape, np.nan), CAMERAS[model.camera]
+    for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, each):
+        A, Z = (x.reshape(len(A), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
+        H = np.einsum("iprj,ipsj->ijrs", Z, A)
+        left = regular((np.eye(2) - H).reshape(-1, 2, 2)).reshape(H.shape)
+        r = np.moveaxis(rest[part], 1, 2)[..., None]
+        distance[part] = np.linalg.norm(np.linalg.solve(left, r)[..., 0], axis=2)
+    return np.where(w > 0, np.sqrt(w) * distance, np.nan)
 
 
 def _distances(

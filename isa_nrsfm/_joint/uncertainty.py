@@ -27,7 +27,6 @@ from scipy.special import softmax
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
-    CameraModel,
     distances,
     full_rotations,
     stacked_motion,
@@ -332,14 +331,14 @@ def depth_certainty(
         rise = min(refit(every, start)[-1] for start in starts) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:
-        costs, squares = [0.5 * prior.cost], [0.0]
+        costs, stretches = [0.5 * prior.cost], [0.0]
         for factor in (STEP, 1.0 / STEP):
             start, stretch = stretched(whole, camera, factor)
             other = prior.stretched(stretch)
             rise = refit(every, start, prior=other)[-1] - value
             costs.append(0.5 * other.cost + FAR_FRAMES * rise)
-            squares.append((factor - 1.0) ** 2)
-        deformation += float(softmax(-np.array(costs)) @ squares)
+            stretches.append((factor - 1.0) ** 2)
+        deformation += float(softmax(-np.array(costs)) @ stretches)
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept in parts:
         _, turned, z, _ = refit(kept)
