@@ -269,7 +269,8 @@ default="affine"
         given, infinite if the depth is not determined.
     prior_std_ : ndarray of shape (2,)
         Standard deviations of mean shape and basis shapes from those of the prior, in
-        sizes of frames. The basis is that of the prior: the second is zero.
+        sizes of frames. The basis is that of the prior, or stretched in depth with the
+        mean shape: the second is zero.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -523,7 +524,9 @@ default="affine"
         UserWarning
             If calibrated cameras do not determine the depth, points are at codes of
             missing ones, in shares of an image's size, of the other layout or lack a
-            coordinate, rows without points are left out, or a fit has not converged.
+            coordinate, rows without points are left out, or a fit has not converged; if
+            outliers bend the shapes, rows are mirror images, or the objects are not
+            those of the prior.
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):

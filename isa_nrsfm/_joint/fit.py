@@ -61,7 +61,7 @@ from isa_nrsfm._joint.whole import (
     rival_depths,
     whole_distribution,
 )
-from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
@@ -400,20 +400,16 @@ def deepened(problem: JointProblem, fit: JointFit) -> JointFit:
 
     As many frames as `FAR_FRAMES` are the evidence.
     """
-    n = problem.frames.n_frames / FAR_FRAMES
-    for _ in range(8):
-        assert fit.prior is not None
-        found = [(_end(fit) / n + 0.5 * fit.prior.cost, fit)]
-        for factor in (STEP, 1.0 / STEP):
-            start, stretch = stretched(fit.state, problem.cameras, factor)
-            other = fit.prior.stretched(stretch)
-            trial = problem.with_prior(other).unreversed(start, problem.cameras)
-            found.append((_end(trial) / n + 0.5 * other.cost, trial))
-        best = min(found, key=itemgetter(0))[1]
-        if best is fit:
-            break
-        fit = widened(problem, best)
-    return fit
+    prior, n = fit.prior, problem.frames.n_frames / FAR_FRAMES
+    assert prior is not None
+    found = [(_end(fit) / n + 0.5 * prior.cost, fit)]
+    for factor in (STEP, 1.0 / STEP):
+        start, stretch = stretched(fit.state, problem.cameras, factor)
+        other = prior.stretched(stretch)
+        trial = problem.with_prior(other).unreversed(start, problem.cameras)
+        found.append((_end(trial) / n + 0.5 * other.cost, trial))
+    best = min(found, key=itemgetter(0))[1]
+    return fit if best is fit else deepened(problem, widened(problem, best))
 
 
 def reweighted(
@@ -472,6 +468,8 @@ def reweighted(
             break
         problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
         fit = refined(problem, fit)
+    if fit.prior is not None:
+        fit = deepened(problem, fit)
     if len(few) < rows.n_frames:
         weighted = rows.derive(without, left_out)
         problem = part(weighted)
@@ -547,13 +545,12 @@ def left_out_distances(
     w = seen_points(rows) * 1.0 if weights is None else weights
     state = JointState(model.shapes, fit.motion, model.noise_variance)
     rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
-    distance, each = np.full(w.shape, np.nan), CAMERAS[model.camera]
-    for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, each):
-        A, Z = (x.reshape(len(A), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
-        H = np.einsum("iprj,ipsj->ijrs", Z, A)
-        left = regular((np.eye(2) - H).reshape(-1, 2, 2)).reshape(H.shape)
-        r = np.moveaxis(rest[part], 1, 2)[..., None]
-        distance[part] = np.linalg.norm(np.linalg.solve(left, r)[..., 0], axis=2)
+    distance, camera = np.full(w.shape, np.nan), CAMERAS[model.camera]
+    for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, camera):
+        Z, Y = (x.reshape(len(x), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
+        left = (1.0 + OF_DIFFERENCES) * np.eye(2) - np.einsum("iprj,ipsj->ijrs", Y, Z)
+        error = np.linalg.solve(left, rest[part].mT[..., None])[..., 0]
+        distance[part] = np.linalg.norm(error, axis=2)
     return np.where(w > 0, np.sqrt(w) * distance, np.nan)
 
 

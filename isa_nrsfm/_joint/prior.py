@@ -22,6 +22,11 @@ coordinates that E is free to change, ::
     g = n - tr(cov E) / tau^2,   tau^2 <- ||E||^2 / g.
 
 Rotation, mirror image, scale and mixing of the shapes are those of the model.
+
+E alone hardly changes the depths as a whole: objects may be flatter or deeper than
+those of the model. So A_0, the basis and the prior of E are stretched by a factor along
+the mean line of sight. Its logarithm is normal, with the deviation `DEPTH_SPREAD`.
+Objects that turn determine it. To first order in the rotations it has no effect.
 """
 
 from typing import NamedTuple
@@ -54,7 +59,7 @@ class ShapePrior(NamedTuple):
     shapes (K + 1, 3, J): A. gauge: maps frames to the public shapes. scaled: whether
     cameras have scales. depth_error: variance of the depths of each public shape of the
     model. width: tau. n_determined: number of coordinates of the mean shape that the
-    table determines.
+    table determines. stretch (3, 3): of the shapes of the model.
     """
 
     shapes: NDArray
