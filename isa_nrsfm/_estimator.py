@@ -50,7 +50,7 @@ from isa_nrsfm._prepare.checks import (
 )
 from isa_nrsfm._prepare.coordinates import warn_of_rows
 from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
     CHECKS,
     StoredTable,
@@ -603,6 +603,7 @@ default="affine"
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
+        left_out = fitted.pop("_left_out", None)
         attributes: dict[str, Any] = fitted | {
             "_model": model,
             "_n_features_out": model.n_components,
@@ -642,10 +643,8 @@ default="affine"
                 self.mirror_certainty_ = 1.0 - self.mirror_certainty_
         if errors and settings.joint:
             facts = facts_of(self)
-            if settings.loss == "linear":
-                some = spread(np.arange(source.n_frames), 100)
-                few = source.take(some), *([] if weights is None else [weights[some]])
-                facts = with_outliers(facts, model.left_out(*few), some)
+            if left_out is not None:
+                facts = with_outliers(facts, *left_out)
             text = [*filter(None, (outlier_advice(facts), depth_advice(facts)))]
             if text:
                 warn_caller(". ".join(text))

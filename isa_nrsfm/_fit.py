@@ -51,7 +51,7 @@ from isa_nrsfm._gauge import (
     rigid_gauge,
 )
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import count_components, fit_jointly
+from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
 from isa_nrsfm._joint.half_tables import half_tables
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
@@ -191,6 +191,11 @@ def fit_table(
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             progress(CONSENSUS_STAGE)
+        if errors and settings.loss == "linear":
+            some = spread(np.arange(len(table.sizes)), 100)
+            own = None if table.weights is None else table.weights[some]
+            distance = left_out_distances(model, table.rows.take(some), own)
+            attributes["_left_out"] = distance, np.flatnonzero(table.shown)[some]
         if (n_more := wanted + 1 - len(model.shapes)) > 0:
             # Coefficients beyond the directions that a table supports are zero.
             shapes = np.pad(model.shapes, ((0, n_more), (0, 0), (0, 0)))

@@ -23,7 +23,6 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.pinhole import Pinhole, zoomed
 from isa_nrsfm._frames.search import FramePosterior
-from isa_nrsfm._joint.fit import left_out_distances
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -307,14 +306,6 @@ class TableModel(NamedTuple):
         if weights and self.frames.certainty.weighted:
             distance *= np.sqrt(weights[0])
         return distance / of_all_rows(sizes, usable)[:, None]
-
-    def left_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
-        """Return `left_out_distances` (n, J) of rows of a table."""
-        rows = self.straightened(rows, weights)
-        usable, centred, _, sizes, weights = self._ready(rows, weights)
-        assert isinstance(self.frames, PosteriorFrames)
-        unit = centred / sizes[:, None, None]
-        return of_all_rows(left_out_distances(self.frames, unit, weights), usable)
 
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return squared errors and signals (n, J, 2) of held-out points.

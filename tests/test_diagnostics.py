@@ -19,6 +19,7 @@ from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.models import DepthCertainty
+from isa_nrsfm._joint.fit import left_out_distances
 from isa_nrsfm._joint.uncertainty import reliabilities
 from isa_nrsfm.analysis._advice import (
     COMPARE,
@@ -347,14 +348,18 @@ class TestOutliers:
         model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
         rows = faces.tracks[:6].mT.copy()
         rows[:, :, 9] += 30.0  # beyond the noise
-        found = model._model.left_out(rows)[:, 9]
-        others = rows.copy()
-        others[:, :, 9] = np.nan
+        rows -= rows.mean(axis=2, keepdims=True)
+        sizes = np.sqrt(np.mean(rows**2, axis=(1, 2)))
+        unit, frames = rows / sizes[:, None, None], model._model.frames
+        found = left_out_distances(frames, unit)
+        others = np.where(np.arange(rows.shape[2]) == 9, np.nan, rows)
         left = model._model.decompose(others, deviations=False)
-        distance = model._model.distances(rows, *left[:3])[:, 9]
-        assert_allclose(found, distance, rtol=0.05)
-        weights = np.ones(rows[:, 0].shape)
-        assert_allclose(model._model.left_out(rows, 1.0 * weights)[:, 9], found)
+        shapes = model._model.shapes(left, None, False)
+        images = model._model.images(shapes, left.motion, left.translation)
+        distance = np.linalg.norm(rows.mT - images, axis=2)[:, 9]
+        assert_allclose(sizes * found[:, 9], distance, rtol=0.05)
+        given = left_out_distances(frames, unit, np.ones(found.shape))
+        assert_allclose(given, found)
 
 
 def test_outliers_are_named_by_rows_and_most_frequent_points():
