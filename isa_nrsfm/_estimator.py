@@ -35,7 +35,6 @@ from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings,
 from isa_nrsfm._other_tables import (
     checked_prior,
     fitted_prior,
-    warn_if_far,
     warn_if_foreign,
 )
 from isa_nrsfm._parameters import choices
@@ -61,15 +60,9 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._advice import (
-    depth_advice,
-    facts_of,
-    outlier_advice,
-    with_outliers,
-)
+from isa_nrsfm.analysis._after_fit import warn_after_fit
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
-from isa_nrsfm.analysis._mirrored_rows import mirrored_rows
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
 from isa_nrsfm.calibration import deformation_metric
 from isa_nrsfm.isa._strategies import ready_strategy
@@ -269,8 +262,7 @@ default="affine"
         given, infinite if the depth is not determined.
     prior_std_ : ndarray of shape (2,)
         Standard deviations of mean shape and basis shapes from those of the prior, in
-        sizes of frames. The basis is that of the prior, or stretched in depth with the
-        mean shape: the second is zero.
+        sizes of frames. The basis is stretched at most in depth: the second is zero.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -524,9 +516,8 @@ default="affine"
         UserWarning
             If calibrated cameras do not determine the depth, points are at codes of
             missing ones, in shares of an image's size, of the other layout or lack a
-            coordinate, rows without points are left out, or a fit has not converged; if
-            outliers bend the shapes, rows are mirror images, or the objects are not
-            those of the prior.
+            coordinate, rows are left out or mirror images, outliers bend the shapes, a
+            prior does not suit, or a fit has not converged.
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
@@ -633,21 +624,7 @@ default="affine"
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
         if errors and settings.joint:
-            given = fitted_prior(self.prior)
-            if prior is not None:
-                warn_if_far(self.prior_std_[0])
-            rows, message = mirrored_rows(self, given, frames.motion)
-            if message:
-                warn_caller(message)
-            if prior is not None and len(rows) > len(frames.motion) / 2:
-                self.mirror_certainty_ = 1.0 - self.mirror_certainty_
-        if errors and settings.joint:
-            facts = facts_of(self)
-            if left_out is not None:
-                facts = with_outliers(facts, *left_out)
-            text = [*filter(None, (outlier_advice(facts), depth_advice(facts)))]
-            if text:
-                warn_caller(". ".join(text))
+            warn_after_fit(self, fitted_prior(self.prior), frames.motion, left_out)
 
     def _ready(
         self, X: Any, point_weight: Any = None

@@ -26,8 +26,6 @@ from isa_nrsfm._tables.tracks import tracks_to_table
 # cameras, that noise and other people do not reach: docs/benchmarks/README.md,
 # "Thresholds".
 OTHER_POINTS, LARGEST_MISFIT, OF_AFFINE = 0.15, 1.8, 5.0
-# Largest `prior_std_` of people and annotators, on the same page.
-LARGEST_WIDTH = 0.2
 
 
 def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> None:
@@ -66,18 +64,6 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
             "show other objects or people (a model of one person fits no other), or "
             "move as the fitted table does not show. Shapes, depths and coefficients "
             f"may be wrong. {way}"
-        )
-
-
-def warn_if_far(width: float) -> None:
-    """Warn if the mean shape of a table is too far from that of a prior."""
-    if width > LARGEST_WIDTH:
-        warn_caller(
-            f"the mean shape lies {width:.2g} sizes of the object from that of the "
-            "prior, farther than those of people and annotators: depths may be wrong. "
-            "Make sure that the points are those of the prior, and that x and y have "
-            "the same unit, unlike shares of the width and height of an image; or fit "
-            "the table without a prior"
         )
 
 

@@ -1,18 +1,58 @@
-"""Rows of a table that are mirror images of the object."""
+"""What a fit warns of: other objects than those of a prior, mirrored rows, outliers."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm.analysis._advice import layout_of
+from isa_nrsfm.analysis._advice import (
+    SAME_UNIT,
+    depth_advice,
+    facts_of,
+    layout_of,
+    outlier_advice,
+    with_outliers,
+)
 
 # Least share of the area between two directions in the image, relative to the largest
 # ones of the table, of a row whose side is known: docs/benchmarks/README.md,
 # "Thresholds".
 LEAST_AREA = 0.5
+# Largest `prior_std_` of people and annotators, on the same page.
+LARGEST_WIDTH = 0.2
+
+
+def warn_after_fit(
+    model: Any,
+    prior: Any,
+    motion: NDArray,
+    left_out: tuple[NDArray, NDArray] | None,
+) -> None:
+    """Warn of what a joint fit shows of its table.
+
+    motion (n_rows, 2, 3): cameras. left_out: distances (n, J) of `left_out_distances`,
+    and the numbers of their rows. Most rows mirrored: the prior has the wrong sign.
+    """
+    rows, message = mirrored_rows(model, prior, motion)
+    if prior is not None and len(rows) > len(motion) / 2:
+        model.mirror_certainty_ = 1.0 - model.mirror_certainty_
+    if prior is not None and (width := model.prior_std_[0]) > LARGEST_WIDTH:
+        warn_caller(
+            f"the mean shape lies {width:.2g} sizes of the object from that of the "
+            "prior, farther than those of people and annotators: depths may be wrong. "
+            f"Make sure that the points are those of the prior, and that {SAME_UNIT}; "
+            "or fit the table without a prior"
+        )
+    facts = facts_of(model)
+    if left_out is not None:
+        facts = with_outliers(facts, *left_out)
+    advice = filter(None, (outlier_advice(facts), depth_advice(facts)))
+    for text in (message, ". ".join(advice)):
+        if text:
+            warn_caller(text)
 
 
 def mirrored_rows(model: Any, prior: Any, motion: NDArray) -> tuple[NDArray, str]:
