@@ -191,10 +191,9 @@ def fit_table(
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             progress(CONSENSUS_STAGE)
-        if errors and settings.loss == "linear":
+        if errors and settings.loss == "linear" and table.weights is None:
             some = spread(np.arange(len(table.sizes)), 100)
-            own = None if table.weights is None else table.weights[some]
-            distance = left_out_distances(model, table.rows.take(some), own)
+            distance = left_out_distances(model, table.rows.take(some))
             attributes["_left_out"] = distance, np.flatnonzero(table.shown)[some]
         if (n_more := wanted + 1 - len(model.shapes)) > 0:
             # Coefficients beyond the directions that a table supports are zero.

@@ -28,7 +28,7 @@ from isa_nrsfm._frames.camera_models import (
     CameraModel,
     residuals,
 )
-from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.models import LEAST_POINTS, PosteriorFrames
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.prior import SETTLED, STEP, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
@@ -531,18 +531,15 @@ def own_unknowns(
         yield part, flat, weighed, np.linalg.inv(regular(gram))
 
 
-def left_out_distances(
-    model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
-) -> NDArray:
+def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
     """Return distances (n, J) of points from fits of the others of their frame.
 
     rows (n, 2, J): of size one. To first order, ``(I - H_jj)^-1 r_j`` with the residual
     r_j of a point and the hat matrix H of its frame. Directions of the shapes that
-    follow a wrong point explain it, but not from the others. Times the roots of
-    weights.
+    follow a wrong point explain it, but not from the others. NaN if these are fewer
+    than `LEAST_POINTS`.
     """
-    fit = model.without_starts.posterior(rows, False, weights)
-    w = seen_points(rows) * 1.0 if weights is None else weights
+    fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
     state = JointState(model.shapes, fit.motion, model.noise_variance)
     rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
     distance, camera = np.full(w.shape, np.nan), CAMERAS[model.camera]
@@ -551,7 +548,8 @@ def left_out_distances(
         left = (1.0 + OF_DIFFERENCES) * np.eye(2) - np.einsum("iprj,ipsj->ijrs", Y, Z)
         error = np.linalg.solve(left, rest[part].mT[..., None])[..., 0]
         distance[part] = np.linalg.norm(error, axis=2)
-    return np.where(w > 0, np.sqrt(w) * distance, np.nan)
+    enough = w.sum(axis=1, keepdims=True) > LEAST_POINTS
+    return np.where((w > 0) & enough, distance, np.nan)
 
 
 def _distances(
