@@ -32,7 +32,11 @@ from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
 from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._other_tables import checked_prior, warn_if_foreign
+from isa_nrsfm._other_tables import (
+    checked_prior,
+    fitted_prior,
+    warn_if_foreign,
+)
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (
@@ -56,7 +60,7 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._advice import depth_advice, facts_of, gross_residuals
+from isa_nrsfm.analysis._after_fit import warn_after_fit
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
@@ -258,7 +262,7 @@ default="affine"
         given, infinite if the depth is not determined.
     prior_std_ : ndarray of shape (2,)
         Standard deviations of mean shape and basis shapes from those of the prior, in
-        sizes of frames. The basis is that of the prior: the second is zero.
+        sizes of frames. The basis is stretched at most in depth: the second is zero.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
@@ -512,7 +516,8 @@ default="affine"
         UserWarning
             If calibrated cameras do not determine the depth, points are at codes of
             missing ones, in shares of an image's size, of the other layout or lack a
-            coordinate, rows without points are left out, or a fit has not converged.
+            coordinate, rows are left out or mirror images, outliers bend the shapes, a
+            prior does not suit, or a fit has not converged.
         """
         self._forget()
         with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
@@ -589,6 +594,7 @@ default="affine"
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
+        left_out = fitted.pop("_left_out", None)
         attributes: dict[str, Any] = fitted | {
             "_model": model,
             "_n_features_out": model.n_components,
@@ -617,10 +623,8 @@ default="affine"
         else:
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
-        if errors and not model.frames.certainty.determined:
-            parts = frames[:3] if weights is None else (*frames[:3], weights)
-            _, energy, _ = gross_residuals(source.joined(model.distances, *parts))
-            warn_caller(depth_advice(facts_of(self, outlier_energy=energy)))
+        if errors and settings.joint:
+            warn_after_fit(self, fitted_prior(self.prior), frames.motion, left_out)
 
     def _ready(
         self, X: Any, point_weight: Any = None

@@ -51,7 +51,7 @@ from isa_nrsfm._gauge import (
     rigid_gauge,
 )
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import count_components, fit_jointly
+from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
 from isa_nrsfm._joint.half_tables import half_tables
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
@@ -191,6 +191,10 @@ def fit_table(
             model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             progress(CONSENSUS_STAGE)
+        if errors and settings.loss == "linear" and table.weights is None:
+            some = spread(np.arange(len(table.sizes)), 100)
+            distance = left_out_distances(model, table.rows.take(some))
+            attributes["_left_out"] = distance, np.flatnonzero(table.shown)[some]
         if (n_more := wanted + 1 - len(model.shapes)) > 0:
             # Coefficients beyond the directions that a table supports are zero.
             shapes = np.pad(model.shapes, ((0, n_more), (0, 0), (0, 0)))
@@ -203,7 +207,7 @@ def fit_table(
             table, model, fits, settings, wanted, widths, remove_pose
         )
         if fit.prior is not None:
-            attributes["prior_std_"] = np.array([fit.prior.width, 0.0])
+            attributes["prior_std_"] = np.array([fit.prior.distance, 0.0])
         if errors and camera != "affine":
             attributes["depth_uncertainty_"] = fitted.frames.certainty.total
         converged = fit.converged

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose
-from refusals import refused
+from refusals import refused, warned
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
@@ -19,6 +19,7 @@ from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.models import DepthCertainty
+from isa_nrsfm._joint.fit import left_out_distances
 from isa_nrsfm._joint.uncertainty import reliabilities
 from isa_nrsfm.analysis._advice import (
     COMPARE,
@@ -206,6 +207,9 @@ class TestFigures:
         assert_allclose(mirrored, expected, rtol=0, atol=1e-15)
 
 
+OUTLIERS = "the table has outliers: .* % of the points .* they bend the shapes"
+
+
 def with_outliers(faces, share, seed=0):
     """Return a table of faces with wrong points, and which points are wrong."""
     rng = np.random.default_rng(seed)
@@ -294,7 +298,8 @@ class TestOutliers:
     def test_are_named_and_stand_for_what_they_cause(self):
         faces = make_face_tracks(100, n_components=2, noise=0.01, random_state=0)
         table, wrong = with_outliers(faces, 0.05)
-        found = AffineNRSfM(2, random_state=0).fit(table).diagnostics(table)
+        model = warned(OUTLIERS, AffineNRSfM(2, random_state=0).fit, table)
+        found = model.diagnostics(table)
         (message,) = found.messages
         assert message.startswith(f"the table has outliers: {len(found.outliers)} ")
         assert message.endswith(f"they bend the shapes. Correct them. {COMPARE}")
@@ -321,9 +326,38 @@ class TestOutliers:
         for point in range(5, 30, 2):
             table.loc[f"image{point + 2}", f"x_{point}"] += 400.0
             table.loc[f"image{90 - point}", "x_5"] += 400.0
-        model = AffineNRSfM(2, random_state=0).fit(table)
+        model = warned(OUTLIERS, AffineNRSfM(2, random_state=0).fit, table)
         (message,) = model.diagnostics(table).messages
         assert re.search(r"rows image9, .* points 7,", message)
+
+    def test_fit_names_a_few_that_directions_of_the_shapes_explain(self):
+        faces = make_face_tracks(60, camera="weak_perspective", random_state=0)
+        table, wrong = with_outliers(faces, 0.02)
+        given = AffineNRSfM("auto", camera="weak_perspective", random_state=0)
+        with pytest.warns(match=OUTLIERS) as caught:
+            given.fit(table)
+        rows = re.search("in the rows (.*), ...:", str(caught[0].message))[1]
+        assert wrong[[*map(int, rows.split(", "))]].any(axis=1).all()
+        given.fit(faces.data)
+
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    def test_distances_are_those_of_fits_without_the_point(self, camera):
+        faces = make_face_tracks(
+            40, camera="weak_perspective", noise=0.01, random_state=0
+        )
+        model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
+        rows = faces.tracks[:6].mT.copy()
+        rows[:, :, 9] += 30.0  # beyond the noise
+        rows -= rows.mean(axis=2, keepdims=True)
+        sizes = np.sqrt(np.mean(rows**2, axis=(1, 2)))
+        unit, frames = rows / sizes[:, None, None], model._model.frames
+        found = left_out_distances(frames, unit)
+        others = np.where(np.arange(rows.shape[2]) == 9, np.nan, rows)
+        left = model._model.decompose(others, deviations=False)
+        shapes = model._model.shapes(left, None, False)
+        images = model._model.images(shapes, left.motion, left.translation)
+        distance = np.linalg.norm(rows.mT - images, axis=2)[:, 9]
+        assert_allclose(sizes * found[:, 9], distance, rtol=0.05)
 
 
 def test_outliers_are_named_by_rows_and_most_frequent_points():

@@ -167,7 +167,8 @@ class TestAccuracy:
         alpha = model.transform(X, point_weight=weights)
         assert_allclose(alpha, model.alpha_, atol=1e-9)
         found = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
-        plain = estimator().fit(X).reconstruct(X)
+        # Without weights the noisy points are outliers.
+        plain = warned("the table has outliers", estimator().fit, X).reconstruct(X)
         error = affine_shape_error(scene.shapes, found)
         assert error < 0.5 * affine_shape_error(scene.shapes, plain)
 

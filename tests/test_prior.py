@@ -42,11 +42,13 @@ N_POINTS = 16
 PERSPECTIVE = {"camera": "perspective", "principal_point": (0, 0)}
 
 
-def study(seed, n_frames, degrees, *, change=0.0, noise=0.3, focal=np.inf, spread=0.3):
+def study(
+    seed, n_frames, degrees, *, change=0.0, noise=0.3, focal=np.inf, spread=0.3, depth=1
+):
     """Return a table of objects within some degrees of frontal, and its truth.
 
     change: RMS difference of its mean shape from that of other tables, whose
-    coordinates are about 0.6.
+    coordinates are about 0.6. depth: factor of the depths.
     """
     rng = np.random.default_rng(7)
     mean_shape = rng.normal(size=(N_POINTS, 3)) * (0.6, 0.7, 0.5)
@@ -54,7 +56,7 @@ def study(seed, n_frames, degrees, *, change=0.0, noise=0.3, focal=np.inf, sprea
     rng = np.random.default_rng(seed)
     mean_shape = mean_shape + change * rng.normal(size=mean_shape.shape)
     S = mean_shape + np.tensordot(rng.normal(size=(n_frames, 2)), basis, 1)
-    S -= S.mean(axis=1, keepdims=True)
+    S = (S - S.mean(axis=1, keepdims=True)) * (1, 1, depth)
     angles = degrees * rng.uniform(-1, 1, (n_frames, 3))
     R = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
     scales = 100 * np.exp(spread * rng.uniform(-1, 1, (n_frames, 1, 1)))
@@ -352,6 +354,90 @@ def test_the_prior_of_real_photos_from_five_cameras(load_data):
         found = model.reconstruct(X).mean(axis=0, keepdims=True)
         signs = (1, 1, np.sign(np.linalg.det(truth[0].T @ found[0])))
         assert mean_shape_error_3d(truth, found * signs, convention="frame") < 0.06
+
+
+# --- other objects and images ---------------------------------------------------------
+
+
+def stated_ratio(model, table):
+    """Return the error of depths over its standard deviation."""
+    S, deviations = model.reconstruct(table.X, return_std=True)
+    z = model.scales_[:, None] * np.vecdot(S, model.rotations_[:, 2][:, None])
+    off = min((s * z - table.depths for s in (1, -1)), key=lambda x: np.sum(x**2))
+    return np.sqrt(np.mean((off / (model.scales_[:, None] * deviations)) ** 2))
+
+
+@pytest.mark.parametrize(("degrees", "factor"), slow_after(1, [(4, 0.7), (4, 1.4)]))
+def test_objects_of_other_depth(turned, degrees, factor):
+    table = study(1, 40, degrees, change=0.04, depth=factor)
+    model = fitted(table.X, turned.model, Thorough)
+    assert 0.4 < stated_ratio(model, table) < 2.5
+
+
+def faces(n_frames=30, degrees=10, depth=1):
+    """Return a table (n_frames, 68, 2) of faces of the face prior, and shapes."""
+    rng, prior = np.random.default_rng(0), load_face_prior(9)
+    S = prior.shapes(rng.normal(size=(n_frames, 9))) * (1, 1, depth)
+    angles = degrees * rng.uniform(-1, 1, (n_frames, 3))
+    R = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+    X = (S @ R.mT)[..., :2]
+    return 100 * X + rng.normal(size=X.shape), S
+
+
+def test_a_table_that_determines_its_depth_overrules_the_prior():
+    X, S = faces(90, 15, 0.6)
+    X = X.reshape(len(X), -1)
+    model = fitted(X, load_face_prior(9), n_components=9)
+    assert error(model, S, X) < 0.06
+
+
+@pytest.mark.parametrize("ways", [(-1, 1), (1, -1), "exchanged"])
+@pytest.mark.parametrize("kind", ["all", "some"])
+def test_mirrored_rows_are_named(ways, kind):
+    (X, _), prior = faces(), load_face_prior(9)
+    wrong = slice(None) if kind == "all" else [3, 7, 8]
+    X[wrong] = X[wrong][..., ::-1] if ways == "exchanged" else X[wrong] * ways
+    which = "all 30 rows" if kind == "all" else r"3 of 30 rows \(3, 7, 8\)"
+    what = {(-1, 1): "are mirror images", (1, -1): "y points up in"}
+    message = what.get(ways, "x and y are exchanged in") + f".*{which}"
+    message = f"{which} are mirror images" if ways == (-1, 1) else message
+    given = {"n_components": "auto"}
+    model = warned(message, fitted, X.reshape(30, -1), prior, **given)
+    assert model.mirror_certainty_ == (kind == "some")
+    # The way out works.
+    X[wrong] = X[wrong][..., ::-1] if ways == "exchanged" else X[wrong] * ways
+    assert fitted(X.reshape(30, -1), prior, **given).mirror_certainty_ == 1
+
+
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+def test_mirrored_rows_are_named_without_a_prior(camera):
+    X, _ = faces(degrees=30)
+    mirrored = X * (-1, 1)
+    fitted(mirrored.reshape(30, -1), camera=camera)  # consistent
+    X[::2] = mirrored[::2]
+    warned(r"15 of 30 rows \(.*\) are mirror", fitted, X.reshape(30, -1), camera=camera)
+
+
+def test_objects_of_which_a_prior_has_no_frame_from_behind(turned):
+    table = study(1, 40, 4)
+    X = table.X.reshape(40, -1, 2)
+    X[5:9, :, 0] *= -1
+    message = r"4 of 40 rows \(5, 6, 7, 8\) are mirror images"
+    warned(message, fitted, X.reshape(40, -1), turned.model)
+    around = fitted(study(0, 60, 180).X)
+    fitted(X.reshape(40, -1), around)  # any view is possible
+
+
+def test_squeezed_images_are_named():
+    X = faces(n_frames=20)[0] * (9 / 16, 1)
+    model = warned(
+        "sizes of the object from that of the prior",
+        fitted,
+        X.reshape(20, -1),
+        load_face_prior(9),
+        n_components=9,
+    )
+    assert model.prior_std_[0] > 0.2
 
 
 # --- refusals -------------------------------------------------------------------------

@@ -28,8 +28,9 @@ from isa_nrsfm._frames.camera_models import (
     CameraModel,
     residuals,
 )
+from isa_nrsfm._frames.models import LEAST_POINTS, PosteriorFrames
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
-from isa_nrsfm._joint.prior import TOL_SHARE, ShapePrior
+from isa_nrsfm._joint.prior import SETTLED, STEP, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,
     FactorisedTable,
@@ -47,9 +48,11 @@ from isa_nrsfm._joint.starts import (
     first_state,
     lifted_shapes,
     steadied,
+    stretched,
     with_prior,
 )
 from isa_nrsfm._joint.whole import (
+    FAR_FRAMES,
     FEW_DIRECTIONS,
     LEAST_NOISE,
     evidence,
@@ -58,10 +61,11 @@ from isa_nrsfm._joint.whole import (
     rival_depths,
     whole_distribution,
 )
-from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
+from isa_nrsfm._tables.tracks import seen_points
 
 # Numbers of basis shapes of the fits that are compared: docs/benchmarks/README.md,
 # "Thresholds".
@@ -129,7 +133,7 @@ def fit_jointly(
         fit, least_noise, sufficient = judged(first, table, fit, start)
         penalty = 0.0 if sufficient else first.penalty
     elif table.outliers is None:  # with them the widths follow the weights
-        fit = widened(first, fit)
+        fit = deepened(first, widened(first, fit))
 
     def of_all(larger: JointProblem) -> JointProblem:
         """Return a problem with the priors of the fit of the sample."""
@@ -380,13 +384,32 @@ def _freedom_correction(
 
 def widened(problem: JointProblem, fit: JointFit) -> JointFit:
     """Return the fit with the widths of the prior that follow from the table."""
-    for _ in range(3):
+    for _ in range(20):
         assert fit.prior is not None
         shapes, _, noise = fit.state
         curvature = problem.likelihood(*fit.state).shape_curvature
-        problem = problem.with_prior(fit.prior.updated(shapes, curvature, noise))
-        fit = problem.unreversed(fit.state, problem.cameras)
+        before, prior = fit.prior.width, fit.prior.updated(shapes, curvature, noise)
+        fit = problem.with_prior(prior).unreversed(fit.state, problem.cameras)
+        if abs(prior.width - before) < SETTLED * prior.width:
+            break
     return fit
+
+
+def deepened(problem: JointProblem, fit: JointFit) -> JointFit:
+    """Return the fit, or that of flatter or deeper objects, if these are likelier.
+
+    As many frames as `FAR_FRAMES` are the evidence.
+    """
+    prior, n = fit.prior, problem.frames.n_frames / FAR_FRAMES
+    assert prior is not None
+    found = [(_end(fit) / n + 0.5 * prior.cost, fit)]
+    for factor in (STEP, 1.0 / STEP):
+        start, stretch = stretched(fit.state, problem.cameras, factor)
+        other = prior.stretched(stretch)
+        trial = problem.with_prior(other).unreversed(start, problem.cameras)
+        found.append((_end(trial) / n + 0.5 * other.cost, trial))
+    best = min(found, key=itemgetter(0))[1]
+    return fit if best is fit else deepened(problem, widened(problem, best))
 
 
 def reweighted(
@@ -445,6 +468,8 @@ def reweighted(
             break
         problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
         fit = refined(problem, fit)
+    if fit.prior is not None:
+        fit = deepened(problem, fit)
     if len(few) < rows.n_frames:
         weighted = rows.derive(without, left_out)
         problem = part(weighted)
@@ -468,10 +493,26 @@ def residual_deviations(
     W, residuals are ``(I - A (A^T W A + P)^-1 A^T W)`` times the noise; the prior P is
     the noise variance for each coefficient.
     """
+    deviations = np.empty(weights.shape)
+    for part, A, weighed, inverse in own_unknowns(state, alpha, weights, cameras):
+        Z = inverse @ A
+        spread = np.einsum("ipx,ipx->ix", Z, weighed @ weighed.swapaxes(1, 2) @ Z)
+        leverage = np.einsum("ipx,ipx->ix", weighed, Z)
+        square = (1.0 - 2.0 * leverage + spread).reshape(len(A), 2, -1).mean(axis=1)
+        deviations[part] = np.sqrt(np.maximum(square, OF_DISTANCES))
+    return deviations
+
+
+def own_unknowns(
+    state: JointState, alpha: NDArray, weights: NDArray, cameras: CameraModel
+) -> Iterator[tuple[slice, NDArray, NDArray, NDArray]]:
+    """Yield A (n, p, 2 J), A W and ``(A^T W A + P)^-1`` of slices of frames.
+
+    A, W and P are those of `residual_deviations`.
+    """
     shapes, motion, noise = state
     (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
     n_pose = 2 + cameras.n_parameters
-    deviations = np.empty(weights.shape)
     # Process frames in slices whose derivatives fit into 1 MB
     length = max(2**17 // (2 * n_points * (n_pose + n_components)), 1)
     for first in range(0, n_frames, length):
@@ -487,12 +528,28 @@ def residual_deviations(
         gram = weighed @ flat.swapaxes(1, 2)
         coefficients = np.arange(n_pose, A.shape[1])
         gram[:, coefficients, coefficients] += noise
-        Z = np.linalg.inv(regular(gram)) @ flat
-        spread = np.einsum("ipx,ipx->ix", Z, weighed @ weighed.swapaxes(1, 2) @ Z)
-        leverage = np.einsum("ipx,ipx->ix", weighed, Z)
-        square = (1.0 - 2.0 * leverage + spread).reshape(-1, 2, n_points).mean(axis=1)
-        deviations[part] = np.sqrt(np.maximum(square, OF_DISTANCES))
-    return deviations
+        yield part, flat, weighed, np.linalg.inv(regular(gram))
+
+
+def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
+    """Return distances (n, J) of points from fits of the others of their frame.
+
+    rows (n, 2, J): of size one. To first order, ``(I - H_jj)^-1 r_j`` with the residual
+    r_j of a point and the hat matrix H of its frame. Directions of the shapes that
+    follow a wrong point explain it, but not from the others. NaN if these are fewer
+    than `LEAST_POINTS`.
+    """
+    fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
+    state = JointState(model.shapes, fit.motion, model.noise_variance)
+    rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
+    distance, camera = np.full(w.shape, np.nan), CAMERAS[model.camera]
+    for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, camera):
+        Z, Y = (x.reshape(len(x), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
+        left = (1.0 + OF_DIFFERENCES) * np.eye(2) - np.einsum("iprj,ipsj->ijrs", Y, Z)
+        error = np.linalg.solve(left, rest[part].mT[..., None])[..., 0]
+        distance[part] = np.linalg.norm(error, axis=2)
+    enough = w.sum(axis=1, keepdims=True) > LEAST_POINTS
+    return np.where((w > 0) & enough, distance, np.nan)
 
 
 def _distances(

@@ -22,6 +22,11 @@ coordinates that E is free to change, ::
     g = n - tr(cov E) / tau^2,   tau^2 <- ||E||^2 / g.
 
 Rotation, mirror image, scale and mixing of the shapes are those of the model.
+
+E alone hardly changes the depths as a whole: objects may be flatter or deeper than
+those of the model. So A_0, the basis and the prior of E are stretched by a factor along
+the mean line of sight. Its logarithm is normal, with the deviation `DEPTH_SPREAD`.
+Objects that turn determine it. To first order in the rotations it has no effect.
 """
 
 from typing import NamedTuple
@@ -37,6 +42,13 @@ from isa_nrsfm._linalg.small_matrices import centred
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Width of the first fit, in sizes of frames.
 FIRST_WIDTH = 0.05
+# Relative change of the width below which it is settled.
+SETTLED = 0.02
+# Standard deviation of the logarithm of the depths of objects over those of a prior.
+DEPTH_SPREAD = 0.15
+# Factor of the depths of compared fits: with three points, the first one in the middle,
+# Gauss-Hermite quadrature has this distance and the weights 4, 1 and 1.
+STEP = float(np.exp(np.sqrt(3.0) * DEPTH_SPREAD))
 # Floor of the noise variance, as a share of the mean square; share of the tolerance.
 LEAST_NOISE, TOL_SHARE = 5e-4, 0.1
 
@@ -47,7 +59,7 @@ class ShapePrior(NamedTuple):
     shapes (K + 1, 3, J): A. gauge: maps frames to the public shapes. scaled: whether
     cameras have scales. depth_error: variance of the depths of each public shape of the
     model. width: tau. n_determined: number of coordinates of the mean shape that the
-    table determines.
+    table determines. stretch (3, 3): of the shapes of the model.
     """
 
     shapes: NDArray
@@ -56,6 +68,7 @@ class ShapePrior(NamedTuple):
     depth_error: float
     width: float = FIRST_WIDTH
     n_determined: float = 0.0
+    stretch: NDArray = np.eye(3)
 
     @classmethod
     def of_model(
@@ -78,9 +91,26 @@ class ShapePrior(NamedTuple):
         return np.kron(self.changes[:, None], np.eye(3))
 
     @property
-    def variance(self) -> float:
-        """Prior variance of the public mean shape."""
-        return max(self.width, OF_DISTANCES) ** 2
+    def variance(self) -> NDArray:
+        """Prior covariance (3, 3) of a point of the public mean shape."""
+        return max(self.width, OF_DISTANCES) ** 2 * self.stretch @ self.stretch.T
+
+    def stretched(self, stretch: NDArray) -> "ShapePrior":
+        """Return the prior of objects that are stretched by a symmetric matrix."""
+        shapes = stretch @ self.shapes
+        return self._replace(shapes=shapes, stretch=stretch @ self.stretch)
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the log prior density of the depths of the objects."""
+        return float((np.linalg.slogdet(self.stretch)[1] / DEPTH_SPREAD) ** 2)
+
+    @property
+    def distance(self) -> float:
+        """RMS distance of a coordinate of the mean shape from that of the model."""
+        A = self.mean_shape(np.linalg.solve(self.stretch, self.shapes))
+        square = np.mean((self.mean_shape(self.shapes) - A) ** 2)
+        return float(np.hypot(self.width, np.sqrt(square)))
 
     def of_points(self, kept: NDArray) -> "ShapePrior":
         """Return the prior of some of the points."""
@@ -109,14 +139,14 @@ class ShapePrior(NamedTuple):
         """Return the term of -2 log L, and its derivative by the shapes."""
         E = self.mean_shape(shapes - self.shapes)
         row = np.linalg.pinv(self.gauge.mixing.T)[0]
-        slope = 2.0 / self.variance * np.multiply.outer(row, E)
-        return float(np.vdot(E, E)) / self.variance, slope
+        weighed = np.linalg.solve(self.variance, E)
+        return float(np.vdot(E, weighed)), 2.0 * np.multiply.outer(row, weighed)
 
     def covariance(self, curvature: NDArray, noise: float) -> NDArray:
         """Return covariances of E (m, 3, 3) of points, for curvatures without prior."""
         along = self.along
         known = along.T @ curvature @ along / noise
-        return np.linalg.inv(known + np.eye(3) / self.variance)
+        return np.linalg.inv(known + np.linalg.inv(self.variance))
 
     def inverse(self, curvature: NDArray, noise: float) -> NDArray:
         """Return inverses of curvatures (m, 3 (K + 1), 3 (K + 1)) with the prior."""
@@ -128,13 +158,12 @@ class ShapePrior(NamedTuple):
     ) -> "ShapePrior":
         """Return the prior with the width that follows from a fit."""
         E, axes = self.mean_shape(shapes - self.shapes), self.similarities()
-        covariance = np.broadcast_to(
-            self.covariance(curvature, noise), (E.shape[1], 3, 3)
-        )
-        trace = np.einsum("jaa->", covariance)
-        trace -= np.einsum("naj,jab,nbj->", axes, covariance, axes)
-        n_determined = max(E.size - len(axes) - trace / self.variance, 1e-9 * E.size)
-        width = float(np.sqrt(np.vdot(E, E) / n_determined))
+        unit = np.linalg.inv(self.variance)
+        C = self.covariance(curvature, noise)
+        C = np.broadcast_to(unit @ C, (E.shape[1], 3, 3))
+        trace = np.einsum("jaa->", C) - np.einsum("naj,jab,nbj->", axes, C, axes)
+        n_determined = max(E.size - len(axes) - trace, 1e-9 * E.size)
+        width = self.width * float(np.sqrt(np.vdot(E, unit @ E) / n_determined))
         return self._replace(width=width, n_determined=float(n_determined))
 
     def depth_errors(
@@ -147,7 +176,7 @@ class ShapePrior(NamedTuple):
         Depths of the model have errors, which the basis keeps.
         """
         variances = np.full((len(self.shapes), 3), OF_DISTANCES**2)
-        variances[0] += self.variance
+        variances[0] += max(self.width, OF_DISTANCES) ** 2
         variances[:, 2] += self.depth_error
         along = np.kron(self.gauge.mixing.T, self.gauge.rotation.T)
         known = along.T @ information @ along / noise

@@ -126,6 +126,21 @@ def steadied(motion: NDArray) -> NDArray:
     return motion @ turn.as_matrix()
 
 
+def stretched(
+    state: JointState, camera: CameraModel, factor: float
+) -> tuple[JointState, NDArray]:
+    """Return depths some times as large, with rotations as many times smaller.
+
+    The depths are those along the mean line of sight. Also returns the stretch (3, 3).
+    """
+    views = full_rotations(state.motion)[0][:, 2]
+    sight = np.linalg.eigh(views.T @ views)[1][:, -1]
+    along = np.outer(sight, sight)
+    motion = camera.nearest(state.motion @ (np.eye(3) + (1 / factor - 1) * along))
+    stretch = np.eye(3) + (factor - 1) * along
+    return state._replace(shapes=stretch @ state.shapes, motion=motion), stretch
+
+
 def affine_start(problem: JointProblem, W: NDArray, paper: NDArray) -> JointState:
     """Return the paper's result, rigid cameras and scaled basis shapes, as a start."""
     shapes = problem.frames.coordinates(paper)

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
+from scipy.special import softmax
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
-    CameraModel,
     distances,
     full_rotations,
     stacked_motion,
@@ -41,9 +41,10 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.prior import STEP, ShapePrior
 from isa_nrsfm._joint.problem import JointState, Widths, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._joint.starts import steadied
+from isa_nrsfm._joint.starts import steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
@@ -285,7 +286,10 @@ def depth_certainty(
         prior, extents = prior.of_points(points), 0.0
 
     def refit(
-        kept: NDArray, start: JointState | None = None, extents: float = 0.0
+        kept: NDArray,
+        start: JointState | None = None,
+        extents: float = 0.0,
+        prior: ShapePrior | None = prior,
     ) -> tuple[JointState, NDArray, NDArray, float]:
         """Fit the kept points by a few steps, by default from the fit of all points.
 
@@ -323,9 +327,18 @@ def depth_certainty(
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
-        starts = (far_state(state, camera) for state in (whole, still))
+        starts = (stretched(state, camera, FAR)[0] for state in (whole, still))
         rise = min(refit(every, start)[-1] for start in starts) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
+    else:
+        costs, stretches = [0.5 * prior.cost], [0.0]
+        for factor in (STEP, 1.0 / STEP):
+            start, stretch = stretched(whole, camera, factor)
+            other = prior.stretched(stretch)
+            rise = refit(every, start, prior=other)[-1] - value
+            costs.append(0.5 * other.cost + FAR_FRAMES * rise)
+            stretches.append((factor - 1.0) ** 2)
+        deformation += float(softmax(-np.array(costs)) @ stretches)
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept in parts:
         _, turned, z, _ = refit(kept)
@@ -360,18 +373,6 @@ def differences(
     # Without any depths the difference is as large as they are.
     square = np.sum(off**2) / np.sum(z**2) if z.any() else 1.0
     return float(square), turns, np.mean(off**2, axis=0)
-
-
-def far_state(state: JointState, camera: CameraModel) -> JointState:
-    """Return depths FAR times as large, with rotations as many times smaller.
-
-    The depths are those along the mean line of sight.
-    """
-    views = full_rotations(state.motion)[0][:, 2]
-    axes = np.linalg.eigh(views.T @ views)[1]  # the mean line of sight is the last one
-    far = np.array([1.0, 1.0, FAR])
-    motion = camera.nearest(state.motion @ axes / far)
-    return state._replace(shapes=far[:, None] * (axes.T @ state.shapes), motion=motion)
 
 
 def neighbours(points: NDArray) -> NDArray:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import n_reliable
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
@@ -143,7 +144,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         yield poor_fit(facts)
         return
     if facts.bent:
-        yield f"{facts.outliers}: they bend the shapes. Correct them{facts.compare}"
+        yield outlier_advice(facts)
     yield (depth := depth_advice(facts))
     if facts.bent:  # outliers may cause all that follows
         return
@@ -189,6 +190,25 @@ def poor_fit(facts: Facts) -> str:
         f"{text}The points are not those of one deforming body, or a column is not the "
         "same point in all rows, or rows are too few for so large movements"
     )
+
+
+def with_outliers(facts: Facts, distance: NDArray, rows: NDArray) -> Facts:
+    """Return facts with the outliers among distances (n, J) of some rows (n,)."""
+    share, energy, found = gross_residuals(distance)
+    wrong = list(dict.fromkeys(rows[found[:, 0]].tolist()))
+    text = (
+        f"the table has outliers: {100 * share:.2g} % of the points of {len(rows)} "
+        f"rows are more than {GROSS:g} standard deviations from where the others of "
+        f"their frame have them, most in the rows {first_items(wrong, 5)}"
+    )
+    return facts._replace(outlier_energy=energy, outliers=text)
+
+
+def outlier_advice(facts: Facts) -> str:
+    """Return the message on outliers that bend the shapes."""
+    if not facts.bent:
+        return ""
+    return f"{facts.outliers}: they bend the shapes. Correct them{facts.compare}"
 
 
 def depth_advice(facts: Facts) -> str:
