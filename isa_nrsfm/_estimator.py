@@ -30,7 +30,7 @@ from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
 from isa_nrsfm._frames import camera_models
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
-from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
+from isa_nrsfm._frames.pinhole import Pinhole, common, focal_shares, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._other_tables import checked_prior, warn_if_foreign
 from isa_nrsfm._parameters import choices
@@ -132,11 +132,13 @@ default="affine"
         are true, up to one mirror image (`mirrored`). "perspective" cameras are pinhole
         cameras, for objects nearer than ten times their size or at the side of images.
     focal_length : float, array-like of shape (n_frames,) or None, default=None
-        Focal length of perspective cameras, in units of the table, or one a row. None
-        estimates one for all frames (`focal_length_`).
+        Focal length of the camera, in units of the table, or one a row. For perspective
+        cameras None estimates one for all frames (`focal_length_`). The fit of other
+        calibrated cameras does not depend on it, only axes: see `rotations_`.
     principal_point : tuple of float (x, y), default=None
-        Point of the image on the axis of perspective cameras, which need it: half of
-        the image's width and height, if nothing else is known.
+        Point of the image on the axis of the camera: half of the image's width and
+        height, if nothing else is known. Perspective cameras and `focal_length` need
+        it.
     prior : AffineNRSfM, default=None
         A fitted model of the same points, with calibrated cameras, for frontal photos
         and few frames, which alone do not determine depths. The fit has its basis
@@ -242,17 +244,20 @@ default="affine"
         missing points decide it: a test of whether these are farther away is
         significant at 1 %. Otherwise NaN, and the sign is a convention; see `mirrored`.
     rotations_ : ndarray of shape (n_frames, 3, 3)
-        Rotations of calibrated cameras, with determinant one. The rows are the axes of
-        the image, x, y and z. Like `scales_`, only with such cameras.
+        Rotations of calibrated cameras, with determinant one, from the shapes to the
+        axes x, y and z of the camera, if its focal length is known. Otherwise z is the
+        line of sight to the object. Like `scales_`, only with such cameras.
     scales_ : ndarray of shape (n_frames,)
         Scales of calibrated cameras, in units of the table per unit of the shapes; one
-        for orthographic cameras. The image of frame i is ``scales_[i] * S_i @
-        rotations_[i, :2].T + translation_[i]`` with ``S_i = reconstruct(X)[i]``.
+        for orthographic cameras. Without a focal length the image of frame i is
+        ``scales_[i] * S_i @ rotations_[i, :2].T + translation_[i]`` with ``S_i =
+        reconstruct(X)[i]``.
     positions_ : ndarray of shape (n_frames, 3)
-        Origins of the shapes in the axes of perspective cameras, in units of the
-        shapes. NaN if the table shows no perspective.
+        Origins of the shapes in the axes of a camera of known focal length, in units of
+        the shapes. NaN if the table shows no perspective.
     focal_length_ : float or ndarray of shape (n_frames,)
-        Focal length of perspective cameras. Infinite if the table shows no perspective.
+        Focal length of the camera, given or that of perspective cameras. Infinite if
+        the table shows no perspective.
     focal_length_std_ : float
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
@@ -567,9 +572,9 @@ default="affine"
         )
         prior, n_components = settings.prior, self.n_components
         n_components = n_components if prior is None else prior.n_components
-        auto = n_components == "auto"
+        auto, f = n_components == "auto", self.focal_length
         if self.camera == "perspective":
-            point, f = self.principal_point, self.focal_length
+            point = self.principal_point
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
             fit = fit_perspective(images, number, f, start, errors, self.remove_pose)
@@ -580,9 +585,14 @@ default="affine"
                 n_components = supported_components(table, isa, settings, progress)
             number = 1 if n_components == "auto" else n_components
             table = scaled_table(source, weights, number, settings)
-            known = start, auto, errors, self.remove_pose
-            fit = fit_table(table, number, isa, settings, progress, *known)
+            options = start, auto, errors, self.remove_pose
+            fit = fit_table(table, number, isa, settings, progress, *options)
         model, frames, converged, fitted = fit
+        if self.principal_point is not None and model.pinhole is None:
+            f, (x, y) = np.inf if f is None else f, map(float, self.principal_point)
+            model = model._replace(axes=Pinhole(common(f), (x, y)))
+            f = np.array(f, dtype=float)[()]
+            fitted |= {"focal_length_": f, "focal_length_std_": 0.0}
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
@@ -593,7 +603,7 @@ default="affine"
             "_model": model,
             "_n_features_out": model.n_components,
             "n_components_": model.n_components,
-            "camera_": self.camera,
+            "camera_": self.camera if model.pinhole is not None else settings.camera,
             "frames_scaled_": bool(settings.scale_frames),
         }
         reported = leading(frames, model.n_components)
@@ -607,10 +617,11 @@ default="affine"
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
-                R, scales = map(source.as_collected, full_rotations(frames.motion))
+                turned = model.in_camera_axes(*frames[:2])
+                R, scales = map(source.as_collected, full_rotations(turned))
                 attributes |= {"rotations_": R, "scales_": scales}
-            if model.pinhole is not None:
-                place = model.pinhole.positions(frames.motion, frames.translation)
+            if (lens := model.pinhole or model.axes) is not None:
+                place = lens.positions(*frames[:2])
                 far = np.isinf(np.max(fitted["focal_length_"]))
                 place = np.where(far, np.nan, place).astype(frames.alpha.dtype)
                 attributes["positions_"] = source.as_collected(place)
@@ -855,6 +866,7 @@ default="affine"
         X: Any,
         camera: choices.CalibratedCamera | None = None,
         *,
+        axes: choices.Axes = "object",
         return_std: bool = False,
         point_weight: Any = None,
     ) -> Any:
@@ -873,6 +885,9 @@ default="affine"
             With "weak_perspective" each camera has its own scale, and the sizes of the
             shapes have no meaning. With "orthographic" all cameras have one scale, and
             shapes are in the units of the table.
+        axes : {"object", "camera"}, default="object"
+            Axes of the shapes, for a model with calibrated cameras: those of
+            `mean_shape_`, or of the camera of each frame, by `rotations_`.
         return_std : bool, default=False
             Whether to return the standard deviations of the depths, for a model with
             calibrated cameras.
@@ -882,20 +897,21 @@ default="affine"
         Returns
         -------
         shapes : ndarray of shape (n_frames, n_points, 3)
-            Shapes in their own axes, not in the axes of the camera. NaN for rows with
-            too few visible points. If `camera` is given for an affine model, each shape
-            is rotated as near as possible to the mean shape.
+            Shapes in the units of `mean_shape_`. NaN for rows with too few visible
+            points. If `camera` is given for an affine model, each shape is rotated as
+            near as possible to the mean shape.
         depth_std : ndarray of shape (n_frames, n_points)
             Only with `return_std`. Standard deviations of the coordinates of the points
-            along the viewing direction of their frame, in the units of the shapes. They
-            contain the uncertainty of camera, coefficients and shapes.
+            along the third of `rotations_`, in the units of the shapes. They contain
+            the uncertainty of camera, coefficients and shapes.
 
         Raises
         ------
         ValueError
             If the cameras of the fitted table see fewer than three directions of
             space, if the model was fitted with calibrated cameras other than `camera`,
-            or if the decomposition does not fit the model or `return_std`.
+            if the decomposition does not fit the model or `return_std`, or if `axes` or
+            `return_std` need calibrated cameras.
 
         Warns
         -----
@@ -920,6 +936,10 @@ default="affine"
                 f"camera must be None or one of {choices.CALIBRATED_CAMERAS}; got "
                 f"{camera!r}"
             )
+        if axes not in choices.AXES:
+            raise ValueError(f"axes must be one of {choices.AXES}; got {axes!r}")
+        if (turned := axes == "camera") and self.camera_ == "affine":
+            raise ValueError(f"axes='camera' {_NEEDS_CALIBRATED}")
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
         if decomposed and point_weight is not None:
             raise ValueError(
@@ -947,15 +967,22 @@ default="affine"
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled, model = metric is not None and camera == "orthographic", self._model
+
+        def shapes_of(fit: Decomposition) -> NDArray:
+            shapes = model.shapes(fit, metric, scaled)
+            return model.turned(shapes, fit) if turned else shapes
+
         if decomposed:
-            return model.shapes(X, metric, scaled)
+            return shapes_of(X)
         table, weights = self._opened(X, point_weight)
+        if return_std:
+            uncertain = partial(model.uncertain_shapes, turned=turned)
+            return table.collect(uncertain, *weights)
 
         def shapes(rows: NDArray, weights: NDArray | None = None) -> NDArray:
-            fit = model.decompose(rows, weights, deviations=False)
-            return model.shapes(fit, metric, scaled)
+            return shapes_of(model.decompose(rows, weights, deviations=False))
 
-        return table.collect(model.uncertain_shapes if return_std else shapes, *weights)
+        return table.collect(shapes, *weights)
 
     def shapes(self, alpha: Any) -> NDArray:
         """
@@ -997,7 +1024,8 @@ default="affine"
         -------
         AffineNRSfM
             A copy with changed signs of z of the shapes and of the third column of the
-            cameras. Its rotations are ``D R D`` with ``D = diag(1, 1, -1)``.
+            cameras. Its rotations are ``M R D`` with ``D = diag(1, 1, -1)``. M is the
+            reflection along the line of sight, D without a focal length.
         """
         check_is_fitted(self)
         if sees_perspective(self):
@@ -1010,13 +1038,20 @@ default="affine"
         mirror.mirror_certainty_ = 1.0 - self.mirror_certainty_
         shapes_and_cameras = "mean_shape_", "basis_", "reference_motion_", "motion_"
         factors = dict.fromkeys(shapes_and_cameras, signs)
-        factors["rotations_"] = np.outer(signs, signs)
         of_modes = np.tile(signs, len(self.basis_))
         factors["pose_effect_"] = np.array([[1.0], [-1.0], [1.0]])
         factors["mode_covariance_"] = np.outer(of_modes, of_modes)
         for name, factor in factors.items():
             if hasattr(self, name):
                 setattr(mirror, name, getattr(self, name) * factor)
+        if hasattr(self, "rotations_"):
+            sight = np.eye(3)[2:]
+            if (axes := self._model.axes) is not None:
+                sight = axes.rays(self.translation_[..., None])[..., 0]
+            length = np.square(sight).sum(axis=1)[:, None, None]
+            across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
+            rotations = across @ self.rotations_ * signs
+            mirror.rotations_ = rotations.astype(self.rotations_.dtype)
         return mirror
 
     def reproject(self, X: Any, *, point_weight: Any = None) -> NDArray:
