@@ -14,7 +14,6 @@ several groups of points it moves, which gives its deviation (jackknife).
 import warnings
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,8 +77,7 @@ class PerspectiveFit(NamedTuple):
 
     model: with the perspective camera. frames, converged, attributes: as `fit_table`
     returns them. changes: shares by which repeats have changed the depths. energies
-    (J,): contributions of the points to E. earlier: models and frames of at most three
-    repeats before, the last one first.
+    (J,): contributions of the points to E.
     """
 
     model: TableModel
@@ -88,7 +86,6 @@ class PerspectiveFit(NamedTuple):
     attributes: dict[str, Any]
     changes: tuple[float, ...] = ()
     energies: NDArray = np.zeros(0)
-    earlier: tuple[tuple[TableModel, Decomposition], ...] = ()
 
     @property
     def energy(self) -> float:
@@ -105,15 +102,6 @@ class PerspectiveFit(NamedTuple):
     def n_components(self) -> int:
         """Number of basis shapes."""
         return self.model.n_components
-
-    @property
-    def for_depths(self) -> list[tuple[TableModel, Decomposition]]:
-        """Models and frames whose depths correct the next images.
-
-        They are several if depths oscillate.
-        """
-        slow = any(new > 0.5 * old for old, new in pairwise(self.changes))
-        return [(self.model, self.frames), *(self.earlier if slow else ())]
 
     def depths(self, part: slice) -> NDArray:
         """Return depths (n, J) of the points of some frames."""
@@ -165,11 +153,10 @@ class PerspectiveTable(NamedTuple):
 
         Without a camera they are those of the table.
         """
-        fits = [] if fit is None else fit.for_depths
-        by_frame = [values for _, f in fits for values in (f.motion, f.alpha)]
-        models = [model for model, _ in fits]
-        function = partial(_straight, pinhole=pinhole, models=models)
-        rows = self.source.derive(function, *by_frame)
+        model = None if fit is None else fit.model
+        known = () if fit is None else (fit.frames.motion, fit.frames.alpha)
+        function = partial(_straight, pinhole=pinhole, model=model)
+        rows = self.source.derive(function, *known)
         return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
@@ -211,9 +198,7 @@ class PerspectiveTable(NamedTuple):
             change = fit.change(before, self.source.slices)
             fit = fit.mirrored() if change < 0 else fit
             fit.attributes["isa_"] = fit.attributes["isa_"] or before.attributes["isa_"]
-            changes = (*before.changes, abs(change))
-            earlier = ((before.model, before.frames), *before.earlier)[:3]
-            fit = fit._replace(changes=changes, earlier=earlier)
+            fit = fit._replace(changes=(*before.changes, abs(change)))
         squares = self.source.map(partial(_squares, model=fit.model), *fit.frames)
         square, counts = np.sum(list(squares), axis=0)
         return fit._replace(energies=square / counts.sum())
@@ -230,7 +215,7 @@ class PerspectiveTable(NamedTuple):
         A fit also ends if it is clearly worse than the best one.
         """
         tol *= self.settings.tol / JOINT_TOL
-        running = [fit._replace(changes=(), earlier=()) for fit in fits]
+        running = [fit._replace(changes=()) for fit in fits]
         ended: list[PerspectiveFit] = []
         while running:
             self.progress.step()
@@ -386,7 +371,6 @@ def fit_perspective(
         n_last = n_components or best.n_components
         fit = table.fit(best.pinhole, n_last, best, **options)
         if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
-            fit = fit._replace(changes=(), earlier=())
             fit = table.fit(best.pinhole, n_last, fit, **options)
     if start is None:
         options["free"] = n_components is None
@@ -445,20 +429,16 @@ def focal_error(
 
 
 def _straight(
-    rows: NDArray, *by_frame: NDArray, pinhole: Any, models: list[TableModel]
+    rows: NDArray, *frames: NDArray, pinhole: Pinhole | None, model: TableModel | None
 ) -> NDArray:
-    """Return weak-perspective images (n, 2, J) of rows, for weighted means of depths.
+    """Return weak-perspective images (n, 2, J) of rows, for the depths of a model.
 
-    Cameras and coefficients of the frames follow each other, for one model each. Each
-    model has half of the weight of the one before it. Without models depths are equal.
+    Frames are cameras and coefficients. Without a model depths are equal.
     """
-    images = rows if pinhole is None else pinhole.virtual(rows)
-    if not models:
-        return images
-    fits = zip(models, by_frame[::2], by_frame[1::2], strict=True)
-    depths = [model.depths(motion, alpha) for model, motion, alpha in fits]
-    weights = 0.5 ** np.arange(len(depths))
-    return pinhole.straight(images, np.average(depths, axis=0, weights=weights))
+    if pinhole is None:
+        return rows
+    images = pinhole.virtual(rows)
+    return images if model is None else pinhole.straight(images, model.depths(*frames))
 
 
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
