@@ -24,7 +24,6 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._frames.pinhole import common
 from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
@@ -334,11 +333,8 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
     # More basis shapes would explain the perspective.
     few = {"n_components": min(len(model.basis_), MOST_SHAPES)}
     near |= few if model.n_components == AUTO else {}
-    lens = dict.fromkeys(("focal_length", "principal_point"))
-    params = model.get_params(deep=False) | few | lens
-    params |= {"prior": None, "refinement": "joint"}
-    f = 5 * max(point) if model.focal_length is None else common(model.focal_length)
-    trials: Sequence[dict[str, Any]] = ({}, near | {"focal_length": f})
+    params = model.get_params(deep=False) | few | {"prior": None, "refinement": "joint"}
+    trials: Sequence[dict[str, Any]] = ({}, near | {"focal_length": 5 * max(point)})
     some = spread(np.arange(rows.X.shape[0]), ROUGH_ROWS)
     X, weights = taken_rows(rows.X, some), {n: w[some] for n, w in rows.weights.items()}
     fits = [StartedNRSfM(**params | each).fit(X, **weights) for each in trials]

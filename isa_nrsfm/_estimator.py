@@ -29,8 +29,8 @@ from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
 from isa_nrsfm._frames import camera_models
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
-from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
-from isa_nrsfm._frames.pinhole import Pinhole, common, focal_shares, zoomed_table
+from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, leading
+from isa_nrsfm._frames.pinhole import focal_shares, pinhole_of, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._other_tables import checked_prior, warn_if_foreign
 from isa_nrsfm._parameters import choices
@@ -132,13 +132,11 @@ default="affine"
         are true, up to one mirror image (`mirrored`). "perspective" cameras are pinhole
         cameras, for objects nearer than ten times their size or at the side of images.
     focal_length : float, array-like of shape (n_frames,) or None, default=None
-        Focal length of the camera, in units of the table, or one a row. For perspective
-        cameras None estimates one for all frames (`focal_length_`). The fit of other
-        calibrated cameras does not depend on it, only axes: see `rotations_`.
+        Focal length of the camera, in units of the table, or one a row. None estimates
+        one of perspective cameras. That of others only turns axes (`rotations_`).
     principal_point : tuple of float (x, y), default=None
-        Point of the image on the axis of the camera: half of the image's width and
-        height, if nothing else is known. Perspective cameras and `focal_length` need
-        it.
+        Point of the image on the axis of the camera, which perspective cameras and
+        `focal_length` need. It is half of the image's size, if nothing else is known.
     prior : AffineNRSfM, default=None
         A fitted model of the same points, with calibrated cameras, for frontal photos
         and few frames, which alone do not determine depths. The fit has its basis
@@ -249,15 +247,14 @@ default="affine"
         line of sight to the object. Like `scales_`, only with such cameras.
     scales_ : ndarray of shape (n_frames,)
         Scales of calibrated cameras, in units of the table per unit of the shapes; one
-        for orthographic cameras. Without a focal length the image of frame i is
-        ``scales_[i] * S_i @ rotations_[i, :2].T + translation_[i]`` with ``S_i =
-        reconstruct(X)[i]``.
+        for orthographic cameras. Without `focal_length` the image of ``S_i =
+        reconstruct(X)[i]`` is ``scales_[i] * S_i @ rotations_[i, :2].T +
+        translation_[i]``.
     positions_ : ndarray of shape (n_frames, 3)
         Origins of the shapes in the axes of a camera of known focal length, in units of
         the shapes. NaN if the table shows no perspective.
     focal_length_ : float or ndarray of shape (n_frames,)
-        Focal length of the camera, given or that of perspective cameras. Infinite if
-        the table shows no perspective.
+        Focal length of the camera. Infinite if the table shows no perspective.
     focal_length_std_ : float
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
@@ -572,9 +569,8 @@ default="affine"
         )
         prior, n_components = settings.prior, self.n_components
         n_components = n_components if prior is None else prior.n_components
-        auto, f = n_components == "auto", self.focal_length
+        auto, f, point = n_components == "auto", self.focal_length, self.principal_point
         if self.camera == "perspective":
-            point = self.principal_point
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
             fit = fit_perspective(images, number, f, start, errors, self.remove_pose)
@@ -588,10 +584,9 @@ default="affine"
             options = start, auto, errors, self.remove_pose
             fit = fit_table(table, number, isa, settings, progress, *options)
         model, frames, converged, fitted = fit
-        if self.principal_point is not None and model.pinhole is None:
-            f, (x, y) = np.inf if f is None else f, map(float, self.principal_point)
-            model = model._replace(axes=Pinhole(common(f), (x, y)))
-            f = np.array(f, dtype=float)[()]
+        if point is not None and model.pinhole is None:
+            f = np.array(np.inf if f is None else f, dtype=float)[()]
+            model = model._replace(axes=pinhole_of(f, point))
             fitted |= {"focal_length_": f, "focal_length_std_": 0.0}
         if not converged:
             warn_caller(
@@ -617,14 +612,8 @@ default="affine"
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
-                turned = model.in_camera_axes(*frames[:2])
-                R, scales = map(source.as_collected, full_rotations(turned))
-                attributes |= {"rotations_": R, "scales_": scales}
-            if (lens := model.pinhole or model.axes) is not None:
-                place = lens.positions(*frames[:2])
-                far = np.isinf(np.max(fitted["focal_length_"]))
-                place = np.where(far, np.nan, place).astype(frames.alpha.dtype)
-                attributes["positions_"] = source.as_collected(place)
+                for name, part in model.cameras(frames).items():
+                    attributes[name] = source.as_collected(part)
         else:
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
@@ -897,9 +886,8 @@ default="affine"
         Returns
         -------
         shapes : ndarray of shape (n_frames, n_points, 3)
-            Shapes in the units of `mean_shape_`. NaN for rows with too few visible
-            points. If `camera` is given for an affine model, each shape is rotated as
-            near as possible to the mean shape.
+            NaN for rows with too few visible points. If `camera` is given for an affine
+            model, each shape is rotated as near as possible to the mean shape.
         depth_std : ndarray of shape (n_frames, n_points)
             Only with `return_std`. Standard deviations of the coordinates of the points
             along the third of `rotations_`, in the units of the shapes. They contain
@@ -910,8 +898,7 @@ default="affine"
         ValueError
             If the cameras of the fitted table see fewer than three directions of
             space, if the model was fitted with calibrated cameras other than `camera`,
-            if the decomposition does not fit the model or `return_std`, or if `axes` or
-            `return_std` need calibrated cameras.
+            or if the decomposition, `axes` or `return_std` do not fit the model.
 
         Warns
         -----
@@ -1024,8 +1011,7 @@ default="affine"
         -------
         AffineNRSfM
             A copy with changed signs of z of the shapes and of the third column of the
-            cameras. Its rotations are ``M R D`` with ``D = diag(1, 1, -1)``. M is the
-            reflection along the line of sight, D without a focal length.
+            cameras. Its rotations are those mirrored along the line of sight.
         """
         check_is_fitted(self)
         if sees_perspective(self):
@@ -1033,25 +1019,8 @@ default="affine"
                 "perspective decides between the two mirror images: the other one does "
                 "not fit. mirror_certainty_ is the probability of the right one"
             )
-        mirror, signs = copy.copy(self), MIRROR.astype(self.mean_shape_.dtype)
-        mirror._model = self._model.mirrored()
-        mirror.mirror_certainty_ = 1.0 - self.mirror_certainty_
-        shapes_and_cameras = "mean_shape_", "basis_", "reference_motion_", "motion_"
-        factors = dict.fromkeys(shapes_and_cameras, signs)
-        of_modes = np.tile(signs, len(self.basis_))
-        factors["pose_effect_"] = np.array([[1.0], [-1.0], [1.0]])
-        factors["mode_covariance_"] = np.outer(of_modes, of_modes)
-        for name, factor in factors.items():
-            if hasattr(self, name):
-                setattr(mirror, name, getattr(self, name) * factor)
-        if hasattr(self, "rotations_"):
-            sight = np.eye(3)[2:]
-            if (axes := self._model.axes) is not None:
-                sight = axes.rays(self.translation_[..., None])[..., 0]
-            length = np.square(sight).sum(axis=1)[:, None, None]
-            across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
-            rotations = across @ self.rotations_ * signs
-            mirror.rotations_ = rotations.astype(self.rotations_.dtype)
+        mirror = copy.copy(self)
+        mirror.__dict__.update(self._model.mirrored_attributes(self.__dict__))
         return mirror
 
     def reproject(self, X: Any, *, point_weight: Any = None) -> NDArray:

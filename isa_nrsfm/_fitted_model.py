@@ -113,6 +113,17 @@ class TableModel(NamedTuple):
         turned = scales[:, None, None] * (turns.mT @ R)[:, :2]
         return turned.astype(motion.dtype, copy=False)
 
+    def cameras(self, fit: Decomposition) -> dict[str, NDArray]:
+        """Return the attributes of calibrated cameras of frames, by name."""
+        motion, translation = fit[:2]
+        R, scales = full_rotations(self.in_camera_axes(motion, translation))
+        found = {"rotations_": R, "scales_": scales}
+        if (lens := self.pinhole or self.axes) is not None:
+            place = lens.positions(motion, translation)
+            place[np.isinf(place).any(axis=1)] = np.nan  # no focal length
+            found["positions_"] = place.astype(motion.dtype)
+        return found
+
     def straightened(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return weak-perspective images.
 
@@ -151,6 +162,24 @@ class TableModel(NamedTuple):
         mean_shape, basis = self.mean_shape * mirror, self.basis * mirror
         frames = self.frames.mirrored()
         return self._replace(frames=frames, mean_shape=mean_shape, basis=basis)
+
+    def mirrored_attributes(self, known: dict[str, Any]) -> dict[str, Any]:
+        """Return the attributes of the mirror image in depth, from those of a fit."""
+        signs, K = MIRROR.astype(self.mean_shape.dtype), self.n_components
+        names = "mean_shape_", "basis_", "reference_motion_", "motion_"
+        factors: dict[str, NDArray] = dict.fromkeys(names, signs)
+        factors["pose_effect_"] = np.array([[1.0], [-1.0], [1.0]])
+        factors["mode_covariance_"] = np.outer(np.tile(signs, K), np.tile(signs, K))
+        found = {name: known[name] * factors[name] for name in factors if name in known}
+        if "rotations_" in known:
+            R, sight = known["rotations_"], np.eye(3)[2:]
+            if self.axes is not None:
+                sight = self.axes.rays(known["translation_"][..., None])[..., 0]
+            length = np.square(sight).sum(axis=1)[:, None, None]
+            across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
+            found["rotations_"] = (across @ R * signs).astype(R.dtype)
+        found["mirror_certainty_"] = 1.0 - known["mirror_certainty_"]
+        return found | {"_model": self.mirrored()}
 
     def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
         """

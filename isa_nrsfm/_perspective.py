@@ -31,7 +31,7 @@ from isa_nrsfm._fit import (
 )
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
-from isa_nrsfm._frames.pinhole import Pinhole, common
+from isa_nrsfm._frames.pinhole import Pinhole, common, pinhole_of
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
@@ -143,8 +143,8 @@ class PerspectiveTable(NamedTuple):
 
     def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
         """Return the camera with a focal length."""
-        x, y = map(float, self.principal_point)
-        return Pinhole(focal_length, (x, y), self.settings.loss != "linear", near)
+        robust = self.settings.loss != "linear"
+        return pinhole_of(focal_length, self.principal_point, robust, near)
 
     def straight(
         self, pinhole: Pinhole | None, n_components: int, fit: PerspectiveFit | None

@@ -31,7 +31,6 @@ from isa_nrsfm.skeletons._column_names import names_layout, parse_coordinate
 
 # With fewer frames or points than this the layouts are not compared.
 FEWEST_COMPARED = 10
-_LENS = "focal_length", "principal_point"
 ONLY_POINTS = (
     "Give only the columns of points: isa_nrsfm.io.landmark_table(X).points has them"
 )
@@ -348,17 +347,14 @@ def check_camera(model: Any) -> None:
             "remove_pose needs calibrated cameras, which have a yaw. Set "
             "camera='weak_perspective' or camera='orthographic', or remove_pose=False"
         )
-    lens = [n for n in _LENS if getattr(model, n) is not None]
-    if lens and camera == "affine":
+    f = model.focal_length
+    lens = (f is not None) + (centre is not None)
+    if lens and (camera == "affine" or (camera != "perspective" and lens == 1)):
         raise ValueError(
-            f"{lens[0]} is for calibrated cameras, which have axes; got "
-            f"camera='affine'. Set {lens[0]}=None, or camera='weak_perspective'"
-        )
-    if camera != "perspective" and len(lens) == 1:
-        (other,) = {*_LENS} - {*lens}
-        raise ValueError(
-            f"the axes of the camera need {other}, besides {lens[0]}. Give both or "
-            f"none; got {other}=None"
+            "focal_length and principal_point are for calibrated cameras, which have "
+            "axes, and belong together. Give both or none, and none with "
+            f"camera='affine'; got camera={camera!r}, focal_length={f!r}, "
+            f"principal_point={centre!r}"
         )
     if camera == "perspective" and refinement not in JOINT_REFINEMENTS:
         raise ValueError(

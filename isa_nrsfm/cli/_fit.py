@@ -19,7 +19,11 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
-from isa_nrsfm._parameters.choices import FACE_PRIORS as LAYOUTS, JOINT_REFINEMENTS
+from isa_nrsfm._parameters.choices import (
+    CALIBRATED_CAMERAS,
+    FACE_PRIORS as LAYOUTS,
+    JOINT_REFINEMENTS,
+)
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
@@ -205,8 +209,12 @@ def _check_options(args: Namespace) -> None:
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
     for name in ("focal_length", "principal_point"):
-        if getattr(args, name) is not None and args.camera == "affine":
-            raise ValueError(f"{flag_of(name)} needs another camera than affine")
+        unused = args.focal_length is None and args.camera in CALIBRATED_CAMERAS
+        if getattr(args, name) is not None and (unused or args.camera == "affine"):
+            raise ValueError(
+                f"{flag_of(name)} has no effect on --camera {args.camera}"
+                f"{' without --focal-length' * unused}"
+            )
     joint = {"--std": args.std, "--n-components auto": args.n_components == (AUTO,)}
     for option, is_given in joint.items():
         if is_given and args.refinement not in (None, *JOINT_REFINEMENTS):
