@@ -188,7 +188,8 @@ def test_units_order_memory_maps_blocks_and_threads(noisy, tmp_path):
     same_model(model, other, order)
     place, position = model.translation_[order], model.positions_[order]
     np.testing.assert_allclose(other.translation_, 10 * place, rtol=1e-3)
-    np.testing.assert_allclose(other.positions_, position, rtol=1e-3)
+    # Coordinates near the axis of the camera: errors are relative to the distance.
+    np.testing.assert_allclose(other.positions_, position, rtol=1e-3, atol=2e-4)
 
 
 @pytest.mark.slow
