@@ -117,7 +117,8 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
     prior : AffineNRSfM, None or "auto", default="auto"
         As in `AffineNRSfM`. "auto" tries that of `isa_nrsfm.datasets.load_face_prior`.
     image_size : tuple of float (width, height), default=None
-        Size of the images, in the units of the table. Perspective cameras need it.
+        Size of the images, in the units of the table. Perspective cameras and a focal
+        length need it, unless the principal point is given.
 
     Attributes
     ----------
@@ -215,7 +216,8 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         params, free = first_settings(given)
         estimator = clone(estimator).set_params(**params)
         point = None if self.image_size is None else np.divide(self.image_size, 2)
-        if estimator.camera == "perspective" and estimator.principal_point is None:
+        known = estimator.camera == "perspective" or estimator.focal_length is not None
+        if known and estimator.principal_point is None:
             estimator.set_params(principal_point=point)
         weights = {} if point_weight is None else {"point_weight": point_weight}
         self.best_estimator_, self.trials_ = decided(
@@ -326,14 +328,12 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
     model, point = best.model, rows.principal_point
     if point is None:
         return "image size not known"
-    if model.refinement != "joint":
-        return "not with the consensus"
     near: dict[str, Any] = {"camera": "perspective"}
     near["principal_point"] = tuple(map(float, point))
     # More basis shapes would explain the perspective.
     few = {"n_components": min(len(model.basis_), MOST_SHAPES)}
     near |= few if model.n_components == AUTO else {}
-    params = model.get_params(deep=False) | few | {"prior": None}
+    params = model.get_params(deep=False) | few | {"prior": None, "refinement": "joint"}
     trials: Sequence[dict[str, Any]] = ({}, near | {"focal_length": 5 * max(point)})
     some = spread(np.arange(rows.X.shape[0]), ROUGH_ROWS)
     X, weights = taken_rows(rows.X, some), {n: w[some] for n, w in rows.weights.items()}
@@ -360,8 +360,8 @@ def _consensus(best: _Fit, rows: _Rows) -> Proposal:
     """Groups of points determine depths that all points together do not."""
     if best.determined:
         return "the depth is known"
-    if best.model.camera not in ("weak_perspective", "orthographic") or rows.weights:
-        return "not with these cameras or weights"
+    if best.model.camera == "affine" or rows.weights:
+        return "not with affine cameras or weights"
     return {"refinement": "consensus"}
 
 
@@ -382,7 +382,8 @@ def _affine(best: _Fit, rows: _Rows) -> Proposal:
     ratio = best.model.camera_noise_ratio_
     if best.model.prior or not ratio >= OTHER_CAMERAS:
         return "not stretched"
-    return {"camera": "affine", "refinement": "joint"}
+    plain = dict.fromkeys(("focal_length", "principal_point"))
+    return {"camera": "affine", "refinement": "joint"} | plain
 
 
 # What is tried, in this order: the parameter that changes, words, the proposal, and the

@@ -29,8 +29,8 @@ from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
 from isa_nrsfm._frames import camera_models
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
-from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames, leading
-from isa_nrsfm._frames.pinhole import focal_shares, zoomed_table
+from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, leading
+from isa_nrsfm._frames.pinhole import focal_shares, pinhole_of, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._other_tables import (
     checked_prior,
@@ -136,11 +136,11 @@ default="affine"
         are true, up to one mirror image (`mirrored`). "perspective" cameras are pinhole
         cameras, for objects nearer than ten times their size or at the side of images.
     focal_length : float, array-like of shape (n_frames,) or None, default=None
-        Focal length of perspective cameras, in units of the table, or one a row. None
-        estimates one for all frames (`focal_length_`).
+        Focal length of the camera, in units of the table, or one a row. None estimates
+        one of perspective cameras. That of others only turns axes (`rotations_`).
     principal_point : tuple of float (x, y), default=None
-        Point of the image on the axis of perspective cameras, which need it: half of
-        the image's width and height, if nothing else is known.
+        Point of the image on the axis of the camera, which perspective cameras and
+        `focal_length` need. It is half of the image's size, if nothing else is known.
     prior : AffineNRSfM, default=None
         A fitted model of the same points, with calibrated cameras, for frontal photos
         and few frames, which alone do not determine depths. The fit has its basis
@@ -246,17 +246,19 @@ default="affine"
         missing points decide it: a test of whether these are farther away is
         significant at 1 %. Otherwise NaN, and the sign is a convention; see `mirrored`.
     rotations_ : ndarray of shape (n_frames, 3, 3)
-        Rotations of calibrated cameras, with determinant one. The rows are the axes of
-        the image, x, y and z. Like `scales_`, only with such cameras.
+        Rotations of calibrated cameras, with determinant one, from the shapes to the
+        axes x, y and z of the camera, if its focal length is known. Otherwise z is the
+        line of sight to the object. Like `scales_`, only with such cameras.
     scales_ : ndarray of shape (n_frames,)
         Scales of calibrated cameras, in units of the table per unit of the shapes; one
-        for orthographic cameras. The image of frame i is ``scales_[i] * S_i @
-        rotations_[i, :2].T + translation_[i]`` with ``S_i = reconstruct(X)[i]``.
+        for orthographic cameras. Without `focal_length` the image of ``S_i =
+        reconstruct(X)[i]`` is ``scales_[i] * S_i @ rotations_[i, :2].T +
+        translation_[i]``.
     positions_ : ndarray of shape (n_frames, 3)
-        Origins of the shapes in the axes of perspective cameras, in units of the
-        shapes. NaN if the table shows no perspective.
+        Origins of the shapes in the axes of a camera of known focal length, in units of
+        the shapes. NaN if the table shows no perspective.
     focal_length_ : float or ndarray of shape (n_frames,)
-        Focal length of perspective cameras. Infinite if the table shows no perspective.
+        Focal length of the camera. Infinite if the table shows no perspective.
     focal_length_std_ : float
         Its standard deviation, from a jackknife over groups of points; zero if it was
         given, infinite if the depth is not determined.
@@ -572,9 +574,8 @@ default="affine"
         )
         prior, n_components = settings.prior, self.n_components
         n_components = n_components if prior is None else prior.n_components
-        auto = n_components == "auto"
+        auto, f, point = n_components == "auto", self.focal_length, self.principal_point
         if self.camera == "perspective":
-            point, f = self.principal_point, self.focal_length
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
             fit = fit_perspective(images, number, f, start, errors, self.remove_pose)
@@ -585,9 +586,13 @@ default="affine"
                 n_components = supported_components(table, isa, settings, progress)
             number = 1 if n_components == "auto" else n_components
             table = scaled_table(source, weights, number, settings)
-            known = start, auto, errors, self.remove_pose
-            fit = fit_table(table, number, isa, settings, progress, *known)
+            options = start, auto, errors, self.remove_pose
+            fit = fit_table(table, number, isa, settings, progress, *options)
         model, frames, converged, fitted = fit
+        if point is not None and model.pinhole is None:
+            f = np.array(np.inf if f is None else f, dtype=float)[()]
+            model = model._replace(axes=pinhole_of(f, point))
+            fitted |= {"focal_length_": f, "focal_length_std_": 0.0}
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
@@ -599,7 +604,7 @@ default="affine"
             "_model": model,
             "_n_features_out": model.n_components,
             "n_components_": model.n_components,
-            "camera_": self.camera,
+            "camera_": self.camera if model.pinhole is not None else settings.camera,
             "frames_scaled_": bool(settings.scale_frames),
         }
         reported = leading(frames, model.n_components)
@@ -613,13 +618,8 @@ default="affine"
             if not settings.joint:
                 del attributes["alpha_std_"]
             if self.camera != "affine":
-                R, scales = map(source.as_collected, full_rotations(frames.motion))
-                attributes |= {"rotations_": R, "scales_": scales}
-            if model.pinhole is not None:
-                place = model.pinhole.positions(frames.motion, frames.translation)
-                far = np.isinf(np.max(fitted["focal_length_"]))
-                place = np.where(far, np.nan, place).astype(frames.alpha.dtype)
-                attributes["positions_"] = source.as_collected(place)
+                for name, part in model.cameras(frames).items():
+                    attributes[name] = source.as_collected(part)
         else:
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
@@ -859,6 +859,7 @@ default="affine"
         X: Any,
         camera: choices.CalibratedCamera | None = None,
         *,
+        axes: choices.Axes = "object",
         return_std: bool = False,
         point_weight: Any = None,
     ) -> Any:
@@ -877,6 +878,9 @@ default="affine"
             With "weak_perspective" each camera has its own scale, and the sizes of the
             shapes have no meaning. With "orthographic" all cameras have one scale, and
             shapes are in the units of the table.
+        axes : {"object", "camera"}, default="object"
+            Axes of the shapes, for a model with calibrated cameras: those of
+            `mean_shape_`, or of the camera of each frame, by `rotations_`.
         return_std : bool, default=False
             Whether to return the standard deviations of the depths, for a model with
             calibrated cameras.
@@ -886,20 +890,19 @@ default="affine"
         Returns
         -------
         shapes : ndarray of shape (n_frames, n_points, 3)
-            Shapes in their own axes, not in the axes of the camera. NaN for rows with
-            too few visible points. If `camera` is given for an affine model, each shape
-            is rotated as near as possible to the mean shape.
+            NaN for rows with too few visible points. If `camera` is given for an affine
+            model, each shape is rotated as near as possible to the mean shape.
         depth_std : ndarray of shape (n_frames, n_points)
             Only with `return_std`. Standard deviations of the coordinates of the points
-            along the viewing direction of their frame, in the units of the shapes. They
-            contain the uncertainty of camera, coefficients and shapes.
+            along the third of `rotations_`, in the units of the shapes. They contain
+            the uncertainty of camera, coefficients and shapes.
 
         Raises
         ------
         ValueError
             If the cameras of the fitted table see fewer than three directions of
             space, if the model was fitted with calibrated cameras other than `camera`,
-            or if the decomposition does not fit the model or `return_std`.
+            or if the decomposition, `axes` or `return_std` do not fit the model.
 
         Warns
         -----
@@ -924,6 +927,10 @@ default="affine"
                 f"camera must be None or one of {choices.CALIBRATED_CAMERAS}; got "
                 f"{camera!r}"
             )
+        if axes not in choices.AXES:
+            raise ValueError(f"axes must be one of {choices.AXES}; got {axes!r}")
+        if (turned := axes == "camera") and self.camera_ == "affine":
+            raise ValueError(f"axes='camera' {_NEEDS_CALIBRATED}")
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
         if decomposed and point_weight is not None:
             raise ValueError(
@@ -951,15 +958,22 @@ default="affine"
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled, model = metric is not None and camera == "orthographic", self._model
+
+        def shapes_of(fit: Decomposition) -> NDArray:
+            shapes = model.shapes(fit, metric, scaled)
+            return model.turned(shapes, fit) if turned else shapes
+
         if decomposed:
-            return model.shapes(X, metric, scaled)
+            return shapes_of(X)
         table, weights = self._opened(X, point_weight)
+        if return_std:
+            uncertain = partial(model.uncertain_shapes, turned=turned)
+            return table.collect(uncertain, *weights)
 
         def shapes(rows: NDArray, weights: NDArray | None = None) -> NDArray:
-            fit = model.decompose(rows, weights, deviations=False)
-            return model.shapes(fit, metric, scaled)
+            return shapes_of(model.decompose(rows, weights, deviations=False))
 
-        return table.collect(model.uncertain_shapes if return_std else shapes, *weights)
+        return table.collect(shapes, *weights)
 
     def shapes(self, alpha: Any) -> NDArray:
         """
@@ -1001,7 +1015,7 @@ default="affine"
         -------
         AffineNRSfM
             A copy with changed signs of z of the shapes and of the third column of the
-            cameras. Its rotations are ``D R D`` with ``D = diag(1, 1, -1)``.
+            cameras. Its rotations are those mirrored along the line of sight.
         """
         check_is_fitted(self)
         if sees_perspective(self):
@@ -1009,18 +1023,8 @@ default="affine"
                 "perspective decides between the two mirror images: the other one does "
                 "not fit. mirror_certainty_ is the probability of the right one"
             )
-        mirror, signs = copy.copy(self), MIRROR.astype(self.mean_shape_.dtype)
-        mirror._model = self._model.mirrored()
-        mirror.mirror_certainty_ = 1.0 - self.mirror_certainty_
-        shapes_and_cameras = "mean_shape_", "basis_", "reference_motion_", "motion_"
-        factors = dict.fromkeys(shapes_and_cameras, signs)
-        factors["rotations_"] = np.outer(signs, signs)
-        of_modes = np.tile(signs, len(self.basis_))
-        factors["pose_effect_"] = np.array([[1.0], [-1.0], [1.0]])
-        factors["mode_covariance_"] = np.outer(of_modes, of_modes)
-        for name, factor in factors.items():
-            if hasattr(self, name):
-                setattr(mirror, name, getattr(self, name) * factor)
+        mirror = copy.copy(self)
+        mirror.__dict__.update(self._model.mirrored_attributes(self.__dict__))
         return mirror
 
     def reproject(self, X: Any, *, point_weight: Any = None) -> NDArray:

@@ -99,7 +99,7 @@ def stages_of(estimator: Any) -> list[str]:
         stages += ["independent subspaces", "block structure and refinement"]
     if estimator.refinement in JOINT_REFINEMENTS:
         stages.append(JOINT_STAGE)
-    if estimator.refinement == "consensus":
+    if estimator.refinement == "consensus" and estimator.camera != "perspective":
         stages.append(CONSENSUS_STAGE)
     stages.append("gauge and coefficients")
     return stages + [PERSPECTIVE_STAGE] * (estimator.camera == "perspective")
@@ -116,6 +116,7 @@ def fit_table(
     free: bool = False,
     errors: bool = False,
     remove_pose: bool = False,
+    placed: Decomposition | None = None,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
@@ -123,7 +124,8 @@ def fit_table(
     of the paper's result. `free`: K is the number of directions that the table
     determines, or with affine cameras falls until all directions of the coefficients
     are reliable. `errors`: estimate the errors of the depths. `remove_pose`: report the
-    directions of the part of the coefficients that the pose does not predict.
+    directions of the part of the coefficients that the pose does not predict. `placed`:
+    frames of the table in the model of the start.
 
     Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
     without visible points; convergence; and the other attributes of `AffineNRSfM`.
@@ -143,7 +145,7 @@ def fit_table(
         # Perspective images are right for the last fit, which has errors.
         given, settings = prior_start(table, settings, checked=errors)
     if start is not None:
-        given = _started(table, start, n_components)
+        given = _started(table, start, n_components, placed)
     if given is None:
         isa, factors = clone(isa), factorised.factors
         shapes, covariance, n_iter, converged = run_paper_pipeline(
@@ -214,7 +216,8 @@ def fit_table(
         # Down-weighted outliers, for example, look like basis shapes at first.
         supported = max(n_reliable(measures["reliability_"]), 1)
         if free and not whole and supported < n_components:
-            known = NoProgress(), start, free, errors, remove_pose
+            progress("gauge and coefficients")
+            known = NoProgress(), start, free, errors, remove_pose, placed
             return fit_table(table, supported, isa, settings, *known)
     else:
         fitted, frames, measures = _paper_frames(
@@ -299,11 +302,13 @@ def _factorised(
     return FactorisedTable(table, compressed, outliers, values, rest, W, parts, factors)
 
 
-def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointState:
-    """Return a start of K basis shapes from a model, in units of a table, no cameras.
+def _started(
+    table: ScaledTable, model: TableModel, n_components: int, placed: Any = None
+) -> JointState:
+    """Return a start of K basis shapes from a model, in units of a table.
 
-    Basis shapes that the model lacks are directions of the residuals of at most 200
-    frames.
+    It has the cameras of frames that are placed, otherwise none. Basis shapes that the
+    model lacks are directions of the residuals of at most 200 frames.
     """
     frames, unit = model.frames, (model.unit or 1.0) / (table.unit or 1.0)
     assert isinstance(frames, PosteriorFrames)
@@ -315,7 +320,13 @@ def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointS
         fit = frames.posterior(rows)
         rows = rows - fit.translation[:, :, None]
         shapes = extended_shapes(rows, shapes, fit.motion, fit.alpha, n_more)
-    return JointState(shapes, np.empty((0, 2, 3)), noise)
+    motion = np.empty((0, 2, 3))
+    if placed is not None:
+        back, sizes = np.linalg.pinv(frames.gauge.mixing), table.sizes[:, None, None]
+        motion, _, alpha, _ = (part[table.shown] for part in placed)
+        scales = back[0, 0] + alpha @ back[0, 1:]
+        motion = scales[:, None, None] * motion @ frames.gauge.space / sizes
+    return JointState(shapes, motion, noise)
 
 
 def _paper_frames(

@@ -21,7 +21,7 @@ from isa_nrsfm._frames.models import (
     RigidFrames,
     leading,
 )
-from isa_nrsfm._frames.pinhole import Pinhole, zoomed
+from isa_nrsfm._frames.pinhole import Pinhole, turns_to, zoomed
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
@@ -52,6 +52,7 @@ class TableModel(NamedTuple):
     first n_components coefficients are reported; shapes and images are of all.
     `unit` is the common size of all frames, or None if each frame has its own. With a
     pinhole the rows are perspective images, and frames those of weak-perspective ones.
+    `axes` is a camera of known focal length that has taken weak-perspective images.
     """
 
     frames: RigidFrames | PosteriorFrames
@@ -61,6 +62,7 @@ class TableModel(NamedTuple):
     layout: Layout
     unit: float | None
     pinhole: Pinhole | None = None
+    axes: Pinhole | None = None
 
     def decompose(
         self,
@@ -98,6 +100,29 @@ class TableModel(NamedTuple):
         if self.pinhole is not None:
             motion, translation = self.pinhole.real(rows, motion, translation)
         return Decomposition(motion, translation, *rest)
+
+    def in_camera_axes(self, motion: NDArray, translation: NDArray) -> NDArray:
+        """Return cameras (n, 2, 3) whose rotations lead to the axes of the camera.
+
+        Weak-perspective rotations lead to the line of sight to the shape's origin.
+        """
+        if self.axes is None:
+            return motion
+        turns = turns_to(self.axes.rays(np.asarray(translation)[..., None])[..., 0])
+        R, scales = full_rotations(np.asarray(motion))
+        turned = scales[:, None, None] * (turns.mT @ R)[:, :2]
+        return turned.astype(motion.dtype, copy=False)
+
+    def cameras(self, fit: Decomposition) -> dict[str, NDArray]:
+        """Return the attributes of calibrated cameras of frames, by name."""
+        motion, translation = fit[:2]
+        R, scales = full_rotations(self.in_camera_axes(motion, translation))
+        found = {"rotations_": R, "scales_": scales}
+        if (lens := self.pinhole or self.axes) is not None:
+            place = lens.positions(motion, translation)
+            place[np.isinf(place).any(axis=1)] = np.nan  # no focal length
+            found["positions_"] = place.astype(motion.dtype)
+        return found
 
     def straightened(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return weak-perspective images.
@@ -137,6 +162,24 @@ class TableModel(NamedTuple):
         mean_shape, basis = self.mean_shape * mirror, self.basis * mirror
         frames = self.frames.mirrored()
         return self._replace(frames=frames, mean_shape=mean_shape, basis=basis)
+
+    def mirrored_attributes(self, known: dict[str, Any]) -> dict[str, Any]:
+        """Return the attributes of the mirror image in depth, from those of a fit."""
+        signs, K = MIRROR.astype(self.mean_shape.dtype), self.n_components
+        names = "mean_shape_", "basis_", "reference_motion_", "motion_"
+        factors: dict[str, NDArray] = dict.fromkeys(names, signs)
+        factors["pose_effect_"] = np.array([[1.0], [-1.0], [1.0]])
+        factors["mode_covariance_"] = np.outer(np.tile(signs, K), np.tile(signs, K))
+        found = {name: known[name] * factors[name] for name in factors if name in known}
+        if "rotations_" in known:
+            R, sight = known["rotations_"], np.eye(3)[2:]
+            if self.axes is not None:
+                sight = self.axes.rays(known["translation_"][..., None])[..., 0]
+            length = np.square(sight).sum(axis=1)[:, None, None]
+            across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
+            found["rotations_"] = (across @ R * signs).astype(R.dtype)
+        found["mirror_certainty_"] = 1.0 - known["mirror_certainty_"]
+        return found | {"_model": self.mirrored()}
 
     def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
         """
@@ -228,22 +271,21 @@ class TableModel(NamedTuple):
         sizes = frames.scales[:, None, None] if scaled else 1.0
         return (sizes * frames.shapes).astype(fit.alpha.dtype, copy=False)
 
+    def turned(self, shapes: NDArray, fit: Decomposition) -> NDArray:
+        """Return shapes (n, J, 3) of frames in the axes of their camera."""
+        rotations, _ = full_rotations(self.in_camera_axes(*fit[:2]))
+        return shapes @ rotations.mT
+
     def uncertain_shapes(
-        self, rows: NDArray, weights: NDArray | None = None
+        self, rows: NDArray, weights: NDArray | None = None, turned: bool = False
     ) -> tuple[NDArray, NDArray]:
         """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
-        assert isinstance(self.frames, PosteriorFrames)
-        dtype = rows.dtype
-        rows = self.straightened(rows, weights)
-        weak = self._replace(pinhole=None)
-        fit = weak.decompose(rows, weights, deviations=False, dtype=dtype)
-        usable, centred, _, sizes, weights = self._ready(rows, weights)
-        covariances = self.frames.point_covariances(centred, sizes, weights)
-        deviations = of_all_rows(np.sqrt(covariances[..., 2, 2]), usable)
-        deviations = deviations.astype(dtype, copy=False)
-        _, scales = full_rotations(fit.motion)
+        fit, variances = self._uncertain(rows, weights)
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
-        return shapes, deviations / scales[:, None]
+        shapes = self.turned(shapes, fit) if turned else shapes
+        _, scales = full_rotations(fit.motion)
+        deviations = np.sqrt(variances[..., 2]) / scales[:, None]
+        return shapes.astype(rows.dtype), deviations.astype(rows.dtype)
 
     def points_in_space(
         self, rows: NDArray, weights: NDArray | None = None
@@ -253,20 +295,31 @@ class TableModel(NamedTuple):
         x and y are places in the table, z is the depth beyond the origin of the shape,
         in the same units.
         """
-        assert isinstance(self.frames, PosteriorFrames)
-        fit = self.decompose(rows, weights, deviations=False, dtype=np.float64)
-        straight = self.straightened(rows, weights)
-        virtual = self._replace(pinhole=None).decompose(straight, weights, False)
-        rotations, scales = full_rotations(fit.motion)
-        shapes = scales[:, None, None] * compose(self.mean_shape, self.basis, fit.alpha)
-        points = shapes @ rotations.mT
+        fit, variances = self._uncertain(rows, weights)
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        points = self.turned(shapes, fit) * full_rotations(fit.motion)[1][:, None, None]
         points[..., :2] += fit.translation[:, None]
+        return points, np.sqrt(variances)
+
+    def _uncertain(
+        self, rows: NDArray, weights: NDArray | None
+    ) -> tuple[Decomposition, NDArray]:
+        """Return frames, and variances (n, J, 3) of points in units of the table.
+
+        They are along the axes of the camera.
+        """
+        assert isinstance(self.frames, PosteriorFrames)
+        straight = self.straightened(rows, weights)
+        weak = self._replace(pinhole=None)
+        virtual = weak.decompose(straight, weights, False, dtype=np.float64)
+        fit = self.in_table_cameras(rows, *virtual)
         usable, centred, _, sizes, weights = self._ready(straight, weights)
         covariances = self.frames.point_covariances(centred, sizes, weights)
-        # Turned from the virtual camera to that of the table, if it is another one.
+        # Turned from the camera of the images, if it is another one
+        rotations, _ = full_rotations(self.in_camera_axes(*fit[:2]))
         turns = (rotations @ full_rotations(virtual.motion)[0].mT)[usable, None]
         variances = np.diagonal(turns @ covariances @ turns.mT, axis1=2, axis2=3)
-        return points, of_all_rows(np.sqrt(variances), usable)
+        return fit, of_all_rows(variances, usable)
 
     def reproject(
         self, rows: NDArray, *by_frame: NDArray, weighted: bool = False
@@ -281,8 +334,9 @@ class TableModel(NamedTuple):
         motion, translation, alpha, _ = self.decompose(rows, weights, deviations=False)
         shapes = compose(self.mean_shape, self.basis, alpha)
         images = self.images(shapes, motion, translation)
-        if self.pinhole is not None and shares:
-            centre = self.pinhole.centre[:, 0]
+        known = self.pinhole or self.axes
+        if known is not None and shares:
+            centre = known.centre[:, 0]
             images = zoomed(images, 1.0 / shares[0][..., None], centre)
         return tracks_to_table(images, self.layout)
 
@@ -329,8 +383,10 @@ class TableModel(NamedTuple):
         seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
         counts = counts * sizes[:, None] ** -2.0
-        # Complete frames are fitted without these points, others with NaN instead.
-        frames = self.frames
+        # Complete frames are fitted without these points, others with NaN instead. With
+        # perspective the other points keep their depths.
+        frames, weak = self.frames, self._replace(pinhole=None)
+        straight = self.straightened(rows, weights)
         linear = self.pinhole is None and frames.loss == "linear"
         complete = linear and weights is None and bool(seen.all())
         tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
@@ -339,7 +395,7 @@ class TableModel(NamedTuple):
         for fold in range(5):
             held = folds == fold
             # Fit without the held-out points
-            visible = np.where(held, np.nan, rows)
+            visible = np.where(held, np.nan, straight)
             enough = centred_frames(visible)[1].usable
             usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
             if not len(usable):
@@ -356,7 +412,8 @@ class TableModel(NamedTuple):
                 if linear:
                     fit = frames.fit(visible[usable], sizes[usable], False, own)
                 else:
-                    fit = self.decompose(visible[usable], own, False)
+                    fit = weak.decompose(visible[usable], own, False)
+                    fit = self.in_table_cameras(rows[usable], *fit)
             # Prediction of the held-out points, and its error
             shapes = compose(mean, others, fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
@@ -414,6 +471,12 @@ def sees_perspective(estimator: Any) -> bool:
     """Return whether perspective decides between the mirror images in depth."""
     pinhole = estimator._model.pinhole
     return pinhole is not None and pinhole.near
+
+
+def in_camera_axes(estimator: Any, motion: NDArray, translation: NDArray) -> NDArray:
+    """Return cameras (n, 2, 3) of `TableModel`."""
+    turned: NDArray = estimator._model.in_camera_axes(motion, translation)
+    return turned
 
 
 def removed_part(estimator: Any, motion: Any) -> Any:

@@ -14,7 +14,6 @@ several groups of points it moves, which gives its deviation (jackknife).
 import warnings
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,12 +31,13 @@ from isa_nrsfm._fit import (
 )
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
-from isa_nrsfm._frames.pinhole import Pinhole, common
+from isa_nrsfm._frames.pinhole import Pinhole, common, pinhole_of
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
 from isa_nrsfm._prepare.scaling import ScaledTable, scaled_table
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm.analysis._diagnostics import MOST_ROWS, unexplained
 
 # Effects of these constants: docs/benchmarks/README.md, "Thresholds".
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
@@ -55,16 +55,20 @@ ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
 # error, as a share of 1/f; and the largest number of fits.
 STEPS, NEAR, MOST_FITS = (1.5, 1.1), 0.01, 16
 
+# Why perspective is not taken.
 UNSTEADY = (
     "the fit of perspective has not settled: depths and fit do not agree. The focal "
-    "length may be wrong, the objects may turn too little, or there are too few basis "
-    "shapes. The fit is that of weak-perspective cameras, turned to each object"
+    "length may be wrong, or the objects may turn too little"
+)
+NOT_BETTER = (
+    "perspective predicts held-out points no better than weak perspective. The focal "
+    "length or the principal point may be wrong, or the objects too far away"
 )
 NO_PERSPECTIVE = (
     "no perspective was found: the focal length is very long, or there are too few "
-    "basis shapes to estimate it. If it is known, give focal_length. The fit is that "
-    "of weak-perspective cameras"
+    "basis shapes to estimate it. If it is known, give focal_length"
 )
+WEAK = "The fit is that of weak-perspective cameras"
 
 
 class PerspectiveFit(NamedTuple):
@@ -73,8 +77,7 @@ class PerspectiveFit(NamedTuple):
 
     model: with the perspective camera. frames, converged, attributes: as `fit_table`
     returns them. changes: shares by which repeats have changed the depths. energies
-    (J,): contributions of the points to E. earlier: models and frames of at most three
-    repeats before, the last one first.
+    (J,): contributions of the points to E.
     """
 
     model: TableModel
@@ -83,7 +86,6 @@ class PerspectiveFit(NamedTuple):
     attributes: dict[str, Any]
     changes: tuple[float, ...] = ()
     energies: NDArray = np.zeros(0)
-    earlier: tuple[tuple[TableModel, Decomposition], ...] = ()
 
     @property
     def energy(self) -> float:
@@ -100,15 +102,6 @@ class PerspectiveFit(NamedTuple):
     def n_components(self) -> int:
         """Number of basis shapes."""
         return self.model.n_components
-
-    @property
-    def for_depths(self) -> list[tuple[TableModel, Decomposition]]:
-        """Models and frames whose depths correct the next images.
-
-        They are several if depths oscillate.
-        """
-        slow = any(new > 0.5 * old for old, new in pairwise(self.changes))
-        return [(self.model, self.frames), *(self.earlier if slow else ())]
 
     def depths(self, part: slice) -> NDArray:
         """Return depths (n, J) of the points of some frames."""
@@ -150,23 +143,25 @@ class PerspectiveTable(NamedTuple):
 
     def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
         """Return the camera with a focal length."""
-        x, y = map(float, self.principal_point)
-        return Pinhole(focal_length, (x, y), self.settings.loss != "linear", near)
+        robust = self.settings.loss != "linear"
+        return pinhole_of(focal_length, self.principal_point, robust, near)
 
     def straight(
-        self, pinhole: Pinhole, n_components: int, fit: PerspectiveFit | None
+        self, pinhole: Pinhole | None, n_components: int, fit: PerspectiveFit | None
     ) -> ScaledTable:
-        """Return weak-perspective images, for the depths of a fit, or equal ones."""
-        fits = [] if fit is None else fit.for_depths
-        by_frame = [values for _, f in fits for values in (f.motion, f.alpha)]
-        models = [model for model, _ in fits]
-        function = partial(_straight, pinhole=pinhole, models=models)
-        rows = self.source.derive(function, *by_frame)
+        """Return weak-perspective images, for the depths of a fit, or equal ones.
+
+        Without a camera they are those of the table.
+        """
+        model = None if fit is None else fit.model
+        known = () if fit is None else (fit.frames.motion, fit.frames.alpha)
+        function = partial(_straight, pinhole=pinhole, model=model)
+        rows = self.source.derive(function, *known)
         return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
         self,
-        pinhole: Pinhole,
+        pinhole: Pinhole | None,
         n_components: int | None,
         before: PerspectiveFit | None = None,
         last: bool = False,
@@ -175,15 +170,21 @@ class PerspectiveTable(NamedTuple):
         """Return the fit of images that are corrected for the depths of another fit.
 
         It has the mirror image with those depths. None stands for as many basis shapes
-        as are relevant. Fits before the last one have principal axes and a larger
-        tolerance. Options are those of `fit_table`.
+        as are relevant. Fits before the last one are joint fits with principal axes and
+        a larger tolerance, from the other fit and its cameras. Options are those of
+        `fit_table`.
         """
         isa, settings = self.isa, self.settings
         if not last:
-            tol = ROUGH * settings.tol
-            # All directions of a shape would explain the perspective.
-            settings = settings._replace(independence=None, tol=tol, whole=False)
-        options["free"] = n_components is None
+            settings = settings._replace(
+                independence=None,
+                tol=ROUGH * settings.tol,
+                whole=False,  # all directions of a shape would explain the perspective
+                refinement="joint",
+            )
+            if before is not None:
+                options |= {"start": before.model, "placed": before.frames}
+        options.setdefault("free", n_components is None)
         options.setdefault("progress", NoProgress())
         if n_components is None:
             table = self.straight(pinhole, 1, before)
@@ -197,9 +198,7 @@ class PerspectiveTable(NamedTuple):
             change = fit.change(before, self.source.slices)
             fit = fit.mirrored() if change < 0 else fit
             fit.attributes["isa_"] = fit.attributes["isa_"] or before.attributes["isa_"]
-            changes = (*before.changes, abs(change))
-            earlier = ((before.model, before.frames), *before.earlier)[:3]
-            fit = fit._replace(changes=changes, earlier=earlier)
+            fit = fit._replace(changes=(*before.changes, abs(change)))
         squares = self.source.map(partial(_squares, model=fit.model), *fit.frames)
         square, counts = np.sum(list(squares), axis=0)
         return fit._replace(energies=square / counts.sum())
@@ -216,13 +215,11 @@ class PerspectiveTable(NamedTuple):
         A fit also ends if it is clearly worse than the best one.
         """
         tol *= self.settings.tol / JOINT_TOL
-        running = [fit._replace(changes=(), earlier=()) for fit in fits]
+        running = [fit._replace(changes=()) for fit in fits]
         ended: list[PerspectiveFit] = []
         while running:
             self.progress.step()
-            running = [
-                self.fit(pinhole, n_components, fit, start=fit.model) for fit in running
-            ]
+            running = [self.fit(pinhole, n_components, fit) for fit in running]
             best = min(fit.energy for fit in [*running, *ended])
             ended += [fit for fit in running if fit.ends(tol, best)]
             running = [fit for fit in running if not fit.ends(tol, best)]
@@ -235,6 +232,13 @@ class PerspectiveTable(NamedTuple):
         if self.log_odds(better, worse) < 0:
             better, worse = worse, better
         return {1.0 / f: better, -1.0 / f: worse}
+
+    def preferred(self, model: TableModel, weak: TableModel) -> bool:
+        """Return whether held-out points prefer a model to weak perspective."""
+        some = spread(np.arange(self.source.n_frames), MOST_ROWS)
+        known = () if self.weights is None else (self.weights[some],)
+        rows = self.source.take(some)
+        return unexplained(model, rows, *known) < unexplained(weak, rows, *known)
 
     def log_odds(self, fit: PerspectiveFit, image: PerspectiveFit) -> float:
         """Return the log odds of a fit against its mirror image.
@@ -325,46 +329,62 @@ def fit_perspective(
 
     `n_components` and the given focal length are estimated if they are None; the table
     has the mean of several. A fit from the model of a similar table has that of it.
+    If perspective is not found, its fit does not settle, or held-out points do not
+    prefer it, the fit is that of weak-perspective cameras, with a warning.
     """
     fits: dict[float, PerspectiveFit] = {}
-    deviation, why = 0.0, ""
+    deviation, why, prior = 0.0, "", table.settings.prior
+    # Like all fits with calibrated cameras, it does not depend on the number reported.
+    number = None if table.settings.whole and prior is None else n_components
     with warnings.catch_warnings(action="ignore"):  # the last fit warns
         if start is not None:
             best = table.started(start, n_components)
         elif given is not None:
             f = common(given)
             virtual = table.pinhole(f, near=False)
-            first = table.fit(virtual, n_components, progress=table.progress)
+            first = table.fit(virtual, number, progress=table.progress)
             fits = {0.0: first, **table.images(first, f)}
             best = fits[1.0 / f]
-            unsteady = best.changes[-1] > UNSETTLED or best.energy > first.energy
-            if unsteady and table.settings.prior is None:
+            if best.changes[-1] > UNSETTLED and prior is None:
                 why = UNSTEADY
             elif errors:  # neighbours tell how far a focal length contradicts the table
                 places = 0.8 / f, 1.25 / f
                 fits |= {place: table.near(fits, place) for place in places}
         else:
-            fits = table.searched(n_components)
+            fits, number = table.searched(n_components), n_components
             place, deviation = minimum(fits)
             deviation = float(np.hypot(deviation, 0.5 * NEAR * place))  # of the search
             if best_of(fits) > 0 and place > 2.0 * deviation:
                 best = table.near(fits, place)
             else:
                 why = NO_PERSPECTIVE
-        if why:
-            best = fits[0.0]
-        elif n_components is None:
+        if number is None and not why:
             best = table.fit(best.pinhole, None, best)
             best = table.settled(best.pinhole, best.n_components, best)[0]
-    # The last fit, with warnings and errors of depths
-    before = None if why else best
-    options = {"start": best.model, "errors": errors, "remove_pose": remove_pose}
-    fit = table.fit(best.pinhole, best.n_components, before, last=True, **options)
+    # The last fits, with warnings and errors of depths
+    options: dict[str, Any] = {
+        "last": True,
+        "errors": errors,
+        "remove_pose": remove_pose,
+    }
+    if not why:
+        n_last = n_components or best.n_components
+        fit = table.fit(best.pinhole, n_last, best, **options)
+        if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
+            fit = table.fit(best.pinhole, n_last, fit, **options)
+    if start is None:
+        options["free"] = n_components is None
+        with warnings.catch_warnings(action=None if why else "ignore"):
+            weak = table.fit(None, n_components or 1, **options)
+        if not why and not table.preferred(fit.model, weak.model):
+            why = NOT_BETTER
+    table.progress(PERSPECTIVE_STAGE)
+    if why:
+        warn_caller(f"{why}. {WEAK}")
+        return weak[:4]
     model, _, converged, attributes, *_ = fit
     f = best.pinhole.focal_length
-    if why:
-        warn_caller(why)
-    elif errors and isinstance(model.frames, PosteriorFrames):
+    if errors and isinstance(model.frames, PosteriorFrames):
         certainty = model.frames.certainty
         error = focal_error(fits, 1.0 / f, deviation, table.source.slices)
         total = float(np.hypot(certainty.total, error))
@@ -388,10 +408,7 @@ def fit_perspective(
         "focal_length_": f if given is None else np.array(given, dtype=float)[()],
         "focal_length_std_": deviation * f**2 if known or not deviation else np.inf,
     }
-    if why == NO_PERSPECTIVE:
-        attributes["focal_length_"] = np.inf
     frames = Decomposition(*(part.astype(dtype) for part in frames))
-    table.progress(PERSPECTIVE_STAGE)
     return model, frames, converged, attributes
 
 
@@ -412,20 +429,16 @@ def focal_error(
 
 
 def _straight(
-    rows: NDArray, *by_frame: NDArray, pinhole: Pinhole, models: list[TableModel]
+    rows: NDArray, *frames: NDArray, pinhole: Pinhole | None, model: TableModel | None
 ) -> NDArray:
-    """Return weak-perspective images (n, 2, J) of rows, for weighted means of depths.
+    """Return weak-perspective images (n, 2, J) of rows, for the depths of a model.
 
-    Cameras and coefficients of the frames follow each other, for one model each. Each
-    model has half of the weight of the one before it. Without models depths are equal.
+    Frames are cameras and coefficients. Without a model depths are equal.
     """
+    if pinhole is None:
+        return rows
     images = pinhole.virtual(rows)
-    if not models:
-        return images
-    fits = zip(models, by_frame[::2], by_frame[1::2], strict=True)
-    depths = [model.depths(motion, alpha) for model, motion, alpha in fits]
-    weights = 0.5 ** np.arange(len(depths))
-    return pinhole.straight(images, np.average(depths, axis=0, weights=weights))
+    return images if model is None else pinhole.straight(images, model.depths(*frames))
 
 
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:

@@ -106,6 +106,12 @@ class Pinhole(NamedTuple):
         return place / scales[:, None]
 
 
+def pinhole_of(focal_length: Any, point: Any, *kind: bool) -> Pinhole:
+    """Return the camera with one or several focal lengths and a principal point."""
+    x, y = map(float, point)
+    return Pinhole(common(focal_length), (x, y), *kind)
+
+
 def turns_to(rays: NDArray) -> NDArray:
     """Return the smallest rotations (n, 3, 3) of rays (n, 3) to the third axis."""
     axis = np.eye(3)[2]

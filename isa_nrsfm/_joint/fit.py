@@ -97,7 +97,10 @@ def fit_jointly(
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is not None:
         shapes = first.frames.coordinates(start.shapes)
-        start = first.aligned(start._replace(shapes=shapes), first.cameras)
+        motion = start.motion[table.parts[0]] if table.parts else start.motion
+        start = start._replace(shapes=shapes, motion=motion)
+        if not len(motion):
+            start = first.aligned(start, first.cameras)
         # The widths of a prior change its first fit.
         rough = {} if settings.prior is None else {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, first.cameras, **rough)

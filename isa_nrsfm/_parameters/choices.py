@@ -11,6 +11,7 @@ CalibratedCamera = Literal["weak_perspective", "orthographic"]
 Camera = Literal["affine", CalibratedCamera, "perspective"]
 Independence = Literal["shapes", "coefficients"]
 Loss = Literal["linear", "huber", "cauchy"]
+Axes = Literal["object", "camera"]
 
 BLOCK_RECOVERIES: tuple[BlockRecovery, ...] = get_args(BlockRecovery)
 REFINEMENTS: tuple[Refinement, ...] = get_args(Refinement)
@@ -20,6 +21,7 @@ CALIBRATED_CAMERAS: tuple[CalibratedCamera, ...] = get_args(CalibratedCamera)
 CAMERA_NAMES: tuple[Camera, ...] = get_args(Camera)
 INDEPENDENCE: tuple[Independence, ...] = get_args(Independence)
 LOSSES: tuple[Loss, ...] = get_args(Loss)
+AXES: tuple[Axes, ...] = get_args(Axes)
 # Sets of points in the files of OpenPose.
 OPENPOSE_PARTS = ("pose", "face", "hand_left", "hand_right")
 # Parts of whole bodies in the files of COCO and MMPose.

@@ -11,6 +11,7 @@ from sklearn.utils.validation import validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import CHECKS, checked_range, unmasked
@@ -346,24 +347,27 @@ def check_camera(model: Any) -> None:
             "remove_pose needs calibrated cameras, which have a yaw. Set "
             "camera='weak_perspective' or camera='orthographic', or remove_pose=False"
         )
-    if camera != "perspective":
-        for name in ("focal_length", "principal_point"):
-            if getattr(model, name) is not None:
-                raise ValueError(
-                    f"{name} is for camera='perspective'; got camera={camera!r}. Set "
-                    f"{name}=None, or camera='perspective'"
-                )
-        return
-    if refinement != "joint":
+    f = model.focal_length
+    lens = (f is not None) + (centre is not None)
+    if lens and (camera == "affine" or (camera != "perspective" and lens == 1)):
         raise ValueError(
-            "camera='perspective' needs refinement='joint', whose fits repeat until "
-            "the depths of the points agree with their images; got "
+            "focal_length and principal_point are for calibrated cameras, which have "
+            "axes, and belong together. Give both or none, and none with "
+            f"camera='affine'; got camera={camera!r}, focal_length={f!r}, "
+            f"principal_point={centre!r}"
+        )
+    if camera == "perspective" and refinement not in JOINT_REFINEMENTS:
+        raise ValueError(
+            "camera='perspective' needs refinement='joint' or 'consensus', whose fits "
+            "repeat until the depths of the points agree with their images; got "
             f"refinement={refinement!r}"
         )
+    if not lens and camera != "perspective":
+        return
     numbers = np.asarray(centre, dtype=float)
     if numbers.shape != (2,) or not np.isfinite(numbers).all():
         raise ValueError(
-            "camera='perspective' needs principal_point=(x, y), the point of the image "
+            f"camera={camera!r} needs principal_point=(x, y), the point of the image "
             "on the axis of the camera. If nothing else is known, give half of the "
             "image's width and height in pixels, such as (640, 360); normalised "
             "coordinates have focal_length=1, principal_point=(0, 0); got "

@@ -19,7 +19,11 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
-from isa_nrsfm._parameters.choices import FACE_PRIORS as LAYOUTS, JOINT_REFINEMENTS
+from isa_nrsfm._parameters.choices import (
+    CALIBRATED_CAMERAS,
+    FACE_PRIORS as LAYOUTS,
+    JOINT_REFINEMENTS,
+)
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
@@ -94,9 +98,11 @@ def fit_table(
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
     frames = asked_columns(args, frames)
-    if args.camera == "perspective" and frames.principal_point is None:
+    known = args.camera == "perspective" or args.focal_length is not None
+    if known and frames.principal_point is None:
+        option = "--focal-length" if args.focal_length else "--camera perspective"
         raise ValueError(
-            "--camera perspective needs the size of the images, with --image-size "
+            f"{option} needs the size of the images, with --image-size "
             "WIDTHxHEIGHT such as 1280x720, or the point of the image on the axis of "
             "the camera, with --principal-point X Y (0 0 and --focal-length 1 for "
             "normalised coordinates)"
@@ -203,8 +209,12 @@ def _check_options(args: Namespace) -> None:
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
     for name in ("focal_length", "principal_point"):
-        if getattr(args, name) is not None and args.camera != "perspective":
-            raise ValueError(f"{flag_of(name)} needs --camera perspective")
+        unused = args.focal_length is None and args.camera in CALIBRATED_CAMERAS
+        if getattr(args, name) is not None and (unused or args.camera == "affine"):
+            raise ValueError(
+                f"{flag_of(name)} has no effect on --camera {args.camera}"
+                f"{' without --focal-length' * unused}"
+            )
     joint = {"--std": args.std, "--n-components auto": args.n_components == (AUTO,)}
     for option, is_given in joint.items():
         if is_given and args.refinement not in (None, *JOINT_REFINEMENTS):
@@ -249,7 +259,7 @@ def _fitted(
         remove_pose=args.remove_pose,
         **params,
     )
-    if estimator.camera == "perspective":
+    if estimator.camera == "perspective" or args.focal_length is not None:
         estimator.set_params(principal_point=frames.principal_point)
     choice: dict[str, Any] = {}
     X, groups = frames.X, frames.groups

@@ -235,9 +235,10 @@ HELP = {
     "webcam), or affine (no assumption, for stretched images), which leaves depth and "
     "proportions open (default: what held-out points prefer; perspective needs the "
     "size of the images)",
-    "focal_length NUMBER": "of perspective cameras, in pixels (default: estimated)",
-    "principal_point X Y": "of perspective cameras: the point of the image on the axis "
-    "of the camera, in pixels (default: the middle of the images)",
+    "focal_length NUMBER": "of the camera, in pixels (default: estimated with "
+    "perspective). Rotations, angles and depths are then in the axes of the camera",
+    "principal_point X Y": "the point of the image on the axis of the camera, in "
+    "pixels (default: the middle of the images)",
     "prior MODEL": "a fitted model of a table in which the objects turn, such as "
     f"model.npz, or {FACE_PRIOR} for faces: with it frontal photos and few frames have "
     f"true depths. Its layouts are {', '.join(choices.FACE_PRIORS)} (default: that of "

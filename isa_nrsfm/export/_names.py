@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from isa_nrsfm._fitted_model import removed_part
+from isa_nrsfm._fitted_model import in_camera_axes, removed_part
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm.skeletons._column_names import checked_names
 
@@ -39,10 +39,11 @@ def frames_of_table(
 ) -> tuple[NDArray, NDArray]:
     """Return cameras and coefficients of a table or of frames that are fitted.
 
-    None is the fitted table.
+    Rotations lead to the axes of the camera, if known. None is the fitted table.
     """
     if X is None:
-        return model.motion_, model.alpha_ + removed_part(model, model.motion_)
+        alpha = model.alpha_ + removed_part(model, model.motion_)
+        return in_camera_axes(model, model.motion_, model.translation_), alpha
     if not isinstance(X, Decomposition):
         X = model.decompose(X, point_weight=point_weight)
-    return X.motion, X.alpha
+    return in_camera_axes(model, X.motion, X.translation), X.alpha

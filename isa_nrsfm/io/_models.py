@@ -237,7 +237,7 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
         len(estimator.basis_),
         entries["layout"],
         entries["unit"],
-        _pinhole(entries),
+        *(_pinhole(entries.get(name)) for name in ("pinhole", "axes")),
     )
     estimator.n_components_ = estimator._n_features_out = len(estimator.basis_)
     pinhole = estimator._model.pinhole
@@ -278,7 +278,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         ((2, 3), ["reference_motion_"]),
         ((2,), ["reference_translation_", "prior_std_"]),
         ((2,), ["image_errors"]),
-        ((5,), ["pinhole"]),
+        ((5,), ["pinhole", "axes"]),
         ((3, 3), ["space", "turns"]),
         ((None,), ["objective_history_", "focal_length_"]),
         ((3, K), ["pose_effect_"]),
@@ -314,10 +314,11 @@ def _check_shapes(values: dict[str, Any]) -> None:
         raise ValueError(f"it has {K} basis shapes of {P} points")
     if "space" in values and np.linalg.matrix_rank(values["space"]) < 3:
         raise ValueError("space has no inverse")
-    focal, *centre = values.get("pinhole", (1.0,))[:3]
     small = values["unit"] is not None and values["unit"] < SMALLEST
-    if small or not (focal > 0 and np.isfinite(centre).all()):
-        raise ValueError("its unit, or its pinhole camera, is not possible")
+    for name in ("pinhole", "axes"):
+        focal, *centre = values.get(name, (1.0,))[:3]
+        if small or not (focal > 0 and np.isfinite(centre).all()):
+            raise ValueError("its unit, or its pinhole camera, is not possible")
 
 
 def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
@@ -330,9 +331,10 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "sizes": vars(estimator).get("_frame_sizes"),
         "further_basis": model.basis[model.n_components :],
     }
-    if model.pinhole is not None:
-        f, (x, y), *kinds = model.pinhole
-        entries["pinhole"] = np.array([f, x, y, *kinds], dtype=float)
+    for name in ("pinhole", "axes"):
+        if (known := getattr(model, name)) is not None:
+            f, (x, y), *kinds = known
+            entries[name] = np.array([f, x, y, *kinds], dtype=float)
     if isinstance(frames, RigidFrames):
         return {**entries, "mean_shape": frames.mean_shape, "basis": frames.basis}
     return {
@@ -354,11 +356,11 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
     }
 
 
-def _pinhole(entries: dict[str, Any]) -> Pinhole | None:
-    """Return the perspective camera of `_frame_entries`, if any."""
-    if "pinhole" not in entries:
+def _pinhole(entry: NDArray | None) -> Pinhole | None:
+    """Return a camera of `_frame_entries`, if any."""
+    if entry is None:
         return None
-    f, x, y, robust, near = entries["pinhole"].tolist()
+    f, x, y, robust, near = entry.tolist()
     return Pinhole(f, (x, y), bool(robust), bool(near))
 
 
