@@ -48,9 +48,8 @@ ROUGH_ROWS, MOST_SHAPES = 50, 4
 MOST_WRONG = 1e-3
 # Largest variation of the scales of frames for which one scale is tried.
 EQUAL_SCALES = 0.1
-# A setting is used if it lowers the error of held-out points to this share; perspective
-# to the second one.
-LOWER, MUCH_LOWER = 0.97, 0.9
+# A setting is used if it lowers the error of held-out points to this share.
+LOWER = 0.97
 # Shapes that determine the depth may have an error of held-out points so much larger.
 LARGER = 1.5
 
@@ -390,7 +389,7 @@ def _affine(best: _Fit, rows: _Rows) -> Proposal:
 # largest error, relative to that of the best fit, with which it is used.
 PROPOSALS: tuple[tuple[str, str, Callable[..., Proposal], float], ...] = (
     ("loss", "robust loss", _robust_loss, LOWER),
-    ("camera", "perspective", _perspective, MUCH_LOWER),
+    ("camera", "perspective", _perspective, LOWER),
     ("prior", "face prior", _face_prior, np.inf),
     ("refinement", "consensus", _consensus, LARGER),
     ("camera", "orthographic", _orthographic, LOWER),

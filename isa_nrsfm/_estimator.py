@@ -1086,9 +1086,8 @@ default="affine"
         """
         Return minus the inverse SNR of points held out of the fit of their frame.
 
-        The points are divided into five fixed parts, each predicted from the others,
-        frame by frame. Unlike the reprojection error of fitted points, this error rises
-        with too many basis shapes: it can choose `n_components`.
+        The points are divided into five fixed parts, each predicted from the others.
+        This error rises with too many basis shapes: it can choose `n_components`.
 
         Parameters
         ----------
@@ -1103,10 +1102,8 @@ default="affine"
         -------
         float
             ``-sum ||m - m_hat||^2 / sum ||m - centroid_i||^2`` over all points, with
-            frames scaled as in the fit. Larger is better. A point is left out if the
-            other points of its frame do not determine the fit. In frames with missing
-            points it is also left out if the camera of the others adds more than
-            twice the noise variance to its prediction.
+            frames scaled as in the fit. Larger is better. Points are left out whose
+            place the others of their frame do not determine.
         """
         table, weights = self._opened(X, point_weight, judged=False)
         noise, signal = table.joined(self._model.held_out_sums, *weights).sum(axis=0)
