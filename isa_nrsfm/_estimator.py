@@ -893,9 +893,8 @@ default="affine"
             NaN for rows with too few visible points. If `camera` is given for an affine
             model, each shape is rotated as near as possible to the mean shape.
         depth_std : ndarray of shape (n_frames, n_points)
-            Only with `return_std`. Standard deviations of the coordinates of the points
-            along the third of `rotations_`, in the units of the shapes. They contain
-            the uncertainty of camera, coefficients and shapes.
+            Only with `return_std`. Standard deviations of the points along the third of
+            `rotations_`: the uncertainty of camera, coefficients and shapes.
 
         Raises
         ------
