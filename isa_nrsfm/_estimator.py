@@ -890,11 +890,11 @@ default="affine"
         Returns
         -------
         shapes : ndarray of shape (n_frames, n_points, 3)
-            NaN for rows with too few visible points. If `camera` is given for an affine
-            model, each shape is rotated as near as possible to the mean shape.
+            In the units of `mean_shape_`; NaN for rows with too few visible points. If
+            `camera` is given for an affine model, each is turned to the mean shape.
         depth_std : ndarray of shape (n_frames, n_points)
-            Only with `return_std`. Standard deviations of the points along the third of
-            `rotations_`: the uncertainty of camera, coefficients and shapes.
+            Only with `return_std`. Standard deviations of the points, in these units,
+            along the third of `rotations_`, from camera, coefficients and shapes.
 
         Raises
         ------
