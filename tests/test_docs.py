@@ -179,6 +179,7 @@ def test_getting_started_runs():
     assert Path("rows.png").stat().st_size
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("tables")
 def test_the_page_of_questions_runs():
     names = run("docs/questions.md")
@@ -207,6 +208,7 @@ def codes_of_calls(column):
     return [code for row in rows for code in re.findall(r"`([^`]+)`", row[column])]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:no perspective")
 @pytest.mark.usefixtures("video")
 def test_python_calls_for_questions_run():
@@ -220,6 +222,7 @@ def test_python_calls_for_questions_run():
     assert {"pdm.txt", "faces.glb", "faces.mat"} <= set(os.listdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("video")
 def test_commands_for_questions_run():
     fit = ["fit", "--n-components", "1", *JOINT]
