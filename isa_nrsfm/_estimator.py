@@ -32,11 +32,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, leading
 from isa_nrsfm._frames.pinhole import focal_shares, pinhole_of, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._other_tables import (
-    checked_prior,
-    fitted_prior,
-    warn_if_foreign,
-)
+from isa_nrsfm._other_tables import checked_prior, fitted_prior, warn_if_foreign
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (

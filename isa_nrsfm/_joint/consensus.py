@@ -177,13 +177,13 @@ def consensus(
         change = (joined - scene.first) @ weights
         change[:, :2, others] = off[:, :, others]
         S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
-        return modelled(
-            aligning_rotations(centred(S[:, :, chosen]), noise).mT @ S, noise
-        )
+        R = aligning_rotations(centred(S[:, :, chosen]), noise)
+        return modelled(R.mT @ S, noise)
 
     # The joint fit has a share of the depths.
     some = spread(np.arange(len(part)), HIDDEN_FRAMES)
-    own = share_of_first(model, merged(joined), part[some])
+    result = merged(joined)
+    own = share_of_first(model, result, part[some])
     joined[:, 2] += own * (centred(scene.first[:, 2]) - centred(joined[:, 2]))
     depths = centred(joined[:, 2] @ weights)
     squares = disagreements(groups, joined[:, 2])
@@ -191,7 +191,8 @@ def consensus(
     nearer = squares.sum() / disagreements(groups, scene.first[:, 2]).sum()
     squares, depths = squares @ weights, np.mean(depths**2, axis=0)
     certainty = certainty.of_consensus(squares, depths, min(nearer, 1.0))
-    return replace(merged(joined), certainty=certainty)
+    result = merged(joined) if own else result
+    return replace(result, certainty=certainty)
 
 
 def share_of_first(
