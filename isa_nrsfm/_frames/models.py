@@ -50,7 +50,8 @@ class DepthCertainty(NamedTuple):
         ``exp(-4 r)``, with the rise r of -2 log L of a frame if depths are a thousand
         times as large, and cameras hardly turn: near one if deformation explains the
         images as well as rotations do. Plus the same of other fits with their evidence,
-        times the relative squared difference of their depths. With a prior, the mean
+        times the relative squared difference of their depths. Plus the error of frames
+        that may be reversed in depth. With a prior, the mean
         square of the relative change of depths that the prior and the table allow.
     turns : ndarray of shape (3, 3) or None
         Covariance of the rotation vectors, in radians squared, in the camera's axes.

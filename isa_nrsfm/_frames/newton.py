@@ -181,6 +181,21 @@ class CalibratedSearch(FrameSearch):
         motion[better] = frames_first(M[:, :, better]) @ self.space
         return motion, better
 
+    def reversals(
+        self, products: FrameSums, noise: float, motion: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the minima from reversed cameras (n, 2, 3) and alpha (n, K) there.
+
+        The third result (n,) is the rise of -2 log L from the given cameras.
+        """
+        M, n_steps = frames_last(motion @ self.space.T), 30
+        problem = self.problem(products, np.full(len(motion), noise))
+        value = _value(problem, _posterior(problem, M))
+        M, _ = self.descend(problem, self.evaluate(problem, M * REVERSED), n_steps)
+        posterior = _posterior(problem, M)
+        rise = (_value(problem, posterior) - value) / noise
+        return frames_first(M) @ self.space, posterior.alpha.T, rise
+
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
         """Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
 

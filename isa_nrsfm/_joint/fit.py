@@ -46,6 +46,7 @@ from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
     first_state,
+    half_reversed,
     lifted_shapes,
     steadied,
     stretched,
@@ -67,9 +68,9 @@ from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import seen_points
 
-# Numbers of basis shapes of the fits that are compared: docs/benchmarks/README.md,
-# "Thresholds".
-FIRST_COMPONENTS = 3, 12
+# Numbers of basis shapes of the fits that are compared, first that of the noise ratio:
+# docs/benchmarks/README.md, "Thresholds".
+FIRST_COMPONENTS = 3, 1, 12
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains are those of two fits of one minimum.
 HOPELESS, LEAST_GAIN = 5.0, 1.0
@@ -186,15 +187,16 @@ def _likeliest_fit(
     """Return the fit of few basis shapes from which all directions fit best."""
     n = n_directions(problem, paper_shapes.shape[2], few=True)
     most = min(len(paper_shapes) - 1, n)
-    few, *more = sorted({min(k, most) for k in FIRST_COMPONENTS})
+    few, *more = dict.fromkeys(min(k, most) for k in FIRST_COMPONENTS)
     rough, cameras = {"tol": problem.settings.tol}, problem.cameras
     fits = [_first_fit(problem, table, paper_shapes[: few + 1], **rough)[0]]
     for k in more:
         paper = paper_shapes[: k + 1]
         fits.append(_calibrated_fit(problem, table, paper, cameras, **rough)[0])
-    best = min((extended(problem, fit, n) for fit in fits), key=_end)
-    # The noise variances of both camera models, each for its degrees of freedom, of the
-    # fewest basis shapes: more of them explain what wrong cameras leave.
+    ends = [extended(problem, fit, n) for fit in fits]
+    best = min(ends, key=lambda fit: (evidence(problem, fit), _end(fit)))
+    # The noise variances of both camera models, each for its degrees of freedom, of few
+    # basis shapes: more of them explain what wrong cameras leave.
     size, n_seen = fits[0].state.shapes.shape, table.scaled.n_seen
     own, affine = (
         _freedom_correction(n_seen, size, 2 + c.n_parameters, None)
@@ -207,10 +209,12 @@ def _likeliest_fit(
 def steadiest(
     problem: JointProblem, table: FactorisedTable, fit: JointFit, n: int
 ) -> JointFit:
-    """Return a fit of n directions, or a more evident one whose cameras turn less.
+    """Return a fit of n directions, or a more evident one.
 
-    Wings that beat look like a bird that rolls. The objective counts coefficients, but
-    not rotations, and its minima lead there; `evidence` counts both.
+    The others start from cameras that turn less: wings that beat look like a bird that
+    rolls. The objective counts coefficients, but not rotations, and its minima lead
+    there; `evidence` counts both. The last one starts with a group of frames reversed
+    in depth: single frames are not turned back if the shapes explain both groups.
     """
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
@@ -219,20 +223,37 @@ def steadiest(
     if not np.isfinite(limit):  # nothing turns
         return fit
     found, latest = [(evidence(problem, fit) - LEAST_GAIN, fit)], fit
+
+    def lifted(motion: NDArray, k: int) -> JointFit:
+        """Return the fit of n directions from cameras, first with k of them."""
+        state = first_state(problem, rows, motion, lifted_shapes(rows, motion, k))
+        state = free.refined(state, held, max_iter=FIXED_STEPS).state
+        other = extended(problem, fit._replace(state=state), k)
+        return extended(problem, other, n) if k < n else other
+
+    def compare(other: JointFit) -> None:
+        """Add a fit, if it may be the most evident one."""
+        if evidence(problem, other) < limit:
+            other, widths = whole_distribution(problem, other)
+            other = other._replace(widths=widths)
+            found.append((evidence(problem, other), other))
+
     for _ in range(4):
         motion, tried = steadied(latest.state.motion), len(found)
         for k in {min(FIRST_COMPONENTS[0], n), n}:
-            state = first_state(problem, rows, motion, lifted_shapes(rows, motion, k))
-            state = free.refined(state, held, max_iter=FIXED_STEPS).state
-            other = extended(problem, fit._replace(state=state), k)
-            other = extended(problem, other, n) if k < n else other
-            if evidence(problem, other) < limit:
-                other, widths = whole_distribution(problem, other)
-                other = other._replace(widths=widths)
-                found.append((evidence(problem, other), other))
+            compare(lifted(motion, k))
         if len(found) == tried:
             break
         latest = min(found[tried:], key=itemgetter(0))[1]
+    best = min(found, key=itemgetter(0))[1]
+    alpha = replace(problem, widths=best.widths).likelihood(*best.state).alpha
+    other = lifted(half_reversed(best.state, alpha), n)
+    for _ in range(5):
+        state, n_reversed = problem.reversed_back(other.state, problem.cameras)
+        if not n_reversed:
+            break
+        other = extended(problem, other._replace(state=state), n)
+    compare(other)
     found.sort(key=itemgetter(0))
     return found[0][1]._replace(rivals=rival_depths(problem, found))
 

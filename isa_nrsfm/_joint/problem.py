@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, line_of_sight
@@ -269,17 +270,35 @@ class JointProblem:
         result is used if its objective is lower.
         """
         search = CalibratedSearch(state.shapes, cameras.scaled)
+        motion, better = self._searched(search.reversed_cameras, search, state)
+        return state._replace(motion=motion), int(better.sum())
 
-        def reversed_cameras(block: FrameTracks, motion: NDArray) -> Any:
+    def reversal_error(self, state: JointState, depths: NDArray) -> float:
+        """Return the mean squared error of depths (I, J) that may be reversed.
+
+        Relative to their mean square. Each frame is reversed with the probability ``1 /
+        (1 + exp(r / 2))``, r the rise of -2 log L at the minimum from there.
+        """
+        search = CalibratedSearch(state.shapes, self.cameras.scaled)
+        motion, alpha, rise = self._searched(search.reversals, search, state)
+        other = state._replace(motion=motion).depths(alpha)
+        square = np.sum((other - depths) ** 2, axis=1)
+        return float(expit(-rise / 2) @ square / max(np.sum(depths**2), 1e-300))
+
+    def _searched(
+        self, method: Any, search: CalibratedSearch, state: JointState
+    ) -> tuple[NDArray, ...]:
+        """Return the results of a method of a search for all frames."""
+
+        def of_block(block: FrameTracks, motion: NDArray) -> Any:
             parts = []
             for frames, piece in block.pieces():
                 sums = frame_sums(piece, search.shared)
-                parts.append(search.reversed_cameras(sums, state.noise, motion[frames]))
+                parts.append(method(sums, state.noise, motion[frames]))
             return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
-        parts = self.frames.blocks.map(reversed_cameras, state.motion)
-        motion, better = map(np.concatenate, zip(*parts, strict=True))
-        return state._replace(motion=motion), int(better.sum())
+        parts = self.frames.blocks.map(of_block, state.motion)
+        return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
 
 def refine_joint(

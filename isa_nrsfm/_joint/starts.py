@@ -126,6 +126,13 @@ def steadied(motion: NDArray) -> NDArray:
     return motion @ turn.as_matrix()
 
 
+def half_reversed(state: JointState, alpha: NDArray) -> NDArray:
+    """Return cameras (I, 2, 3), reversed in depth if the first of alpha is negative."""
+    axis = np.linalg.svd(state.shapes[0], full_matrices=False)[0][:, 2]
+    mirror = np.eye(3) - 2.0 * np.outer(axis, axis)
+    return np.where(alpha[:, :1, None] < 0, state.motion @ mirror, state.motion)
+
+
 def stretched(
     state: JointState, camera: CameraModel, factor: float
 ) -> tuple[JointState, NDArray]:

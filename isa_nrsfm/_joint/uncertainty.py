@@ -42,7 +42,7 @@ from isa_nrsfm._frames.models import (
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import STEP, ShapePrior
-from isa_nrsfm._joint.problem import JointState, Widths, refine_joint
+from isa_nrsfm._joint.problem import JointProblem, JointState, Widths, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
@@ -285,6 +285,13 @@ def depth_certainty(
     if prior is not None:  # which does not let depths grow
         prior, extents = prior.of_points(points), 0.0
 
+    def of_points(kept: NDArray) -> JointFrames:
+        """Return the frames of the kept points."""
+        rows = tracks[:, :, kept]
+        blocks = FrameBlocks.of_array(rows, len(rows))
+        counts = None if w is None else w[:, kept]
+        return JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
+
     def refit(
         kept: NDArray,
         start: JointState | None = None,
@@ -296,15 +303,12 @@ def depth_certainty(
         Returns the state, rotations (I, 3, 3), centred depths (I, n_kept) and the
         objective for each frame, without the prior of the extents.
         """
-        rows = tracks[:, :, kept]
-        blocks = FrameBlocks.of_array(rows, len(rows))
-        counts = None if w is None else w[:, kept]
-        part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
+        part = of_points(kept)
         n_numbers, energy = part.totals
         if prior is not None:
             likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
         elif widths is not None:
-            own = widths.of_points(rows.shape[2], most)
+            own = widths.of_points(int(kept.sum()), most)
             likelihood = own.likelihood(part, frames.camera)
         else:
             penalty = part.basis_penalty(limits.basis_std)
@@ -319,11 +323,12 @@ def depth_certainty(
         state = refine_joint(likelihood, start, camera, **ends).state
         terms = likelihood._replace(extent_weight=0.0)(*state)
         rotations, _ = full_rotations(state.motion)
-        return state, rotations, state.depths(terms.alpha), terms.value / len(rows)
+        return state, rotations, state.depths(terms.alpha), terms.value / len(tracks)
 
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extents=extents)
-    deformation = rivals
+    problem = JointProblem(of_points(every), settings)
+    deformation = rivals + problem.reversal_error(whole, depths)
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
