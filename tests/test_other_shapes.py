@@ -248,16 +248,18 @@ def test_columns_scaled_one_by_one(tmp_path, scaled):
 @pytest.mark.filterwarnings("ignore:(in 1 of|68 of 136)")
 def test_points_of_three_or_four_numbers(tracks, further, n):
     X = np.concatenate([tracks, *further], axis=2)
-    model = AffineNRSfM(1, refinement=None)
-    told = str(refused(f"{n} numbers for each point", model.fit, X.reshape(60, -1)))
-    found = eval(told.rpartition("Give ")[2], {"X": X.reshape(60, -1)})
-    assert_array_equal(found, tracks.reshape(60, -1))
-    told = str(refused("the shape", model.fit, X))
-    assert_array_equal(eval(told.rpartition("give ")[2], {"X": X}), found)
-    if n == 3:
-        odd = X[:, :21].reshape(60, -1)
-        told = str(refused("an even number", model.fit, odd))
-        assert eval(told.rpartition("give ")[2], {"X": odd}).shape == (60, 42)
+    for layout, axes in (("interleaved", (0, 1, 2)), ("planar", (0, 2, 1))):
+        fit = AffineNRSfM(1, layout=layout, refinement=None).fit
+        flat, odd = (a.transpose(axes).reshape(60, -1) for a in (X, X[:, :21]))
+        for given, told in (
+            (pd.DataFrame(flat), f"{n} numbers for each point"),
+            (X, "the shape"),
+            (pd.DataFrame(odd), "an even number"),
+        )[: 3 if n == 3 else 2]:
+            way = re.split("[gG]ive ", str(refused(told, fit, given)))[-1]
+            found = eval(way, {"X": given, "np": np})
+            points = tracks[:, : found.shape[1] // 2].transpose(axes)
+            assert_array_equal(found, points.reshape(60, -1))
 
 
 @pytest.mark.parametrize("still", [2, 3, 30])
