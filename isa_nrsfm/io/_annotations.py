@@ -27,7 +27,6 @@ from isa_nrsfm.io._landmarks import (
     Landmarks,
     assemble,
     checked_sizes,
-    refuse_same_names,
 )
 from isa_nrsfm.io._tables import first_lines, header_names, parse_table
 
@@ -171,7 +170,11 @@ def read_imglab(path: Path) -> Landmarks:
 
 def _named(places: Sequence[tuple[Any, Any]]) -> dict[str, NDArray]:
     """Return points by name, or raise if two have the same."""
-    refuse_same_names([name for name, _ in places])
+    names = [name for name, _ in places]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(
+            f"more than one point is called {twice[0]!r}: each needs its own name"
+        )
     found = {name: floats_of([str(v) for v in place]) for name, place in places}
     if any(len(place) != 2 for place in found.values()):
         raise ValueError("each point should have two numbers, x and y")

@@ -35,6 +35,8 @@ def is_openface(path: Path) -> bool:
     names = header_names(path)
     of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
     groups = {"x_0", "x0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
+    cut = [{"success", f"x{_}67", f"y{_}67"}.issubset(names) for _ in ("", "_")]
+    of_video |= any(cut)  # without some columns
     return (of_video or names[:2] == ["face", "confidence"]) and bool(groups)
 
 
@@ -53,8 +55,8 @@ def read_openface(path: Path) -> Landmarks:
             "it has no 2D landmarks x_0, ..., y_0, ...: run OpenFace with -2Dfp"
         )
     of_video = names[:1] != ["face"]
-    scores = ["confidence", "success"] if of_video else ["confidence"]
-    _need(names, scores)
+    _need(names, ["success"] if of_video else ["confidence"])
+    scores = [name for name in ("confidence", "success") if name in names]
     found = find_landmark_columns(names, "x_#,y_#" if "x_0" in first else "x#,y#")
     numbers = [*found.interleaved, *scores]
     table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
@@ -63,7 +65,8 @@ def read_openface(path: Path) -> Landmarks:
             raise ValueError("the column success must hold 0 and 1 only")
         table["success"] = table["success"].astype(int)
         table.loc[table["success"] == 0, found.interleaved] = np.nan
-    return _assembled(table, found, "openface", scores=["confidence"])
+    scores = [name for name in scores if name == "confidence"]
+    return _assembled(table, found, "openface", scores=scores)
 
 
 def is_pyfeat(path: Path) -> bool:

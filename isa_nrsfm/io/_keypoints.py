@@ -35,14 +35,17 @@ _PLACES = {
     133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
     136: [(0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)],
 }
-# What json of programs begins with; that of COCO has none of these.
+# The keys of json of programs, outside of all objects but one, and what a value begins
+# with.
 _KINDS = {
-    "openpose": rb'"people"\s*:',
-    "mmpose": rb'"(?:instance_info|instances|keypoint_scores|predictions)"\s*:',
-    "ultralytics": rb'"keypoints"\s*:\s*\{',
-    "labelme": rb'"shapes"\s*:',
-    "coco": rb'"\w+"\s*:',
+    "coco": r'"(?:images|annotations|image_id)":',
+    "openpose": r'"people":',
+    "mmpose": r'"(?:instance_info|instances|keypoint_scores|predictions)":',
+    "ultralytics": r'"keypoints":\{',
+    "labelme": r'"shapes":',
 }
+# A key and the beginning of its value, or another text, or a brace.
+_TOKEN = re.compile(r'("(?:[^"\\]|\\.)*+")(?:\s*:\s*(?=(.)))?|([{}])')
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
@@ -57,12 +60,24 @@ _WFLW_LENGTHS = (197, 207)
 
 
 def json_kind(path: Path) -> str:
-    """Return the program of a json file by its beginning; empty for other files."""
-    with path.open("rb") as file:
-        text = file.read(2**16).removeprefix(b"\xef\xbb\xbf").lstrip()
-    if text[:1] not in (b"{", b"["):
-        return ""
-    return next((kind for kind, e in _KINDS.items() if re.search(e, text)), "none")
+    """Return the program of a json file by its keys; empty for other files."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        text = file.read(2**16).lstrip()
+        found = _kind_of(text)
+        if found in ("none", "other") and (rest := file.read()):
+            found = _kind_of(text + rest)
+    return found if text[:1] in ("{", "[") else ""
+
+
+def _kind_of(text: str) -> str:
+    """Return the program of a text by the keys of objects that are in no other."""
+    keys, depth = [], 0
+    for key, value, brace in _TOKEN.findall(text):
+        depth += (brace == "{") - (brace == "}")
+        if value and depth == 1:
+            keys.append(f"{key}:{value}")
+    found = (kind for kind, e in _KINDS.items() if re.search(e, " ".join(keys)))
+    return next(found, "other" if keys else "none")
 
 
 def json_files(path: Path, *kinds: str) -> list[Path]:
@@ -74,7 +89,7 @@ def json_files(path: Path, *kinds: str) -> list[Path]:
 
 def is_coco(path: Path) -> bool:
     """Return whether a file begins as a json object or list, of no other format."""
-    return json_kind(path) in ("coco", "none")
+    return json_kind(path) in ("coco", "other", "none")
 
 
 def read_coco(path: Path, part: str | None = None) -> Landmarks:
