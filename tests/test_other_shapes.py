@@ -265,6 +265,7 @@ LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
         CENTRED / COLUMNS.std(axis=0),
         (CENTRED / COLUMNS.std(axis=0, ddof=1)).round(2),
         COLUMNS / COLUMNS.std(axis=0),
+        PIXELS.reshape(60, -1) / PIXELS.reshape(60, -1).max(axis=0),
         RANGE,
         100 * RANGE,
         2 * RANGE - 1,
