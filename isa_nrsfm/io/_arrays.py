@@ -43,6 +43,8 @@ def read_array(path: Path) -> Landmarks:
         way = "array[..., :2]" if array.shape[-1] in (3, 4) else "array.transpose(...)"
         if array.ndim == 2:  # x and y of frames in turn
             way = f"array.reshape(-1, 2, {array.shape[1]})"
+        elif len(array) == 2:
+            way = "array.transpose(1, 2, 0)"
         raise ValueError(
             "the array should be (n_frames, n_points, 2); got the shape "
             f"{array.shape}: np.save('new.npy', {way})"
@@ -78,6 +80,8 @@ def read_trc(path: Path) -> Landmarks:
     the fifth. All z must be equal or empty.
     """
     lines = path.read_text(encoding="utf-8-sig").splitlines()
+    if len(lines) < 6:
+        raise ValueError(f"it has {len(lines)} lines, and no rows of points")
     names = [name.strip() for name in lines[3].split("\t")[2:] if name.strip()]
     rows = [line.split("\t") for line in lines[5:] if line.strip()]
     cells = [[c.strip() or "nan" for c in row[: 2 + 3 * len(names)]] for row in rows]

@@ -509,6 +509,8 @@ def read_tps(path: Path) -> Landmarks:
     for number, part in enumerate(parts):
         with errors_of(f"specimen {number} (counted from 0)"):
             count, *lines = filter(None, map(str.strip, part.splitlines()))
+            if not count.isdigit():
+                raise ValueError(f"LM= needs a number of landmarks; got {count!r:.40}")
             points = " ".join(lines[: int(count)]).replace("NA", "nan")
             tracks.append({0: floats_of(points.split()).reshape(int(count), 2)})
             entries = [line.partition("=") for line in lines[int(count) :]]
