@@ -330,7 +330,9 @@ def confidences_in(
     try:
         with warnings.catch_warnings(action="ignore"):  # of commas, as in coordinates
             frame = with_points(frame, names)
-        found = {name: _as_numbers(frame[name].replace(_SEEN)) for name in names}
+        texts = [name for name in names if frame[name].dtype.kind not in "iuf"]
+        seen = {n: frame[n].map(lambda cell: _SEEN.get(cell, cell)) for n in texts}
+        found = {name: _as_numbers(seen.get(name, frame[name])) for name in names}
         values = pd.DataFrame(found, frame.index)
         # p may be a pressure, and v a velocity; in COCO it is 0, 1 or 2.
         is_letter = bool(names) and len(names[0].strip()) == len(x[0].strip())
