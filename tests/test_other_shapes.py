@@ -355,6 +355,7 @@ def test_confidences_of_other_scales(tmp_path, begins, fails, scores, told):
     assert_array_equal(read_landmarks(path).confidence, table[names] == "True")
 
 
+OBJECTS = [{"x": x, "y": y, "z": 0.5, "visibility": 0.9} for x, y in TRACKS[0].tolist()]
 PERSON = {"pose_keypoints_2d": files.SCORED[0].ravel().tolist()}
 INSTANCE = dict(sorted(files.mmpose(files.SCORED[0]).items()))
 
@@ -370,6 +371,13 @@ INSTANCE = dict(sorted(files.mmpose(files.SCORED[0]).items()))
         ({"dataset": ["people"] * 9000, "instance_info": [[INSTANCE]]}, "mmpose"),
         ({"dataset": {"people": [3], "keypoints": {}}, "instances": 3}, "mmpose"),
         ([files.RESULTS[0] | {"attributes": {"shapes": 3, "people": 1}}], "coco"),
+        (OBJECTS, "mediapipe"),
+        ([OBJECTS], "mediapipe"),
+        ({"fps": 3, "frames": [{"t": 1, "landmarks": [OBJECTS]}]}, "mediapipe"),
+        ({"poseLandmarks": OBJECTS, "poseWorldLandmarks": OBJECTS}, "mediapipe"),
+        ([{"face_landmarks": OBJECTS, "hand_landmarks": [OBJECTS]}], "choose one with"),
+        ([{"landmarks": [[1, 2]]}], "no lists of objects"),
+        ([{"points": 3}], "but points"),
         ([dict(reversed(files.RESULTS[0].items()))], "coco"),
         ([{"instances": [INSTANCE | {"keypoints": [[1, 2, 3]] * J}]}], "in space"),
         ([INSTANCE | {"keypoint_scores": 3}], "keypoint_scores"),

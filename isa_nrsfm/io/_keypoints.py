@@ -43,6 +43,7 @@ _KINDS = {
     "mmpose": r'"(?:instance_info|instances|keypoint_scores|predictions)":',
     "ultralytics": r'"keypoints":\{',
     "labelme": r'"shapes":',
+    "mediapipe": r'"x":.*"y":|[lL]andmarks":',
 }
 # A key and the beginning of its value, or another text, or a brace.
 _TOKEN = re.compile(r'("(?:[^"\\]|\\.)*+")(?:\s*:\s*(?=(.)))?|([{}])')
@@ -76,8 +77,10 @@ def _kind_of(text: str) -> str:
         depth += (brace == "{") - (brace == "}")
         if value and depth == 1:
             keys.append(f"{key}:{value}")
-    found = (kind for kind, e in _KINDS.items() if re.search(e, " ".join(keys)))
-    return next(found, "other" if keys else "none")
+    found = [kind for kind, e in _KINDS.items() if re.search(e, " ".join(keys))]
+    if keys and not found and re.search(r'[lL]andmarks"\s*:\s*\[', text):
+        found = ["mediapipe"]  # of frames in an object
+    return [*found, "other" if keys else "none"][0]
 
 
 def json_files(path: Path, *kinds: str) -> list[Path]:
@@ -124,7 +127,10 @@ def entries_as_rows(
     """
     seen = [bool(entry.get("keypoints")) for entry in entries]
     if names is None and not any(seen):
-        raise ValueError(f"there are no frames in it: no {what} has keypoints")
+        others = first_items(dict.fromkeys(name for each in entries for name in each))
+        raise ValueError(
+            f"there are no frames in it: no {what} has keypoints, but {others}"
+        )
     given = [entry for entry in entries if entry.get("keypoints")]
     found, names = _keypoints(given, names, part, what)
     values = np.full((len(entries), *found.shape[1:]), np.nan)
