@@ -275,7 +275,7 @@ LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
 def test_columns_scaled_one_by_one(tmp_path, scaled):
     told = "Each column was scaled by itself"
     with pytest.warns(match=told):
-        AffineNRSfM(1, refinement=None).fit(scaled)
+        AffineNRSfM(1, refinement=None, random_state=0).fit(scaled)
     wide("{axis}{part}", scaled, range(68)).to_csv(tmp_path / "a.csv", index=False)
     assert told in read(tmp_path / "a.csv")[0]
 
@@ -371,10 +371,10 @@ INSTANCE = dict(sorted(files.mmpose(files.SCORED[0]).items()))
         ({"dataset": ["people"] * 9000, "instance_info": [[INSTANCE]]}, "mmpose"),
         ({"dataset": {"people": [3], "keypoints": {}}, "instances": 3}, "mmpose"),
         ([files.RESULTS[0] | {"attributes": {"shapes": 3, "people": 1}}], "coco"),
-        (OBJECTS, "mediapipe"),
-        ([OBJECTS], "mediapipe"),
-        ({"fps": 3, "frames": [{"t": 1, "landmarks": [OBJECTS]}]}, "mediapipe"),
-        ({"poseLandmarks": OBJECTS, "poseWorldLandmarks": OBJECTS}, "mediapipe"),
+        (OBJECTS, "mediapipe_json"),
+        ([OBJECTS], "mediapipe_json"),
+        ({"fps": 3, "frames": [{"t": 1, "landmarks": [OBJECTS]}]}, "mediapipe_json"),
+        ({"poseLandmarks": OBJECTS, "poseWorldLandmarks": OBJECTS}, "mediapipe_json"),
         ([{"face_landmarks": OBJECTS, "hand_landmarks": [OBJECTS]}], "choose one with"),
         ([{"landmarks": [[1, 2]]}], "no lists of objects"),
         ([{"points": 3}], "but points"),

@@ -142,15 +142,8 @@ def read_mediapipe_json(
     Their names, such as ``pose_landmarks`` or ``poseLandmarks``, are told apart by
     ``part``; points in space (``world``) are left out.
     """
-    content, entries = read_json(path), []
+    frames, entries = _frames_in(read_json(path)), []
     names: dict[str, str] = {}
-    if isinstance(content, dict):
-        values = (v for v in content.values() if isinstance(v, list) and v)
-        lists = [v for v in values if isinstance(v[0], dict) and not _persons(v)]
-        content = lists[0] if lists else [content]
-    elif isinstance(content[0], dict) and _persons(content):
-        content = [content]  # of one image
-    frames = [f if isinstance(f, dict) else {"landmarks": f} for f in content]
     for number, frame in enumerate(frames):
         found = {n: p for n, value in frame.items() if (p := _persons(value))}
         found = {n: p for n, p in found.items() if "world" not in n.lower()}
@@ -179,6 +172,17 @@ def read_mediapipe_json(
     points = read.points.copy()
     points[:] = _in_pixels(tracks, image_size, None).reshape(len(rows), -1)
     return replace(read, points=points, confidence=read.confidence if seen else None)
+
+
+def _frames_in(content: Any) -> list[dict[str, Any]]:
+    """Return the frames in a list, in an object with a list of them, or the only one."""
+    if isinstance(content, dict):
+        values = (v for v in content.values() if isinstance(v, list) and v)
+        lists = [v for v in values if isinstance(v[0], dict) and not _persons(v)]
+        content = lists[0] if lists else [content]
+    elif isinstance(content[0], dict) and _persons(content):
+        content = [content]
+    return [f if isinstance(f, dict) else {"landmarks": f} for f in content]
 
 
 def _persons(value: Any) -> list[list[dict[str, Any]]]:
