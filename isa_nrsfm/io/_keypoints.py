@@ -364,7 +364,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     known = [name for name in OPENPOSE_PARTS if name in names_in]
     listed = ", ".join(known)
     if not known:
-        raise ValueError("it has no visible points in pose_keypoints_2d, ... of people")
+        raise ValueError("it has no visible points in pose_keypoints_2d, ...")
     if len(known) > 1 and part is None:
         raise ValueError(
             f"it has points of {listed}: choose one with part (command line: --part)"
