@@ -175,7 +175,7 @@ def read_mediapipe_json(
 
 
 def _frames_in(content: Any) -> list[dict[str, Any]]:
-    """Return the frames in a list, in an object with a list of them, or the only one."""
+    """Return the frames in a list, or in an object with a list; or the only one."""
     if isinstance(content, dict):
         values = (v for v in content.values() if isinstance(v, list) and v)
         lists = [v for v in values if isinstance(v[0], dict) and not _persons(v)]
