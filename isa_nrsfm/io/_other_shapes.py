@@ -268,9 +268,8 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
     """
     codes = pd.DataFrame({name: pd.factorize(frame[name])[0] for name in keys})
     sizes, is_frame = codes.nunique(), {n: bool(_FRAME.search(n)) for n in keys}
-    # Points have names or whole numbers; rows are counted.
-    numbers = frame[keys].apply(pd.to_numeric, errors="coerce")
-    no_point = (numbers % 1 > 0).any() | (numbers.diff().iloc[1:] == 1).all()
+    # Points have names or whole numbers.
+    no_point = (frame[keys].apply(pd.to_numeric, errors="coerce") % 1 > 0).any()
 
     def count(names: list[str]) -> int:
         return len(codes[names].drop_duplicates()) if names else 1
@@ -278,7 +277,7 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
     named = [name for name in keys if _POINT.search(name)]
     image = next(filter(_IMAGE.fullmatch, keys), None)
     others = [n for n in keys[::-1] if not (is_frame[n] or no_point[n])]
-    for point in dict.fromkeys([*named, *others, *(keys if len(keys) == 1 else ())]):
+    for point in dict.fromkeys([*named, *others]):
         by_frame, by_point = [name for name in keys if name != point], [point]
         if count(keys) < len(frame):
             break
