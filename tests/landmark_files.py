@@ -442,6 +442,10 @@ WRITERS = {
     "coco-results": lambda d: write_json(d / "a.json", RESULTS),
     "openpose": lambda d: write_openpose(d / "a", POSES),
     "openpose-file": lambda d: next(write_openpose(d / "a", POSES[:1]).iterdir()),
+    "mediapipe_json": lambda d: write_json(
+        d / "a.json",
+        [[dict(zip("xy", point, strict=True)) for point in p] for p in TRACKS.tolist()],
+    ),
     "mmpose": lambda d: write_json(d / "a.json", VIDEO),
     "mmpose-image": lambda d: write_json(d / "a.json", VIDEO[0]["instances"]),
     "mmpose-demo": lambda d: write_json(
@@ -504,7 +508,7 @@ WRITERS = {
     "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
-IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
+IN_MESH = [n for n in WRITERS if n[:10] in ("mediapipe", "mediapipe-", "pyfeat-mp")]
 EXPECTED = dict.fromkeys(IN_MESH, MESH)
 EXPECTED |= dict.fromkeys(["pts-file", "openpose-file", "mmpose-image"], TRACKS[:1])
 EXPECTED |= {n: TRACKS / 500 for n in WRITERS if n.startswith("yolo")}

@@ -105,7 +105,7 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
             "--principal-point has no effect on --camera orthographic without --focal",
         ),
         (write_openface, "--camera perspective", "needs the size of the images, with"),
-        (write_openface, "--part face", "--part needs --format coco or openpose"),
+        (write_openface, "--part face", "or coco or openpose or mmpose"),
         (write_openpose, "", "has points of pose, face: choose one with part"),
         (
             write_openface,

@@ -817,4 +817,4 @@ def test_arrays_have_the_size_of_their_file(tmp_path):
     for changed, n_bytes in ((mean[:-1], 47), (mean + b"0", 49)):
         refused(f"48 bytes; got {n_bytes}", read, changed)
     for size in (0, 8, 16, 24):
-        refused("type object should have 16 bytes", read, head + bytes(size))
+        refused("holds Python objects", read, head + bytes(size))

@@ -243,7 +243,7 @@ def test_openpose_that_cannot_be_read_is_refused_with_the_way(tmp_path):
     folder = files.write_openpose(tmp_path / "json", people)
     refused("shares of the image's size.* --keypoint_scale 0", read_landmarks, folder)
     empty = files.write_openpose(tmp_path / "empty", [[], [files.openpose_person()]])
-    refused("no visible points in the lists pose_keypoints_2d", read_landmarks, empty)
+    refused("no visible points in pose_keypoints_2d", read_landmarks, empty)
     refused("no files with names", read_landmarks, tmp_path, "openpose")
     other = folder / "b_keypoints.json"
     other.write_text('{"people": [], "author": "Jos\xe9"}', encoding="latin-1")

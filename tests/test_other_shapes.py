@@ -62,6 +62,8 @@ def moved(**names):
 
 
 TWICE = "the points are probably there more than once"
+SHOWN = np.arange(N * J).reshape(N, J) % 5 > 0
+GAPS = np.where(SHOWN, 1, np.nan).repeat(2, axis=1)
 # A table, and what is read: the points, or a part of a message.
 TABLES = {
     "R": (LONG.rename(columns={"frame": "Image", "point": "Landmark"}), FLAT),
@@ -76,6 +78,26 @@ TABLES = {
     "ImageJ": (LONG.rename(columns={"x": "X [px]", "y": "Y [px]"}), FLAT),
     "times": (LONG.assign(time=FRAMES / 25, score=np.linspace(0, 1, N * J)), FLAT),
     "videos": (LONG.assign(video=FRAMES // 6, frame=FRAMES % 6), FLAT),
+    "floats are no points": (
+        LONG.drop(columns="frame").assign(
+            POSITION_T=FRAMES / 25 + 0.01, ID=range(N * J)
+        ),
+        "--row-per-point",
+    ),
+    "ImageJ, multi-point": (
+        LONG[["x", "y"]].assign(**{" ": range(1, N * J + 1), "Slice": FRAMES + 1}),
+        FLAT,
+    ),
+    "hidden points": (NAMED.assign(occluded=np.arange(N * J) % 2), FLAT),
+    "VIA": (
+        LONG[["frame", "point"]].assign(
+            shape=[
+                f'{{"name":"point","cx":{x},"cy":{y}}}'
+                for x, y in LONG[["x", "y"]].values
+            ]
+        ),
+        FLAT,
+    ),
     "people": (PEOPLE, FLAT.repeat(2, axis=0)),
     "people without numbers": (PEOPLE.drop(columns="person"), FLAT.repeat(2, axis=0)),
     "order": (LONG.drop(columns="point"), FLAT),
@@ -95,6 +117,18 @@ TABLES = {
     "numbers above tuples": (cells("({}, {})".format, map(str, range(J))), FLAT),
     "json": (cells(lambda x, y: json.dumps({"x": x, "y": y})), FLAT),
     "x, y, z": (cells("({}, {}, -0.1)".format), FLAT),
+    "numpy 2": (cells("[np.float64({}), np.float64({}), 0.9]".format), FLAT),
+    "numbers as keys": (faces(lambda f: str(dict(enumerate(f.tolist())))), FLAT),
+    "objects": (
+        faces(lambda f: str([f"P(x={x}, y={y}, z=1.5, name=None)" for x, y in f])),
+        FLAT,
+    ),
+    "gaps": (cells("({}, {})".format).where(SHOWN, ""), FLAT * GAPS),
+    "None": (cells("({}, {})".format).where(SHOWN, "(None, None)"), FLAT * GAPS),
+    "shortened": (
+        faces(lambda f: f"[[{f[0, 0]} 1.5]\n ...\n [2.5 1.5]]"),
+        "leaves out",
+    ),
     "AffectNet": (faces(lambda face: ";".join(map(str, face.ravel()))), FLAT),
     "lists of lists": (faces(lambda face: str(face.tolist())), FLAT),
     "numpy": (faces(str), FLAT),
@@ -120,6 +154,17 @@ TABLES = {
         TWICE,
     ),
     "after": (wide("{axis}_{part}").join(wide("{axis}_{part}_raw")), TWICE),
+    "velocities": (
+        moved(gyro_x=1, gyro_y=2)
+        .join(wide("{part}_smooth_{axis}"))
+        .join(wide("{part}_velocity_{axis}")),
+        TWICE,
+    ),
+    "cameras": (
+        wide("{part}_leftcam_{axis}").join(wide("{part}_rightcam_{axis}")),
+        "views of several cameras",
+    ),
+    "force plate": (moved(force_x=1, force_y=2, COP_x=1, COP_y=2), FLAT),
     "gyroscope": (moved(gyro_x=1, gyro_y=2, gyro_z=3), FLAT),
     "gaze angles": (moved(gaze_angle_x=1, gaze_angle_y=2), FLAT),
     "head": (moved(head_rotation_x=1, head_rotation_y=2), FLAT),
@@ -220,6 +265,7 @@ LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
         CENTRED / COLUMNS.std(axis=0),
         (CENTRED / COLUMNS.std(axis=0, ddof=1)).round(2),
         COLUMNS / COLUMNS.std(axis=0),
+        PIXELS.reshape(60, -1) / PIXELS.reshape(60, -1).max(axis=0),
         RANGE,
         100 * RANGE,
         2 * RANGE - 1,
@@ -229,7 +275,7 @@ LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
 def test_columns_scaled_one_by_one(tmp_path, scaled):
     told = "Each column was scaled by itself"
     with pytest.warns(match=told):
-        AffineNRSfM(1, refinement=None).fit(scaled)
+        AffineNRSfM(1, refinement=None, random_state=0).fit(scaled)
     wide("{axis}{part}", scaled, range(68)).to_csv(tmp_path / "a.csv", index=False)
     assert told in read(tmp_path / "a.csv")[0]
 
@@ -248,16 +294,18 @@ def test_columns_scaled_one_by_one(tmp_path, scaled):
 @pytest.mark.filterwarnings("ignore:(in 1 of|68 of 136)")
 def test_points_of_three_or_four_numbers(tracks, further, n):
     X = np.concatenate([tracks, *further], axis=2)
-    model = AffineNRSfM(1, refinement=None)
-    told = str(refused(f"{n} numbers for each point", model.fit, X.reshape(60, -1)))
-    found = eval(told.rpartition("Give ")[2], {"X": X.reshape(60, -1)})
-    assert_array_equal(found, tracks.reshape(60, -1))
-    told = str(refused("the shape", model.fit, X))
-    assert_array_equal(eval(told.rpartition("give ")[2], {"X": X}), found)
-    if n == 3:
-        odd = X[:, :21].reshape(60, -1)
-        told = str(refused("an even number", model.fit, odd))
-        assert eval(told.rpartition("give ")[2], {"X": odd}).shape == (60, 42)
+    for layout, axes in (("interleaved", (0, 1, 2)), ("planar", (0, 2, 1))):
+        fit = AffineNRSfM(1, layout=layout, refinement=None).fit
+        flat, odd = (a.transpose(axes).reshape(60, -1) for a in (X, X[:, :21]))
+        for given, told in (
+            (pd.DataFrame(flat), f"{n} numbers for each point"),
+            (X, "the shape"),
+            (pd.DataFrame(odd), "an even number"),
+        )[: 3 if n == 3 else 2]:
+            way = re.split("[gG]ive ", str(refused(told, fit, given)))[-1]
+            found = eval(way, {"X": given, "np": np})
+            points = tracks[:, : found.shape[1] // 2].transpose(axes)
+            assert_array_equal(found, points.reshape(60, -1))
 
 
 @pytest.mark.parametrize("still", [2, 3, 30])
@@ -299,10 +347,15 @@ def test_confidences_of_other_scales(tmp_path, begins, fails, scores, told):
         assert "left out" not in fails(
             "fit", path, *QUICK, "1", "-o", tmp_path, *option
         )
-    if scores.max() < 0.5:
-        assert read(path, min_confidence=0.6)[1] is None
+    told = read(path, min_confidence=0.6)[0]
+    assert ("no point has" in told) == (0 < scores.max() < 0.6)
+    assert ("no probabilities: a threshold" in told) == (scores.max() > 2)
+    table[names] = np.where(scores >= np.median(scores), "True", "FALSE")
+    table.to_csv(path, index=False)
+    assert_array_equal(read_landmarks(path).confidence, table[names] == "True")
 
 
+OBJECTS = [{"x": x, "y": y, "z": 0.5, "visibility": 0.9} for x, y in TRACKS[0].tolist()]
 PERSON = {"pose_keypoints_2d": files.SCORED[0].ravel().tolist()}
 INSTANCE = dict(sorted(files.mmpose(files.SCORED[0]).items()))
 
@@ -315,6 +368,16 @@ INSTANCE = dict(sorted(files.mmpose(files.SCORED[0]).items()))
         ([INSTANCE], "mmpose"),
         ([{"instances": [INSTANCE], "frame_id": 0}], "mmpose"),
         ({"dataset": {"name": "a"}, "instance_info": [[INSTANCE]]}, "mmpose"),
+        ({"dataset": ["people"] * 9000, "instance_info": [[INSTANCE]]}, "mmpose"),
+        ({"dataset": {"people": [3], "keypoints": {}}, "instances": 3}, "mmpose"),
+        ([files.RESULTS[0] | {"attributes": {"shapes": 3, "people": 1}}], "coco"),
+        (OBJECTS, "mediapipe_json"),
+        ([OBJECTS], "mediapipe_json"),
+        ({"fps": 3, "frames": [{"t": 1, "landmarks": [OBJECTS]}]}, "mediapipe_json"),
+        ({"poseLandmarks": OBJECTS, "poseWorldLandmarks": OBJECTS}, "mediapipe_json"),
+        ([{"face_landmarks": OBJECTS, "hand_landmarks": [OBJECTS]}], "choose one with"),
+        ([{"landmarks": [[1, 2]]}], "no lists of objects"),
+        ([{"points": 3}], "but points"),
         ([dict(reversed(files.RESULTS[0].items()))], "coco"),
         ([{"instances": [INSTANCE | {"keypoints": [[1, 2, 3]] * J}]}], "in space"),
         ([INSTANCE | {"keypoint_scores": 3}], "keypoint_scores"),
@@ -352,6 +415,9 @@ def test_failed_frames_of_the_first_openface(tmp_path):
     assert list(np.flatnonzero(found.failed)) == [3]
     table.to_csv(path := tmp_path / "a.txt", index=False)
     assert list(np.flatnonzero(read_landmarks(path).failed)) == [3]
+    table = wide("{axis}_{part}", files.scene(N, 68), range(68))  # parts of a table
+    table.assign(success=np.arange(N) % 2).to_csv(path, index=False)
+    assert list(read_landmarks(path).failed) == [True, False] * (N // 2)
 
 
 @pytest.mark.parametrize("names", [["a.jpg"], ["a.jpg", "happy"]])

@@ -83,12 +83,12 @@ def test_datasets_of_movement(face, tmp_path):
     with netcdf_file(path, mmap=False) as file:
         for name in ("position", "position_std"):
             variable = file.variables[name]
-            assert variable.dimensions == ("time", "space", "keypoints", "individuals")
+            assert variable.dimensions == ("time", "space", "keypoint", "individual")
             values = getattr(points, name)
             assert_array_equal(variable[..., 0].swapaxes(1, 2), values)
         assert_array_equal(file.variables["determined"][..., 0], points.determined)
         assert_allclose(file.variables["time"][:], np.arange(40) / 25)
-        names = [b"".join(row).decode() for row in file.variables["keypoints"][:]]
+        names = [b"".join(row).decode() for row in file.variables["keypoint"][:]]
         assert [name.strip("\0") for name in names] == [f"p{j}" for j in range(30)]
         assert (file.ds_type, file.time_unit, file.fps) == (b"poses", b"seconds", 25)
     xarray = pytest.importorskip("xarray", reason="reads the file as movement does")
@@ -125,6 +125,10 @@ def test_files_of_opensim(face, tmp_path):
         head, table = read_trc(tmp_path / f"{name}.trc")
         assert head[3].split("\t")[::3][1:3] == ["p1", "p2"] or "p1" in head[3]
         assert head[2].split("\t")[2:4] == ["40", "30"]
+        # OpenSim reads rows of as many cells, none of which is empty at the end.
+        rows = (tmp_path / f"{name}.trc").read_text().splitlines()[6:]
+        assert {len(row.split("\t")) for row in rows} == {2 + 3 * 30}
+        assert "" not in "\t".join(rows).split("\t")
         assert_allclose(table[:, 2:].reshape(values.shape), values, rtol=1e-12)
 
 

@@ -433,7 +433,7 @@ def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
     for X in (tracks, tracks.swapaxes(1, 2)):
         told = str(refused(r"reshape\(len\(X\), -1\)", estimator.fit, X))
         way = told.rpartition("give ")[2]
-        table = eval(way, {"X": X})
+        table = eval(way, {"X": X, "np": np})
         np.testing.assert_array_equal(table, expected.reshape(N, -1))
     for X in (tracks[None], np.zeros((30, 12, 5))):
         refused(r"one row per frame .* got the shape .*\)$", estimator.fit, X)

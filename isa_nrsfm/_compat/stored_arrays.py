@@ -59,8 +59,13 @@ def array_in(content: bytes) -> NDArray:
         shape, _, dtype = np.lib.format.read_array_header_1_0(stored)
     else:
         shape, _, dtype = np.lib.format.read_array_header_2_0(stored)
+    if dtype.hasobject:
+        raise ValueError(
+            f"an array of shape {shape} holds Python objects, which are not read: save "
+            "it with a type of numbers, such as array.astype(float)"
+        )
     n_bytes, expected = len(content) - stored.tell(), math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or n_bytes != expected:
+    if n_bytes != expected:
         raise ValueError(
             f"an array of shape {shape} and type {dtype} should have {expected} bytes; "
             f"got {n_bytes}"

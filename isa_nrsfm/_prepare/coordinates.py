@@ -122,8 +122,8 @@ def warn_of_scaled_columns(tracks: NDArray) -> bool:
 def are_scaled(tracks: NDArray, tol: float) -> bool:
     """Return whether all columns of tracks have the same spread, up to `tol` of it.
 
-    That is the standard deviation with n or n - 1, smallest and largest value, or
-    median and quartiles.
+    That is the standard deviation with n or n - 1, smallest and largest value, the
+    largest magnitude, or median and quartiles.
     """
     X = tracks.reshape(len(tracks), 2 * tracks.shape[1])
     X = X[:, np.isfinite(X).sum(axis=0) > max(len(X) / 2, 9)].astype(np.float64)
@@ -136,6 +136,7 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
         [np.nanstd(X, axis=0)],
         [np.nanstd(X, axis=0, ddof=1)],
         [high - low, low],
+        [np.fmax(high, -low)],
         [third - first, median],
     )
     return any(

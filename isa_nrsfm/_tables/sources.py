@@ -56,7 +56,7 @@ def open_table(
             f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
             "per frame and two columns per point"
         )
-    refuse_odd(X.shape[1])
+    refuse_odd(X.shape[1], layout)
     n_columns = max(X.shape[1], 1)
     # Blocks large enough that products of matrices are fast
     length, n_threads = max(2**21 // n_columns, 1), effective_n_jobs(n_jobs)

@@ -26,25 +26,29 @@ FEWEST_POINTS = 4
 def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
     """Return the tracks (n_frames, n_points, 2) of a table."""
     n_frames, n_columns = X.shape
-    refuse_odd(n_columns)
+    refuse_odd(n_columns, layout)
     if layout == "planar":
         return X.reshape(n_frames, 2, n_columns // 2).transpose(0, 2, 1)
     return X.reshape(n_frames, n_columns // 2, 2)
 
 
-def refuse_odd(n_columns: int) -> None:
+def refuse_odd(n_columns: int, layout: Layout) -> None:
     """Refuse a number of columns that is odd."""
     if n_columns % 2:
-        three = f". If points have x, y and a third number, give {two_of(3)}"
+        three = f". If points have x, y and a third number, give {two_of(3, layout)}"
         raise ValueError(
             "X must have two columns per point (x and y), an even number; "
             f"got n_features={n_columns}{three * (n_columns % 3 == 0)}"
         )
 
 
-def two_of(n_numbers: int) -> str:
-    """Return what makes an interleaved table X of the first two numbers of points."""
-    return f"X.reshape(len(X), -1, {n_numbers})[..., :2].reshape(len(X), -1)"
+def two_of(n_numbers: int, layout: Layout) -> str:
+    """Return what makes a table X of the first two numbers of points."""
+    shape, two = (
+        ("-1, {}", "..., :2") if layout == "interleaved" else ("{}, -1", ":, :2")
+    )
+    shape = shape.format(n_numbers)
+    return f"np.asarray(X).reshape(len(X), {shape})[{two}].reshape(len(X), -1)"
 
 
 def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:

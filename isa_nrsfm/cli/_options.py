@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from isa_nrsfm import __version__
+from isa_nrsfm._compat.texts import printable
 from isa_nrsfm._parameters import choices
 from isa_nrsfm.io._formats import FORMATS, TABLE
 
@@ -410,7 +411,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End with the message of an error."""
-        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+        text = printable(f"{self.prog}: error: {message} (see {self.prog} --help)")
+        self.exit(2, f"{text}\n")
 
 
 def build_parser() -> Parser:

@@ -159,6 +159,12 @@ def read_frames(
     tracks, confidence, weighting = cleaned.mT, confidence[shown], {}
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
+        if (least := np.nanmin(confidence, initial=0.0)) < 0:
+            raise ValueError(
+                f"--weights: confidences of {args.table} are down to {least:g}, and "
+                "weights not below 0. Save probabilities, such as numpy.exp of "
+                "log-likelihoods"
+            )
         if (largest := np.nanmax(confidence, initial=0.0)) > 1:
             confidence = confidence / largest
             warn_caller(f"confidences up to {largest:g} are divided by it, as weights")

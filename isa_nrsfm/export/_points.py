@@ -143,9 +143,11 @@ def write_points(
 
     Notes
     -----
-    The dataset has the variables position, position_std and determined. The other
+    The dataset has the variables position, position_std and determined. Its axes are
+    named as in movement from version 0.17 on, keypoint and individual. The other
     formats have no place for deviations: a second file of the same layout, with
-    ``_std`` at the end of its name, has them; empty cells are not determined.
+    ``_std`` at the end of its name, has them; empty cells, in ``.trc`` nan, are not
+    determined.
     """
     suffix, path = suffix_of(path, SUFFIXES), Path(path)
     if fps is None and suffix == ".trc":
@@ -177,7 +179,7 @@ def _netcdf(
     content, n_frames = io.BytesIO(), len(points.position)
     file = netcdf_file(content, "w", version=2)
     times = np.arange(n_frames) / (fps or 1.0)
-    texts = {"space": "xyz", "keypoints": names, "individuals": ["individual_0"]}
+    texts = {"space": "xyz", "keypoint": names, "individual": ["individual_0"]}
     file.createDimension("time", n_frames)
     file.createVariable("time", "f8", ("time",))[:] = times
     for name, words in texts.items():
@@ -188,7 +190,7 @@ def _netcdf(
         axis = file.createVariable(name, "c", (name, f"{name}_letters"))
         axis[:] = letters.view("S1").reshape(len(words), size)
         setattr(axis, "_Encoding", "utf-8")  # noqa: B010
-    axes = ("time", "space", "keypoints", "individuals")
+    axes = ("time", "space", "keypoint", "individual")
     for name in ("position", "position_std"):
         values = getattr(points, name).swapaxes(1, 2)[..., None]
         file.createVariable(name, "f8", axes)[:] = values
@@ -222,7 +224,7 @@ def _write_deeplabcut(
 
 
 def _write_trc(path: Path, values: NDArray, names: Sequence[str], fps: Any) -> None:
-    """Write values (n_frames, n_points, 3) as OpenSim reads them, NaN as blanks."""
+    """Write values (n_frames, n_points, 3) as OpenSim writes them, NaN as nan."""
     n_frames, n_points, _ = values.shape
     axes = "\t".join(f"X{j}\tY{j}\tZ{j}" for j in range(1, n_points + 1))
     numbers = map(str, (fps, fps, n_frames, n_points, "px", fps, 1, n_frames))
@@ -237,5 +239,5 @@ def _write_trc(path: Path, values: NDArray, names: Sequence[str], fps: Any) -> N
     table = pd.DataFrame(values.reshape(n_frames, -1))
     table.insert(0, "time", np.arange(n_frames) / fps)
     table.index += 1
-    rows = table.to_csv(sep="\t", header=False, lineterminator="\n")
+    rows = table.to_csv(sep="\t", header=False, lineterminator="\n", na_rep="nan")
     path.write_text("\n".join(head) + "\n" + rows, encoding="utf-8")

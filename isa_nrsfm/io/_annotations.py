@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.texts import as_utf8
+from isa_nrsfm._compat.texts import as_utf8, first_items
 from isa_nrsfm.io._keypoints import (
     entries_as_rows,
     floats_of,
@@ -27,7 +27,6 @@ from isa_nrsfm.io._landmarks import (
     Landmarks,
     assemble,
     checked_sizes,
-    refuse_same_names,
 )
 from isa_nrsfm.io._tables import first_lines, header_names, parse_table
 
@@ -91,7 +90,12 @@ def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmark
     All are shares of the image's width and height, multiplied by ``image_size``.
     """
     lines = path.read_text(encoding="utf-8-sig").splitlines()
-    values = np.array([floats_of(line.split()) for line in lines if line.strip()])
+    rows = [floats_of(line.split()) for line in lines if line.strip()]
+    if len(lengths := sorted({*map(len, rows)})) > 1:
+        raise ValueError(
+            f"its lines have {first_items(lengths)} numbers: all must have as many"
+        )
+    values = np.array(rows)
     size = [1, 1] if image_size is None else checked_sizes("image_size", image_size, 1)
     parts = product(range(3), (3, 2))  # numbers after all points, and of a point
     fits = [(n, k) for k, n in parts if (values.shape[1] - _N_BOX - k) % n == 0]
@@ -171,7 +175,11 @@ def read_imglab(path: Path) -> Landmarks:
 
 def _named(places: Sequence[tuple[Any, Any]]) -> dict[str, NDArray]:
     """Return points by name, or raise if two have the same."""
-    refuse_same_names([name for name, _ in places])
+    names = [name for name, _ in places]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(
+            f"more than one point is called {twice[0]!r}: each needs its own name"
+        )
     found = {name: floats_of([str(v) for v in place]) for name, place in places}
     if any(len(place) != 2 for place in found.values()):
         raise ValueError("each point should have two numbers, x and y")

@@ -19,14 +19,17 @@ def read_array(path: Path) -> Landmarks:
     It is (n_frames, n_points, 2), (n_frames, 2, n_points), or a table (n_frames,
     2 * n_points) of x and y in turn. A warning says how it is read.
     """
-    found = {n: a for n, a in _arrays_in(path).items() if a.dtype.kind in "fiu"}
+    seen = _arrays_in(path)
+    # (n_frames, 1, n_points, 2) of one individual
+    found = {n: a.squeeze() if a.ndim > 3 else a for n, a in seen.items()}
     found = {n: a for n, a in found.items() if a.ndim in (2, 3) and a.size > 2}
+    found = {n: a for n, a in found.items() if a.dtype.kind in "fiu"}
     if len(found) > 1:
         found = {name: array for name, array in found.items() if array.ndim == 3}
     if len(found) != 1:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in found.items())
+        shapes = (f"{n} {a.shape} of {a.dtype}" for n, a in (found or seen).items())
         raise ValueError(
-            f"one array of points is needed; got {shapes or 'none of numbers'}. Save "
+            f"one array of points is needed; got {', '.join(shapes) or 'none'}. Save "
             "that of the points with np.save('new.npy', array)"
         )
     ((_, array),) = found.items()
@@ -38,6 +41,10 @@ def read_array(path: Path) -> Landmarks:
         tracks = array if last else array.mT
     else:
         way = "array[..., :2]" if array.shape[-1] in (3, 4) else "array.transpose(...)"
+        if array.ndim == 2:  # x and y of frames in turn
+            way = f"array.reshape(-1, 2, {array.shape[1]})"
+        elif len(array) == 2:
+            way = "array.transpose(1, 2, 0)"
         raise ValueError(
             "the array should be (n_frames, n_points, 2); got the shape "
             f"{array.shape}: np.save('new.npy', {way})"
@@ -73,6 +80,8 @@ def read_trc(path: Path) -> Landmarks:
     the fifth. All z must be equal or empty.
     """
     lines = path.read_text(encoding="utf-8-sig").splitlines()
+    if len(lines) < 6:
+        raise ValueError(f"it has {len(lines)} lines, and no rows of points")
     names = [name.strip() for name in lines[3].split("\t")[2:] if name.strip()]
     rows = [line.split("\t") for line in lines[5:] if line.strip()]
     cells = [[c.strip() or "nan" for c in row[: 2 + 3 * len(names)]] for row in rows]

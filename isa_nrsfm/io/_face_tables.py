@@ -2,13 +2,17 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._prepare.coordinates import are_shares
+from isa_nrsfm.io._keypoints import entries_as_rows, json_kind, read_json
 from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
     find_landmark_columns,
@@ -35,6 +39,8 @@ def is_openface(path: Path) -> bool:
     names = header_names(path)
     of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
     groups = {"x_0", "x0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
+    cut = [{"success", f"x{_}67", f"y{_}67"}.issubset(names) for _ in ("", "_")]
+    of_video |= any(cut)  # without some columns
     return (of_video or names[:2] == ["face", "confidence"]) and bool(groups)
 
 
@@ -53,8 +59,8 @@ def read_openface(path: Path) -> Landmarks:
             "it has no 2D landmarks x_0, ..., y_0, ...: run OpenFace with -2Dfp"
         )
     of_video = names[:1] != ["face"]
-    scores = ["confidence", "success"] if of_video else ["confidence"]
-    _need(names, scores)
+    _need(names, ["success"] if of_video else ["confidence"])
+    scores = [name for name in ("confidence", "success") if name in names]
     found = find_landmark_columns(names, "x_#,y_#" if "x_0" in first else "x#,y#")
     numbers = [*found.interleaved, *scores]
     table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
@@ -63,7 +69,8 @@ def read_openface(path: Path) -> Landmarks:
             raise ValueError("the column success must hold 0 and 1 only")
         table["success"] = table["success"].astype(int)
         table.loc[table["success"] == 0, found.interleaved] = np.nan
-    return _assembled(table, found, "openface", scores=["confidence"])
+    scores = [name for name in scores if name == "confidence"]
+    return _assembled(table, found, "openface", scores=scores)
 
 
 def is_pyfeat(path: Path) -> bool:
@@ -115,23 +122,104 @@ def read_mediapipe(
     sure = confidences_in(table, found.x, found.y)
     table, scores = table.assign(**sure), [*sure]
     tracks = tracks_in(table, found.interleaved, missing)
+    scale = table[sizes].to_numpy(float) if len(sizes) == 2 else None
+    tracks = _in_pixels(tracks, image_size, scale)
+    return _assembled(table, found, "mediapipe", tracks=tracks, scores=scores)
+
+
+def is_mediapipe_json(path: Path) -> bool:
+    """Return whether json has objects with x and y, or lists called landmarks."""
+    return json_kind(path) == "mediapipe"
+
+
+def read_mediapipe_json(
+    path: Path,
+    image_size: tuple[float, float] | None = None,
+    part: str | None = None,
+) -> Landmarks:
+    """Read json of results: lists of objects with x and y, of frames and persons.
+
+    Their names, such as ``pose_landmarks`` or ``poseLandmarks``, are told apart by
+    ``part``; points in space (``world``) are left out.
+    """
+    frames, entries = _frames_in(read_json(path)), []
+    names: dict[str, str] = {}
+    for number, frame in enumerate(frames):
+        found = {n: p for n, value in frame.items() if (p := _persons(value))}
+        found = {n: p for n, p in found.items() if "world" not in n.lower()}
+        names |= {n: re.sub("([A-Z])", r"_\1", n).lower() for n in found}
+        numbered = {"frame": number} if len(frames) > 1 else {}
+        entries.append((numbered | frame, found))
+    chosen = [n for n, plain in names.items() if part is None or part in plain]
+    if not names:
+        raise ValueError("it has no lists of objects with x and y")
+    if len(chosen) != 1:
+        raise ValueError(
+            f"it has {first_items(names)}: choose one with part, such as 'pose' "
+            "(command line: --part)"
+        )
+    every = [p for _, found in entries for each in found.values() for p in each]
+    seen = any(point.get("visibility") for points in every for point in points)
+    rows = [
+        known
+        | {"person": k}
+        | {"keypoints": [float(v) for p in points for v in _xyv(p, seen)]}
+        for known, found in entries
+        for k, points in enumerate(found.get(chosen[0]) or [[]])
+    ]
+    read = entries_as_rows(rows, None, None, "mediapipe_json", "result")
+    tracks = read.points.to_numpy().reshape(len(rows), -1, 2)
+    points = read.points.copy()
+    points[:] = _in_pixels(tracks, image_size, None).reshape(len(rows), -1)
+    return replace(read, points=points, confidence=read.confidence if seen else None)
+
+
+def _frames_in(content: Any) -> list[dict[str, Any]]:
+    """Return the frames in a list, or in an object with a list; or the only one."""
+    if isinstance(content, dict):
+        values = (v for v in content.values() if isinstance(v, list) and v)
+        lists = [v for v in values if isinstance(v[0], dict) and not _persons(v)]
+        content = lists[0] if lists else [content]
+    elif isinstance(content[0], dict) and _persons(content):
+        content = [content]
+    return [f if isinstance(f, dict) else {"landmarks": f} for f in content]
+
+
+def _persons(value: Any) -> list[list[dict[str, Any]]]:
+    """Return the points of each person in a list of points, or a list of such."""
+    if not isinstance(value, list) or not value:
+        return []
+    if all(isinstance(p, dict) and {"x", "y"} <= p.keys() for p in value):
+        return [value]
+    inner = [_persons(each) for each in value]
+    return [each[0] for each in inner] if all(len(i) == 1 for i in inner) else []
+
+
+def _xyv(point: dict[str, Any], seen: bool) -> tuple[Any, Any, Any]:
+    """Return x, y and the visibility of a point, 1 if there is none."""
+    return point["x"], point["y"], point.get("visibility", 1.0) if seen else 1.0
+
+
+def _in_pixels(
+    tracks: NDArray[np.float64], image_size: Any, sizes: NDArray | None
+) -> NDArray[np.float64]:
+    """Return tracks (n_frames, n_points, 2) in pixels, by the size of the images."""
     n_known = np.count_nonzero(~np.isnan(tracks))
     # Pixels of a face reach beyond this, and shares of the image's size do not.
     if 2 * np.count_nonzero((tracks >= -2) & (tracks <= 2)) > n_known:
-        if image_size is None and len(sizes) < 2:
+        if image_size is None and sizes is None:
             raise ValueError(
                 "its coordinates are shares of the image's width and height: give "
                 "image_size=(width, height) in pixels (command line: --image-size "
                 "1920x1080), or columns image_width and image_height"
             )
         _check_inside(tracks)
-        if image_size is None:
-            scale = table[sizes].to_numpy(float)
-        else:
+        scale = sizes
+        if image_size is not None:
             scale = checked_sizes("image_size", image_size, 1)
         with np.errstate(over="ignore"):  # `assemble` refuses infinite numbers
-            tracks = tracks * scale.reshape(-1, 1, 2)
-    elif image_size is not None:
+            return np.asarray(tracks * np.asarray(scale).reshape(-1, 1, 2))
+    if image_size is not None:
         raise ValueError(
             "image_size is for coordinates that are shares of the image's width and "
             "height; these are in pixels (median "
@@ -139,7 +227,7 @@ def read_mediapipe(
             if n_known
             else "image_size is given, but there are no points"
         )
-    return _assembled(table, found, "mediapipe", tracks=tracks, scores=scores)
+    return tracks
 
 
 def _check_inside(shares: NDArray[np.float64]) -> None:

@@ -158,9 +158,10 @@ def read_landmarks(
     min_confidence : float, optional
         Points with a lower confidence become NaN, where the format has confidences.
     **options : dict
-        Options of the format: ``image_size`` (width, height) of "mediapipe", in
-        pixels, and of "yolo", for shares of the image's size; ``part`` of "openpose",
-        one of "pose", "face", "hand_left" and "hand_right"; ``part`` of whole bodies of
+        Options of the format: ``image_size`` (width, height) of "mediapipe" and
+        "mediapipe_json", in pixels, and of "yolo", for shares of the image's size;
+        ``part`` of "openpose", one of "pose", "face", "hand_left" and "hand_right", and
+        of "mediapipe_json", also "left_hand" and "right_hand"; of whole bodies of
         "coco" and "mmpose", one of "body", "feet", "face", "left_hand", "right_hand"
         and "all"; ``columns`` and ``missing`` of "table" and "mediapipe", and
         ``individuals`` and ``row_per_point`` of "table", as in `landmark_table`.

@@ -35,14 +35,18 @@ _PLACES = {
     133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
     136: [(0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)],
 }
-# What json of programs begins with; that of COCO has none of these.
+# The keys of json of programs, outside of all objects but one, and what a value begins
+# with.
 _KINDS = {
-    "openpose": rb'"people"\s*:',
-    "mmpose": rb'"(?:instance_info|instances|keypoint_scores|predictions)"\s*:',
-    "ultralytics": rb'"keypoints"\s*:\s*\{',
-    "labelme": rb'"shapes"\s*:',
-    "coco": rb'"\w+"\s*:',
+    "coco": r'"(?:images|annotations|image_id)":',
+    "openpose": r'"people":',
+    "mmpose": r'"(?:instance_info|instances|keypoint_scores|predictions)":',
+    "ultralytics": r'"keypoints":\{',
+    "labelme": r'"shapes":',
+    "mediapipe": r'"x":.*"y":|[lL]andmarks":',
 }
+# A key and the beginning of its value, or another text, or a brace.
+_TOKEN = re.compile(r'("(?:[^"\\]|\\.)*+")(?:\s*:\s*(?=(.)))?|([{}])')
 # The columns of a specimen.
 _TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
@@ -57,12 +61,26 @@ _WFLW_LENGTHS = (197, 207)
 
 
 def json_kind(path: Path) -> str:
-    """Return the program of a json file by its beginning; empty for other files."""
-    with path.open("rb") as file:
-        text = file.read(2**16).removeprefix(b"\xef\xbb\xbf").lstrip()
-    if text[:1] not in (b"{", b"["):
-        return ""
-    return next((kind for kind, e in _KINDS.items() if re.search(e, text)), "none")
+    """Return the program of a json file by its keys; empty for other files."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        text = file.read(2**16).lstrip()
+        found = _kind_of(text)
+        if found in ("none", "other") and (rest := file.read()):
+            found = _kind_of(text + rest)
+    return found if text[:1] in ("{", "[") else ""
+
+
+def _kind_of(text: str) -> str:
+    """Return the program of a text by the keys of objects that are in no other."""
+    keys, depth = [], 0
+    for key, value, brace in _TOKEN.findall(text):
+        depth += (brace == "{") - (brace == "}")
+        if value and depth == 1:
+            keys.append(f"{key}:{value}")
+    found = [kind for kind, e in _KINDS.items() if re.search(e, " ".join(keys))]
+    if keys and not found and re.search(r'[lL]andmarks"\s*:\s*\[', text):
+        found = ["mediapipe"]  # of frames in an object
+    return [*found, "other" if keys else "none"][0]
 
 
 def json_files(path: Path, *kinds: str) -> list[Path]:
@@ -74,7 +92,7 @@ def json_files(path: Path, *kinds: str) -> list[Path]:
 
 def is_coco(path: Path) -> bool:
     """Return whether a file begins as a json object or list, of no other format."""
-    return json_kind(path) in ("coco", "none")
+    return json_kind(path) in ("coco", "other", "none")
 
 
 def read_coco(path: Path, part: str | None = None) -> Landmarks:
@@ -109,7 +127,10 @@ def entries_as_rows(
     """
     seen = [bool(entry.get("keypoints")) for entry in entries]
     if names is None and not any(seen):
-        raise ValueError(f"there are no frames in it: no {what} has keypoints")
+        others = first_items(dict.fromkeys(name for each in entries for name in each))
+        raise ValueError(
+            f"there are no frames in it: no {what} has keypoints, but {others}"
+        )
     given = [entry for entry in entries if entry.get("keypoints")]
     found, names = _keypoints(given, names, part, what)
     values = np.full((len(entries), *found.shape[1:]), np.nan)
@@ -343,10 +364,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     known = [name for name in OPENPOSE_PARTS if name in names_in]
     listed = ", ".join(known)
     if not known:
-        raise ValueError(
-            "it has no visible points in the lists pose_keypoints_2d, "
-            "face_keypoints_2d, ... of people"
-        )
+        raise ValueError("it has no visible points in pose_keypoints_2d, ...")
     if len(known) > 1 and part is None:
         raise ValueError(
             f"it has points of {listed}: choose one with part (command line: --part)"
@@ -494,6 +512,8 @@ def read_tps(path: Path) -> Landmarks:
     for number, part in enumerate(parts):
         with errors_of(f"specimen {number} (counted from 0)"):
             count, *lines = filter(None, map(str.strip, part.splitlines()))
+            if not count.isdigit():
+                raise ValueError(f"LM= needs a number of landmarks; got {count!r:.40}")
             points = " ".join(lines[: int(count)]).replace("NA", "nan")
             tracks.append({0: floats_of(points.split()).reshape(int(count), 2)})
             entries = [line.partition("=") for line in lines[int(count) :]]

@@ -31,7 +31,9 @@ MIN_POINTS = 7
 # Words of columns with x and y that are no points, and of the same points once more: in
 # another unit, filtered, or their velocities.
 _NO_POINT = re.compile(
-    "(?i)(?<![a-z])(?:gyro|gyroscope|accel|accelerometer|acceleration|magnetometer|imu|"
+    "(?i)(?<![a-z])(?:gyro|gyroscope|acc|accel|accelerometer|acceleration|mag|magnetometer"
+    "|imu|gravity|force|torque|cop|touch|screen|scroll|wheel|eye_?track(?:er|ing)|"
+    "(?:optical_?)?flow|offset|image_?size|resolution|"
     "gaze|fixation|cursor|joystick|rotation|head_?(?:rot|angle)|euler|angular_?velocity|"
     "quaternion|translation|velocity|speed|b?box|roi|crop|centroid|cent(?:er|re)_?of_?mass"
     "|com|cog|stimulus)(?![a-z])|^(?:mouse|target|origin|head_?pose)$"
@@ -95,7 +97,7 @@ def find_landmark_columns(
     all_names, names = without_boxes(names), only_points(names)
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
-    _refuse_copies(names)
+    _refuse_copies(all_names)
     _refuse_individuals(names, candidates or sets)
     if not candidates:
         if any(isinstance(name, tuple) for name in names):
@@ -109,8 +111,8 @@ def find_landmark_columns(
         raise ValueError(
             "no landmark columns such as x0, y0, x1, y1 or nose_x, nose_y were found"
             f"{small}; {_first_columns(names)}. If there is a row for each point, give "
-            "row_per_point (command line: --row-per-point). If they have other names, "
-            "give columns (command line: --columns), such as "
+            "row_per_point (command line: --row-per-point), such as 'frame,point'. If "
+            "they have other names, give columns (command line: --columns), such as "
             f"{_likely_pattern(names)!r}"
         )
     if len(candidates) > 1:
@@ -177,8 +179,12 @@ def _ask_which(
     names: Sequence[Hashable], which: str, words: list[str], without: Sequence[str] = ()
 ) -> NoReturn:
     """Raise the question which of points that are there twice are to be read."""
+    copies = [name for word in words for name in _chosen(names, [f"+*{word}*"])]
+    points = {*only_points(names), *copies}
+    others = [f"-{n}" for n, axis, _ in _coordinates(names) if n not in points]
+    names = [name for name in names if name in points]
     ways = [*([without] if without else []), *([f"+*{word}*"] for word in words)]
-    every = [",".join([_all_sets(_chosen(names, way)), *way]) for way in ways]
+    every = [",".join([_all_sets(_chosen(names, w)), *w, *others]) for w in ways]
     raise ValueError(
         f"the points are probably there more than once, such as {which}, in another "
         "unit or filtered. Choose with columns (command line: --columns): "
@@ -313,8 +319,9 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     )
     raise ValueError(
         f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
-        f"of several individuals in one row. {way}. If all are points of one body, use "
-        f"columns={whole!r} (command line: --columns {shlex.quote(whole)})"
+        f"of several individuals in one row, or in views of several cameras. {way}. If "
+        f"all are points of one body, use columns={whole!r} (command line: --columns "
+        f"{shlex.quote(whole)})"
     )
 
 

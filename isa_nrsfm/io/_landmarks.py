@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.skeletons import Skeleton, find_skeleton, skeleton_of_names
 from isa_nrsfm.skeletons._recognition import LAYOUTS_OF_READERS, numbered
 
@@ -103,6 +104,11 @@ def unsure_points(confidence: NDArray, least: float) -> NDArray[np.bool_]:
         raise ValueError(
             f"no point has a confidence of {least:g} or more: they are from "
             f"{confidence.min():.3g} to {confidence.max():.3g}"
+        )
+    if least <= 1 and (largest := np.nanmax(confidence, initial=0.0)) > 2:
+        warn_caller(
+            f"confidences are up to {largest:g}, and no probabilities: a threshold of "
+            f"{least:g} leaves out {unsure.sum():,} of {unsure.size:,} points"
         )
     return np.asarray(unsure)
 

@@ -27,14 +27,23 @@ from isa_nrsfm.skeletons._column_names import parse_coordinate
 # Columns that name points, and frames or who is shown.
 _POINT = re.compile(r"(?i)point|landmark|joint|marker|node|part(?!ic)")
 _FRAME = re.compile(
-    "(?i)frame|time|image|video|file|session|trial|person|people|participant|subject|"
+    "(?i)frame|time|image|slice|video|file|session|trial|person|people|participant|subject|"
     "patient|animal|individual|track|face|hand"
 )
-_IMAGE = re.compile(rf"(?i)\s*(?:{FRAME}|{IMAGE_NAME})\s*")
+_IMAGE = re.compile(rf"(?i)\s*(?:{FRAME}|{IMAGE_NAME}|slice)\s*")
 _VALUE = re.compile("(?i)value|position|coord|pos$")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan")
-# Cells of numbers, with brackets, separators, and the names of axes.
-_NUMBERS = re.compile(r"[\d\s.,;:|()\[\]{}'\"=+\-eExyzXYZna]+")
+# Cells of numbers, with brackets and separators, and cells of missing points.
+_NUMBERS = re.compile(r"[\d\s.,;:|()\[\]{}=+\-eEnax]+")
+_MISSING = re.compile(r"(?i)[\s,()\[\]{}]*(?:n/?a|nan|null|none)?[\s()\[\]{}]*")
+# In cells with brackets: missing numbers; keys and quotation marks; words but for nan
+# and exponents, such as in np.float64(1.5); and what then is in brackets by itself.
+_WRITTEN = (
+    (r"\b(?:None|null)\b", "nan"),
+    (r"""(["'])[^"']*\1\s*:|\b\d+\s*:(?=\s*[\[({])|["']""", " "),
+    (r"(?<![\w.])(?!nan\b)[A-Za-z_][\w.]*", " "),
+    (r"\(\s*([^\s,()]+)\s*\)", r"\1"),
+)
 _INNERMOST = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
 # A table, and the names of its columns that tell frames and points apart.
 Keys = tuple["pd.DataFrame", list[str], list[str]]
@@ -60,26 +69,43 @@ def frames_of(
             sets = {name: MIN_POINTS for name in names if matches(name, patterns[0])}
         if max(sets.values(), default=0) >= MIN_POINTS:
             return frame, columns
+    if pair is None and (row_per_point is None or not axis_pairs(names)):
         found = _cells_apart(frame)
-    found = found or _points_apart(_axes_apart(frame), pair, row_per_point)
+    if found is None or found[1] is None:
+        frame = _axes_apart(frame) if found is None else found[0]
+        found = _points_apart(frame, pair, row_per_point)
     if found is None:
         return frame, columns
     return found[0], columns if patterns and not pair else found[1]
 
 
-def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | None:
-    """Return a table whose cells hold points with a column for each coordinate."""
+def _cells_apart(
+    frame: "pd.DataFrame",
+) -> tuple["pd.DataFrame", list[str] | None] | None:
+    """Return a table whose cells hold points with a column for each coordinate.
+
+    Also the names of these columns; None if they are x and y of one point a row.
+    """
     found: dict[str, NDArray] = {}
     for name in frame.select_dtypes(["object", "string"]):
         cells = frame[name].dropna().astype(str)
+        cells = cells[cells.map(_MISSING.fullmatch).isna()]
+        if not cells.empty and re.search(r"[\[({=]", cells.iloc[0]):
+            for pattern, other in _WRITTEN:
+                cells = cells.str.replace(pattern, other, regex=True)
         if cells.empty or len(_NUMBER.findall(cells.iloc[0])) < 2:
             continue
         if cells.map(_NUMBERS.fullmatch).isna().any():
             continue
+        if cells.str.contains("...", regex=False).any():
+            raise ValueError(
+                f"the cells of the column {name!r} hold arrays of which '...' leaves "
+                "out numbers: write all, such as with str(array.tolist())"
+            )
         numbers, inner = cells.map(_NUMBER.findall), _INNERMOST.search(cells.iloc[0])
         n_all = len(numbers.iloc[0])
         n_each = len(_NUMBER.findall(inner[1])) if inner else n_all
-        n_each = n_each if 1 < n_each < 5 and n_all % n_each == 0 else 1
+        n_each = n_each if 1 < n_each < 7 and n_all % n_each == 0 else 1
         if (numbers.map(len) == n_all).all():
             values = pd.DataFrame(numbers.tolist(), cells.index).reindex(frame.index)
             values = values.to_numpy(float).reshape(len(frame), -1, n_each)
@@ -98,6 +124,11 @@ def _cells_apart(frame: "pd.DataFrame") -> tuple["pd.DataFrame", list[str]] | No
         used, tracks = pairs[0], np.stack([found[name] for name in pairs[0]], axis=2)
     elif len(lists) == 1 and found[lists[0]].shape[1] % 2 == 0:
         used, tracks = lists, found[lists[0]].reshape(len(frame), -1, 2)
+    elif (
+        len(points) == 1 and frame[points[0]].astype(str).str.contains(r"[\[({]").all()
+    ):
+        x, y = found[points[0]].T
+        return frame.drop(columns=points).assign(x=x, y=y), None
     else:
         return None
     warn_caller(
@@ -145,6 +176,11 @@ def _points_apart(
     if pair:
         pairs = [(pair[0], pair[1], -1)]
     plain = [each for each in pairs if "".join(each[:2]).lower() == "xy"]
+    if given is not None and not pairs:
+        raise ValueError(
+            "with row_per_point, columns named x and y are needed, or their names in "
+            "columns (command line: --columns), such as 'u,v'"
+        )
     if not 0 < len(pairs) < MIN_POINTS:
         return None
     x, y, place = (plain or pairs)[0]
@@ -215,12 +251,13 @@ def _keys_as_given(frame: "pd.DataFrame", given: str | Sequence[str]) -> Keys:
     keys = [*by_frame, *point.split("+")]
     known = [name for name in keys if name in frame]
     absent = [name for name in keys if name not in frame]
-    if len(absent) > 1 or not known:
+    if len(absent) > 1:
         raise ValueError(
             "row_per_point must name the columns that tell frames apart, and then that "
             f"of the points, such as 'frame,landmark'; the table has no {absent}"
         )
-    counts = {name: frame.groupby(known, dropna=False).cumcount() for name in absent}
+    groups = frame.groupby(known or np.zeros(len(frame)), dropna=False)
+    counts = {name: groups.cumcount() for name in absent}
     return frame.assign(**counts), by_frame, point.split("+")
 
 
@@ -231,13 +268,16 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
     """
     codes = pd.DataFrame({name: pd.factorize(frame[name])[0] for name in keys})
     sizes, is_frame = codes.nunique(), {n: bool(_FRAME.search(n)) for n in keys}
+    # Points have names or whole numbers.
+    no_point = (frame[keys].apply(pd.to_numeric, errors="coerce") % 1 > 0).any()
 
     def count(names: list[str]) -> int:
         return len(codes[names].drop_duplicates()) if names else 1
 
     named = [name for name in keys if _POINT.search(name)]
     image = next(filter(_IMAGE.fullmatch, keys), None)
-    for point in dict.fromkeys([*named, *[n for n in keys[::-1] if not is_frame[n]]]):
+    others = [n for n in keys[::-1] if not (is_frame[n] or no_point[n])]
+    for point in dict.fromkeys([*named, *others]):
         by_frame, by_point = [name for name in keys if name != point], [point]
         if count(keys) < len(frame):
             break
@@ -257,6 +297,10 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
             ):
                 by_frame.remove(name)
                 by_point.insert(0, name)
+        for name in by_point[::-1]:
+            fewer = [other for other in by_point if other != name]
+            if fewer and count([*by_frame, *fewer]) == len(frame):
+                by_point = fewer
         n_points = count(by_point)
         if n_points >= MIN_POINTS and len(frame) > 0.4 * n_points * count(by_frame):
             return frame, by_frame, by_point

@@ -36,6 +36,9 @@ _TAIL = 2**16
 # Numbers with a decimal comma, and with commas between thousands.
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
+# Whether points are visible, as pandas and spreadsheets write it.
+_SEEN = dict.fromkeys((True, "True", "TRUE", "true"), 1.0)
+_SEEN |= dict.fromkeys((False, "False", "FALSE", "false"), 0.0)
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = (
     *("", "na", "nan", "-nan", "n/a", "null", "none"),
@@ -327,7 +330,9 @@ def confidences_in(
     try:
         with warnings.catch_warnings(action="ignore"):  # of commas, as in coordinates
             frame = with_points(frame, names)
-        found = {name: _as_numbers(frame[name]) for name in names}
+        texts = [name for name in names if frame[name].dtype.kind not in "iuf"]
+        seen = {n: frame[n].map(lambda cell: _SEEN.get(cell, cell)) for n in texts}
+        found = {name: _as_numbers(seen.get(name, frame[name])) for name in names}
         values = pd.DataFrame(found, frame.index)
         # p may be a pressure, and v a velocity; in COCO it is 0, 1 or 2.
         is_letter = bool(names) and len(names[0].strip()) == len(x[0].strip())
@@ -337,8 +342,9 @@ def confidences_in(
                 f"{names[0]}, ... are no confidences: they are not all from 0 to 1"
             )
         # MediaPipe writes zeros for faces and hands.
-        if names and len(known) and not known.any():
-            raise ValueError(f"{names[0]}, ... are no confidences: they are all 0")
+        if names and not known.any():
+            empty = "0" if len(known) else "empty"
+            raise ValueError(f"{names[0]}, ... are no confidences: all are {empty}")
         return values
     except ValueError:
         if strict:

@@ -46,7 +46,10 @@ _SERIES = re.compile(
     "wing|fin|coxa|trochanter|femur|tibia|tarsus|claw|antenna|tentacle|rib|vertebra|"
     "daumen|zeige|mittel|kleiner|bein|row|col|column)(?:finger|tip|s)?(?![a-z])"
 )
-_ANIMAL = re.compile("mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|person")
+# Individuals, and views of one, are no parts of a body, though they may have sides.
+_ANIMAL = re.compile(
+    "mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|person|cam|view"
+)
 # The axis, 0, 1 or 2 for x, y or z; the point, the name without its axis letter ("3",
 # "nose", "eye_lmk_3"); and the sets, the narrowest first: the text before the axis
 # letter, the three letters and the text after it, each with the key of the point.
