@@ -107,10 +107,10 @@ def test_all_results_have_the_same_coefficients(model, table, tmp_path):
     assert_allclose(smooth.alpha, model.transform(table), atol=1e-9)
     fit = model.decompose(table)
     assert_allclose(smooth.decomposition.alpha, fit.alpha, atol=1e-9)
-    forgetful = AffineNRSfM(2, remove_pose=True, keep_frames=False, **CALIBRATED)
-    assert_allclose(forgetful.fit_transform(table), alpha, atol=1e-5)
-    single = AffineNRSfM(2, remove_pose=True, **CALIBRATED).fit(table.astype("f4"))
-    assert single.alpha_.dtype == single.transform(table.astype("f4")).dtype == "f4"
+    single = AffineNRSfM(2, remove_pose=True, keep_frames=False, **CALIBRATED)
+    found = single.fit_transform(table.astype("f4"))
+    assert_allclose(found, alpha, atol=0.05)
+    assert found.dtype == single.transform(table.astype("f4")).dtype == "f4"
     # A new fit without the option forgets it.
     single.set_params(remove_pose=False, refinement=None)
     assert not hasattr(single.fit(table), "pose_effect_")
