@@ -101,6 +101,8 @@ def fit_jointly(
         start = start._replace(shapes=shapes, motion=motion)
         if not len(motion):
             start = first.aligned(start, first.cameras)
+        if settings.prior is None:  # a fit without the prior has larger basis shapes
+            start = with_prior(first, start)
         # The widths of a prior change its first fit.
         rough = {} if settings.prior is None else {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, first.cameras, **rough)
