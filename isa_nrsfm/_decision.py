@@ -323,7 +323,7 @@ def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
 
 
 def _perspective(best: _Fit, rows: _Rows) -> Proposal:
-    """Compare rough fits, with a focal length that is too long for most cameras."""
+    """Fit few rows roughly, with a focal length too long for most cameras."""
     model, point = best.model, rows.principal_point
     if point is None:
         return "image size not known"
