@@ -7,7 +7,7 @@ cannot win. It starts from the best fit so far.
 
 import time
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -24,6 +24,7 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
+from isa_nrsfm._fitted_model import MOST_ROWS
 from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
@@ -35,7 +36,6 @@ from isa_nrsfm.analysis._advice import (
     gross_residuals,
     layout_of,
 )
-from isa_nrsfm.analysis._diagnostics import MOST_ROWS, unexplained
 from isa_nrsfm.datasets import load_face_prior
 
 AUTO = "auto"
@@ -282,7 +282,7 @@ class _Rows(NamedTuple):
     def error(self, model: AffineNRSfM, robust: bool) -> float:
         """Return the error of held-out points."""
         table, weights = model._opened(self.X, **self.weights, judged=False)
-        return unexplained(model._model, table.whole(), *weights, robust=robust)
+        return model._model.held_out_error(table, *weights, robust=robust)
 
     def outlier_share(self, model: AffineNRSfM) -> float:
         """Return the share of gross errors among held-out points.
@@ -323,7 +323,7 @@ def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
 
 
 def _perspective(best: _Fit, rows: _Rows) -> Proposal:
-    """Compare rough fits, with a focal length that is too long for most cameras."""
+    """Fit few rows roughly, with a focal length too long for most cameras."""
     model, point = best.model, rows.principal_point
     if point is None:
         return "image size not known"
@@ -333,12 +333,11 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
     few = {"n_components": min(len(model.basis_), MOST_SHAPES)}
     near |= few if model.n_components == AUTO else {}
     params = model.get_params(deep=False) | few | {"prior": None, "refinement": "joint"}
-    trials: Sequence[dict[str, Any]] = ({}, near | {"focal_length": 5 * max(point)})
+    params |= near | {"focal_length": 5 * max(point)}
     some = spread(np.arange(rows.X.shape[0]), ROUGH_ROWS)
     X, weights = taken_rows(rows.X, some), {n: w[some] for n, w in rows.weights.items()}
-    fits = [StartedNRSfM(**params | each).fit(X, **weights) for each in trials]
-    weak, perspective = (-fit.score(X, **weights) for fit in fits)
-    return near if perspective < weak else "held-out points do not show it"
+    seen = StartedNRSfM(**params).fit(X, **weights).camera_ == "perspective"
+    return near if seen else "held-out points do not show it"
 
 
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
@@ -444,6 +443,8 @@ def decided(
                 best, robust = best._replace(error=rows.error(best.model, True)), True
             try:
                 model = clone(best.model).set_params(**changes)
+                if model.camera == "perspective":
+                    model.__dict__["_weak"] = best.model._model
                 found = fitted(model, setting, robust)
             except ValueError as error:  # such as points that too few frames show
                 changes = str(error)

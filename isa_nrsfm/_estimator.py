@@ -574,7 +574,9 @@ default="affine"
         if self.camera == "perspective":
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
-            fit = fit_perspective(images, number, f, start, errors, self.remove_pose)
+            weak = self.__dict__.pop("_weak", None)  # of `decided`
+            options = start, errors, self.remove_pose, weak
+            fit = fit_perspective(images, number, f, *options)
         else:
             if auto and self.camera == "affine":
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
@@ -582,8 +584,8 @@ default="affine"
                 n_components = supported_components(table, isa, settings, progress)
             number = 1 if n_components == "auto" else n_components
             table = scaled_table(source, weights, number, settings)
-            options = start, auto, errors, self.remove_pose
-            fit = fit_table(table, number, isa, settings, progress, *options)
+            of_table = start, auto, errors, self.remove_pose
+            fit = fit_table(table, number, isa, settings, progress, *of_table)
         model, frames, converged, fitted = fit
         if point is not None and model.pinhole is None:
             f = np.array(np.inf if f is None else f, dtype=float)[()]

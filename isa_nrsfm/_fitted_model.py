@@ -25,7 +25,7 @@ from isa_nrsfm._frames.pinhole import Pinhole, turns_to, zoomed
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import (
     Layout,
     centred_frames,
@@ -42,6 +42,8 @@ MIRROR_LEVEL = 0.01
 # Least distance of points from the fit, in sizes of frames, of `TableModel.misfit`:
 # docs/benchmarks/README.md, "Thresholds".
 LEAST_MISFIT = 0.005
+# Rows on which held-out points are compared, at most.
+MOST_ROWS = 300
 
 
 class TableModel(NamedTuple):
@@ -432,6 +434,23 @@ class TableModel(NamedTuple):
     def held_out_sums(self, *rows_and_weights: NDArray) -> NDArray:
         """Return the sums (1, 2) of squared errors and signals of held-out points."""
         return np.nansum(self.held_out(*rows_and_weights), axis=(0, 1))[None]
+
+    def held_out_error(
+        self, table: FrameBlocks, *weights: NDArray, robust: bool = False
+    ) -> float:
+        """Return the share of the energy of held-out points that is not explained.
+
+        Of at most `MOST_ROWS` rows. Of robust fits it is that of the median point, with
+        normally distributed errors.
+        """
+        some = spread(np.arange(table.n_frames), MOST_ROWS)
+        squares = self.held_out(table.take(some), *(w[some] for w in weights))
+        error, signal = np.moveaxis(squares, 2, 0)
+        if np.isnan(error).all():
+            return np.nan
+        if robust or self.frames.loss != "linear":
+            return float(np.nanmedian(error) / (2 * np.log(2)))  # frames have size one
+        return float(np.nansum(error) / np.nansum(signal))
 
     def _ready(
         self, rows: NDArray, weights: NDArray | None = None

@@ -36,8 +36,7 @@ from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
 from isa_nrsfm._prepare.scaling import ScaledTable, scaled_table
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm.analysis._diagnostics import MOST_ROWS, unexplained
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Effects of these constants: docs/benchmarks/README.md, "Thresholds".
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
@@ -235,10 +234,9 @@ class PerspectiveTable(NamedTuple):
 
     def preferred(self, model: TableModel, weak: TableModel) -> bool:
         """Return whether held-out points prefer a model to weak perspective."""
-        some = spread(np.arange(self.source.n_frames), MOST_ROWS)
-        known = () if self.weights is None else (self.weights[some],)
-        rows = self.source.take(some)
-        return unexplained(model, rows, *known) < unexplained(weak, rows, *known)
+        known = () if self.weights is None else (self.weights,)
+        ours, theirs = (m.held_out_error(self.source, *known) for m in (model, weak))
+        return ours < theirs
 
     def log_odds(self, fit: PerspectiveFit, image: PerspectiveFit) -> float:
         """Return the log odds of a fit against its mirror image.
@@ -324,13 +322,15 @@ def fit_perspective(
     start: TableModel | None = None,
     errors: bool = False,
     remove_pose: bool = False,
+    weak: TableModel | None = None,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
     """Fit perspective images as `fit_table` fits weak-perspective ones.
 
     `n_components` and the given focal length are estimated if they are None; the table
     has the mean of several. A fit from the model of a similar table has that of it.
     If perspective is not found, its fit does not settle, or held-out points do not
-    prefer it, the fit is that of weak-perspective cameras, with a warning.
+    prefer it, the fit is that of weak-perspective cameras, with a warning. `weak`: the
+    model of that fit, if it is known.
     """
     fits: dict[float, PerspectiveFit] = {}
     deviation, why, prior = 0.0, "", table.settings.prior
@@ -372,16 +372,16 @@ def fit_perspective(
         fit = table.fit(best.pinhole, n_last, best, **options)
         if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
             fit = table.fit(best.pinhole, n_last, fit, **options)
-    if start is None:
-        options["free"] = n_components is None
-        with warnings.catch_warnings(action=None if why else "ignore"):
-            weak = table.fit(None, n_components or 1, **options)
-        if not why and not table.preferred(fit.model, weak.model):
-            why = NOT_BETTER
+    options["free"] = n_components is None
+    if not why and start is None:
+        with warnings.catch_warnings(action="ignore"):
+            plain = options | {"errors": False}
+            weak = weak or table.fit(None, n_components or 1, **plain).model
+        why = "" if table.preferred(fit.model, weak) else NOT_BETTER
     table.progress(PERSPECTIVE_STAGE)
     if why:
         warn_caller(f"{why}. {WEAK}")
-        return weak[:4]
+        return table.fit(None, n_components or 1, **options)[:4]
     model, _, converged, attributes, *_ = fit
     f = best.pinhole.focal_length
     if errors and isinstance(model.frames, PosteriorFrames):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from isolated import measured_square
 from layers import may_not_converge, slow_after
 from refusals import refused
 from scenes import random_rotation
@@ -43,14 +44,6 @@ def test_cells_say_median_range_and_failures():
     assert cell(pd.concat([wrong, late]), "error") == "over 60 s"
     assert cell(wrong, "error") == "error"
     assert cell(ok[:0], "error") == cell(ok, "another") == ""
-
-
-def measured_square(measured, x):
-    """Return a square, unless there is none, or one that takes for ever."""
-    with measured():
-        while x < 0:
-            pass
-        return {"square": x**2}
 
 
 @pytest.mark.subprocess

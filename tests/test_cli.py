@@ -207,6 +207,16 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     assert "--prior needs one number of basis shapes" in fails(*again, "-k", "1-2")
 
 
+def test_pose_is_removed_in_fit_and_transform(fits, transforms, tmp_path):
+    options = {"n_components": 2, "camera": "weak_perspective", "random_state": 0}
+    X = make_face_tracks(40, **options, noise=0.01).data
+    table = saved(pd.DataFrame(X, columns=LANDMARKS), tmp_path)
+    found = fits(table, "-k", 2, "--remove-pose", *JOINT)
+    assert "--remove-pose: what yaw predicts was removed" in found.page
+    alpha, *_ = transforms(found.path, table)
+    assert_allclose(alpha[ALPHA], found.model.alpha_, atol=1e-4)
+
+
 @pytest.mark.slow
 def test_faces_whose_table_does_not_determine_depths(fits, fails, tmp_path, load_data):
     photos = load_data("muct_68")["W2d"][1::7]

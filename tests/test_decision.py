@@ -58,7 +58,7 @@ TABLES = {
         * np.tile([1.0, 0.5], 16)
     ),
     "few frames": lambda: make_nonrigid_tracks(14, 24, noise=0.02, **GIVEN).data,
-    "outliers": lambda: with_outliers(make_nonrigid_tracks(50, 16, **GIVEN).data),
+    "outliers": lambda: with_outliers(make_nonrigid_tracks(40, 12, **GIVEN).data),
     "bodies": lambda: make_body_tracks(80, random_state=0).data,
     "frontal faces": frontal,
 }
@@ -108,9 +108,6 @@ def test_robust_losses_are_tried_if_there_are_outliers():
     given = {"camera": "weak_perspective", "refinement": "joint", "n_components": 2}
     found, model = tried(TABLES["outliers"](), **given)
     assert (found["robust loss"].result, model.loss) == ("used", "cauchy")
-    found, model = tried(make_nonrigid_tracks(40, 16, **GIVEN).data, **given)
-    assert (found["robust loss"].result, model.loss) == ("no outliers", "linear")
-    assert np.isnan(found["robust loss"].held_out_error)
 
 
 def test_faces_that_do_not_turn_have_the_prior():
@@ -118,21 +115,17 @@ def test_faces_that_do_not_turn_have_the_prior():
     assert found["face prior"].result == "used"
     assert (model.n_components, len(model.prior.basis_)) == (9, 9)
     assert found["weak perspective cameras"].depth_uncertainty > 0.55
-    given = {"camera": "weak_perspective", "refinement": "joint", "n_components": 2}
-    found, model = tried(frontal()[::2], prior=None, loss="linear", **given)
-    assert "face prior" not in found
-    assert model.prior is None
 
 
 def test_one_scale_is_found():
     found, model = tried(TABLES["one scale"]())
     one, many = found["orthographic"], found["weak perspective cameras"]
     assert one.held_out_error < many.held_out_error
-    assert (model.camera, one.result, many.result) == (
-        "orthographic",
-        "used",
-        "less good",
-    )
+    results = model.camera, one.result, many.result
+    assert results == ("orthographic", "used", "less good")
+    no_outliers = found["robust loss"]
+    assert (no_outliers.result, model.loss) == ("no outliers", "linear")
+    assert np.isnan(no_outliers.held_out_error)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import pytest
 import sklearn
 from fit_runs import JOINT
 from landmark_files import write_openface
+from layers import slow_after
 from scipy.io import savemat
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
@@ -47,9 +48,9 @@ def blocks(page):
 def tables(tmp_path, monkeypatch):
     """Write the files that the pages read, and go where they are."""
     monkeypatch.chdir(tmp_path)
-    faces = make_face_tracks(n_frames=120, n_components=8, random_state=0)
+    faces = make_face_tracks(n_frames=60, n_components=8, random_state=0)
     frame = pd.DataFrame(faces.data, columns=faces.feature_names)
-    frame.insert(0, "person", np.repeat(["Ada", "Ben", "Cyd"], 40))
+    frame.insert(0, "person", np.repeat(["Ada", "Ben", "Cyd"], 20))
     frame.to_csv("faces.csv", index=False)
     frame[:5].to_csv("new_faces.csv", index=False)
 
@@ -165,8 +166,8 @@ def test_the_api_page_lists_all_public_modules():
 @pytest.mark.usefixtures("tables")
 def test_the_readme_runs():
     names = run("README.md")
-    assert names["model"].alpha_.shape == (120, names["auto"].n_components_)
-    assert repr(names["faces"]) == "Landmarks(120 frames of 68 points, format='table')"
+    assert names["model"].alpha_.shape == (60, names["auto"].n_components_)
+    assert repr(names["faces"]) == "Landmarks(60 frames of 68 points, format='table')"
 
 
 @pytest.mark.usefixtures("tables")
@@ -272,7 +273,7 @@ def test_variables_of_matlab_are_the_model(sequence):
 WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
 REFERENCE = (
     *("conventions", "depth", "export", "formats", "index", "large_tables"),
-    *("perspective", "skeletons", "two_studies"),
+    *("skeletons", "two_studies", "perspective"),
 )
 # Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
 OF_OTHERS = ("from_movement", "dask")
@@ -287,7 +288,7 @@ def test_pages_with_code_have_tests():
 @pytest.fixture(scope="module")
 def fitted():
     """Return a table of faces, and models of faces, bodies and mice."""
-    faces = make_face_tracks(60, random_state=0)
+    faces = make_face_tracks(40, random_state=0)
     models = [AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(faces.data)]
     for n_points in (17, 7):
         scene = make_nonrigid_tracks(
@@ -299,7 +300,7 @@ def fitted():
 
 
 @pytest.mark.usefixtures("video")
-@pytest.mark.parametrize("page", REFERENCE)
+@pytest.mark.parametrize("page", slow_after(8, REFERENCE))
 def test_code_of_reference_pages_runs(page, fitted):
     faces, model, bodies, mice = fitted
     Path("landmarks").mkdir()
@@ -310,10 +311,10 @@ def test_code_of_reference_pages_runs(page, fitted):
     names = {"AffineNRSfM": AffineNRSfM, "GridSearchCV": GridSearchCV}
     names |= {"sklearn": sklearn, "BasisShapeDisplay": BasisShapeDisplay}
     names |= {"write_viewer": write_viewer, "canonical_pose": canonical_pose}
-    names |= {"X": faces.data, "stream": faces.data[:2], "weights": np.ones((60, 68))}
+    names |= {"X": faces.data, "stream": faces.data[:2], "weights": np.ones((40, 68))}
     names |= {"points": pd.DataFrame(faces.data, columns=columns), "model": model}
     names |= {"new_points": names["points"][:20]}
-    names |= {"expressions": ["a", "b"] * 30, "shape": bodies.mean_shape_}
+    names |= {"expressions": ["a", "b"] * 20, "shape": bodies.mean_shape_}
     others = {"coco-17": bodies, "mouse.html": mice}
     with sklearn.config_context():
         for code in blocks(f"docs/{page}.md"):

@@ -819,7 +819,7 @@ CALIBRATED = ("weak_perspective", "orthographic")
 def calibrated(camera, refinement="joint"):
     """Return a model with calibrated cameras, to be left as it is, and its table."""
     options = {"camera": camera, "noise": 0.01, "missing": 0.05}
-    truth = make_nonrigid_tracks(80, 40, 2, **options, random_state=0)
+    truth = make_nonrigid_tracks(80, 24, 2, **options, random_state=0)
     model = AffineNRSfM(2, camera=camera, refinement=refinement, random_state=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
@@ -971,7 +971,7 @@ def test_intervals_contain_the_errors_of_shapes(loss, missing):
     ],
 )
 def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meaning):
-    made = make_nonrigid_tracks(150, 40, 2, camera=truth, noise=0.02, random_state=0)
+    made = make_nonrigid_tracks(80, 24, 2, camera=truth, noise=0.02, random_state=0)
     model = AffineNRSfM(2, camera=camera, random_state=0).fit(made.data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

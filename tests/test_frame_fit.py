@@ -317,7 +317,7 @@ class TestSamplePosterior:
         assert_allclose(found, information, rtol=1e-12, atol=1e-12)
 
 
-def faces_turned_by(degrees, seed=0, n_frames=150, noise=0.01, missing=0.0):
+def faces_turned_by(degrees, seed=0, n_frames=80, noise=0.01, missing=0.0):
     """Return a table of faces whose rotation vectors have this spread, and the truth.
 
     The truth are points in the axes of the camera, in pixels, and rotations.
@@ -468,9 +468,11 @@ class TestTurnedFaces:
         assert error / 3 < model.depth_uncertainty_ < 3 * error
 
     @pytest.mark.parametrize("missing", slow_after(1, [0.0, 0.2]))
-    def test_deviations_of_depths_are_the_errors(self, missing):
-        X, points, _ = faces_turned_by(20, n_frames=80, missing=missing)
-        model = fitted(X)
+    def test_deviations_of_depths_are_the_errors(self, turned, missing):
+        X, points, _, model = turned
+        if missing:
+            X, points, _ = faces_turned_by(20, missing=missing)
+            model = fitted(X)
         shapes, deviation = model.reconstruct(X, return_std=True)
         assert_allclose(shapes, model.reconstruct(X))
         assert deviation.shape == shapes.shape[:2]

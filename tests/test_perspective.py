@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from layers import slow_after
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
@@ -110,18 +111,7 @@ def test_images_with_true_depths_are_weak_perspective():
     np.testing.assert_allclose(projected.reshape(s.X.shape), s.X)
 
 
-# The last fit leaves the exact one of few basis shapes, and ends at an error of .1 %.
-NOT_EXACT = pytest.mark.xfail(reason="the last fit of all directions starts afresh")
-
-
-@pytest.mark.parametrize(
-    "seed",
-    [
-        0,
-        pytest.param(5, marks=(pytest.mark.slow, NOT_EXACT)),
-        *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 20) if k != 5),
-    ],
-)
+@pytest.mark.parametrize("seed", slow_after(1, range(20)))
 def test_without_noise_the_fit_is_exact(seed):
     s = scene(seed, yaw=40.0, distance=2.4 * (2.5 + 0.25 * seed))  # radii
     X, S, R = s.X, s.S, s.R

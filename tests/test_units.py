@@ -63,7 +63,7 @@ def table(camera):
     """Return a table that such cameras see."""
     camera = camera if camera == "orthographic" else "weak_perspective"
     options = {"n_components": 2, "noise": 0.01, "camera": camera, "random_state": 0}
-    return make_face_tracks(60, **options).tracks[:, ::2].reshape(60, -1)
+    return make_face_tracks(40, **options).tracks[:, ::4].reshape(40, -1)
 
 
 def changed(name, value, factor):

@@ -30,7 +30,7 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.models import LEAST_POINTS, PosteriorFrames
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
-from isa_nrsfm._joint.prior import SETTLED, STEP, TOL_SHARE, ShapePrior
+from isa_nrsfm._joint.prior import SETTLED_WIDTH, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
     NOISE_FLOOR,
     FactorisedTable,
@@ -48,8 +48,8 @@ from isa_nrsfm._joint.starts import (
     first_state,
     half_reversed,
     lifted_shapes,
+    other_depths,
     steadied,
-    stretched,
     with_prior,
 )
 from isa_nrsfm._joint.whole import (
@@ -102,6 +102,8 @@ def fit_jointly(
         start = start._replace(shapes=shapes, motion=motion)
         if not len(motion):
             start = first.aligned(start, first.cameras)
+        if settings.prior is None:  # a fit without the prior has larger basis shapes
+            start = with_prior(first, start)
         # The widths of a prior change its first fit.
         rough = {} if settings.prior is None else {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, first.cameras, **rough)
@@ -414,7 +416,7 @@ def widened(problem: JointProblem, fit: JointFit) -> JointFit:
         curvature = problem.likelihood(*fit.state).shape_curvature
         before, prior = fit.prior.width, fit.prior.updated(shapes, curvature, noise)
         fit = problem.with_prior(prior).unreversed(fit.state, problem.cameras)
-        if abs(prior.width - before) < SETTLED * prior.width:
+        if abs(prior.width - before) < SETTLED_WIDTH * prior.width:
             break
     return fit
 
@@ -427,9 +429,7 @@ def deepened(problem: JointProblem, fit: JointFit) -> JointFit:
     prior, n = fit.prior, problem.frames.n_frames / FAR_FRAMES
     assert prior is not None
     found = [(_end(fit) / n + 0.5 * prior.cost, fit)]
-    for factor in (STEP, 1.0 / STEP):
-        start, stretch = stretched(fit.state, problem.cameras, factor)
-        other = prior.stretched(stretch)
+    for start, other, _ in other_depths(fit.state, problem.cameras, prior):
         trial = problem.with_prior(other).unreversed(start, problem.cameras)
         found.append((_end(trial) / n + 0.5 * other.cost, trial))
     best = min(found, key=itemgetter(0))[1]

@@ -43,7 +43,7 @@ from isa_nrsfm._linalg.small_matrices import centred
 # Width of the first fit, in sizes of frames.
 FIRST_WIDTH = 0.05
 # Relative change of the width below which it is settled.
-SETTLED = 0.02
+SETTLED_WIDTH = 0.02
 # Standard deviation of the logarithm of the depths of objects over those of a prior.
 DEPTH_SPREAD = 0.15
 # Factor of the depths of compared fits: with three points, the first one in the middle,

@@ -21,6 +21,7 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rigid_cameras,
 )
+from isa_nrsfm._joint.prior import STEP, ShapePrior
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
@@ -146,6 +147,15 @@ def stretched(
     motion = camera.nearest(state.motion @ (np.eye(3) + (1 / factor - 1) * along))
     stretch = np.eye(3) + (factor - 1) * along
     return state._replace(shapes=stretch @ state.shapes, motion=motion), stretch
+
+
+def other_depths(
+    state: JointState, camera: CameraModel, prior: ShapePrior
+) -> Iterator[tuple[JointState, ShapePrior, float]]:
+    """Yield flatter and deeper states, their priors, and squared changes of depth."""
+    for factor in (STEP, 1.0 / STEP):
+        start, stretch = stretched(state, camera, factor)
+        yield start, prior.stretched(stretch), (factor - 1.0) ** 2
 
 
 def affine_start(problem: JointProblem, W: NDArray, paper: NDArray) -> JointState:

@@ -41,10 +41,10 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
-from isa_nrsfm._joint.prior import STEP, ShapePrior
+from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem, JointState, Widths, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._joint.starts import steadied, stretched
+from isa_nrsfm._joint.starts import other_depths, steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
@@ -337,12 +337,10 @@ def depth_certainty(
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:
         costs, stretches = [0.5 * prior.cost], [0.0]
-        for factor in (STEP, 1.0 / STEP):
-            start, stretch = stretched(whole, camera, factor)
-            other = prior.stretched(stretch)
+        for start, other, change in other_depths(whole, camera, prior):
             rise = refit(every, start, prior=other)[-1] - value
             costs.append(0.5 * other.cost + FAR_FRAMES * rise)
-            stretches.append((factor - 1.0) ** 2)
+            stretches.append(change)
         deformation += float(softmax(-np.array(costs)) @ stretches)
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept in parts:

@@ -19,7 +19,7 @@ from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._joint.half_tables import HalfTables
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.analysis._advice import (
     DEPTH,
     FIT,
@@ -40,8 +40,6 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
 # to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
 MOST_POSE = 0.3
-# Rows on which held-out points are compared, at most.
-MOST_ROWS = 300
 
 
 class Diagnostics(NamedTuple):
@@ -253,10 +251,7 @@ def diagnose(
         *gross_residuals(distance),
     )
     names, layout = names_of_points(estimator), layout_of(estimator)
-    error = np.nan
-    if table is not None:
-        few = spread(np.arange(table.n_frames), MOST_ROWS)
-        error = unexplained(model, table.take(few), *(w[few] for w in weights))
+    error = np.nan if table is None else model.held_out_error(table, *weights)
     facts = facts_of(
         estimator,
         held_out_error=error,
@@ -272,21 +267,6 @@ def diagnose(
         fit=verdict(error, *FIT),
         depth=verdict(found.depth_uncertainty, *DEPTH),
     )
-
-
-def unexplained(
-    model: Any, rows: NDArray, *weights: NDArray, robust: bool = False
-) -> float:
-    """Return the share of the energy of held-out points that is not explained.
-
-    Of robust fits it is that of the median point, with normally distributed errors.
-    """
-    error, signal = np.moveaxis(model.held_out(rows, *weights), 2, 0)
-    if np.isnan(error).all():
-        return np.nan
-    if robust or model.frames.loss != "linear":
-        return float(np.nanmedian(error) / (2 * np.log(2)))  # frames have size one
-    return float(np.nansum(error) / np.nansum(signal))
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:

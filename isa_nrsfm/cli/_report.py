@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
@@ -50,18 +49,16 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
     }
 
 
-def quality_report(
-    estimator: AffineNRSfM, X: Any, square: float, weighting: dict[str, Any]
-) -> dict[str, Any]:
+def quality_report(error: float, square: float, weighted: bool) -> dict[str, Any]:
     """Describe how well a model explains a table, whose points may have weights.
 
-    `square` is the mean of the squared errors of its coordinates.
+    `error` is that of held-out points, `square` the mean of the squared errors of the
+    coordinates.
     """
-    error = -estimator.score(X, **weighting)
     return {
         "fit": verdict(error, *FIT),
         "held_out_error": error,
-        "held_out_error_weighted": bool(weighting),
+        "held_out_error_weighted": weighted,
         "rms_point_error": np.sqrt(2 * square),
     }
 
@@ -83,9 +80,8 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     n_edges = 0 if lines is None else len(lines.edges)
     for message in () if found is None else found.messages:
         warn_caller(message)
-    quality = quality_report(estimator, X, mean_of(square), frames.weighting)
-    if estimator.loss != "linear" and found is not None:
-        quality |= {"fit": found.fit}  # of the median point
+    error = found.held_out_error if found else -estimator.score(X, **frames.weighting)
+    quality = quality_report(error, mean_of(square), bool(frames.weighting))
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),

@@ -297,8 +297,9 @@ def _fit(report: dict[str, Any]) -> Section:
         f"held-out error {percent(model['held_out_error'])}: energy of the errors of "
         "points that are predicted from the other points of their frame, relative to "
         "that of the centred points."
-        + " Points count by their weights."
-        * model["held_out_error_weighted"],
+        + " Points count by their weights." * model["held_out_error_weighted"]
+        + " It is that of the median point, as outliers have less weight."
+        * (model["parameters"]["loss"] != "linear"),
         f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}",
     ]
     if square is not None:
