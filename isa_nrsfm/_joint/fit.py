@@ -101,8 +101,10 @@ def fit_jointly(
         start = start._replace(shapes=shapes, motion=motion)
         if not len(motion):
             start = first.aligned(start, first.cameras)
-        # The widths of a prior change its first fit.
-        rough = {} if settings.prior is None else {"tol": settings.tol / TOL_SHARE}
+        # The widths of a prior change its first fit. All directions have another one.
+        rough: dict[str, Any] = {"max_iter": 0} if whole else {}
+        if settings.prior is not None:
+            rough = {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, first.cameras, **rough)
     elif whole:
         fit = _likeliest_fit(first, table, paper_shapes)

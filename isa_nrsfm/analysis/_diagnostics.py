@@ -281,10 +281,16 @@ def unexplained(
 
     Of robust fits it is that of the median point, with normally distributed errors.
     """
-    error, signal = np.moveaxis(model.held_out(rows, *weights), 2, 0)
+    squares = model.held_out(rows, *weights)
+    return unexplained_share(squares, robust or model.frames.loss != "linear")
+
+
+def unexplained_share(squares: NDArray, robust: bool) -> float:
+    """Return the same for squared errors and signals (n, J, 2)."""
+    error, signal = np.moveaxis(squares, 2, 0)
     if np.isnan(error).all():
         return np.nan
-    if robust or model.frames.loss != "linear":
+    if robust:
         return float(np.nanmedian(error) / (2 * np.log(2)))  # frames have size one
     return float(np.nansum(error) / np.nansum(signal))
 
