@@ -26,12 +26,7 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._joint.consensus import (
-    MOST_POINTS,
-    SMALLEST,
-    neighbour_distances,
-    neighbourhoods,
-)
+from isa_nrsfm._joint import consensus
 from isa_nrsfm._linalg.small_matrices import centred, procrustes
 from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
@@ -304,9 +299,10 @@ class _Rows(NamedTuple):
         """
         S = model.reconstruct(self.X).mT
         S = S[np.isfinite(S).all(axis=(1, 2))]
-        some = spread(np.arange(S.shape[2]), MOST_POINTS)
-        distances, before, left = neighbour_distances(S[:, :, some]), 0.0, 0.0
-        for points, count in neighbourhoods(distances, SMALLEST):
+        some = spread(np.arange(S.shape[2]), consensus.MOST_POINTS)
+        distances, before, left = consensus.neighbour_distances(S[:, :, some]), 0.0, 0.0
+        groups = consensus.neighbourhoods(distances, consensus.SMALLEST)
+        for points, count in groups:
             part = centred(S[:, :, some[points]])
             before += count * np.sum((part - part.mean(axis=0)) ** 2)
             for _ in range(3):  # to their mean
@@ -329,12 +325,10 @@ class _Fit(NamedTuple):
 
     def clearly_better(self, other: "_Fit", robust: bool) -> bool:
         """Return whether held-out points of frames have clearly smaller errors."""
-        mean_of = np.nanmedian if robust else np.nanmean
-        pairs = other.squares[..., 0], self.squares[..., 0]
-        known = np.logical_and(*(np.isfinite(each).any(axis=1) for each in pairs))
-        gain = np.subtract(*(mean_of(each[known], axis=1) for each in pairs))
-        error = gain.std() / np.sqrt(len(gain)) if len(gain) else np.inf
-        return bool(gain.sum() > CLEAR * error * len(gain))
+        pairs = np.stack([other.squares[..., 0], self.squares[..., 0]])
+        pairs = pairs[:, np.isfinite(pairs.sum(axis=0)).any(axis=1)]
+        gain = np.subtract(*(np.nanmedian if robust else np.nanmean)(pairs, axis=2))
+        return len(gain) > 0 and gain.mean() > CLEAR * gain.std() / np.sqrt(len(gain))
 
     @property
     def determined(self) -> bool:
@@ -379,13 +373,13 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
     """The prior of faces supplies depths that a table does not determine."""
     layout, K = rows.face_layout, best.model.n_components
+    layout = layout or getattr(layout_of(best.model), "name", None)
+    if layout not in choices.FACE_PRIORS:
+        return "no layout of faces"
     if best.determined:
         return "the depth is known"
     if best.model.camera != "weak_perspective":
         return f"not with {best.model.camera} cameras"
-    layout = layout or getattr(layout_of(best.model), "name", None)
-    if layout not in choices.FACE_PRIORS:
-        return "no layout of faces"
     prior = load_face_prior(FACE_COMPONENTS if K == AUTO else K, layout=layout)
     return {"prior": prior, "n_components": AUTO}
 
@@ -455,16 +449,18 @@ def decided(
     Returns the fit that is kept, with warnings, and what was tried.
     """
 
-    def fitted(model: AffineNRSfM, setting: str, robust: bool) -> _Fit:
-        since = time.perf_counter()
+    def fitted(model: AffineNRSfM, setting: str, first: _Fit | None = None) -> _Fit:
+        since = time.perf_counter() - (first.trial.seconds if first else 0.0)
         with warnings.catch_warnings(record=True, action="always") as caught:
             if not hasattr(model, "_model"):
                 model.fit(X, groups=groups, **weights)
-        seconds, squares = time.perf_counter() - since, rows.squares(model)
+        seconds = time.perf_counter() - since
+        squares = first.squares if first else rows.squares(model)
+        error = unexplained_share(squares, robust or model.loss != "linear")
         depth = float(getattr(model, "depth_uncertainty_", np.nan))
-        trial = Trial(setting, np.nan, depth, seconds, "used")
-        found = _Fit(model, trial, caught, squares)
-        return found._replace(trial=trial._replace(held_out_error=found.error(robust)))
+        return _Fit(
+            model, Trial(setting, error, depth, seconds, "used"), caught, squares
+        )
 
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
@@ -472,12 +468,13 @@ def decided(
     setting = f"{estimator.camera.replace('_p', ' p')} cameras"
     if free and not hasattr(estimator, "_model"):
         estimator._known = {}
-    best, robust = fitted(estimator, setting, False), False
+    robust = False
+    best = fitted(estimator, setting)
     trials, used = [best.trial], 0
     for name, setting, proposal in PROPOSALS:
         if name not in free:
             continue
-        changes, found = proposal(best, rows), None
+        changes = proposal(best, rows)
         if not isinstance(changes, str):
             show(setting)
             robust |= name == "loss"  # outliers have no influence on medians
@@ -489,11 +486,11 @@ def decided(
                     model._known, model._errors = {}, False
                 if model.camera == "orthographic":
                     model._start = best.model._model
-                found = fitted(model, setting, robust)
+                found = fitted(model, setting)
             except ValueError as error:  # such as points that too few frames show
                 changes = str(error)
-        if found is None:
-            trials.append(Trial(setting, np.nan, np.nan, 0.0, str(changes)))
+        if isinstance(changes, str):
+            trials.append(Trial(setting, np.nan, np.nan, 0.0, changes))
             continue
         if name in MOST_ERROR:
             better = not found.error(robust) > MOST_ERROR[name] * best.error(robust)
@@ -502,11 +499,11 @@ def decided(
         if name in FOR_DEPTH:
             better &= found.trial.depth_uncertainty < best.trial.depth_uncertainty
         if better and not found.model._errors:
-            model, first = clone(found.model), found.trial
+            model = clone(found.model)
             model._known = found.model._known
-            found = fitted(model, setting, robust)
-            seconds = first.seconds + found.trial.seconds
-            found = found._replace(trial=found.trial._replace(seconds=seconds))
+            found = fitted(model, setting, found)
+            if model.camera == "orthographic":  # compared with affine ones before
+                model.camera_noise_ratio_ = best.model.camera_noise_ratio_
         trials.append(found.trial)
         if better:
             trials[used] = trials[used]._replace(result="less good")

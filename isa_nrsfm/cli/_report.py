@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
@@ -50,18 +49,16 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
     }
 
 
-def quality_report(
-    estimator: AffineNRSfM, X: Any, square: float, weighting: dict[str, Any]
-) -> dict[str, Any]:
+def quality_report(error: float, square: float, weighted: bool) -> dict[str, Any]:
     """Describe how well a model explains a table, whose points may have weights.
 
-    `square` is the mean of the squared errors of its coordinates.
+    `error` is that of held-out points, `square` the mean of the squared errors of the
+    coordinates.
     """
-    error = -estimator.score(X, **weighting)
     return {
         "fit": verdict(error, *FIT),
         "held_out_error": error,
-        "held_out_error_weighted": bool(weighting),
+        "held_out_error_weighted": weighted,
         "rms_point_error": np.sqrt(2 * square),
     }
 
@@ -81,11 +78,11 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     n_edges = 0 if lines is None else len(lines.edges)
-    for message in () if found is None else found.messages:
+    for message in getattr(found, "messages", ()):
         warn_caller(message)
-    quality = quality_report(estimator, X, mean_of(square), frames.weighting)
-    if estimator.loss != "linear" and found is not None:
-        quality |= {"fit": found.fit}  # of the median point
+    weighting = frames.weighting
+    error = found.held_out_error if found else -estimator.score(X, **weighting)
+    known = ("effective_frames", "pose_share", "pose_removed")
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),
@@ -94,24 +91,22 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
             "row_of_min": X.index[alpha.argmin(axis=0)],
             "max": alpha.max(axis=0),
             "row_of_max": X.index[alpha.argmax(axis=0)],
-            "effective_frames": None if found is None else found.effective_frames,
-            "pose_share": None if found is None else found.pose_share,
-            "pose_removed": None if found is None else found.pose_removed,
             "stability": getattr(estimator, "stability_", None),
-            "stability_word": None if found is None else found.stability,
+            "stability_word": getattr(found, "stability", None),
+            **{name: getattr(found, name, None) for name in known},
         }
     )
     return {
         "n_components": alpha.shape[1],
-        "depth": "" if found is None else found.depth,
+        "depth": getattr(found, "depth", ""),
         "inverse_snr": estimator.inverse_snr_,
-        **quality,
+        **quality_report(error, mean_of(square), bool(weighting)),
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "noise_variance": getattr(estimator, "noise_variance_", None),
         "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
-        "camera_meaning": None if np.isnan(ratio) else camera_meaning(ratio),
+        "camera_meaning": camera_meaning(ratio),
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "mirror_certainty": estimator.mirror_certainty_,
         "mirror_decided_by_perspective": sees_perspective(estimator),

@@ -27,17 +27,6 @@ from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.io._formats import TABLE
 
-_CAMERAS = {
-    "affine": "affine: shapes are known up to an affine transformation of space. "
-    "Angles and proportions need --camera weak_perspective.",
-    "weak_perspective": "weak-perspective: shapes are known up to size and a mirror "
-    "image in depth",
-    "orthographic": "orthographic: shapes are known up to a mirror image in depth, in "
-    "the units of the table",
-    "perspective": "perspective: shapes are known up to size",
-}
-
-_DATA = {REPORT: "the numbers of this report, for programs"}
 # Coefficients in the summary, at most; its texts in lines, without a break in paths.
 MOST_SHOWN = 5
 WRAPPED = textwrap.TextWrapper(80, break_on_hyphens=False, break_long_words=False)
@@ -49,11 +38,6 @@ class Cells(NamedTuple):
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     title: str = ""
-
-    @property
-    def lines(self) -> Sequence[Sequence[str]]:
-        """The rows, after the head if there is one."""
-        return [self.head, *self.rows] if self.head else self.rows
 
     @property
     def numbers(self) -> list[bool]:
@@ -259,7 +243,6 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
     found = report["versions"].items()
     sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
-    sections["Files"] = [Cells([], [*(report["files"] | _DATA).items()])]
     for name, section in sections.items():
         parts += _markup(name, section)
     page = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
@@ -277,11 +260,11 @@ def _markup(name: str, parts: Section) -> list[str]:
         if part.title:
             found.append(f"<h3>{escape(part.title)}</h3>")
         found.append('<div class="wide"><table>')
-        for i, row in enumerate(part.lines):
-            tag = "th" if part.head and not i else "td"
+        for row in [part.head, *part.rows][not part.head :]:
+            tag = "th" if row is part.head else "td"
             cells = (
                 f"<{tag}{' class=number' * is_number}>{escape(cell)}</{tag}>"
-                for cell, is_number in zip(row, part.numbers, strict=True)
+                for cell, is_number in zip(row, part.numbers, strict=False)
             )
             found.append(f"<tr>{''.join(cells)}</tr>")
         found.append("</table></div>")
@@ -291,14 +274,13 @@ def _markup(name: str, parts: Section) -> list[str]:
 def _fit(report: dict[str, Any]) -> Section:
     """Return the numbers of the fit and its cameras, with what they mean."""
     model, table = report["model"], report["table"]
-    worst, camera = model["largest_error"], _CAMERAS[model["camera"]]
     square, mirror = model["noise_variance"], model["mirror_certainty"]
+    worst, known = model["largest_error"], model["depth_determined"]
+    weighted = " Points count by their weights." * model["held_out_error_weighted"]
     parts = [
         f"held-out error {percent(model['held_out_error'])}: energy of the errors of "
         "points that are predicted from the other points of their frame, relative to "
-        "that of the centred points."
-        + " Points count by their weights."
-        * model["held_out_error_weighted"],
+        f"that of the centred points.{weighted}",
         f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}",
     ]
     if square is not None:
@@ -320,18 +302,15 @@ def _fit(report: dict[str, Any]) -> Section:
             "viewer with --edges FILE or --skeleton LAYOUT. If they are upside down, "
             "use --origin lower."
         )
-    if model["camera"] != "affine" and not model["depth_determined"]:
-        camera = f"{camera.partition(':')[0]}: the depth is not determined. cameras.csv"
-        camera += " has no angles, and proportions in viewer.html are not true."
-    elif mirror and math.isfinite(mirror):
+    if known and mirror and math.isfinite(mirror):
         which = "missing points are farther away"
         if model["mirror_decided_by_perspective"]:
             which = "perspective fits"
         elif model["parameters"]["prior"] is not None:
             which = "the prior is alike"
         parts.append(f"mirror image in depth: the one for which {which}")
-    parts += [camera, *_perspective(model, report.get("position_unit"))]
-    if model["depth_determined"] and model["camera_meaning"]:
+    parts += _perspective(model, report.get("position_unit"))
+    if known and not np.isnan(model["camera_noise_ratio"]):
         parts.append(_sentence(model["camera_meaning"]))
     return parts
 
@@ -343,17 +322,14 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
         return []
     if not math.isfinite(focal):
         return ["no perspective: the focal length is too long to estimate it"]
-    shown, length = "given", "in units of the shapes"
+    (x, y), shown, length = model["principal_point"], "given", "units of the shapes"
     if model["parameters"]["focal_length"] is None:
         shown = f"estimated, standard deviation {model['focal_length_std']:.2g}"
-    x, y = model["principal_point"]
     if unit is not None:
         a, b = unit["points"]
         length = f"points {a} and {b} of the mean shape are {unit['length']:g} apart"
-    return [
-        f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})",
-        f"positions in cameras.csv: {length}",
-    ]
+    focal = f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})"
+    return [focal, f"positions in cameras.csv: {length}"]
 
 
 def _alpha(model: dict[str, Any]) -> Section:
@@ -434,23 +410,22 @@ def _score(label: dict[str, Any]) -> str:
     """Return how well coefficients predict a label, compared with PCA."""
     if "not_cross_validated" in label:
         return f"not cross-validated: {label['not_cross_validated']}"
-    classes = label["score"] == "accuracy"
+    classes, names = label["score"] == "accuracy", ("", "_standard_error")
 
     def shown(name: str) -> str:
-        score, error = (label[name + each] for each in ("", "_standard_error"))
-        if classes:
-            return f"{100 * score:.1f} +- {100 * error:.1f} %"
-        return f"{score:.2f} +- {error:.2f}"
+        score, error = ((1, 100)[classes] * label[name + each] for each in names)
+        return f"{score:.{2 - classes}f} +- {error:.{2 - classes}f}{' %' * classes}"
 
-    parts = [
-        f"{'accuracy' if classes else 'R^2'} {shown('cross_validated')} (standard error"
-        "); PCA of the aligned frames"
+    others = [
+        f"{shown(name)} ({label[f'{name}_n_features']} components)"
+        for name in ("cross_validated_pca", "cross_validated_pca_of_rank")
     ]
-    for name in ("cross_validated_pca", "cross_validated_pca_of_rank"):
-        parts.append(f"{shown(name)} ({label[f'{name}_n_features']} components)")
     if classes:
-        parts.append(f"largest class {100 * label['largest_class']:.1f} %")
-    return f"cross-validated {parts[0]} {', '.join(parts[1:])}"
+        others.append(f"largest class {100 * label['largest_class']:.1f} %")
+    return (
+        f"cross-validated {('R^2', 'accuracy')[classes]} {shown('cross_validated')} "
+        f"(standard error); PCA of the aligned frames {', '.join(others)}"
+    )
 
 
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:

@@ -48,8 +48,8 @@ def run(args: Namespace, warned: list[str]) -> str:
         motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
         explained = estimator.inverse_transform(alpha, motion, translation)
         square = np.nanmean((explained - np.asarray(X)) ** 2)
-        found = quality_report(estimator, X, square, frames.weighting)
-        quality = quality_row(found)
+        error = -estimator.score(X, **frames.weighting)
+        quality = quality_row(quality_report(error, square, bool(frames.weighting)))
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting

@@ -306,15 +306,16 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
     way = (
-        f"For a row for each individual, use individuals={listed!r} (command line: "
+        f"For a row for each, use individuals={listed!r} (command line: "
         f"--individuals {shlex.quote(listed)})"
         if n_points >= MIN_POINTS
         else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
     )
     raise ValueError(
         f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
-        f"of several individuals in one row. {way}. If all are points of one body, use "
-        f"columns={whole!r} (command line: --columns {shlex.quote(whole)})"
+        f"of several individuals in one row, or of several views. {way}. If all are "
+        f"points of one body, use columns={whole!r} (command line: --columns "
+        f"{shlex.quote(whole)})"
     )
 
 
