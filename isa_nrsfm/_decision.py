@@ -319,10 +319,6 @@ class _Fit(NamedTuple):
     caught: list[warnings.WarningMessage]
     squares: NDArray
 
-    def error(self, robust: bool) -> float:
-        """Return the error of held-out points."""
-        return unexplained_share(self.squares, robust or self.model.loss != "linear")
-
     def clearly_better(self, other: "_Fit", robust: bool) -> bool:
         """Return whether held-out points of frames have clearly smaller errors."""
         pairs = np.stack([other.squares[..., 0], self.squares[..., 0]])
@@ -477,7 +473,10 @@ def decided(
         changes = proposal(best, rows)
         if not isinstance(changes, str):
             show(setting)
-            robust |= name == "loss"  # outliers have no influence on medians
+            if name == "loss":  # outliers have no influence on medians
+                robust, median = True, unexplained_share(best.squares, True)
+                trials[used] = best.trial._replace(held_out_error=median)
+                best = best._replace(trial=trials[used])
             try:
                 model = clone(best.model).set_params(**changes)
                 if name == "refinement":
@@ -492,12 +491,13 @@ def decided(
         if isinstance(changes, str):
             trials.append(Trial(setting, np.nan, np.nan, 0.0, changes))
             continue
-        if name in MOST_ERROR:
-            better = not found.error(robust) > MOST_ERROR[name] * best.error(robust)
-        else:
+        _, off, depth, *_ = found.trial
+        if name == "camera":
             better = found.clearly_better(best, robust)
+        else:
+            better = not off > MOST_ERROR[name] * best.trial.held_out_error
         if name in FOR_DEPTH:
-            better &= found.trial.depth_uncertainty < best.trial.depth_uncertainty
+            better &= depth < best.trial.depth_uncertainty
         if better and not found.model._errors:
             model = clone(found.model)
             model._known = found.model._known

@@ -274,15 +274,13 @@ def diagnose(
     )
 
 
-def unexplained(
-    model: Any, rows: NDArray, *weights: NDArray, robust: bool = False
-) -> float:
+def unexplained(model: Any, rows: NDArray, *weights: NDArray) -> float:
     """Return the share of the energy of held-out points that is not explained.
 
     Of robust fits it is that of the median point, with normally distributed errors.
     """
     squares = model.held_out(rows, *weights)
-    return unexplained_share(squares, robust or model.frames.loss != "linear")
+    return unexplained_share(squares, model.frames.loss != "linear")
 
 
 def unexplained_share(squares: NDArray, robust: bool) -> float:

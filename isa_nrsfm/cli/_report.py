@@ -77,7 +77,6 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
     certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
-    n_edges = 0 if lines is None else len(lines.edges)
     for message in getattr(found, "messages", ()):
         warn_caller(message)
     weighting = frames.weighting
@@ -96,6 +95,12 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
             **{name: getattr(found, name, None) for name in known},
         }
     )
+    outliers = None
+    if found is not None:
+        names, worst = names_of_points(estimator), found.outliers[:MOST_LISTED]
+        largest = [{"row": X.index[i], "point": names[j]} for i, j in worst]
+        n_points, share = len(found.outliers), found.outlier_share
+        outliers = {"share": share, "n_points": n_points, "largest": largest}
     return {
         "n_components": alpha.shape[1],
         "depth": getattr(found, "depth", ""),
@@ -115,22 +120,10 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         "principal_point": estimator.principal_point,
         "depth_determined": certainty.determined and estimator.camera_ != "affine",
         "skeleton": None if layout is None else layout.name,
-        # None if no lines are wanted.
-        "n_edges": None if edges is None else n_edges,
-        "spanning_tree": lines is not None and lines.name == SPANNING_TREE,
-        "outliers": None if found is None else _outliers(found, estimator, X),
+        # Also if no lines are wanted.
+        "lines_known": edges is None
+        or getattr(lines, "name", SPANNING_TREE) != SPANNING_TREE,
+        "outliers": outliers,
         "parameters": estimator.get_params(deep=True),
         "alpha": coefficients.to_dict("records"),
-    }
-
-
-def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
-    """Describe the gross residuals of a table, by its rows and names of points."""
-    names = names_of_points(model)
-    largest = found.outliers[:MOST_LISTED]
-    return {
-        "share": found.outlier_share,
-        "n_points": len(found.outliers),
-        "n_frames": len(np.unique(found.outliers[:, 0])),
-        "largest": [{"row": X.index[i], "point": names[j]} for i, j in largest],
     }

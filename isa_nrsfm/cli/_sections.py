@@ -33,11 +33,10 @@ WRAPPED = textwrap.TextWrapper(80, break_on_hyphens=False, break_long_words=Fals
 
 
 class Cells(NamedTuple):
-    """A table: titles of the columns if they have any, rows, and a title."""
+    """A table: titles of the columns if they have any, and rows."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
-    title: str = ""
 
     @property
     def numbers(self) -> list[bool]:
@@ -84,13 +83,10 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
     if "time" in report:
         rows.append(["time", "", str(_time(report["time"])[0])])
     tried = [each["text"] for each in report["tried"] if each["seconds"]]
-    others: dict[str, list[str]] = {}
-    for each in report["tried"]:
-        if not each["seconds"]:
-            others.setdefault(each["result"], []).append(each["setting"])
+    others = [each for each in report["tried"] if not each["seconds"]]
     if "choice" in report:
         tried.insert(0, _choice(report["choice"]))
-    listed = "; ".join(f"{', '.join(them)} ({why})" for why, them in others.items())
+    listed = "; ".join(f"{each['setting']} ({each['result']})" for each in others)
     tried += [f"not tried: {listed}"] * bool(others)
     rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
     rows.append(left_out_row(table))
@@ -132,37 +128,33 @@ def _answer(label: dict[str, Any]) -> str:
 
 def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     """Return the sections of the report of a fit, answers first, without the files."""
-    model = report["model"]
-    sections: dict[str, Section] = {}
-    if "labels" in report:
-        labels = [_label(label) for label in report["labels"]]
-        sections["Labels"] = [part for parts in labels for part in parts]
-    if "groups" in report:
-        sections["Groups"] = _groups(report["groups"])
-    if "time" in report:
-        sections["Time"] = _time(report["time"])
-    sections["Alpha"] = _alpha(model)
-    sections["Fit"] = _fit(report)
-    return sections | {"Table": table_section(report["table"])}
+    labels = map(_label, report.get("labels", ()))
+    return {
+        "Labels": [part for parts in labels for part in parts],
+        "Groups": _groups(report["groups"]) if "groups" in report else (),
+        "Time": _time(report["time"]) if "time" in report else (),
+        "Alpha": _alpha(report["model"]),
+        "Fit": _fit(report),
+        "Table": table_section(report["table"]),
+    }
 
 
 def table_section(table: dict[str, Any]) -> Section:
     """Return the rows and columns of a table that are used, and the others."""
     format, out = table["format"], left_out_row(table)[2]
     listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
-    parts: list[str | Cells] = [
+    unused = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
+    others = {"coordinates not used": unused, "other columns": table["other_columns"]}
+    return [
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
         f"{table['n_frames']} of {table['n_rows']} rows; left out: {out}",
+        *(
+            f"{what}: {first_items(map(str, names), MOST_LISTED)}"
+            for what, names in others.items()
+            if names
+        ),
     ]
-    others = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
-    for what, names in (
-        ("coordinates not used", others),
-        ("other columns", table.get("other_columns")),
-    ):
-        if names:
-            parts.append(f"{what}: {first_items(map(str, names), MOST_LISTED)}")
-    return parts
 
 
 def quality_row(quality: dict[str, Any]) -> list[str]:
@@ -231,7 +223,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
     sections = fit_sections(report)
     for name in ("Labels", "Groups", "Time", "Alpha"):
-        parts += _markup(name, sections.pop(name, ()))
+        parts += _markup(name, sections.pop(name))
     for name, content in report["files"].items():
         if name.endswith(".png"):
             image = base64.b64encode((folder / name).read_bytes()).decode()
@@ -257,8 +249,6 @@ def _markup(name: str, parts: Section) -> list[str]:
         if isinstance(part, str):
             found.append(f"<p>{escape(part)}</p>")
             continue
-        if part.title:
-            found.append(f"<h3>{escape(part.title)}</h3>")
         found.append('<div class="wide"><table>')
         for row in [part.head, *part.rows][not part.head :]:
             tag = "th" if row is part.head else "td"
@@ -296,7 +286,7 @@ def _fit(report: dict[str, Any]) -> Section:
             " Coefficients are those of the prior, so that studies with the same prior "
             "can be compared."
         )
-    if model["skeleton"] is None and (model["n_edges"] == 0 or model["spanning_tree"]):
+    if model["skeleton"] is None and not model["lines_known"]:
         parts.append(
             f"{table['n_points']} points of no known layout: give lines of figures and "
             "viewer with --edges FILE or --skeleton LAYOUT. If they are upside down, "
@@ -380,10 +370,9 @@ def _label(label: dict[str, Any]) -> Section:
     title = f"{label['column']}: {label['n_frames']} frames"
     if "classes" in label:
         title += f" of {len(label['classes'])} classes"
-    if label["n_copies"]:
-        title += f"; {label['n_copies']} copies of other frames count once with them"
-    if label["n_without_label"]:
-        title += f"; {label['n_without_label']} without a label left out"
+    copies = "copies of other frames count once with them"
+    counts = {"n_copies": copies, "n_without_label": "without a label left out"}
+    title += "".join(f"; {label[n]} {what}" for n, what in counts.items() if label[n])
     names = names_of_components(None, len(label["values"]))
     statistic, meaning = STATISTICS[label["kind"]]
     columns = {"": names, statistic: [f"{value:z.2f}" for value in label["values"]]}
@@ -399,7 +388,8 @@ def _label(label: dict[str, Any]) -> Section:
             means = _class_means(label, names)
     return [
         _answer(label),
-        Cells([*columns], [*zip(*columns.values(), strict=True)], title),
+        title,
+        Cells([*columns], [*zip(*columns.values(), strict=True)]),
         f"{statistic}: {meaning}; {test}",
         *means,
         _score(label),
@@ -432,10 +422,10 @@ def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
     lines = ["mean of each class if p < 0.05, in standard deviations:"]
     means = pd.DataFrame(label["class_means"], names)
+    rest = " (all in report.json)" * (len(means.columns) > MOST_CLASSES)
     for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
-        listed = [f"{each} {mean:+z.1f}" for each, mean in largest.items()]
-        rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
+        listed = (f"{each} {mean:+z.1f}" for each, mean in largest.items())
         lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{rest}.")
     return lines
 
@@ -449,7 +439,7 @@ def _groups(groups: dict[str, Any]) -> Section:
     shares = zip(names, groups["between"], groups["within"], strict=True)
     rows = [[name, f"{100 * a:.1f} %", f"{100 * b:.1f} %"] for name, a, b in shares]
     title = f"{column}: variance between and within {groups['n_groups']} groups"
-    return [Cells(["", "between", "within"], rows, title)]
+    return [title, Cells(["", "between", "within"], rows)]
 
 
 def _time(time: dict[str, Any]) -> Section:
@@ -461,10 +451,10 @@ def _time(time: dict[str, Any]) -> Section:
     if not len(scales):
         return [f"{name}: no dynamics found, coefficients are not smoothed"]
     fading = scales[np.isfinite(scales)]
-    found = []
-    if len(fading):
-        listed = first_items(f"{each:.3g}" for each in fading)
-        found.append(f"changes of the shape fade within {listed} {time['unit']}")
+    listed = first_items(f"{each:.3g}" for each in fading)
+    found = [f"changes of the shape fade within {listed} {time['unit']}"] * (
+        len(fading) > 0
+    )
     if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")
     return [
