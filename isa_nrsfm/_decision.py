@@ -387,10 +387,9 @@ def _consensus(best: _Fit, rows: _Rows) -> Proposal:
     """
     if best.model.camera == "affine" or rows.weights:
         return "not with affine cameras or weights"
-    if best.determined and (best.model.prior or best.model.camera == "perspective"):
+    known = best.model.prior or best.model.camera == "perspective"
+    if best.determined and (known or rows.own_rotations(best.model) < OWN_ROTATIONS):
         return "the depth is known"
-    if best.determined and rows.own_rotations(best.model) < OWN_ROTATIONS:
-        return "parts do not turn by themselves"
     return {"refinement": "consensus"}
 
 
@@ -454,19 +453,15 @@ def decided(
         squares = first.squares if first else rows.squares(model)
         error = unexplained_share(squares, robust or model.loss != "linear")
         depth = float(getattr(model, "depth_uncertainty_", np.nan))
-        return _Fit(
-            model, Trial(setting, error, depth, seconds, "used"), caught, squares
-        )
+        trial = Trial(setting, error, depth, seconds, "used")
+        return _Fit(model, trial, caught, squares)
 
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    setting = f"{estimator.camera.replace('_p', ' p')} cameras"
-    if free and not hasattr(estimator, "_model"):
-        estimator._known = {}
-    robust = False
-    best = fitted(estimator, setting)
-    trials, used = [best.trial], 0
+    robust, used, estimator._known = False, 0, {}
+    best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras")
+    trials = [best.trial]
     for name, setting, proposal in PROPOSALS:
         if name not in free:
             continue

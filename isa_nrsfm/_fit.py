@@ -325,9 +325,9 @@ def _started(
     It has the cameras of frames that are placed, otherwise none. Basis shapes that the
     model lacks are directions of the residuals of at most 200 frames.
     """
-    frames, unit = model.frames, 1.0  # frames of size one, unless all have one scale
-    if model.unit is not None and table.unit is not None:
-        unit = model.unit / table.unit
+    frames, (own, other) = model.frames, (model.unit, table.unit)
+    # Frames have size one, unless all have one scale.
+    unit = own / other if own and other else 1.0
     assert isinstance(frames, PosteriorFrames)
     n_more = max(n_components + 1 - len(frames.shapes), 0)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance

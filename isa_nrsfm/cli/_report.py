@@ -75,12 +75,10 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     mean_of = np.nanmean if missing else np.mean  # which takes no copy
     errors = np.sqrt(2 * mean_of(square, axis=1))
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
-    certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
     for message in getattr(found, "messages", ()):
         warn_caller(message)
-    weighting = frames.weighting
-    error = found.held_out_error if found else -estimator.score(X, **weighting)
+    error = found.held_out_error if found else -estimator.score(X, **frames.weighting)
     known = ("effective_frames", "pose_share", "pose_removed")
     coefficients = pd.DataFrame(
         {
@@ -99,13 +97,13 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     if found is not None:
         names, worst = names_of_points(estimator), found.outliers[:MOST_LISTED]
         largest = [{"row": X.index[i], "point": names[j]} for i, j in worst]
-        n_points, share = len(found.outliers), found.outlier_share
-        outliers = {"share": share, "n_points": n_points, "largest": largest}
+        outliers = {"share": found.outlier_share, "largest": largest}
+        outliers["n_points"] = len(found.outliers)
     return {
         "n_components": alpha.shape[1],
         "depth": getattr(found, "depth", ""),
         "inverse_snr": estimator.inverse_snr_,
-        **quality_report(error, mean_of(square), bool(weighting)),
+        **quality_report(error, mean_of(square), bool(frames.weighting)),
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "noise_variance": getattr(estimator, "noise_variance_", None),
         "frames_scaled": estimator.frames_scaled_,
@@ -118,7 +116,8 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         "focal_length": getattr(estimator, "focal_length_", None),
         "focal_length_std": getattr(estimator, "focal_length_std_", None),
         "principal_point": estimator.principal_point,
-        "depth_determined": certainty.determined and estimator.camera_ != "affine",
+        "depth_determined": estimator.camera_ != "affine"
+        and frames_of(estimator).certainty.determined,
         "skeleton": None if layout is None else layout.name,
         # Also if no lines are wanted.
         "lines_known": edges is None

@@ -52,9 +52,8 @@ Section = Sequence[str | Cells]
 
 def fit_title(report: dict[str, Any]) -> str:
     """Return the title of the report of a fit."""
-    table, n, layout = report["table"], len(report["model"]["alpha"]), ""
-    if report["model"]["skeleton"] is not None:
-        layout = f" ({report['model']['skeleton']})"
+    table, n = report["table"], len(report["model"]["alpha"])
+    layout = f" ({name})" if (name := report["model"]["skeleton"]) else ""
     rows = f"{table['n_frames']} frames of {table['n_points']} points{layout}"
     return f"{n} movement{'s' * (n != 1)} in {rows}"
 
@@ -380,18 +379,14 @@ def _label(label: dict[str, Any]) -> Section:
     if label["corrected"] is not None:
         columns["corrected"] = [f"{value:z.2f}" for value in label["corrected"]]
         meaning += "; corrected: without the errors of the coefficients"
-    test = "no p-values"
-    means: list[str] = []
-    if not label["untested"]:
-        test = f"corrected p-values: permutations of {label['permuted']}"
-        if "class_means" in label and np.less(label["p_values"], 0.05).any():
-            means = _class_means(label, names)
+    test = f"corrected p-values: permutations of {label['permuted']}"
+    test = "no p-values" if label["untested"] else test
     return [
         _answer(label),
         title,
         Cells([*columns], [*zip(*columns.values(), strict=True)]),
         f"{statistic}: {meaning}; {test}",
-        *means,
+        *(_class_means(label, names) if "class_means" in label else ()),
         _score(label),
     ]
 
@@ -427,7 +422,7 @@ def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
         listed = (f"{each} {mean:+z.1f}" for each, mean in largest.items())
         lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{rest}.")
-    return lines
+    return lines if len(lines) > 1 else []
 
 
 def _groups(groups: dict[str, Any]) -> Section:
