@@ -162,7 +162,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         yield (
             f"the table does not support n_components={n_components}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
-            'probably noise. n_components="auto" leaves them out'
+            f"probably noise{facts.compare}"
         )
     elif facts.camera == "affine" and facts.deviation > LARGEST_DEVIATION:
         yield (

@@ -379,14 +379,15 @@ def _label(label: dict[str, Any]) -> Section:
     if label["corrected"] is not None:
         columns["corrected"] = [f"{value:z.2f}" for value in label["corrected"]]
         meaning += "; corrected: without the errors of the coefficients"
-    test = f"corrected p-values: permutations of {label['permuted']}"
-    test = "no p-values" if label["untested"] else test
+    test, means = "no p-values", "class_means" in label and not label["untested"]
+    if not label["untested"]:
+        test = f"corrected p-values: permutations of {label['permuted']}"
     return [
         _answer(label),
         title,
         Cells([*columns], [*zip(*columns.values(), strict=True)]),
         f"{statistic}: {meaning}; {test}",
-        *(_class_means(label, names) if "class_means" in label else ()),
+        *(_class_means(label, names) if means else ()),
         _score(label),
     ]
 
