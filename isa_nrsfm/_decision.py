@@ -93,7 +93,7 @@ class Trial(NamedTuple):
             return f"{self.setting}: {self.result}"
         text = f"{self.setting}: {percent(self.held_out_error)} unexplained"
         if np.isfinite(self.depth_uncertainty):
-            text += f", depth known to {100 * self.depth_uncertainty:.2g} %"
+            text += f", depth known to {percent(self.depth_uncertainty)}"
         return f"{text}, {self.result}"
 
 
@@ -301,8 +301,7 @@ class _Rows(NamedTuple):
         S = S[np.isfinite(S).all(axis=(1, 2))]
         some = spread(np.arange(S.shape[2]), consensus.MOST_POINTS)
         distances, before, left = consensus.neighbour_distances(S[:, :, some]), 0.0, 0.0
-        groups = consensus.neighbourhoods(distances, consensus.SMALLEST)
-        for points, count in groups:
+        for points, count in consensus.neighbourhoods(distances, consensus.SMALLEST):
             part = centred(S[:, :, some[points]])
             before += count * np.sum((part - part.mean(axis=0)) ** 2)
             for _ in range(3):  # to their mean

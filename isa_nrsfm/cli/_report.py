@@ -71,9 +71,10 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
 
     estimator, frames, edges = fit.estimator, fit.frames, fit.drawn["edges"]
     X, alpha = frames.X, estimator.alpha_
-    square, missing = (fit.explained - X.to_numpy()) ** 2, X.isna().any(axis=None)
-    mean_of = np.nanmean if missing else np.mean  # which takes no copy
-    errors = np.sqrt(2 * mean_of(square, axis=1))
+    square = (fit.explained - X.to_numpy()) ** 2
+    errors, typical = np.sqrt(2 * np.nanmean(square, axis=1)), np.nanmean(square)
+    if estimator.loss != "linear":  # of the median point
+        typical = np.nanmedian(square[:, ::2] + square[:, 1::2]) / np.log(4)
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
     _, layout, lines, _ = view_and_layout(estimator, edges)
     for message in getattr(found, "messages", ()):
@@ -103,7 +104,7 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         "n_components": alpha.shape[1],
         "depth": getattr(found, "depth", ""),
         "inverse_snr": estimator.inverse_snr_,
-        **quality_report(error, mean_of(square), bool(frames.weighting)),
+        **quality_report(error, typical, bool(frames.weighting)),
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "noise_variance": getattr(estimator, "noise_variance_", None),
         "frames_scaled": estimator.frames_scaled_,
