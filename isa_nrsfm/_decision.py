@@ -2,7 +2,8 @@
 
 The first fit has weak-perspective cameras and all directions of deformation. Each
 further one changes one setting, in the order of its time, and is skipped where it
-cannot win. It starts from the best fit so far.
+cannot win. The consensus has the joint fit of the best fit so far, orthographic cameras
+start from its shapes. Most fits have errors of depths only if they are used.
 """
 
 import time
@@ -11,6 +12,7 @@ from collections.abc import Callable, Collection
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone
 from sklearn.utils.validation import validate_data
 
@@ -24,7 +26,9 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._fitted_model import MOST_ROWS
+from isa_nrsfm._fitted_model import MOST_ROWS, unexplained_share
+from isa_nrsfm._joint import consensus
+from isa_nrsfm._linalg.small_matrices import centred, procrustes
 from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters import choices
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
@@ -48,10 +52,14 @@ ROUGH_ROWS, MOST_SHAPES = 50, 4
 MOST_WRONG = 1e-3
 # Largest variation of the scales of frames for which one scale is tried.
 EQUAL_SCALES = 0.1
-# A setting is used if it lowers the error of held-out points to this share.
-LOWER = 0.97
-# Shapes that determine the depth may have an error of held-out points so much larger.
-LARGER = 1.5
+# Share of the deformation of groups of neighbours that must be rotations of their own.
+OWN_ROTATIONS = 0.6
+# Cameras are used if errors of held-out points fall by so many standard errors.
+CLEAR = 2.0
+# Other settings are used with errors that are at most so many times as large, those for
+# depths if these are known better.
+MOST_ERROR = {"loss": 0.97, "prior": np.inf, "refinement": 1.5}
+FOR_DEPTH = ("prior", "refinement")
 
 
 class Trial(NamedTuple):
@@ -85,7 +93,7 @@ class Trial(NamedTuple):
             return f"{self.setting}: {self.result}"
         text = f"{self.setting}: {percent(self.held_out_error)} unexplained"
         if np.isfinite(self.depth_uncertainty):
-            text += f", depth known to {100 * self.depth_uncertainty:.2g} %"
+            text += f", depth known to {percent(self.depth_uncertainty)}"
         return f"{text}, {self.result}"
 
 
@@ -97,8 +105,8 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
     The first fit has weak-perspective cameras. Robust losses are tried if the table has
     outliers, orthographic cameras if all frames have one scale, affine ones if images
     are stretched, and perspective if the size of the images is known. If the depth is
-    not determined, the face prior is tried for layouts of faces, and the consensus of
-    groups of points for others.
+    not determined, the face prior is tried for layouts of faces, and then the consensus
+    of groups of points, which is also tried for objects whose parts turn by themselves.
 
     Parameters
     ----------
@@ -279,28 +287,43 @@ class _Rows(NamedTuple):
     principal_point: Any
     face_layout: str | None
 
-    def error(self, model: AffineNRSfM, robust: bool) -> float:
-        """Return the error of held-out points."""
+    def squares(self, model: AffineNRSfM) -> NDArray:
+        """Return squared errors and signals (n, J, 2) of held-out points."""
         table, weights = model._opened(self.X, **self.weights, judged=False)
-        return model._model.held_out_error(table, *weights, robust=robust)
+        return np.asarray(table.joined(model._model.held_out, *weights))
 
-    def outlier_share(self, model: AffineNRSfM) -> float:
-        """Return the share of gross errors among held-out points.
+    def own_rotations(self, model: AffineNRSfM) -> float:
+        """Return the share of the deformation of groups that is their own rotation.
 
-        Fits with all directions of deformation follow outliers, held-out points cannot.
+        It is that of groups of points that move together, as the consensus fits them.
         """
-        table, _ = model._opened(self.X, judged=False)
-        error = table.joined(model._model.held_out)[..., 0]
-        return gross_residuals(np.sqrt(error))[0]
+        S = model.reconstruct(self.X).mT
+        S = S[np.isfinite(S).all(axis=(1, 2))]
+        some = spread(np.arange(S.shape[2]), consensus.MOST_POINTS)
+        distances, before, left = consensus.neighbour_distances(S[:, :, some]), 0.0, 0.0
+        for points, count in consensus.neighbourhoods(distances, consensus.SMALLEST):
+            part = centred(S[:, :, some[points]])
+            before += count * np.sum((part - part.mean(axis=0)) ** 2)
+            for _ in range(3):  # to their mean
+                part = procrustes(part.mean(axis=0) @ part.mT) @ part
+            left += count * np.sum((part - part.mean(axis=0)) ** 2)
+        return 1.0 - left / before if before > 0 else 0.0
 
 
 class _Fit(NamedTuple):
-    """A fit, its figures, warnings, and the error with which others are compared."""
+    """A fit, its figures, warnings, and the errors with which others are compared."""
 
     model: AffineNRSfM
     trial: Trial
     caught: list[warnings.WarningMessage]
-    error: float
+    squares: NDArray
+
+    def clearly_better(self, other: "_Fit", robust: bool) -> bool:
+        """Return whether held-out points of frames have clearly smaller errors."""
+        pairs = np.stack([other.squares[..., 0], self.squares[..., 0]])
+        pairs = pairs[:, np.isfinite(pairs.sum(axis=0)).any(axis=1)]
+        gain = np.subtract(*(np.nanmedian if robust else np.nanmean)(pairs, axis=2))
+        return len(gain) > 0 and gain.mean() > CLEAR * gain.std() / np.sqrt(len(gain))
 
     @property
     def determined(self) -> bool:
@@ -317,7 +340,8 @@ def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
     """Outliers have their full influence on a fit with the linear loss."""
     if rows.weights:
         return "points have weights"
-    if not rows.outlier_share(best.model) > MOST_WRONG:
+    # Fits with all directions of deformation follow outliers, held-out points cannot.
+    if not gross_residuals(np.sqrt(best.squares[..., 0]))[0] > MOST_WRONG:
         return "no outliers"
     return {"loss": "cauchy"}
 
@@ -343,23 +367,27 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
     """The prior of faces supplies depths that a table does not determine."""
     layout, K = rows.face_layout, best.model.n_components
+    layout = layout or getattr(layout_of(best.model), "name", None)
+    if layout not in choices.FACE_PRIORS:
+        return "no layout of faces"
     if best.determined:
         return "the depth is known"
     if best.model.camera != "weak_perspective":
         return f"not with {best.model.camera} cameras"
-    layout = layout or getattr(layout_of(best.model), "name", None)
-    if layout not in choices.FACE_PRIORS:
-        return "no layout of faces"
     prior = load_face_prior(FACE_COMPONENTS if K == AUTO else K, layout=layout)
     return {"prior": prior, "n_components": AUTO}
 
 
 def _consensus(best: _Fit, rows: _Rows) -> Proposal:
-    """Groups of points determine depths that all points together do not."""
-    if best.determined:
-        return "the depth is known"
+    """Groups of points determine depths that all points together do not.
+
+    They explain objects whose parts turn by themselves better.
+    """
     if best.model.camera == "affine" or rows.weights:
         return "not with affine cameras or weights"
+    known = best.model.prior or best.model.camera == "perspective"
+    if best.determined and (known or rows.own_rotations(best.model) < OWN_ROTATIONS):
+        return "the depth is known"
     return {"refinement": "consensus"}
 
 
@@ -369,7 +397,7 @@ def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
     if model.camera != "weak_perspective" or model.prior or not best.determined:
         return "scales not known"
     if model.refinement != "joint":
-        return "the depth needs groups"
+        return "the fit has groups"
     if model.scales_.std() > EQUAL_SCALES * model.scales_.mean():
         return "scales differ"
     return {"camera": "orthographic"}
@@ -384,18 +412,15 @@ def _affine(best: _Fit, rows: _Rows) -> Proposal:
     return {"camera": "affine", "refinement": "joint"} | plain
 
 
-# What is tried, in this order: the parameter that changes, words, the proposal, and the
-# largest error, relative to that of the best fit, with which it is used.
-PROPOSALS: tuple[tuple[str, str, Callable[..., Proposal], float], ...] = (
-    ("loss", "robust loss", _robust_loss, LOWER),
-    ("camera", "perspective", _perspective, LOWER),
-    ("prior", "face prior", _face_prior, np.inf),
-    ("refinement", "consensus", _consensus, LARGER),
-    ("camera", "orthographic", _orthographic, LOWER),
-    ("camera", "affine", _affine, LOWER),
+# What is tried, in this order: the parameter that changes, words, and the proposal.
+PROPOSALS: tuple[tuple[str, str, Callable[..., Proposal]], ...] = (
+    ("loss", "robust loss", _robust_loss),
+    ("camera", "perspective", _perspective),
+    ("prior", "face prior", _face_prior),
+    ("camera", "affine", _affine),
+    ("camera", "orthographic", _orthographic),
+    ("refinement", "consensus", _consensus),
 )
-# Fits with other ones of these are for depths, which they must determine.
-FOR_DEPTH = ("prior", "refinement")
 
 
 def decided(
@@ -417,43 +442,65 @@ def decided(
     Returns the fit that is kept, with warnings, and what was tried.
     """
 
-    def fitted(model: AffineNRSfM, setting: str, robust: bool) -> _Fit:
-        since = time.perf_counter()
+    def fitted(model: AffineNRSfM, setting: str, first: _Fit | None = None) -> _Fit:
+        since = time.perf_counter() - (first.trial.seconds if first else 0.0)
         with warnings.catch_warnings(record=True, action="always") as caught:
             if not hasattr(model, "_model"):
                 model.fit(X, groups=groups, **weights)
-        seconds, error = time.perf_counter() - since, rows.error(model, robust)
+        seconds = time.perf_counter() - since
+        squares = first.squares if first else rows.squares(model)
+        error = unexplained_share(squares, robust or model.loss != "linear")
         depth = float(getattr(model, "depth_uncertainty_", np.nan))
         trial = Trial(setting, error, depth, seconds, "used")
-        return _Fit(model, trial, caught, error)
+        return _Fit(model, trial, caught, squares)
 
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    setting = f"{estimator.camera.replace('_p', ' p')} cameras"
-    best, robust = fitted(estimator, setting, False), False
-    trials, used = [best.trial], 0
-    for name, setting, proposal, share in PROPOSALS:
+    robust, used, estimator._known = False, 0, {}
+    best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras")
+    trials = [best.trial]
+    for name, setting, proposal in PROPOSALS:
         if name not in free:
             continue
-        changes, found = proposal(best, rows), None
+        changes = proposal(best, rows)
         if not isinstance(changes, str):
             show(setting)
             if name == "loss":  # outliers have no influence on medians
-                best, robust = best._replace(error=rows.error(best.model, True)), True
+                robust, median = True, unexplained_share(best.squares, True)
+                trials[used] = best.trial._replace(held_out_error=median)
+                best = best._replace(trial=trials[used])
             try:
                 model = clone(best.model).set_params(**changes)
-                if model.camera == "perspective":
-                    model.__dict__["_weak"] = best.model._model
-                found = fitted(model, setting, robust)
+                if name == "refinement":
+                    model._known = best.model._known
+                elif model.camera == "perspective":
+                    model._known = {"weak": best.model._model}
+                elif name not in FOR_DEPTH:
+                    model._known, model._errors = {}, False
+                if model.camera == "orthographic":
+                    model._start = best.model._model
+                found = fitted(model, setting)
             except ValueError as error:  # such as points that too few frames show
                 changes = str(error)
-        if found is None:
-            trials.append(Trial(setting, np.nan, np.nan, 0.0, str(changes)))
+        if isinstance(changes, str):
+            trials.append(Trial(setting, np.nan, np.nan, 0.0, changes))
             continue
+        _, off, depth, *_ = found.trial
+        if name == "camera":
+            better = found.clearly_better(best, robust)
+        else:
+            better = not off > MOST_ERROR[name] * best.trial.held_out_error
+        if name in FOR_DEPTH:
+            better &= depth < best.trial.depth_uncertainty
+        if better and not found.model._errors:
+            model = clone(found.model)
+            model._known = found.model._known
+            found = fitted(model, setting, found)
+            if model.camera == "orthographic":  # compared with affine ones before
+                model.camera_noise_ratio_ = best.model.camera_noise_ratio_
         trials.append(found.trial)
-        better = np.isinf(share) or found.error < share * best.error
-        if better and (found.determined or name not in FOR_DEPTH):
+        if better:
             trials[used] = trials[used]._replace(result="less good")
             best, used = found, len(trials) - 1
         else:
@@ -463,5 +510,7 @@ def decided(
         model.set_params(n_components=model.n_components_)
     for each in best.caught:  # made before the comparison
         warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
+    for name in ("_known", "_start", "_errors"):
+        model.__dict__.pop(name, None)
     model._trials = trials
     return model, trials

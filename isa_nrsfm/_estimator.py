@@ -391,6 +391,9 @@ default="affine"
     _frame_sizes: NDArray
     _limits: ClassVar[Limits] = LIMITS  # others: `limited`
     _whole: ClassVar[bool] = True  # whether joint fits have all directions of a shape
+    _start: TableModel | None = None  # from which a fit starts
+    _known: dict[str, Any] | None = None  # results of the joint fit, kept or reused
+    _errors = True  # whether fits have errors of depths, and warn
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
@@ -520,7 +523,7 @@ default="affine"
         self._forget()
         with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
             progress = FitProgress(self, stages_of(self), stepwise=STEPWISE, X=X, y=y)
-            self._fit(X, point_weight, progress, keep=keep, errors=True, groups=groups)
+            self._fit(X, point_weight, progress, keep=keep, groups=groups)
         progress.end()
         return self
 
@@ -555,12 +558,11 @@ default="affine"
         point_weight: Any,
         progress: FitProgress | NoProgress,
         *,
-        start: TableModel | None = None,
         keep: Keep = dict,
-        errors: bool = False,
         groups: Any = None,
     ) -> None:
-        """Fit a table, from a start if given; `errors`: with those of the depths."""
+        """Fit a table."""
+        start, errors = self._start, self._errors
         source, weights, settings = self._ready(X, point_weight)
         if groups is not None:
             settings = settings._replace(groups=group_numbers(groups, source.n_frames))
@@ -574,7 +576,7 @@ default="affine"
         if self.camera == "perspective":
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
-            weak = self.__dict__.pop("_weak", None)  # of `decided`
+            weak = self._known.get("weak") if self._known else None
             options = start, errors, self.remove_pose, weak
             fit = fit_perspective(images, number, f, *options)
         else:
@@ -584,8 +586,9 @@ default="affine"
                 n_components = supported_components(table, isa, settings, progress)
             number = 1 if n_components == "auto" else n_components
             table = scaled_table(source, weights, number, settings)
-            of_table = start, auto, errors, self.remove_pose
-            fit = fit_table(table, number, isa, settings, progress, *of_table)
+            of_table = progress, start, auto, errors, self.remove_pose
+            args = table, number, isa, settings, *of_table
+            fit = fit_table(*args, known=self._known)
         model, frames, converged, fitted = fit
         if point is not None and model.pinhole is None:
             f = np.array(np.inf if f is None else f, dtype=float)[()]

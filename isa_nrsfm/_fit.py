@@ -93,7 +93,7 @@ STEPWISE = JOINT_STAGE, CONSENSUS_STAGE, PERSPECTIVE_STAGE
 def stages_of(estimator: Any) -> list[str]:
     """Return the names of the stages of a fit, in order."""
     stages = ["table", "factorisation"]
-    if estimator.prior is None:
+    if estimator.prior is None and estimator._start is None:
         if estimator.n_components == "auto" and estimator.camera == "affine":
             stages.insert(0, "number of basis shapes")
         stages += ["independent subspaces", "block structure and refinement"]
@@ -117,6 +117,7 @@ def fit_table(
     errors: bool = False,
     remove_pose: bool = False,
     placed: Decomposition | None = None,
+    known: dict[str, Any] | None = None,
 ) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
@@ -125,7 +126,8 @@ def fit_table(
     determines, or with affine cameras falls until all directions of the coefficients
     are reliable. `errors`: estimate the errors of the depths. `remove_pose`: report the
     directions of the part of the coefficients that the pose does not predict. `placed`:
-    frames of the table in the model of the start.
+    frames of the table in the model of the start. `known`: the joint fit and the errors
+    of its depths, of another fit that has the same; those that it lacks are added.
 
     Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
     without visible points; convergence; and the other attributes of `AffineNRSfM`.
@@ -160,7 +162,8 @@ def fit_table(
     # 5. Refinement, gauge and frames
     if settings.joint:
         settings = settings._replace(on_step=progress.step)
-        fit, tracks, alpha = fit_jointly(factorised, shapes, settings, given)
+        args = factorised, shapes, settings, given
+        fit, tracks, alpha = _remembered(known, "joint", fit_jointly, *args)
         (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
         settings = settings._replace(shape_prior=fit.prior)
         gauge = FrameMap.identity(len(shapes) - 1)
@@ -183,14 +186,15 @@ def fit_table(
                 n_unknowns = widths.n_unknowns(len(table.sizes), camera)
                 noise *= n_numbers / (n_numbers - n_unknowns)
             grouped = fit.misfit > noise
+        if (needed := errors and camera != "affine") and (
+            not grouped or (known and "certainty" in known)
+        ):
+            of = model, table.rows, table.weights, settings, widths, fit.rivals
+            certainty = _remembered(known, "certainty", depth_certainty, *of)
+            model, needed = replace(model, certainty=certainty), False
         if grouped:
-            model, widths = consensus(model, table, settings, errors, fit), None
+            model, widths = consensus(model, table, settings, needed, fit), None
             tracks = JointFrames.from_points(table.rows, table.complete)
-        elif errors and camera != "affine":
-            certainty = depth_certainty(
-                model, table.rows, table.weights, settings, widths, fit.rivals
-            )
-            model = replace(model, certainty=certainty)
         if settings.refinement == "consensus":
             progress(CONSENSUS_STAGE)
         if errors and settings.loss == "linear" and table.weights is None:
@@ -217,8 +221,8 @@ def fit_table(
         supported = max(n_reliable(measures["reliability_"]), 1)
         if free and not whole and supported < n_components:
             progress("gauge and coefficients")
-            known = NoProgress(), start, free, errors, remove_pose, placed
-            return fit_table(table, supported, isa, settings, *known)
+            same = NoProgress(), start, free, errors, remove_pose, placed
+            return fit_table(table, supported, isa, settings, *same)
     else:
         fitted, frames, measures = _paper_frames(
             table, factorised.factors, shapes, covariance, settings
@@ -302,6 +306,17 @@ def _factorised(
     return FactorisedTable(table, compressed, outliers, values, rest, W, parts, factors)
 
 
+def _remembered(
+    known: dict[str, Any] | None, name: str, function: Callable[..., Any], *args: Any
+) -> Any:
+    """Return a known result, or that of a function, which is known from now on."""
+    if known is None:
+        return function(*args)
+    if name not in known:
+        known[name] = function(*args)
+    return known[name]
+
+
 def _started(
     table: ScaledTable, model: TableModel, n_components: int, placed: Any = None
 ) -> JointState:
@@ -310,7 +325,9 @@ def _started(
     It has the cameras of frames that are placed, otherwise none. Basis shapes that the
     model lacks are directions of the residuals of at most 200 frames.
     """
-    frames, unit = model.frames, (model.unit or 1.0) / (table.unit or 1.0)
+    frames, (own, other) = model.frames, (model.unit, table.unit)
+    # Frames have size one, unless all have one scale.
+    unit = own / other if own and other else 1.0
     assert isinstance(frames, PosteriorFrames)
     n_more = max(n_components + 1 - len(frames.shapes), 0)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance

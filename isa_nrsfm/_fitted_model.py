@@ -435,9 +435,7 @@ class TableModel(NamedTuple):
         """Return the sums (1, 2) of squared errors and signals of held-out points."""
         return np.nansum(self.held_out(*rows_and_weights), axis=(0, 1))[None]
 
-    def held_out_error(
-        self, table: FrameBlocks, *weights: NDArray, robust: bool = False
-    ) -> float:
+    def held_out_error(self, table: FrameBlocks, *weights: NDArray) -> float:
         """Return the share of the energy of held-out points that is not explained.
 
         Of at most `MOST_ROWS` rows. Of robust fits it is that of the median point, with
@@ -445,12 +443,7 @@ class TableModel(NamedTuple):
         """
         some = spread(np.arange(table.n_frames), MOST_ROWS)
         squares = self.held_out(table.take(some), *(w[some] for w in weights))
-        error, signal = np.moveaxis(squares, 2, 0)
-        if np.isnan(error).all():
-            return np.nan
-        if robust or self.frames.loss != "linear":
-            return float(np.nanmedian(error) / (2 * np.log(2)))  # frames have size one
-        return float(np.nansum(error) / np.nansum(signal))
+        return unexplained_share(squares, self.frames.loss != "linear")
 
     def _ready(
         self, rows: NDArray, weights: NDArray | None = None
@@ -469,6 +462,16 @@ class TableModel(NamedTuple):
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes, weights
+
+
+def unexplained_share(squares: NDArray, robust: bool) -> float:
+    """Return `held_out_error` of squared errors and signals (n, J, 2)."""
+    error, signal = np.moveaxis(squares, 2, 0)
+    if np.isnan(error).all():
+        return np.nan
+    if robust:
+        return float(np.nanmedian(error) / (2 * np.log(2)))  # frames have size one
+    return float(np.nansum(error) / np.nansum(signal))
 
 
 def frames_of(estimator: Any) -> Any:

@@ -36,7 +36,6 @@ from isa_nrsfm._compat.scikit_learn import (
     with_numpy_defaults,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._joint.settings import JOINT_TOL
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.scaling import scaled_table
@@ -53,8 +52,7 @@ NO_SHAPE = (
 class StartedNRSfM(AffineNRSfM):
     """A fit that starts from another one, without warnings and errors of depths."""
 
-    start: TableModel | None = None
-    _whole = False  # held-out points compare numbers of basis shapes
+    _whole = _errors = False  # held-out points compare numbers of basis shapes
 
     def __sklearn_clone__(self) -> Self:
         """Return a copy with the same start."""
@@ -65,7 +63,7 @@ class StartedNRSfM(AffineNRSfM):
     ) -> Self:
         """Fit a table, and remember whether the fit has not converged."""
         with warnings.catch_warnings(record=True, action="always") as caught:
-            self._fit(X, point_weight, NoProgress(), start=self.start)
+            self._fit(X, point_weight, NoProgress())
         self.unconverged = ConvergenceWarning in [each.category for each in caught]
         return self
 
@@ -311,7 +309,7 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
             since = time.perf_counter()
             if joint:
                 whole.set_params(n_components=k).fit(X)
-                whole.start = trial.start = whole._model
+                whole._start = trial._start = whole._model
             seconds = joint * (time.perf_counter() - since)
             trial.set_params(n_components=k)
             part = cross_validate(trial, X, y, n_jobs=self.n_jobs, **validation)

@@ -253,7 +253,7 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     assert found.err == ""
     assert all(len(line) <= 120 for line in out.splitlines())
     page = unescape((tmp_path / "report.html").read_text(encoding="utf-8"))
-    assert f"{camera.replace('_', '-')}: shapes are known up to " in page
+    assert f"tried    {camera.replace('_p', ' p')} cameras: " in out
     assert ("perspective: held-out points do not show it" in " ".join(out.split())) == (
         camera == "weak_perspective"
     )

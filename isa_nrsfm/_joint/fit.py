@@ -97,15 +97,17 @@ def fit_jointly(
     whole = first.cameras.calibrated and settings.whole and settings.prior is None
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is not None:
-        shapes = first.frames.coordinates(start.shapes)
-        motion = start.motion[table.parts[0]] if table.parts else start.motion
-        start = start._replace(shapes=shapes, motion=motion)
-        if not len(motion):
+        start = start._replace(shapes=first.frames.coordinates(start.shapes))
+        if not len(start.motion):
             start = first.aligned(start, first.cameras)
+        elif table.parts:
+            start = start._replace(motion=start.motion[table.parts[0]])
         if settings.prior is None:  # a fit without the prior has larger basis shapes
             start = with_prior(first, start)
-        # The widths of a prior change its first fit.
-        rough = {} if settings.prior is None else {"tol": settings.tol / TOL_SHARE}
+        # The widths of a prior change its first fit. All directions have another one.
+        rough: dict[str, Any] = {"max_iter": 0} if whole else {}
+        if settings.prior is not None:
+            rough = {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, first.cameras, **rough)
     elif whole:
         fit = _likeliest_fit(first, table, paper_shapes)

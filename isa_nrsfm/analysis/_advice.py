@@ -162,7 +162,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         yield (
             f"the table does not support n_components={n_components}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
-            'probably noise. n_components="auto" leaves them out'
+            f"probably noise{facts.compare}"
         )
     elif facts.camera == "affine" and facts.deviation > LARGEST_DEVIATION:
         yield (
@@ -262,16 +262,11 @@ def camera_meaning(ratio: float) -> str:
     """Return the meaning of `camera_noise_ratio_`, in a sentence."""
     if np.isnan(ratio):
         return "not known: it was not measured"
+    stretched = "the images were stretched, or there are far too few basis shapes"
+    what = f"the cameras are probably not calibrated: {stretched}"
+    if ratio < OTHER_CAMERAS:
+        reasons = "too few basis shapes, perspective, or slightly stretched images"
+        what = f"affine cameras explain more than calibrated ones, because of {reasons}"
     if ratio < SAME_NOISE:
         what = "calibrated cameras explain the table as well as affine ones"
-    elif ratio < OTHER_CAMERAS:
-        what = (
-            "affine cameras explain more than calibrated ones: possible reasons are "
-            "too few basis shapes, perspective, or slightly stretched images"
-        )
-    else:
-        what = (
-            "the cameras are probably not calibrated: the images were stretched, or "
-            "there are far too few basis shapes"
-        )
     return f"{what} (noise variance {ratio:#.3g} times that of affine cameras)"

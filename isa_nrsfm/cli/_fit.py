@@ -109,11 +109,11 @@ def fit_table(
         )
     figures = {} if args.no_figures else figures_of(frames)
     drawn = drawing(args, frames.columns.points, frames.skeleton)
-    results, inputs = _outputs.RESULTS, drawing_files(args)
+    results, inputs = dict.fromkeys(_outputs.RESULTS, ""), drawing_files(args)
     if table is None:
         inputs.append(args.table)
     else:
-        results = results | {Path(args.table).name: "the table"}
+        results[Path(args.table).name] = ""
     if prior not in (None, NONE, *FACE_PRIORS):
         inputs.append(prior)
     with whole_files.folder_for_writing(folder):

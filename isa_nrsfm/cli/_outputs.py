@@ -25,17 +25,9 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 
 PAGE = "report.html"
 REPORT = "report.json"
-# The files of every fit and their contents; docs/command_line.md has their columns.
-RESULTS = {
-    PAGE: "this report with its figures, for any browser",
-    "model.npz": "the fitted model, for isa-nrsfm transform",
-    "alpha.csv": "row of the table, its other columns, the coefficients of each frame",
-    "cameras.csv": "row of the table, camera of each frame: the image of (X, Y, Z) is "
-    "x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; angles in degrees",
-    "shapes.csv": "mean shape and basis shapes, a row for each point",
-    "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays",
-    "viewer.html": "the shapes and the frames in 3D, for any browser",
-}
+# The files of every fit; docs/command_line.md has their contents.
+_DATA = "model.npz alpha.csv cameras.csv shapes.csv shapes.npz viewer.html"
+RESULTS = (PAGE, *_DATA.split())
 
 
 class Fit(NamedTuple):

@@ -71,17 +71,16 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
 
     estimator, frames, edges = fit.estimator, fit.frames, fit.drawn["edges"]
     X, alpha = frames.X, estimator.alpha_
-    square, missing = (fit.explained - X.to_numpy()) ** 2, X.isna().any(axis=None)
-    mean_of = np.nanmean if missing else np.mean  # which takes no copy
-    errors = np.sqrt(2 * mean_of(square, axis=1))
+    square = (fit.explained - X.to_numpy()) ** 2
+    errors, typical = np.sqrt(2 * np.nanmean(square, axis=1)), np.nanmean(square)
+    if estimator.loss != "linear":  # of the median point
+        typical = np.nanmedian(square[:, ::2] + square[:, 1::2]) / np.log(4)
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
-    certainty = frames_of(estimator).certainty
     _, layout, lines, _ = view_and_layout(estimator, edges)
-    n_edges = 0 if lines is None else len(lines.edges)
-    for message in () if found is None else found.messages:
+    for message in getattr(found, "messages", ()):
         warn_caller(message)
     error = found.held_out_error if found else -estimator.score(X, **frames.weighting)
-    quality = quality_report(error, mean_of(square), bool(frames.weighting))
+    known = ("effective_frames", "pose_share", "pose_removed")
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),
@@ -90,48 +89,41 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
             "row_of_min": X.index[alpha.argmin(axis=0)],
             "max": alpha.max(axis=0),
             "row_of_max": X.index[alpha.argmax(axis=0)],
-            "effective_frames": None if found is None else found.effective_frames,
-            "pose_share": None if found is None else found.pose_share,
-            "pose_removed": None if found is None else found.pose_removed,
             "stability": getattr(estimator, "stability_", None),
-            "stability_word": None if found is None else found.stability,
+            "stability_word": getattr(found, "stability", None),
+            **{name: getattr(found, name, None) for name in known},
         }
     )
+    outliers = None
+    if found is not None:
+        names, worst = names_of_points(estimator), found.outliers[:MOST_LISTED]
+        largest = [{"row": X.index[i], "point": names[j]} for i, j in worst]
+        outliers = {"share": found.outlier_share, "largest": largest}
+        outliers["n_points"] = len(found.outliers)
     return {
         "n_components": alpha.shape[1],
-        "depth": "" if found is None else found.depth,
+        "depth": getattr(found, "depth", ""),
         "inverse_snr": estimator.inverse_snr_,
-        **quality,
+        **quality_report(error, typical, bool(frames.weighting)),
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "noise_variance": getattr(estimator, "noise_variance_", None),
         "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
-        "camera_meaning": None if np.isnan(ratio) else camera_meaning(ratio),
+        "camera_meaning": camera_meaning(ratio),
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "mirror_certainty": estimator.mirror_certainty_,
         "mirror_decided_by_perspective": sees_perspective(estimator),
         "focal_length": getattr(estimator, "focal_length_", None),
         "focal_length_std": getattr(estimator, "focal_length_std_", None),
         "principal_point": estimator.principal_point,
-        "depth_determined": certainty.determined and estimator.camera_ != "affine",
+        "depth_determined": estimator.camera_ != "affine"
+        and frames_of(estimator).certainty.determined,
         "skeleton": None if layout is None else layout.name,
-        # None if no lines are wanted.
-        "n_edges": None if edges is None else n_edges,
-        "spanning_tree": lines is not None and lines.name == SPANNING_TREE,
-        "outliers": None if found is None else _outliers(found, estimator, X),
+        # Also if no lines are wanted.
+        "lines_known": edges is None
+        or getattr(lines, "name", SPANNING_TREE) != SPANNING_TREE,
+        "outliers": outliers,
         "parameters": estimator.get_params(deep=True),
         "alpha": coefficients.to_dict("records"),
-    }
-
-
-def _outliers(found: Diagnostics, model: Any, X: Any) -> dict[str, Any]:
-    """Describe the gross residuals of a table, by its rows and names of points."""
-    names = names_of_points(model)
-    largest = found.outliers[:MOST_LISTED]
-    return {
-        "share": found.outlier_share,
-        "n_points": len(found.outliers),
-        "n_frames": len(np.unique(found.outliers[:, 0])),
-        "largest": [{"row": X.index[i], "point": names[j]} for i, j in largest],
     }

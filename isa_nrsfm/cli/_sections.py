@@ -27,33 +27,16 @@ from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.io._formats import TABLE
 
-_CAMERAS = {
-    "affine": "affine: shapes are known up to an affine transformation of space. "
-    "Angles and proportions need --camera weak_perspective.",
-    "weak_perspective": "weak-perspective: shapes are known up to size and a mirror "
-    "image in depth",
-    "orthographic": "orthographic: shapes are known up to a mirror image in depth, in "
-    "the units of the table",
-    "perspective": "perspective: shapes are known up to size",
-}
-
-_DATA = {REPORT: "the numbers of this report, for programs"}
 # Coefficients in the summary, at most; its texts in lines, without a break in paths.
 MOST_SHOWN = 5
 WRAPPED = textwrap.TextWrapper(80, break_on_hyphens=False, break_long_words=False)
 
 
 class Cells(NamedTuple):
-    """A table: titles of the columns if they have any, rows, and a title."""
+    """A table: titles of the columns if they have any, and rows."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
-    title: str = ""
-
-    @property
-    def lines(self) -> Sequence[Sequence[str]]:
-        """The rows, after the head if there is one."""
-        return [self.head, *self.rows] if self.head else self.rows
 
     @property
     def numbers(self) -> list[bool]:
@@ -69,9 +52,8 @@ Section = Sequence[str | Cells]
 
 def fit_title(report: dict[str, Any]) -> str:
     """Return the title of the report of a fit."""
-    table, n, layout = report["table"], len(report["model"]["alpha"]), ""
-    if report["model"]["skeleton"] is not None:
-        layout = f" ({report['model']['skeleton']})"
+    table, n = report["table"], len(report["model"]["alpha"])
+    layout = f" ({name})" if (name := report["model"]["skeleton"]) else ""
     rows = f"{table['n_frames']} frames of {table['n_points']} points{layout}"
     return f"{n} movement{'s' * (n != 1)} in {rows}"
 
@@ -100,13 +82,10 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
     if "time" in report:
         rows.append(["time", "", str(_time(report["time"])[0])])
     tried = [each["text"] for each in report["tried"] if each["seconds"]]
-    others: dict[str, list[str]] = {}
-    for each in report["tried"]:
-        if not each["seconds"]:
-            others.setdefault(each["result"], []).append(each["setting"])
+    others = [each for each in report["tried"] if not each["seconds"]]
     if "choice" in report:
         tried.insert(0, _choice(report["choice"]))
-    listed = "; ".join(f"{', '.join(them)} ({why})" for why, them in others.items())
+    listed = "; ".join(f"{each['setting']} ({each['result']})" for each in others)
     tried += [f"not tried: {listed}"] * bool(others)
     rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
     rows.append(left_out_row(table))
@@ -148,37 +127,33 @@ def _answer(label: dict[str, Any]) -> str:
 
 def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     """Return the sections of the report of a fit, answers first, without the files."""
-    model = report["model"]
-    sections: dict[str, Section] = {}
-    if "labels" in report:
-        labels = [_label(label) for label in report["labels"]]
-        sections["Labels"] = [part for parts in labels for part in parts]
-    if "groups" in report:
-        sections["Groups"] = _groups(report["groups"])
-    if "time" in report:
-        sections["Time"] = _time(report["time"])
-    sections["Alpha"] = _alpha(model)
-    sections["Fit"] = _fit(report)
-    return sections | {"Table": table_section(report["table"])}
+    labels = map(_label, report.get("labels", ()))
+    return {
+        "Labels": [part for parts in labels for part in parts],
+        "Groups": _groups(report["groups"]) if "groups" in report else (),
+        "Time": _time(report["time"]) if "time" in report else (),
+        "Alpha": _alpha(report["model"]),
+        "Fit": _fit(report),
+        "Table": table_section(report["table"]),
+    }
 
 
 def table_section(table: dict[str, Any]) -> Section:
     """Return the rows and columns of a table that are used, and the others."""
     format, out = table["format"], left_out_row(table)[2]
     listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
-    parts: list[str | Cells] = [
+    unused = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
+    others = {"coordinates not used": unused, "other columns": table["other_columns"]}
+    return [
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
         f"{table['n_frames']} of {table['n_rows']} rows; left out: {out}",
+        *(
+            f"{what}: {first_items(map(str, names), MOST_LISTED)}"
+            for what, names in others.items()
+            if names
+        ),
     ]
-    others = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
-    for what, names in (
-        ("coordinates not used", others),
-        ("other columns", table.get("other_columns")),
-    ):
-        if names:
-            parts.append(f"{what}: {first_items(map(str, names), MOST_LISTED)}")
-    return parts
 
 
 def quality_row(quality: dict[str, Any]) -> list[str]:
@@ -247,7 +222,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
     sections = fit_sections(report)
     for name in ("Labels", "Groups", "Time", "Alpha"):
-        parts += _markup(name, sections.pop(name, ()))
+        parts += _markup(name, sections.pop(name))
     for name, content in report["files"].items():
         if name.endswith(".png"):
             image = base64.b64encode((folder / name).read_bytes()).decode()
@@ -259,7 +234,6 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
     found = report["versions"].items()
     sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
-    sections["Files"] = [Cells([], [*(report["files"] | _DATA).items()])]
     for name, section in sections.items():
         parts += _markup(name, section)
     page = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
@@ -274,14 +248,12 @@ def _markup(name: str, parts: Section) -> list[str]:
         if isinstance(part, str):
             found.append(f"<p>{escape(part)}</p>")
             continue
-        if part.title:
-            found.append(f"<h3>{escape(part.title)}</h3>")
         found.append('<div class="wide"><table>')
-        for i, row in enumerate(part.lines):
-            tag = "th" if part.head and not i else "td"
+        for row in [part.head, *part.rows][not part.head :]:
+            tag = "th" if row is part.head else "td"
             cells = (
                 f"<{tag}{' class=number' * is_number}>{escape(cell)}</{tag}>"
-                for cell, is_number in zip(row, part.numbers, strict=True)
+                for cell, is_number in zip(row, part.numbers, strict=False)
             )
             found.append(f"<tr>{''.join(cells)}</tr>")
         found.append("</table></div>")
@@ -291,13 +263,13 @@ def _markup(name: str, parts: Section) -> list[str]:
 def _fit(report: dict[str, Any]) -> Section:
     """Return the numbers of the fit and its cameras, with what they mean."""
     model, table = report["model"], report["table"]
-    worst, camera = model["largest_error"], _CAMERAS[model["camera"]]
     square, mirror = model["noise_variance"], model["mirror_certainty"]
+    worst, known = model["largest_error"], model["depth_determined"]
+    weighted = " Points count by their weights." * model["held_out_error_weighted"]
     parts = [
         f"held-out error {percent(model['held_out_error'])}: energy of the errors of "
         "points that are predicted from the other points of their frame, relative to "
-        "that of the centred points."
-        + " Points count by their weights." * model["held_out_error_weighted"]
+        f"that of the centred points.{weighted}"
         + " It is that of the median point, as outliers have less weight."
         * (model["parameters"]["loss"] != "linear"),
         f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}",
@@ -315,24 +287,21 @@ def _fit(report: dict[str, Any]) -> Section:
             " Coefficients are those of the prior, so that studies with the same prior "
             "can be compared."
         )
-    if model["skeleton"] is None and (model["n_edges"] == 0 or model["spanning_tree"]):
+    if model["skeleton"] is None and not model["lines_known"]:
         parts.append(
             f"{table['n_points']} points of no known layout: give lines of figures and "
             "viewer with --edges FILE or --skeleton LAYOUT. If they are upside down, "
             "use --origin lower."
         )
-    if model["camera"] != "affine" and not model["depth_determined"]:
-        camera = f"{camera.partition(':')[0]}: the depth is not determined. cameras.csv"
-        camera += " has no angles, and proportions in viewer.html are not true."
-    elif mirror and math.isfinite(mirror):
+    if known and mirror and math.isfinite(mirror):
         which = "missing points are farther away"
         if model["mirror_decided_by_perspective"]:
             which = "perspective fits"
         elif model["parameters"]["prior"] is not None:
             which = "the prior is alike"
         parts.append(f"mirror image in depth: the one for which {which}")
-    parts += [camera, *_perspective(model, report.get("position_unit"))]
-    if model["depth_determined"] and model["camera_meaning"]:
+    parts += _perspective(model, report.get("position_unit"))
+    if known and not np.isnan(model["camera_noise_ratio"]):
         parts.append(_sentence(model["camera_meaning"]))
     return parts
 
@@ -344,17 +313,14 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
         return []
     if not math.isfinite(focal):
         return ["no perspective: the focal length is too long to estimate it"]
-    shown, length = "given", "in units of the shapes"
+    (x, y), shown, length = model["principal_point"], "given", "units of the shapes"
     if model["parameters"]["focal_length"] is None:
         shown = f"estimated, standard deviation {model['focal_length_std']:.2g}"
-    x, y = model["principal_point"]
     if unit is not None:
         a, b = unit["points"]
         length = f"points {a} and {b} of the mean shape are {unit['length']:g} apart"
-    return [
-        f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})",
-        f"positions in cameras.csv: {length}",
-    ]
+    focal = f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})"
+    return [focal, f"positions in cameras.csv: {length}"]
 
 
 def _alpha(model: dict[str, Any]) -> Section:
@@ -405,10 +371,9 @@ def _label(label: dict[str, Any]) -> Section:
     title = f"{label['column']}: {label['n_frames']} frames"
     if "classes" in label:
         title += f" of {len(label['classes'])} classes"
-    if label["n_copies"]:
-        title += f"; {label['n_copies']} copies of other frames count once with them"
-    if label["n_without_label"]:
-        title += f"; {label['n_without_label']} without a label left out"
+    copies = "copies of other frames count once with them"
+    counts = {"n_copies": copies, "n_without_label": "without a label left out"}
+    title += "".join(f"; {label[n]} {what}" for n, what in counts.items() if label[n])
     names = names_of_components(None, len(label["values"]))
     statistic, meaning = STATISTICS[label["kind"]]
     columns = {"": names, statistic: [f"{value:z.2f}" for value in label["values"]]}
@@ -416,17 +381,15 @@ def _label(label: dict[str, Any]) -> Section:
     if label["corrected"] is not None:
         columns["corrected"] = [f"{value:z.2f}" for value in label["corrected"]]
         meaning += "; corrected: without the errors of the coefficients"
-    test = "no p-values"
-    means: list[str] = []
+    test, means = "no p-values", "class_means" in label and not label["untested"]
     if not label["untested"]:
         test = f"corrected p-values: permutations of {label['permuted']}"
-        if "class_means" in label and np.less(label["p_values"], 0.05).any():
-            means = _class_means(label, names)
     return [
         _answer(label),
-        Cells([*columns], [*zip(*columns.values(), strict=True)], title),
+        title,
+        Cells([*columns], [*zip(*columns.values(), strict=True)]),
         f"{statistic}: {meaning}; {test}",
-        *means,
+        *(_class_means(label, names) if means else ()),
         _score(label),
     ]
 
@@ -435,35 +398,34 @@ def _score(label: dict[str, Any]) -> str:
     """Return how well coefficients predict a label, compared with PCA."""
     if "not_cross_validated" in label:
         return f"not cross-validated: {label['not_cross_validated']}"
-    classes = label["score"] == "accuracy"
+    classes, names = label["score"] == "accuracy", ("", "_standard_error")
 
     def shown(name: str) -> str:
-        score, error = (label[name + each] for each in ("", "_standard_error"))
-        if classes:
-            return f"{100 * score:.1f} +- {100 * error:.1f} %"
-        return f"{score:.2f} +- {error:.2f}"
+        score, error = ((1, 100)[classes] * label[name + each] for each in names)
+        return f"{score:.{2 - classes}f} +- {error:.{2 - classes}f}{' %' * classes}"
 
-    parts = [
-        f"{'accuracy' if classes else 'R^2'} {shown('cross_validated')} (standard error"
-        "); PCA of the aligned frames"
+    others = [
+        f"{shown(name)} ({label[f'{name}_n_features']} components)"
+        for name in ("cross_validated_pca", "cross_validated_pca_of_rank")
     ]
-    for name in ("cross_validated_pca", "cross_validated_pca_of_rank"):
-        parts.append(f"{shown(name)} ({label[f'{name}_n_features']} components)")
     if classes:
-        parts.append(f"largest class {100 * label['largest_class']:.1f} %")
-    return f"cross-validated {parts[0]} {', '.join(parts[1:])}"
+        others.append(f"largest class {100 * label['largest_class']:.1f} %")
+    return (
+        f"cross-validated {('R^2', 'accuracy')[classes]} {shown('cross_validated')} "
+        f"(standard error); PCA of the aligned frames {', '.join(others)}"
+    )
 
 
 def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
     lines = ["mean of each class if p < 0.05, in standard deviations:"]
     means = pd.DataFrame(label["class_means"], names)
+    rest = " (all in report.json)" * (len(means.columns) > MOST_CLASSES)
     for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
-        listed = [f"{each} {mean:+z.1f}" for each, mean in largest.items()]
-        rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
+        listed = (f"{each} {mean:+z.1f}" for each, mean in largest.items())
         lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{rest}.")
-    return lines
+    return lines if len(lines) > 1 else []
 
 
 def _groups(groups: dict[str, Any]) -> Section:
@@ -475,7 +437,7 @@ def _groups(groups: dict[str, Any]) -> Section:
     shares = zip(names, groups["between"], groups["within"], strict=True)
     rows = [[name, f"{100 * a:.1f} %", f"{100 * b:.1f} %"] for name, a, b in shares]
     title = f"{column}: variance between and within {groups['n_groups']} groups"
-    return [Cells(["", "between", "within"], rows, title)]
+    return [title, Cells(["", "between", "within"], rows)]
 
 
 def _time(time: dict[str, Any]) -> Section:
@@ -487,10 +449,10 @@ def _time(time: dict[str, Any]) -> Section:
     if not len(scales):
         return [f"{name}: no dynamics found, coefficients are not smoothed"]
     fading = scales[np.isfinite(scales)]
-    found = []
-    if len(fading):
-        listed = first_items(f"{each:.3g}" for each in fading)
-        found.append(f"changes of the shape fade within {listed} {time['unit']}")
+    listed = first_items(f"{each:.3g}" for each in fading)
+    found = [f"changes of the shape fade within {listed} {time['unit']}"] * (
+        len(fading) > 0
+    )
     if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")
     return [

@@ -312,7 +312,7 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
     way = (
-        f"For a row for each individual, use individuals={listed!r} (command line: "
+        f"For a row for each, use individuals={listed!r} (command line: "
         f"--individuals {shlex.quote(listed)})"
         if n_points >= MIN_POINTS
         else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
