@@ -23,6 +23,7 @@ from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
+    half_reversed,
     lifted_shapes,
     likely_basis,
     mixed_cameras,
@@ -356,6 +357,32 @@ def test_steadied_cameras_turn_about_one_axis_less():
     spread = np.linalg.svd(sight, compute_uv=False)
     assert spread[2] < 1e-12
     assert spread[1] < 0.3 < np.linalg.svd(np.cross(*motion.swapaxes(0, 1)))[1][1]
+
+
+@BOTH
+def test_frames_of_flat_objects_may_be_reversed(camera):
+    """Bent to both sides, each frame has z or -z, with the same probability."""
+    rng, n_frames = np.random.default_rng(0), 30
+    shapes = rng.normal(size=(2, 3, 12)) * [[[1.0], [1.0], [0.0]], [[0], [0], [0.2]]]
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    turns = Rotation.from_rotvec(0.3 * rng.normal(size=(n_frames, 3)))
+    motion, alpha = turns.as_matrix()[:, :2], rng.normal(size=(n_frames, 1))
+    settings = FitSettings(camera=camera)
+    for thickness, expected in ((0.0, 2.0), (0.5, 0.0)):
+        shapes[0, 2] += thickness * rng.permutation(np.repeat([-1.0, 1.0], 6))
+        state = JointState(shapes, motion, 1e-4)
+        rows = motion @ (shapes[0] + alpha[..., None] * shapes[1])
+        blocks = FrameBlocks.of_array(rows, n_frames)
+        problem = JointProblem(JointFrames.from_points(blocks, True), settings)
+        depths = state.depths(problem.likelihood(*state).alpha)
+        error = problem.reversal_error(state, depths)
+        assert_allclose(error, expected, atol=0.02)
+        turned = half_reversed(state, alpha)
+        assert_calibrated(turned, "orthographic")
+        same = np.isclose(turned, motion).all(axis=(1, 2))
+        assert_array_equal(same, alpha[:, 0] >= 0)
+        if not thickness:
+            assert_allclose(turned @ shapes[0], motion @ shapes[0], atol=1e-12)
 
 
 def test_evidence_does_not_know_the_axes_of_the_object():

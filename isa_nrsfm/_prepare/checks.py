@@ -247,7 +247,6 @@ def check_arrangement(
     other = next(name for name in LAYOUTS if name != layout)
     swapped = table_to_rows(X, other)
     rigid = _noise_ratio(given, swapped, scale_frames, 3)
-    least = 0.6 if layout == "planar" else 0.8
     for n in [] if named else [3, 4]:
         if X.shape[1] % n == 0:
             parts = X.reshape(len(X), n, -1)
@@ -255,10 +254,8 @@ def check_arrangement(
                 parts = X.reshape(len(X), -1, n).transpose(0, 2, 1)
             certain = 0.1 if n == 3 else _visibility(parts)
             ratio = _noise_ratio(given, parts[:, :2], scale_frames, 3)
-            # Points of three numbers leave 0.004 to 0.6 of the energy of two; if there
-            # are two, 2.4 times as much (planar: 0.014 to 0.37, with a visibility to
-            # 1.3, and 0.77): docs/benchmarks/README.md, "Thresholds".
-            if certain > 0.5 or (certain > 0.05 and ratio < min(least, rigid)):
+            # docs/benchmarks/README.md, "Thresholds"
+            if certain > 0.5 or (certain > 0.05 and ratio < min(0.65, rigid)):
                 raise ValueError(
                     f"X seems to have {n} numbers for each point (x, y, z, or a "
                     f"visibility); x and y are needed. Give {two_of(n, layout)}"
@@ -276,13 +273,16 @@ def check_arrangement(
 def _visibility(parts: NDArray) -> float:
     """Return how certainly the fourth of four numbers (I, 4, J) are visibilities.
 
-    They are from 0 to 1: the share of the others that are not; 1 if they are all equal.
+    They are from 0 to 1, some above 0.5: the share of the others that are not. 1 if
+    all are equal.
     """
     others, fourth = parts[:, :3], parts[:, 3]
     if not (np.isnan(fourth) | ((fourth >= 0) & (fourth <= 1))).all():
         return 0.0
-    is_constant = np.nanmin(fourth) == np.nanmax(fourth)
-    return 1.0 if is_constant else float(np.mean((others < 0) | (others > 1)))
+    least, largest = np.nanmin(fourth), np.nanmax(fourth)
+    if least < largest < 0.5:  # y of points in a row
+        return 0.0
+    return 1.0 if least == largest else float(np.mean((others < 0) | (others > 1)))
 
 
 def _noise_ratio(
@@ -318,7 +318,8 @@ def _residual(rows: NDArray, rank: int) -> float:
     if np.isfinite(rows).all():
         W = rows.reshape(-1, rows.shape[2])
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
-        return max(float(energy[:-rank].sum()), 0.0) / W.size
+        left = 1.0 - rank / (W.shape[1] - 1)  # of the dimensions
+        return max(float(energy[:-rank].sum()), 0.0) / W.size / left
     return completion_model(rows, rank=rank)[1]
 
 
