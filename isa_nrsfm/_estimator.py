@@ -576,8 +576,7 @@ default="affine"
         if self.camera == "perspective":
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
             number = None if auto else n_components
-            weak = self._known.get("weak") if self._known else None
-            options = start, errors, self.remove_pose, weak
+            options = start, errors, self.remove_pose, (self._known or {}).get("weak")
             fit = fit_perspective(images, number, f, *options)
         else:
             if auto and self.camera == "affine":

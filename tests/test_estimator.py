@@ -559,7 +559,7 @@ BAD_TABLES = {
     ),
     "infinite values": (with_value(np.inf), "X contains infinity"),
     "one frame": (TABLE[:1], "minimum of 2 is required|at least 8 frames"),
-    "three dimensions": (FACES.tracks, r"one row per frame .*: give X\.reshape"),
+    "three dimensions": (FACES.tracks, r"one row per frame .*: give np\.asarray\(X\)"),
 }
 
 

@@ -223,8 +223,8 @@ def steadiest(
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
     first, free = extended(problem, fit, n), replace(problem, penalty=0.0)
-    limit, held = evidence(problem, first) + HOPELESS, AffineCameras(held=True)
-    if not np.isfinite(limit):  # nothing turns
+    before, held = evidence(problem, first), AffineCameras(held=True)
+    if not np.isfinite(before):  # nothing turns
         return fit
     found, latest = [(evidence(problem, fit) - LEAST_GAIN, fit)], fit
 
@@ -235,9 +235,9 @@ def steadiest(
         other = extended(problem, fit._replace(state=state), k)
         return extended(problem, other, n) if k < n else other
 
-    def compare(other: JointFit) -> None:
+    def compare(other: JointFit, margin: float) -> None:
         """Add a fit, if it may be the most evident one."""
-        if evidence(problem, other) < limit:
+        if evidence(problem, other) < before + margin:
             other, widths = whole_distribution(problem, other)
             other = other._replace(widths=widths)
             found.append((evidence(problem, other), other))
@@ -245,7 +245,7 @@ def steadiest(
     for _ in range(4):
         motion, tried = steadied(latest.state.motion), len(found)
         for k in {min(FIRST_COMPONENTS[0], n), n}:
-            compare(lifted(motion, k))
+            compare(lifted(motion, k), HOPELESS)
         if len(found) == tried:
             break
         latest = min(found[tried:], key=itemgetter(0))[1]
@@ -257,7 +257,7 @@ def steadiest(
         if not n_reversed:
             break
         other = extended(problem, other._replace(state=state), n)
-    compare(other)
+    compare(other, -LEAST_GAIN)
     found.sort(key=itemgetter(0))
     return found[0][1]._replace(rivals=rival_depths(problem, found))
 
