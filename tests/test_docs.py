@@ -272,8 +272,8 @@ def test_variables_of_matlab_are_the_model(sequence):
 # Of these pages each runs in a test of its own.
 WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
 REFERENCE = (
-    *("conventions", "depth", "export", "formats", "index", "large_tables"),
-    *("skeletons", "two_studies", "perspective"),
+    *("conventions", "export", "formats", "index", "large_tables", "skeletons"),
+    *("two_studies", "depth", "perspective"),  # slow
 )
 # Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
 OF_OTHERS = ("from_movement", "dask")
@@ -300,7 +300,7 @@ def fitted():
 
 
 @pytest.mark.usefixtures("video")
-@pytest.mark.parametrize("page", slow_after(8, REFERENCE))
+@pytest.mark.parametrize("page", slow_after(6, REFERENCE))
 def test_code_of_reference_pages_runs(page, fitted):
     faces, model, bodies, mice = fitted
     Path("landmarks").mkdir()

@@ -400,7 +400,8 @@ def test_evidence_does_not_know_the_axes_of_the_object():
         assert_allclose(there, back, rtol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_beating_wings_are_no_rolling_bird(seed, monkeypatch):
     """Depths are right or withheld, for a bird from above that turns by 3 degrees."""
     monkeypatch.setattr(AffineNRSfM, "_limits", LIMITS)

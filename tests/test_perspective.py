@@ -148,6 +148,7 @@ def test_rotation_covariance_and_smoothing(noisy):
     np.testing.assert_allclose(motion, model.motion_, rtol=0, atol=0.05 * motion.max())
 
 
+@pytest.mark.slow
 def test_perspective_decides_the_mirror_image(noisy):
     X, S, model = noisy.X, noisy.S, noisy.model
     assert model.mirror_certainty_ > 0.9
@@ -203,6 +204,7 @@ def test_a_camera_that_turns_about_its_centre(noisy):
     same_model(model, other, tol=5e-3, turn=Q)
 
 
+@pytest.mark.slow
 def test_focal_length_is_estimated_where_points_are_missing(noisy):
     X, S = noisy.X, noisy.S
     rng = np.random.RandomState(0)
