@@ -61,7 +61,7 @@ TABLES = {
         * np.tile([1.0, 0.5], 16)
     ),
     "few frames": lambda: make_nonrigid_tracks(14, 24, noise=0.02, **GIVEN).data,
-    "outliers": lambda: with_outliers(make_nonrigid_tracks(40, 12, **GIVEN).data),
+    "outliers": lambda: with_outliers(make_nonrigid_tracks(40, 14, **GIVEN).data),
     "bodies": lambda: make_body_tracks(80, random_state=0).data,
     "frontal faces": frontal,
     "few shapes": lambda: make_nonrigid_tracks(60, 14, 1, noise=0.05, **SEED).data,
