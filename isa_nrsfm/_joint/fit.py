@@ -251,12 +251,12 @@ def steadiest(
         latest = min(found[tried:], key=itemgetter(0))[1]
     best = min(found, key=itemgetter(0))[1]
     alpha = replace(problem, widths=best.widths).likelihood(*best.state).alpha
+
+    def refined(state: JointState) -> JointFit:
+        return extended(problem, fit._replace(state=state), n)
+
     other = lifted(half_reversed(best.state, alpha), n)
-    for _ in range(5):
-        state, n_reversed = problem.reversed_back(other.state, problem.cameras)
-        if not n_reversed:
-            break
-        other = extended(problem, other._replace(state=state), n)
+    other = problem.turned_back(other, problem.cameras, refined)
     compare(other, -LEAST_GAIN)
     found.sort(key=itemgetter(0))
     return found[0][1]._replace(rivals=rival_depths(problem, found))

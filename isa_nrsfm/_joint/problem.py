@@ -253,12 +253,27 @@ class JointProblem:
         self, state: JointState, cameras: CameraModel, **limits: Any
     ) -> JointFit:
         """Refine a state; with calibrated cameras no frame stays reversed in depth."""
-        fit = self.refined(state, cameras, **limits)
-        for _ in range(5 if self.thorough and cameras.calibrated else 0):
+
+        def refined(state: JointState) -> JointFit:
+            return self.refined(state, cameras, **limits)
+
+        fit = refined(state)
+        if self.thorough and cameras.calibrated:
+            fit = self.turned_back(fit, cameras, refined)
+        return fit
+
+    def turned_back(
+        self,
+        fit: JointFit,
+        cameras: CameraModel,
+        refined: Callable[[JointState], JointFit],
+    ) -> JointFit:
+        """Return the fit that is refined until no frame is reversed in depth."""
+        for _ in range(5):
             state, n_reversed = self.reversed_back(fit.state, cameras)
             if not n_reversed:
                 break
-            fit = self.refined(state, cameras, **limits)
+            fit = refined(state)
         return fit
 
     def reversed_back(

@@ -26,8 +26,10 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 PAGE = "report.html"
 REPORT = "report.json"
 # The files of every fit; docs/command_line.md has their contents.
-_DATA = "model.npz alpha.csv cameras.csv shapes.csv shapes.npz viewer.html"
-RESULTS = (PAGE, *_DATA.split())
+RESULTS = (
+    *(PAGE, "model.npz", "alpha.csv", "cameras.csv"),
+    *("shapes.csv", "shapes.npz", "viewer.html"),
+)
 
 
 class Fit(NamedTuple):
