@@ -16,17 +16,17 @@ from benchmarks.depth import bird, depth_error, seen
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import LARGEST_SHARE
-from isa_nrsfm._joint.fit import _first_fit
+from isa_nrsfm._joint.fit import GROUPS, _first_fit
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState, Widths
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
-    half_reversed,
     lifted_shapes,
     likely_basis,
     mixed_cameras,
+    reversed_groups,
     rigid_start,
     steadied,
 )
@@ -37,6 +37,7 @@ from isa_nrsfm._joint.whole import (
     n_directions,
     whole_distribution,
 )
+from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._paper.pipeline import Factorisation, factorise
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -377,12 +378,34 @@ def test_frames_of_flat_objects_may_be_reversed(camera):
         depths = state.depths(problem.likelihood(*state).alpha)
         error = problem.reversal_error(state, depths)
         assert_allclose(error, expected, atol=0.02)
-        turned = half_reversed(state, alpha)
-        assert_calibrated(turned, "orthographic")
-        same = np.isclose(turned, motion).all(axis=(1, 2))
-        assert_array_equal(same, alpha[:, 0] >= 0)
-        if not thickness:
-            assert_allclose(turned @ shapes[0], motion @ shapes[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("reversed_share", [0.0, 0.25, 0.5])
+def test_groups_of_frames_are_turned_back(reversed_share):
+    """Shapes that fit frames reversed together explain them, but not the others."""
+    rng, n_frames = np.random.default_rng(1), 80
+    sizes = np.array([[1.0, 1.0, 0.3], [0.2] * 3, [0.2] * 3])[..., None]
+    shapes = centred(rng.normal(size=(3, 3, 12)) * sizes)
+    turns = Rotation.from_rotvec(0.3 * rng.normal(size=(n_frames, 3)))
+    motion, alpha = turns.as_matrix()[:, :2], rng.normal(size=(n_frames, 2))
+    rows = motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
+    rows = centred(rows + 0.02 * rng.normal(size=rows.shape))
+    frames = JointFrames.from_points(FrameBlocks.of_array(rows, n_frames), True)
+    problem = JointProblem(frames, FitSettings(camera="weak_perspective"))
+    mirrored = motion * [1.0, 1.0, -1.0]
+    turned = alpha[:, 0] < np.quantile(alpha[:, 0], reversed_share)
+    start = np.where(turned[:, None, None], mirrored, motion)
+    state = JointState(lifted_shapes(rows, start, 6), start, 0.01)
+    state = problem.refined(state, max_iter=50).state
+    cameras, alpha = state.motion, problem.likelihood(*state).alpha
+    for n_groups in GROUPS:
+        cameras = reversed_groups(problem, rows, cameras, alpha, n_groups)
+    assert_calibrated(cameras, "weak_perspective")
+    distances = (np.linalg.norm(cameras - x, axis=(1, 2)) for x in (motion, mirrored))
+    near = np.less(*distances).mean()
+    assert max(near, 1.0 - near) >= 1.0 - 0.6 * reversed_share
+    if not reversed_share:
+        assert_array_equal(cameras, state.motion)
 
 
 def test_evidence_does_not_know_the_axes_of_the_object():
@@ -398,6 +421,29 @@ def test_evidence_does_not_know_the_axes_of_the_object():
         fits = (each._replace(widths=own) for each in (turned, fit))
         there, back = (evidence(problem, each) for each in fits)
         assert_allclose(there, back, rtol=1e-9)
+
+
+def test_noise_of_the_fit_is_the_most_evident():
+    """The unknowns count once in the evidence: its minimum is where the fit ends."""
+    tracks = make_nonrigid_tracks(
+        60, 20, 2, noise=0.02, camera="weak_perspective", random_state=0
+    )
+    rows = tracks.data.reshape(60, 20, 2).mT
+    rows = rows - rows.mean(axis=2, keepdims=True)
+    problem, state = random_problem(camera="weak_perspective")
+    frames = JointFrames.from_points(FrameBlocks.of_array(rows, 60), True)
+    settings = problem.settings._replace(camera="weak_perspective", tol=1e-6)
+    problem = replace(problem, frames=frames, settings=settings)
+    motion, noise = tracks.motion, 0.01 * problem.mean_square
+    start = JointState(lifted_shapes(rows, motion, 4), motion, noise)
+    fit, widths = whole_distribution(problem, problem.refined(start, max_iter=30))
+    values = []
+    for factor in 0.8, 1.0, 1.25:
+        state = fit.state._replace(noise=factor * fit.state.noise)
+        other = fit._replace(state=state, widths=widths)
+        values.append(evidence(problem, other))
+    assert values[1] == min(values)
+    assert_allclose(values[0], values[2], atol=0.5 * (values[0] - values[1]))
 
 
 @pytest.mark.slow

@@ -46,9 +46,9 @@ from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
     first_state,
-    half_reversed,
     lifted_shapes,
     other_depths,
+    reversed_groups,
     steadied,
     with_prior,
 )
@@ -74,6 +74,8 @@ FIRST_COMPONENTS = 3, 1, 12
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains are those of two fits of one minimum.
 HOPELESS, LEAST_GAIN = 5.0, 1.0
+# Numbers of groups of similar frames that may be reversed in depth, on the same page
+GROUPS = 2, 4
 
 
 def fit_jointly(
@@ -226,7 +228,7 @@ def steadiest(
     before, held = evidence(problem, first), AffineCameras(held=True)
     if not np.isfinite(before):  # nothing turns
         return fit
-    found, latest = [(evidence(problem, fit) - LEAST_GAIN, fit)], fit
+    found, latest = [(evidence(problem, fit) - LEAST_GAIN, before, fit)], fit
 
     def lifted(motion: NDArray, k: int) -> JointFit:
         """Return the fit of n directions from cameras, first with k of them."""
@@ -237,10 +239,11 @@ def steadiest(
 
     def compare(other: JointFit, margin: float) -> None:
         """Add a fit, if it may be the most evident one."""
-        if evidence(problem, other) < before + margin:
+        at_first = evidence(problem, other)
+        if at_first < before + margin:
             other, widths = whole_distribution(problem, other)
             other = other._replace(widths=widths)
-            found.append((evidence(problem, other), other))
+            found.append((evidence(problem, other), at_first, other))
 
     for _ in range(4):
         motion, tried = steadied(latest.state.motion), len(found)
@@ -248,18 +251,21 @@ def steadiest(
             compare(lifted(motion, k), HOPELESS)
         if len(found) == tried:
             break
-        latest = min(found[tried:], key=itemgetter(0))[1]
-    best = min(found, key=itemgetter(0))[1]
-    alpha = replace(problem, widths=best.widths).likelihood(*best.state).alpha
+        latest = min(found[tried:], key=itemgetter(0))[2]
 
     def refined(state: JointState) -> JointFit:
         return extended(problem, fit._replace(state=state), n)
 
-    other = lifted(half_reversed(best.state, alpha), n)
-    other = problem.turned_back(other, problem.cameras, refined)
-    compare(other, -LEAST_GAIN)
+    for n_groups in GROUPS:
+        _, before, best = min(found, key=itemgetter(0))
+        alpha = replace(problem, widths=best.widths).likelihood(*best.state).alpha
+        motion = reversed_groups(problem, rows, best.state.motion, alpha, n_groups)
+        if np.any(motion != best.state.motion):
+            other = problem.turned_back(lifted(motion, n), problem.cameras, refined)
+            compare(other, -LEAST_GAIN)
     found.sort(key=itemgetter(0))
-    return found[0][1]._replace(rivals=rival_depths(problem, found))
+    rivals = rival_depths(problem, [(value, fit) for value, _, fit in found])
+    return found[0][2]._replace(rivals=rivals)
 
 
 def count_components(

@@ -12,6 +12,7 @@ from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import (
@@ -127,11 +128,33 @@ def steadied(motion: NDArray) -> NDArray:
     return motion @ turn.as_matrix()
 
 
-def half_reversed(state: JointState, alpha: NDArray) -> NDArray:
-    """Return cameras (I, 2, 3), reversed in depth if the first of alpha is negative."""
-    axis = np.linalg.svd(state.shapes[0], full_matrices=False)[0][:, 2]
-    mirror = np.eye(3) - 2.0 * np.outer(axis, axis)
-    return np.where(alpha[:, :1, None] < 0, state.motion @ mirror, state.motion)
+def reversed_groups(
+    problem: JointProblem,
+    rows: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    n_groups: int,
+) -> NDArray:
+    """Return cameras (I, 2, 3) with groups of similar frames turned back in depth.
+
+    If all frames of a group are reversed, the shapes contain their mirror images. So
+    each group, of at most half of the frames, is compared under shapes that fit the
+    others. alpha (I, K): coefficients, for the groups (Ward, "Hierarchical grouping to
+    optimize an objective function", 1963).
+    """
+    free, held = replace(problem, penalty=0.0), AffineCameras(held=True)
+    group = fcluster(linkage(alpha, "ward"), n_groups, "maxclust")
+    for number in range(1, group.max() + 1):
+        own, rest = group == number, np.flatnonzero(group != number)
+        if 2 * own.sum() > len(own):
+            continue
+        others = free.part(rest, problem.settings.tol)
+        shapes = lifted_shapes(rows[rest], motion[rest], alpha.shape[1])
+        state = first_state(others, rows[rest], motion[rest], shapes)
+        state = others.refined(state, held, max_iter=FIXED_STEPS).state
+        state, _ = free.reversed_back(state._replace(motion=motion), problem.cameras)
+        motion = np.where(own[:, None, None], state.motion, motion)
+    return motion
 
 
 def stretched(

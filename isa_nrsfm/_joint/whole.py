@@ -143,7 +143,7 @@ def evidence(problem: JointProblem, fit: JointFit) -> float:
     The objective has all coefficients integrated out, but takes cameras and shapes as
     known. Laplace's method integrates them out (MacKay, 1992): with the Hessians C_i of
     the cameras, the covariance V of the lines of sight in the object, and the Hessian A
-    of the shapes, for n frames, ::
+    of the shapes, for n frames and F with ``(N - 2n) log s2``, ::
 
         F / n + mean_i log det C_i + log det V + (log det A + 3J sum_k log v_k) / n.
 
@@ -155,7 +155,9 @@ def evidence(problem: JointProblem, fit: JointFit) -> float:
     shapes, motion, noise = fit.state
     cameras = problem.cameras
     assert isinstance(cameras, CalibratedCameras)
-    terms = part.objective(cameras)(*fit.state)
+    n_positions = 2.0 * problem.frames.n_frames
+    objective = part.objective(cameras)._replace(n_unknowns=n_positions)
+    terms = objective(*fit.state)
     turns = unpacked(cameras.curvature(frames_last(motion), terms.motion_curvature))
     price = np.linalg.slogdet(np.moveaxis(turns, 2, 0) / noise)[1].mean()
     views = full_rotations(motion)[0][:, 2]
