@@ -219,8 +219,8 @@ def steadiest(
 
     The others start from cameras that turn less: wings that beat look like a bird that
     rolls. The objective counts coefficients, but not rotations, and its minima lead
-    there; `evidence` counts both. The last one starts with a group of frames reversed
-    in depth: single frames are not turned back if the shapes explain both groups.
+    there; `evidence` counts both. The last ones have groups of frames turned back in
+    depth (`reversed_groups`).
     """
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
