@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from layers import slow_after
+from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
@@ -386,19 +387,4 @@ def test_files(noisy, tmp_path):
     assert loaded.camera_ == "perspective"
 
 
-@pytest.mark.parametrize(
-    ("params", "message"),
-    [
-        ({"principal_point": None}, "needs principal_point"),
-        ({"principal_point": (1, np.nan)}, "needs principal_point"),
-        ({"focal_length": [1.0, 2.0]}, "one for each of the 40 rows"),
-        ({"focal_length": -1.0}, "focal_length"),
-        ({"camera": "affine"}, "are for calibrated cameras, which have axes"),
-        ({"camera": "orthographic", "principal_point": None}, "Give both or none"),
-        ({"camera": "weak_perspective", "focal_length": None}, "Give both or none"),
-        ({"refinement": None}, "needs refinement='joint' or 'consensus'"),
-    ],
-)
-def test_refused(params, message):
-    with pytest.raises(ValueError, match=message):
-        fitted(scene().X, **params)
+test_refusals = refusals_of("perspective", globals())

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from fit_runs import fit, write_landmarks
 from landmark_files import deeplabcut_frame, scene, write_deeplabcut, write_openface
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from sklearn.base import clone
 
 import isa_nrsfm
@@ -356,13 +356,6 @@ def test_several_codes_are_missing_together(tracks_read):
     assert found.points.isna().to_numpy().tolist() == [[True, True, False, False] * 4]
 
 
-@pytest.mark.parametrize("number", ["nan", "inf", "x"])
-def test_codes_are_finite_numbers(number, capsys):
-    with pytest.raises(SystemExit):
-        build_parser().parse_args(["fit", "t", "-o", "f", "--missing-value", number])
-    assert "--missing-value: expected a number, such as -1" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
     path, folder = tmp_path / "table.csv", tmp_path / "out"
@@ -500,37 +493,7 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
 
 WIDE = landmarks(2).round(1)
 TEXT = WIDE.to_csv(index=False)
-
-
-@pytest.mark.parametrize(
-    ("name", "contents", "message"),
-    [
-        ("a.csv", WIDE.to_csv(index=False, header=False), "line with column names"),
-        ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
-        ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
-        ("a.csv", b"PK\3\4", r"a spreadsheet or .*: save it as \.csv"),
-        ("a.csv", gzip.compress(TEXT.encode()), "compressed file, in spite .* unpack"),
-        ("a.csv.gz", gzip.compress(TEXT.encode()), "known .* Unpack compressed files"),
-        ("a.npy", b"\x93NUMPY", "as array .* Expected one array"),
-        ("a.pkl", b"\x80", r"Save other tables and arrays as \.csv, in pandas: "),
-        ("a.csv", "my experiment of May\n" + TEXT, "line 2 .* delete titles"),
-        ("a.csv", "# made by T, version 2\n" + TEXT, "line 2 .* delete .* comments"),
-        ("a.csv", re.sub("(?m)^([0-9])", r'"1",\1', TEXT), "2 .* that of row names"),
-        ("a.csv", re.sub("(?m)^(.*)$", r'"\1"', TEXT), "quotation marks: remove them"),
-        ("a.csv", ",".join("xy" * 12) + TEXT[TEXT.index("\n") :], "called 'x': each"),
-        ("a.csv", TEXT.replace("\n", "\n" + "px," * 23 + "px\n", 1), "of units"),
-        ("a.csv", "p,,q,\nx,y,x,y\n1,2,3,4\n", "two lines; .* nose_y is needed$"),
-        ("a.csv", TEXT + TEXT, r"row 2 .* 'x0'\. .* repeated names"),
-        ("a.csv", WIDE.astype(str).add("%").to_csv(index=False), r"like 1234\.5"),
-        ("a.csv", WIDE.map("1,{:.1f}".format).to_csv(index=False), r"like 1234\.5"),
-    ],
-)
-def test_tables_of_another_form_are_told_the_way(tmp_path, name, contents, message):
-    path = tmp_path / name
-    if isinstance(contents, str):
-        contents = contents.encode()
-    path.write_bytes(contents)
-    refused(message, read_by_fit, path)
+PACKED = gzip.compress(TEXT.encode())
 
 
 def followed(call, given, /, **scope):
@@ -639,3 +602,6 @@ def test_words_for_missing_points_are_missing(tmp_path, word):
     text = table.to_csv(index=False, na_rep="@").replace("@", word)
     (tmp_path / "a.csv").write_text(text)
     np.testing.assert_array_equal(read_landmarks(tmp_path / "a.csv").points, table)
+
+
+test_refusals = refusals_of("tables_of_people", globals())
