@@ -342,7 +342,7 @@ def test_perspective_cameras(fits, fails, transforms, webcam, tmp_path):
     assert "decides between the two mirror images" in message
 
 
-@pytest.mark.parametrize("camera", slow_after(1, [None, "weak_perspective"]))
+@pytest.mark.parametrize("camera", slow_after(0, [None, "weak_perspective"]))
 def test_perspective_is_found_unless_another_camera_is_given(fits, webcam, camera):
     options = ["--image-size", "1280x720", *["--camera", camera] * bool(camera)]
     options += ["--loss", "linear", "--refinement", "joint"]

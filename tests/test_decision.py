@@ -78,7 +78,7 @@ def fitted(estimator, X):
     return model, [*found.messages, *texts], found
 
 
-@pytest.mark.parametrize("name", slow_after(3, [*TABLES]))
+@pytest.mark.parametrize("name", slow_after(2, [*TABLES]))
 def test_advice_ends_after_one_more_fit_which_is_not_worse(name):
     X = TABLES[name]()
     model, messages, before = fitted(AffineNRSfM(random_state=0), X)
