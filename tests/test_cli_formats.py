@@ -192,11 +192,11 @@ def test_confidences_of_a_plain_table(fits, transforms, tmp_path, axes, word):
     assert list(found.alpha) == ["row", "id", "alpha_1"]
 
 
-SHARES = "like shares of the width and height of an image"
+SHARES = "like fractions of the width and height of an image"
 
 
 def write_shares(folder, change=lambda shares: shares):
-    """Write points of hands in shares of an image of 1920 x 1080 pixels."""
+    """Write points of hands in normalised coordinates of 1920 x 1080 pixels."""
     shares = change(tracks(21) * [2.5 / 1920, 2.5 / 1080])
     names = [f"{axis}_{j}" for j in range(21) for axis in "xy"]
     path = folder / "hands.csv"
@@ -231,7 +231,7 @@ def test_most_points_are_inside_of_the_image(begins, fails, tmp_path):
     assert find_format(path) == "table"
     assert SHARES not in begins(path, *options)
     path = write_shares(tmp_path, lambda shares: shares - shares[:, :1])
-    message = "the coordinates are no shares of the width and height of an image"
+    message = "the coordinates are no fractions of the width and height of an image"
     assert message in fails("fit", path, "-o", tmp_path / "results", *options)
 
 

@@ -238,8 +238,8 @@ def test_frames_are_drawn_with_their_residuals(answers):
 @pytest.mark.parametrize(
     ("scales", "expected"),
     [
-        ([np.inf, np.inf, 8.24], "within 8.24 s; changes last in 2 of 3 directions"),
-        ([8.24, 3.0], "fade within 8.24, 3 s"),
+        ([np.inf, np.inf, 8.24], "mation: 8.24 s; changes last in 2 of 3 directions"),
+        ([8.24, 3.0], "time constants of the deformation: 8.24, 3 s"),
         ([np.inf], "t: changes last in 1 of 1 directions"),
         ([], "no dynamics found"),
     ],

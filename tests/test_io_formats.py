@@ -52,7 +52,7 @@ def individuals_of(landmarks):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-@pytest.mark.filterwarnings("ignore:the array", "ignore:.*shares of the width")
+@pytest.mark.filterwarnings("ignore:the array", "ignore:.*fractions of the width")
 @pytest.mark.filterwarnings("default")  # tables of HDF5 files stay open
 def test_files_read_back_as_they_were_written(name, tmp_path):
     path, format = WRITERS[name](tmp_path), name.partition("-")[0]
@@ -137,7 +137,7 @@ def test_pyfeat_has_empty_cells_where_no_face_is(detector, tmp_path):
 
 def test_shares_of_the_image_become_pixels(tmp_path):
     path = files.write_mesh(tmp_path / "a.csv", MESH)
-    refused(r"shares of the image's width.*--image-size", read_landmarks, path)
+    refused(r"fractions of the image's width.*--image-size", read_landmarks, path)
     landmarks = read_landmarks(path, image_size=files.IMAGE_SIZE)
     assert_allclose(tracks_of(landmarks), MESH)
     assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
@@ -242,7 +242,9 @@ def test_openpose_that_cannot_be_read_is_refused_with_the_way(tmp_path):
     shares[3, 0] = 1.02  # a foot that the image cuts off
     people = [[files.openpose_person(pose=shares)]]
     folder = files.write_openpose(tmp_path / "json", people)
-    refused("shares of the image's size.* --keypoint_scale 0", read_landmarks, folder)
+    refused(
+        "fractions of the image's size.* --keypoint_scale 0", read_landmarks, folder
+    )
     empty = files.write_openpose(tmp_path / "empty", [[], [files.openpose_person()]])
     refused("no visible points in pose_keypoints_2d", read_landmarks, empty)
     refused("no files with names", read_landmarks, tmp_path, "openpose")

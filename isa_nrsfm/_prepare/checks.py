@@ -224,7 +224,7 @@ def check_points(
             "together, so that they cannot be joined to one object (first: "
             f"{describe_point(int(group.argmax()), layout, names)} is never visible "
             f"with {describe_point(0, layout, names)} and its group). Add frames that "
-            "show points of both, or fit each group by itself"
+            "show points of both, or fit each group separately"
         )
 
 

@@ -1,7 +1,6 @@
-"""Coordinates that are no places in an image, or of no object.
+"""Detect sentinel values, normalised coordinates, and points of no object.
 
-Codes of missing points, shares of the image, columns that were scaled one by one, and
-points that stand still while the object moves.
+Columns may have been scaled one by one. Some points stand still while the object moves.
 """
 
 from collections.abc import Hashable
@@ -18,7 +17,7 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
 MOST_ROWS = 1000
-# Points of a lower confidence are seldom where they are said to be.
+# Confidence below which points are unreliable.
 UNSURE = 0.6
 # Largest part of the coordinates of shares that are beyond all borders but one.
 FEW = 0.05
@@ -37,7 +36,7 @@ TOLD = "warned of coordinates"
 
 
 class CoordinateWarning(UserWarning):
-    """Coordinates are probably codes of missing points, or shares of an image."""
+    """Coordinates are probably sentinel values, or normalised."""
 
 
 def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> None:
@@ -111,9 +110,9 @@ def warn_of_scaled_columns(tracks: NDArray) -> bool:
         return False
     warn_caller(
         "all columns have the same spread, as after z-scores, StandardScaler or "
-        "MinMaxScaler. Each column was scaled by itself, which stretches each point in "
-        "x and y by another factor: shapes will be wrong. Give the coordinates as they "
-        "were before, in a pipeline without the scaler",
+        "MinMaxScaler. Each column was scaled separately, which stretches each point "
+        "in x and y by another factor: shapes will be wrong. Give the coordinates as "
+        "they were before, in a pipeline without the scaler",
         CoordinateWarning,
     )
     return True
@@ -215,7 +214,7 @@ def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
         )
     warn_caller(
         f"{100 * inside:.3g} % of the coordinates are between 0 and 1 (all between "
-        f"{known.min():.2g} and {known.max():.2g}), like shares of the width and "
+        f"{known.min():.2g} and {known.max():.2g}), like fractions of the width and "
         "height of an image. Such shares stretch the shapes, which changes their "
         "proportions and rotations. If they have another unit, such as metres, ignore "
         "this. If these are shares, multiply x by the width and y by the height of the "
@@ -226,7 +225,7 @@ def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
 
 
 def are_shares(tracks: NDArray) -> bool:
-    """Return whether tracks (n_frames, n_points, 2) look like shares of an image.
+    """Return whether tracks (n_frames, n_points, 2) look like normalised coordinates.
 
     Positions in an image are apart in both directions. Trackers also place points
     that it cuts off, such as the legs of a body at a desk, beyond one of its borders;

@@ -24,7 +24,7 @@ LARGEST_DEVIATION = 0.1
 # to 4 (``python -m benchmarks.accuracy cameras``).
 SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
 SAME_UNIT = (
-    "x and y have the same unit, unlike shares of the width and height of an image"
+    "x and y have the same unit, unlike fractions of the width and height of an image"
 )
 # Errors of held-out points, as shares of the energy, up to which a fit is good, and
 # above which it is poor; errors of depths likewise, of which the second withholds them.

@@ -17,7 +17,7 @@ intercept in the alternative without dynamics only.
 
 Parameters of cameras are integrated random walks, ``(w, v)_t+1 = (w + v, v)_t`` plus
 noise of the covariance ``q [[1/3, 1/2], [1/2, 1]]``. They are relative to the camera of
-each frame by itself.
+each frame alone.
 
 A frame is observed through its likelihood as a function of its coefficients and camera.
 Near the fit ``f_t = (alpha_t, 0)`` of the frame by itself, its logarithm at ``f_t + d``

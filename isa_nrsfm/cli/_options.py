@@ -169,7 +169,7 @@ HELP = {
     "# for a number, * for any text, such as 'x_#,y_#' or '*.px,*.py'; a pattern after "
     "- leaves columns out, as in '*_x,*_y,-gaze_*'",
     "individuals NAMES": "individuals in one row, such as 1,2 for nose_1_x and "
-    "nose_2_x: each gets a row of its own, with the column individual",
+    "nose_2_x: each gets its own row, with the column individual",
     "row_per_point NAMES": "of a table with a row for each point, the columns that "
     "tell frames apart and, last, that of the points, such as video,frame,landmark",
     "skip_rows COLUMN=REGEX": "leave out rows whose column matches the expression, "
@@ -250,9 +250,9 @@ HELP = {
     "n_init STARTS": "number of random starts (default: 16 of pooled, 30 of fast)",
     "block_recovery": "algorithm that finds the block structure",
     "refinement": "joint: cameras, coefficients and basis shapes together; consensus: "
-    "afterwards groups of neighbouring points, for the truest shapes of calibrated "
-    "cameras; alternating: the refinement of the paper, with cameras of the rigid part "
-    "(default: joint, or consensus if only that determines the depth)",
+    "afterwards groups of neighbouring points, most accurate for bodies seen by "
+    "calibrated cameras; alternating: the refinement of the paper, with cameras of the "
+    "rigid part (default: joint, or consensus if only that determines the depth)",
     "independence": "joint refinement: independent basis shapes, or independent "
     "coefficients",
     "loss": "joint refinement: all but linear limit the influence of outliers "

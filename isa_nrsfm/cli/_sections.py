@@ -450,7 +450,7 @@ def _time(time: dict[str, Any]) -> Section:
         return [f"{name}: no dynamics found, coefficients are not smoothed"]
     fading = scales[np.isfinite(scales)]
     listed = first_items(f"{each:.3g}" for each in fading)
-    found = [f"changes of the shape fade within {listed} {time['unit']}"] * (
+    found = [f"time constants of the deformation: {listed} {time['unit']}"] * (
         len(fading) > 0
     )
     if lasting := len(scales) - len(fading):

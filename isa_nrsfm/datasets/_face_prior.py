@@ -19,9 +19,9 @@ def load_face_prior(
     """
     Return a model of faces, to be the prior of tables with landmarks of faces.
 
-    Frontal photos do not determine depths. With this prior they need not: it knows how
-    deep faces are, and how people and expressions differ. Coefficients of all tables
-    of a layout that are fitted with it can be compared.
+    Frontal photos do not determine depths. This prior supplies the depths of faces, and
+    how people and expressions differ. Coefficients of all tables of a layout that are
+    fitted with it can be compared.
 
     Parameters
     ----------

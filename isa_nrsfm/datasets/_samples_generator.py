@@ -645,7 +645,7 @@ default="weak_perspective"
         labels : ndarray of shape (n_frames,), dtype=str
             The action: "walk", "reach" or "squat"; in a transition the nearer one.
         groups : ndarray of shape (n_frames,), dtype=int
-            The number of the person, from 0. Each has lengths of bones of their own.
+            The number of the person, from 0. Each has their own lengths of bones.
         time : ndarray of shape (n_frames,)
             Seconds since the person was first seen, at 25 frames per second.
         positions : ndarray of shape (n_frames, 3)
@@ -871,7 +871,7 @@ default="weak_perspective"
         labels : ndarray of shape (n_frames,), dtype=str
             The pose: "open", "fist" or "point"; in a transition the nearer one.
         groups : ndarray of shape (n_frames,), dtype=int
-            The number of the person, from 0. Each has lengths of bones of their own.
+            The number of the person, from 0. Each has their own lengths of bones.
         time : ndarray of shape (n_frames,)
             Seconds since the person was first seen, at 25 frames per second.
         positions : ndarray of shape (n_frames, 3)

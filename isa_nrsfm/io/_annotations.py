@@ -87,7 +87,7 @@ def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmark
     A line has the class, the box (middle, width, height) and x, y and mostly a third
     number of each point; predictions may have the score and the number of a track
     after them. The third number is 0, 1 or 2 in labels, a confidence in predictions.
-    All are shares of the image's width and height, multiplied by ``image_size``.
+    All are fractions of the image's width and height, multiplied by ``image_size``.
     """
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     rows = [floats_of(line.split()) for line in lines if line.strip()]

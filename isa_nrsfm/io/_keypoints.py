@@ -251,7 +251,7 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
     if twice is not None:
         raise ValueError(
             f"two of the {what} have the id {twice['id']!r}, as in files that were "
-            "joined: give each an id of its own, and its annotations as well"
+            "joined: give each its own id, also in the annotations"
         )
     return found
 
@@ -388,8 +388,8 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
-            "the coordinates are shares of the image's size, which stretch the shapes. "
-            "Run OpenPose with --keypoint_scale 0 for pixels"
+            "the coordinates are fractions of the image's size, which stretch the "
+            "shapes. Run OpenPose with --keypoint_scale 0 for pixels"
         )
     return found
 

@@ -122,7 +122,7 @@ def find_landmark_columns(
     if pattern.startswith(f"{axis}.#") and axis in names:  # as pandas reads x, y, x, y
         raise ValueError(
             f"the columns '{axis}', '{axis}.1', ... come from a header that repeats "
-            "the same names: give every point a name of its own, such as x0, y0, x1, y1"
+            "the same names: give each point its own name, such as x0, y0, x1, y1"
         )
     patterns, others = pattern.split(","), {*all_names}.difference(names)
     of_set = [n for n in others if any(matches(n, each) for each in patterns)]

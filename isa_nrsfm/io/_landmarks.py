@@ -25,7 +25,7 @@ class Landmarks:
     Landmarks read from a file or from the results of another program.
 
     All tables have one row per frame and the same index, 0, 1, .... Where a frame shows
-    several individuals, each has a row of its own.
+    several individuals, each has its own row.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def assemble_individuals(
     of_instances: dict[str, NDArray[np.float64]] | None = None,
     **known: Any,
 ) -> Landmarks:
-    """Give each individual that a frame shows a row of its own.
+    """Give each individual that a frame shows its own row.
 
     A single individual has a row in every frame. Of several, those without a visible
     point have none. A frame in which nobody is seen has one row without points.
@@ -296,7 +296,7 @@ def from_mediapipe(
         that has, for each face, a list of objects with ``x`` and ``y`` are taken.
     image_sizes : array-like of shape (2,) or (n_results, 2)
         Width and height of all images, or of each, in pixels. MediaPipe gives x in
-        shares of the width and y in shares of the height.
+        fractions of the width and y in fractions of the height.
     part : {"face", "hand", "pose", "left_hand", "right_hand"}, optional
         The part to take, if the results have several, as those of holistic landmarkers.
 
@@ -531,7 +531,7 @@ def _persons(result: Any, part: str, where: str) -> list[NDArray[np.float64]]:
 
 
 def _side(hand: Any) -> str | None:
-    """Return the side of a hand, from what MediaPipe tells of it."""
+    """Return the side of a hand in a result of MediaPipe."""
     first = next(iter(getattr(hand, "classification", hand)), None)
     return getattr(first, "category_name", None) or getattr(first, "label", None)
 

@@ -192,7 +192,7 @@ def landmark_table(
         several numbers, a point has one.
     individuals : str or sequence of str, optional
         The individuals in one row, such as ``"1,2"`` for nose_1_x and nose_2_x: the
-        parts by which their columns differ. Each has a row of its own, and the other
+        parts by which their columns differ. Each has its own row, and the other
         columns have ``frame``, the number of the row, and ``individual``.
     row_per_point : str or sequence of str, optional
         Of a table with a row for each point, the columns that tell frames apart and,
