@@ -421,12 +421,14 @@ def build_parser() -> Parser:
     top.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     commands = top.add_subparsers(dest="command", required=True)
     for command, (line, description, examples, groups) in _COMMANDS.items():
-        own = commands.add_parser(command, help=line, **_manners(description, examples))
+        parser = commands.add_parser(
+            command, help=line, **_manners(description, examples)
+        )
         # For commands without these
         absent = dict.fromkeys(("weights", "points", "principal_point"))
-        own.set_defaults(**absent, missing_value=())
+        parser.set_defaults(**absent, missing_value=())
         for title, entries in groups.items():
-            group = own.add_argument_group(title)
+            group = parser.add_argument_group(title)
             for entry in entries:
                 is_one = isinstance(entry, str)
                 place = group if is_one else group.add_mutually_exclusive_group()

@@ -148,8 +148,8 @@ def read_labelme(path: Path) -> Landmarks:
                 warn_caller("shapes that are no points, such as boxes, are left out")
             image = as_utf8(str(content.get("imagePath") or file.name))
             for group in dict.fromkeys(s.get("group_id") for s in points) or [None]:
-                own = [s for s in points if s.get("group_id") == group]
-                places = [(str(s["label"]), s["points"][0]) for s in own]
+                group_shapes = [s for s in points if s.get("group_id") == group]
+                places = [(str(s["label"]), s["points"][0]) for s in group_shapes]
                 rows.append(({"image": image, "individual": group}, _named(places)))
     return _rows_of_names(rows, "labelme")
 
