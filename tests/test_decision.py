@@ -107,7 +107,7 @@ def tried(X, **options):
 
 
 def test_robust_losses_are_tried_if_there_are_outliers():
-    given = {"camera": "weak_perspective", "refinement": "joint", "n_components": 2}
+    given = {"camera": "affine", "refinement": "joint", "n_components": 2}
     found, model = tried(TABLES["outliers"](), **given)
     assert (found["robust loss"].result, model.loss) == ("used", "cauchy")
 

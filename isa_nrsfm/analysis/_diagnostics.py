@@ -148,8 +148,8 @@ class Diagnostics(NamedTuple):
         quality = "" if not self.fit else f"{self.fit.upper()}, "
         quality += f"{percent(self.held_out_error)} of left-out points unexplained"
         lines = [
-            f"fit: {quality if self.fit else 'not quality without the table'}",
-            f"depth: {self.depth.upper() or 'not quality for affine cameras'}",
+            f"fit: {quality if self.fit else 'not known without the table'}",
+            f"depth: {self.depth.upper() or 'not known for affine cameras'}",
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
             f"depth error: {certainty}",
