@@ -17,8 +17,10 @@ from isa_nrsfm._linalg.small_matrices import (
     FEW,
     LANES,
     ROWS,
+    diagonal_of,
     inverse3,
     invert_positive,
+    packed_products,
     padded,
     pair_indices,
     procrustes,
@@ -49,6 +51,11 @@ def last_to_first(matrices):
 
 
 class TestThreeByThree:
+    def test_inverse(self):
+        A = positive_matrices(0, 3, 50)
+        expected = np.linalg.inv(last_to_first(A))
+        assert_allclose(last_to_first(inverse3(A[ROWS, COLUMNS])), expected, rtol=1e-9)
+
     def test_scales_of_coordinates_cost_no_precision(self):
         A = positive_matrices(0, 3, 50, condition=10)
         scale = np.array([1e-70, 1.0, 1e80])
@@ -69,6 +76,19 @@ class TestThreeByThree:
 
 @pytest.mark.parametrize("n", NUMBERS)
 class TestPositiveDefinite:
+    @pytest.mark.parametrize("k", [1, 3, 9, 15])
+    def test_solution_and_inverse(self, k, n):
+        A = positive_matrices(k, k, n)
+        b = np.random.default_rng(0).normal(size=(k, n))
+        x, positive = solve_positive(packed(A), b)
+        expected = np.linalg.solve(last_to_first(A), b.T[..., None])[..., 0].T
+        assert_allclose(x, expected, rtol=1e-10, atol=1e-11 * np.abs(x).max())
+        assert positive.all()
+        inverse, positive = invert_positive(packed(A))
+        expected = np.linalg.inv(last_to_first(A))
+        assert_allclose(last_to_first(unpacked(inverse)), expected, atol=1e-9)
+        assert positive.all()
+
     @pytest.mark.parametrize("k", [2, 9])
     def test_indefinite_matrices_are_told(self, k, n):
         rng = np.random.default_rng(k)
@@ -109,6 +129,20 @@ class TestPositiveDefinite:
         assert np.abs(invert_positive(packed(A))[0]).max() < 1e5
 
 
+class TestPacking:
+    def test_unpacked_is_the_matrix_and_has_its_diagonal(self):
+        A = positive_matrices(0, 5, 3)
+        matrices = packed(A)
+        assert_array_equal(unpacked(matrices), A)
+        assert_array_equal(matrices[diagonal_of(matrices)], np.diagonal(A).T)
+
+    @pytest.mark.parametrize("n", NUMBERS)
+    def test_gram(self, n):
+        rows = np.random.default_rng(0).normal(size=(5, 4, n))
+        expected = np.einsum("kmn,lmn->kln", rows, rows)
+        assert_allclose(unpacked(packed_products(rows, rows)), expected, atol=1e-13)
+
+
 @pytest.mark.parametrize("n", NUMBERS)
 def test_nan_is_not_positive(n):
     A = packed(positive_matrices(0, 4, n))
@@ -118,6 +152,22 @@ def test_nan_is_not_positive(n):
 
 
 class TestSweep:
+    @pytest.mark.parametrize("first", [0, 1, 3, 5])
+    def test_identity(self, first):
+        A = positive_matrices(0, 5, 7)
+        swept = packed(A)
+        log_determinant, positive = sweep(swept, first)
+        swept = last_to_first(unpacked(swept))
+        C, G, B = A[:first, :first], A[first:, :first], A[first:, first:]
+        inverse = np.linalg.inv(last_to_first(B))
+        G = last_to_first(G)
+        assert_allclose(swept[:, first:, first:], -inverse, rtol=1e-9)
+        assert_allclose(swept[:, first:, :first], inverse @ G, rtol=1e-9, atol=1e-12)
+        rest = last_to_first(C) - G.swapaxes(1, 2) @ inverse @ G
+        assert_allclose(swept[:, :first, :first], rest, rtol=1e-9, atol=1e-12)
+        assert_allclose(log_determinant, np.linalg.slogdet(last_to_first(B))[1])
+        assert positive.all()
+
     def test_a_row_without_a_positive_pivot_is_zero_in_the_end(self):
         A = positive_matrices(0, 5, 7)
         A[3] = A[:, 3] = 0.0
@@ -186,6 +236,26 @@ def plain_gram(shapes, weights):
     mean = (shapes * weights).sum(axis=2) / weights.sum()
     moved = shapes - mean[..., None]
     return np.einsum("kaj,j,lbj->klab", moved, weights, moved)
+
+
+def test_products_by_definition():
+    tracks, shapes, weights = random_problem(0)
+    products = frame_sums(
+        frame_tracks(tracks.transpose(0, 2, 1), weights), ShapeProducts(shapes)
+    )
+    first, second = pair_indices(3)
+    for i, w in enumerate(weights):
+        mean = w @ tracks[i] / w.sum()
+        moved = tracks[i] - mean
+        G = plain_gram(shapes, w)
+        pairs = 0.5 * (G + G.swapaxes(2, 3))[first, second][:, ROWS, COLUMNS]
+        P = np.einsum("kaj,j,jr->kar", shapes, w, moved)
+        assert_allclose(products.centroid[:, i], mean)
+        assert_allclose(products.weight[i], w.sum())
+        assert_allclose(products.energy[i], np.sum(w[:, None] * moved**2))
+        assert_allclose(products.cross[..., i], P, atol=1e-13)
+        assert_allclose(products.shape_centroid[..., i], shapes @ w / w.sum())
+        assert_allclose(products.gram.pairs[..., i], pairs, atol=1e-13)
 
 
 class TestWhitened:
