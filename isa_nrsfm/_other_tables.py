@@ -31,7 +31,7 @@ OTHER_POINTS, LARGEST_MISFIT, OF_AFFINE = 0.15, 1.8, 5.0
 def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> None:
     """Warn if frames lie farther from the shapes of a model than its noise explains.
 
-    Without weights the noise of a fit with weights does not tell.
+    The noise of a weighted fit is not comparable to unweighted residuals.
     """
     model = estimator._model
     certainty, camera = model.frames.certainty, model.frames.camera
@@ -43,11 +43,11 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
     distance = model.distances(rows, *fit[:3], *own)
     misfit = model.misfit(distance)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
-        way = "Fit X by itself"
+        way = "Fit X separately"
         if far_points(distance, model.frames):
             way = (
                 "Check whether X has the same points in the same order as the fitted "
-                "table, or fit X by itself"
+                "table, or fit X separately"
             )
         elif camera != "affine" and certainty.determined:
             before, after = adapting_errors(estimator, rows, *own)
@@ -61,9 +61,9 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "
             "model as its noise explains: they come from another annotator or tracker, "
-            "show other objects or people (a model of one person fits no other), or "
-            "move as the fitted table does not show. Shapes, depths and coefficients "
-            f"may be wrong. {way}"
+            "show other objects or people (a model of one person does not generalise "
+            "to others), or move as the fitted table does not show. Shapes, depths and "
+            f"coefficients may be wrong. {way}"
         )
 
 

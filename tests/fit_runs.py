@@ -1,11 +1,14 @@
 """Runs of the command fit that tests let fail, and what a folder then holds."""
 
 import hashlib
+import io
 import json
 import re
+from contextlib import redirect_stderr, redirect_stdout
 from html import unescape
 
 import pandas as pd
+import pytest
 
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -66,6 +69,33 @@ def fit(table, folder, seed, *options):
     quick = ["--isa", "fast", "--n-init", 1, "--refinement", "none", "-k", 1]
     argv = ["fit", table, "-o", folder, "--random-state", seed, *quick, *options]
     return main([str(word) for word in argv])
+
+
+def told(*argv):
+    """Raise the message of a command that fails, which is the last line it shows."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = main([str(word) for word in argv])
+    assert (code, out.getvalue()) == (1, ""), err.getvalue()
+    assert "Traceback" not in err.getvalue()
+    raise ValueError(err.getvalue().splitlines()[-1].partition("isa-nrsfm: error: ")[2])
+
+
+def told_of_fit(table, options):
+    """Raise the message of a fit that fails, and writes nothing beside its table."""
+    try:
+        told("fit", table, "-o", table.parent / "results", *options.split())
+    finally:
+        assert not (table.parent / "results").exists()
+
+
+def usage(words):
+    """Raise the message of wrong usage, which has one line, and ends with code 2."""
+    with redirect_stderr(io.StringIO()) as err, pytest.raises(SystemExit) as end:
+        main(words.split(" ") if words else [])
+    message = err.getvalue()
+    assert (end.value.code, message.count("\n"), message[:9]) == (2, 1, "isa-nrsfm")
+    raise ValueError(message)
 
 
 def whole_run(files):

@@ -1,6 +1,17 @@
-"""Calls that are refused, or that warn."""
+"""Calls that are refused, or that warn; `refusals.txt` is a table of refused calls.
+
+A section of the table has the name of a test file, and for each call two lines: the
+call, in the names of that file, and an expression for the message of its ValueError.
+`written(name, content)` writes a file into `folder`. `tmp_path` stays empty. Commands
+are `told_of_fit` and `usage`.
+"""
+
+from pathlib import Path
 
 import pytest
+from fit_runs import told_of_fit, usage
+
+TABLE = Path(__file__).with_suffix(".txt")
 
 
 def refused(message, call, /, *args, error=ValueError, **kwargs):
@@ -14,3 +25,27 @@ def warned(message, call, /, *args, category=UserWarning, **kwargs):
     """Check that a call warns with a message that matches, and return its result."""
     with pytest.warns(category, match=message):
         return call(*args, **kwargs)
+
+
+def refusals_of(section, names):
+    """Return a test that the calls in a section are refused, and write no file."""
+    text = TABLE.read_text(encoding="utf-8").partition(f"[{section}]\n")[2]
+    lines = text.partition("\n[")[0].splitlines()
+    calls = [*zip(lines[::2], map(str.strip, lines[1::2]), strict=True)]
+    assert calls, section
+
+    @pytest.mark.parametrize(("call", "message"), calls)
+    def test(call, message, tmp_path, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("input")
+
+        def written(name, content):
+            text = content.encode() if isinstance(content, str) else content
+            (folder / name).write_bytes(text)
+            return folder / name
+
+        given = {"tmp_path": tmp_path, "folder": folder, "written": written}
+        given |= {"told_of_fit": told_of_fit, "usage": usage}
+        refused(message, eval, call, names | given)
+        assert not any(tmp_path.iterdir())
+
+    return test

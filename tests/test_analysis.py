@@ -5,7 +5,7 @@ import pytest
 import sklearn
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scipy.signal import lfilter
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
@@ -304,24 +304,6 @@ class TestAssociation:
         assert "rank correlation" in str(untested)
         assert "no p-values: one group; 120 frames" in str(untested)
 
-    @pytest.mark.parametrize(
-        ("y", "options", "message"),
-        [
-            (np.zeros(120), {}, "all 120 labels are.*nothing to compare"),
-            (np.arange(120), {}, "all different.*kind='number'"),
-            (["a"] * 119 + [None], {}, r"missing in 1 of 120 \(first: row 119\)"),
-            (np.r_[np.nan, np.ones(119)], {}, "missing in 1 of 120"),
-            (np.r_[0.5, np.inf, -np.inf, np.ones(117)], {}, "2 of 120.*in row 1: "),
-            (["a", "b"], {}, "each of the 120 frames; got 2"),
-            (["a", "b"] * 60, {"kind": "number"}, "labels must be numbers; got"),
-            (["a", "b"] * 60, {"kind": "odd"}, "kind must be"),
-            (["a", "b"] * 60, {"groups": [1, 2]}, "groups must have one entry"),
-            (["a", "b"] * 60, {"n_permutations": 0}, "n_permutations"),
-        ],
-    )
-    def test_refusals(self, y, options, message):
-        refused(message, association, related()[0], y, **options)
-
     def test_refuses_a_table_without_coefficients(self):
         alpha = np.full((4, 2), np.nan)
         refused("no frame has coefficients", association, alpha, [0, 0, 1, 1])
@@ -453,3 +435,6 @@ class TestAlignedFrames:
 
     def test_refuses_half_a_point(self):
         refused("two columns per point; got 3", AlignedFrames().fit, np.ones((4, 3)))
+
+
+test_refusals = refusals_of("analysis", globals())

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from landmark_files import FRAME, TRACKS, XY
 from numpy.testing import assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm.analysis import AlignedFrames, WithinGroups
@@ -206,26 +206,6 @@ def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
 YOLO = "0 .5 .5 .2 .2" + " .5" * 10
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("a.tps", "LM=0\nID=1\nLM=0\nID=2\n", "there are no points in it"),
-        ("a.csv", f"x0,y0,note\n1,2,{'b' * 140_000}\n", "more than 131,072 characters"),
-        ("a.csv", 'x0,y0,n\n1,2,"' + "b\n" * 99_000, "or a quotation mark no end"),
-        ("a.tsv", f"x0\ty0\tn\n1\t2\t{'b' * 140_000}\n", "more than 131,072"),
-        ("a.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><dataset/>", "it has declarations"),
-        ("a.txt", "3\n1 2\n3 4\n", "as many points as it says"),
-        ("b.txt", f"{YOLO}\n{YOLO} .3 .4\n", "its lines have 15, 17 numbers"),
-        ("a.trc", "PathFileType\n", "it has 1 lines, and no rows"),
-        ("b.tps", "LM=1e3\n1 2\n", "LM= needs a number of landmarks"),
-    ],
-)
-def test_odd_files_are_refused_in_a_line(name, text, message, tmp_path):
-    (tmp_path / name).write_text(text)
-    told = str(refused(message, read_landmarks, tmp_path / name))
-    assert "\n" not in told
-
-
 def test_sizes_of_images_have_a_limit(tmp_path, capsys):
     path = files.write_mesh(tmp_path / "a.csv", files.MESH)
     refused("image_size must be", read_landmarks, path, image_size=(10**21, 10**21))
@@ -272,3 +252,6 @@ def test_folders_of_several_kinds(tmp_path):
         read_landmarks,
         files.write_trc(tmp_path / "b.trc", TRACKS, np.arange(12.0)[:, None, None]),
     )
+
+
+test_refusals = refusals_of("attacks", globals())

@@ -9,7 +9,7 @@ import pytest
 from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scenes import random_cameras, with_gaps
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
@@ -386,17 +386,6 @@ class TestCompressible:
         assert many.n_iter_ <= 2
         assert many.dictionary_residual_ < first.dictionary_residual_
 
-    @pytest.mark.parametrize(
-        ("parameters", "message"),
-        [
-            ({"n_atoms": 2, "sparsity": 3}, "sparsity=3 must not be .* n_atoms=2"),
-            ({"sparsity": 4}, "sparsity=4 must not be .* n_atoms=3"),
-            ({"n_atoms": 61}, "n_atoms=61 needs as many frames .* n_samples=60"),
-        ],
-    )
-    def test_impossible_sizes(self, parameters, message):
-        refused(message, CompressibleNRSfM(2, **parameters).fit, table().data)
-
 
 SHARK, YOGA = "shark_torresani", "akhter_yoga"
 DRINK, PICKUP = "akhter_drink", "akhter_pickup"
@@ -434,3 +423,6 @@ def test_public_sequences(load_data, name, model, inverse_snr, error):
         assert found < error
     else:
         assert found == pytest.approx(error, rel=0.02)
+
+
+test_refusals = refusals_of("baselines", globals())

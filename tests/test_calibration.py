@@ -7,7 +7,7 @@ import pytest
 from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scenes import measurements, random_rotation
 from scipy.linalg import expm
 from scipy.optimize import approx_fprime, minimize
@@ -430,10 +430,14 @@ UP, FRONT = [[8, 27]], [[0, 30], [16, 30]]
 POINTS = {"left_right": LEFT_RIGHT, "up": UP, "front": FRONT}
 
 
-@pytest.fixture(scope="module")
-def face():
+def upright_face():
     """A face that looks at the viewer: x points right, y down, z away from it."""
     return make_face_tracks(n_frames=2, random_state=0).neutral_shape
+
+
+@pytest.fixture(scope="module")
+def face():
+    return upright_face()
 
 
 def angle_between(one, two):
@@ -521,31 +525,6 @@ def test_nearest_principal_axes(rng):
     assert not pose.mirrored
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"left_right": LEFT_RIGHT}, "two of left_right, up and front"),
-        (
-            {"up": [0, 1.0, 0], "front": [0, 2.0, 0]},
-            "up and front must not be parallel",
-        ),
-        ({"left_right": [[0, 16]], "up": [1.0, 0, 0]}, "left_right and up must not be"),
-        ({"up": np.zeros(3), "front": FRONT}, "up must be a direction other than zero"),
-        ({"up": [np.nan, 0, 1], "front": FRONT}, "up must be a direction other than"),
-        ({"up": [1.0, 2.0], "front": FRONT}, r"pairs of points.*got the shape \(2,\)"),
-        ({"up": [[0.0, 1.0]], "front": FRONT}, "integers of shape.*dtype float64"),
-        ({"up": [[0, 68]], "front": FRONT}, "points 0 to 67; got 0 to 68"),
-        ({"left_right": [[-1, 2]], "up": UP}, "points 0 to 67; got -1 to 2"),
-        ({"left_right": [0, 16], "up": UP}, r"shape \(n_pairs, 2\).*got shape \(2,\)"),
-        ({"left_right": [[3, 3]], "up": UP}, "no direction in common"),
-        ({"left_right": [[0, 16], [16, 0]], "up": UP}, "no direction in common"),
-        ({"scheme": "dlib"}, r"skeletons are ibug-68, .*; got 'dlib'"),
-    ],
-)
-def test_refused_poses(face, arguments, message):
-    refused(message, canonical_pose, face, **arguments)
-
-
 def test_refused_shapes(face):
     message = "'ibug-68' has 68 points, the shape 60"
     refused(message, canonical_pose, face[:60], scheme="ibug-68")
@@ -595,37 +574,6 @@ def test_deviations_of_angles_are_those_of_random_small_turns(rng):
     expected = np.std(np.array(view_angles((R * turns).as_matrix())), axis=1)
     found = angle_deviations(view_angles([R.as_matrix()]), [root @ root.T])
     assert_allclose(np.ravel(found), expected, rtol=0.03)
-
-
-@pytest.mark.parametrize(
-    ("call", "arguments", "message"),
-    [
-        *(
-            (metric_upgrade, (motion, camera), message)
-            for motion, camera, message in (
-                (np.ones((4, 3, 3)), "orthographic", r"2, 3\); got \(4, 3, 3\)"),
-                (np.ones((0, 2, 3)), "orthographic", r"2, 3\); got \(0, 2, 3\)"),
-                (np.full((4, 2, 3), np.inf), "orthographic", "infinite; 24 entries"),
-                (np.zeros((4, 2, 3)), "orthographic", "0 usable cameras see 0"),
-                (np.ones((4, 2, 3)), "weak_perspective", "4 usable cameras see 1"),
-                (np.ones((4, 2, 3)), "perspective", "must be one of .*'perspective'"),
-            )
-        ),
-        (euclidean_shapes, (np.ones((4, 2)), np.eye(3)), r"3\); got \(4, 2\)"),
-        (euclidean_shapes, (np.ones(3), np.eye(3)), r"n_points, 3\); got \(3,\)"),
-        (euclidean_shapes, (np.eye(3), np.eye(2)), r"not singular; got \(2, 2\)"),
-        (euclidean_shapes, (np.eye(3), np.ones((3, 3))), "got a singular one"),
-        (orthonormal_cameras, (np.eye(10, 2)[:, [0, 1, 0]],), "independent columns; 2"),
-        (orthonormal_cameras, (np.ones((5, 3)),), "an even number; got 5"),
-        (orthonormal_cameras, (np.full((6, 3), np.nan),), "motion contains NaN"),
-        (orthonormal_cameras, (np.eye(6, 3), -1.0), "must not be negative; got -1"),
-        (view_angles, (np.eye(3),), r"\(n_frames, 3, 3\); got \(3, 3\)"),
-        (view_angles, (-np.eye(3)[None],), "[Nn]on-positive determinant"),
-        (view_angles, (2.0 * np.eye(3)[None],), "without a scale; .* up to 3"),
-    ],
-)
-def test_refused_arrays(call, arguments, message):
-    refused(message, call, *arguments)
 
 
 # --- shapes of estimators: what is known of the cameras is used ----------------------
@@ -775,3 +723,6 @@ class TestReconstruct:
         flat.motion_[:, :, 2] = 0
         with pytest.raises(ValueError, match=r"three directions of space; .* see 2"):
             flat.reconstruct(photos.data, camera="weak_perspective")
+
+
+test_refusals = refusals_of("calibration", globals())

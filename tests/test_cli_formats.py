@@ -6,6 +6,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
@@ -83,42 +84,6 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
     assert err == ""
     assert list(again) == list(alpha)
     np.testing.assert_allclose(again["alpha_1"], alpha["alpha_1"], atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("write", "options", "message"),
-    [
-        (
-            write_openface,
-            "--columns x_#,y_# --format openface",
-            "--columns needs --format mediapipe or table; ",
-        ),
-        (
-            write_openface,
-            "--image-size 640x480 --camera affine",
-            "--image-size needs --format mediapi",
-        ),
-        (write_openface, "--focal-length 1000", "--focal-length needs the size of"),
-        (
-            write_openface,
-            "--principal-point 1 2 --camera orthographic",
-            "--principal-point has no effect on --camera orthographic without --focal",
-        ),
-        (write_openface, "--camera perspective", "needs the size of the images, with"),
-        (write_openface, "--part face", "or coco or openpose or mmpose"),
-        (write_openpose, "", "has points of pose, face: choose one with part"),
-        (
-            write_openface,
-            "--min-confidence 1 --columns x_#,y_#",
-            "has no confidences of all points. Their columns need the names of the x",
-        ),
-        (write_pts, "--min-confidence 1", "(pts) has no confidences"),
-    ],
-)
-def test_options_without_effect_are_refused(fails, tmp_path, write, options, message):
-    path, *_ = write(tmp_path)
-    folder = ["-o", tmp_path / "results", *QUICK]
-    assert message in fails("fit", path, *options.split(), *folder)
 
 
 def write_sized_mesh(folder):
@@ -227,11 +192,11 @@ def test_confidences_of_a_plain_table(fits, transforms, tmp_path, axes, word):
     assert list(found.alpha) == ["row", "id", "alpha_1"]
 
 
-SHARES = "like shares of the width and height of an image"
+SHARES = "like fractions of the width and height of an image"
 
 
 def write_shares(folder, change=lambda shares: shares):
-    """Write points of hands in shares of an image of 1920 x 1080 pixels."""
+    """Write points of hands in normalised coordinates of 1920 x 1080 pixels."""
     shares = change(tracks(21) * [2.5 / 1920, 2.5 / 1080])
     names = [f"{axis}_{j}" for j in range(21) for axis in "xy"]
     path = folder / "hands.csv"
@@ -266,5 +231,8 @@ def test_most_points_are_inside_of_the_image(begins, fails, tmp_path):
     assert find_format(path) == "table"
     assert SHARES not in begins(path, *options)
     path = write_shares(tmp_path, lambda shares: shares - shares[:, :1])
-    message = "the coordinates are no shares of the width and height of an image"
+    message = "the coordinates are no fractions of the width and height of an image"
     assert message in fails("fit", path, "-o", tmp_path / "results", *options)
+
+
+test_refusals = refusals_of("cli_formats", globals())

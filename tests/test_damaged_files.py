@@ -120,7 +120,7 @@ def check_cells(points, failed, path, separator=","):
 
 
 # Warnings of some formats: how an array is read, shares, and what is left out.
-SAID = "the array|.*shares of the width|not of \\w+, and left|shapes that are no"
+SAID = "the array|.*fractions of the width|not of \\w+, and left|shapes that are no"
 
 
 def read_format(name):

@@ -3,7 +3,9 @@ from functools import partial
 import numpy as np
 import pytest
 from layers import slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose
+from refusals import refusals_of
 from scenes import waving_scene
 from scipy.linalg import block_diag
 from scipy.optimize import approx_fprime
@@ -259,8 +261,8 @@ def test_likelihood_of_frames_is_linearised(name, loss):
     assert_allclose(np.linalg.eigvals(ratio), 1.0, atol=0.2)
 
 
-@pytest.fixture(scope="module")
-def waving():
+@made_once
+def waving_model():
     """Return a model of a thing that waves, its table in order of time."""
     rng = np.random.default_rng(0)
     tracks = waving_scene(160, 20, [0.1, 0.07])[0].tracks
@@ -268,6 +270,16 @@ def waving():
     tracks[rng.random(tracks.shape[:2]) < 0.4] = np.nan
     table = tracks.reshape(160, -1)
     return AffineNRSfM(2, random_state=0, scale_frames=False).fit(table), table
+
+
+@pytest.fixture
+def waving():
+    return waving_model()
+
+
+def smoothed_waves(**options):
+    model, table = waving_model()
+    return model.smooth(table, **options)
 
 
 class TestSmooth:
@@ -361,25 +373,11 @@ class TestSmooth:
         assert found.time_scales.shape == (0,)
         assert_allclose(found.alpha, model.transform(few), atol=1e-12)
 
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            ({"time": np.zeros(160)}, "row 1 has 0 after 0 of row 0"),
-            ({"time": np.r_[np.nan, np.arange(159)]}, "missing in 1 of 160.*row 0"),
-            ({"time": np.arange(9)}, "each of the 160 frames; got 9"),
-            ({"groups": np.arange(160)}, "no group has two rows"),
-            ({"groups": ["a"] * 9}, "each of the 160 frames; got 9"),
-            ({"groups": ["a"] * 159 + [None]}, "missing in 1 of 160.*row 159"),
-            ({"max_gap": 0}, "max_gap"),
-        ],
-    )
-    def test_refusals(self, waving, options, message):
-        model, table = waving
-        with pytest.raises(ValueError, match=message):
-            model.smooth(table, **options)
-
     def test_needs_a_posterior(self, waving):
         _, table = waving
         model = AffineNRSfM(1, isa=FastISA(n_init=1), refinement=None).fit(table)
         with pytest.raises(ValueError, match="refinement='joint'"):
             model.smooth(table)
+
+
+test_refusals = refusals_of("dynamics", globals())

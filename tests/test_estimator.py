@@ -13,7 +13,7 @@ import pytest
 from layers import may_not_converge, slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
-from refusals import refused
+from refusals import refusals_of, refused
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
@@ -86,7 +86,7 @@ def size_weights(model, table):
 
 @pytest.fixture(scope="module")
 def model():
-    return estimator().fit(TABLE)
+    return fitted()
 
 
 VARIANTS = [
@@ -552,23 +552,6 @@ def with_value(value):
     return table
 
 
-BAD_TABLES = {
-    "odd number of columns": (
-        TABLE[:, :-1],
-        "must have two columns per point .* even number; got n_features=135",
-    ),
-    "infinite values": (with_value(np.inf), "X contains infinity"),
-    "one frame": (TABLE[:1], "minimum of 2 is required|at least 8 frames"),
-    "three dimensions": (FACES.tracks, r"one row per frame .*: give np\.asarray\(X\)"),
-}
-
-
-@pytest.mark.parametrize("name", BAD_TABLES)
-def test_bad_tables_are_refused(name):
-    table, message = BAD_TABLES[name]
-    refused(message, estimator().fit, table)
-
-
 def test_calibrated_cameras_need_seven_points():
     model = AffineNRSfM(1, camera="weak_perspective")
     refused(
@@ -590,32 +573,6 @@ def test_calibrated_cameras_need_seven_points():
 )
 def test_bad_new_tables_are_refused(model, method, table, message):
     refused(message, getattr(model, method), table)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([[0.0, 0.0]],), r"alpha must have shape \(1, 3\); got \(1, 2\)"),
-        (([["low", 0.0, 0.0]],), "could not convert string to float"),
-        (([0.0, 0.0, 0.0],), "Expected 2D array"),
-        (
-            (np.zeros((4, 3)), np.zeros((3, 2, 3))),
-            r"motion must have shape \(4, 2, 3\) or \(2, 3\); got \(3, 2, 3\)",
-        ),
-        (
-            (np.zeros((4, 3)), np.zeros((3, 2))),
-            r"motion must have shape .*; got \(3, 2\)",
-        ),
-        (
-            (np.zeros((4, 3)), None, np.zeros((1, 2))),
-            r"translation must have shape \(4, 2\) or \(2,\); got \(1, 2\)",
-        ),
-        ((np.zeros((4, 3)), np.full((2, 3), np.nan)), "motion contains NaN"),
-        ((np.zeros((4, 3)), None, [np.inf, 0.0]), "translation contains infinity"),
-    ],
-)
-def test_bad_arguments_of_inverse_transform_are_refused(model, arguments, message):
-    refused(message, model.inverse_transform, *arguments)
 
 
 @pytest.mark.parametrize("library", ["pandas", "polars"])
@@ -763,18 +720,6 @@ def test_strategies_of_others_can_be_used():
     model = estimator(2, isa=FastICA(max_iter=2000)).fit(TABLE)
     assert isinstance(model.isa_, FastICA)
     assert model.inverse_snr_ < 0.01
-
-
-@pytest.mark.parametrize(
-    ("isa", "message"),
-    [
-        *((FastISA(size, n_init=2), "subspace_size") for size in (1, 2, 6)),
-        *((PooledFastICA(size, n_init=2), "subspace_size") for size in (1, 2, 6)),
-        (Given(rows=5), "components_"),
-    ],
-)
-def test_strategies_with_other_subspaces_or_too_few_are_refused(isa, message):
-    refused(message, estimator(2, isa=isa).fit, TABLE)
 
 
 def test_verbose_prints_a_line_for_each_stage(capsys):
@@ -979,3 +924,6 @@ def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meanin
     assert found.camera_noise_ratio == model.camera_noise_ratio_
     assert least <= found.camera_noise_ratio < most
     assert meaning in found.camera_meaning
+
+
+test_refusals = refusals_of("estimator", globals())

@@ -5,7 +5,6 @@ import copy
 import hashlib
 import io
 import re
-from functools import partial
 from zipfile import ZipFile
 
 import numpy as np
@@ -23,11 +22,10 @@ from export_models import (
 from exported_files import Read, content_of, numbers
 from layers import may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scipy.io import loadmat
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from sklearn.decomposition import PCA
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -203,87 +201,8 @@ def test_names_are_cell_arrays_in_matlab(tmp_path):
     assert names.shape == (N_COMPONENTS, 1)
 
 
-distances = partial(point_distances, pairs=[(48, 54)])
-POINTS, SHAPES = "must name points 0 to 67; got 0 to", r"\(n_pairs, 2\), the"
-CASES = [
-    (write_glb, {"edges": [[0, 68]]}, f"{POINTS} 68"),
-    (write_glb, {"edges": [[0, 1, 2, 3]]}, SHAPES),
-    (write_glb, {"edges": [[0.5, 1]]}, SHAPES),
-    (write_glb, {"names": ["one"]}, "names must hold 3 names; got 1"),
-    (write_glb, {"camera": "perspective"}, "camera must be"),
-    (write_viewer, {"labels": ["a"]}, "labels must hold 150 labels, one per row; got"),
-    (write_viewer, {"labels": range(N_FRAMES)}, "at most 30 different .* got 150"),
-    (write_viewer, {"n_frames": -1}, "n_frames must be a whole number .*; got -1"),
-    (write_viewer, {"n_frames": 2.5}, "n_frames must be a whole number .*; got 2.5"),
-    (write_viewer, {"names": ["jaw"]}, "names must hold 3 names"),
-    (write_viewer, {"edges": [[0, 99]]}, POINTS),
-    (write_viewer, {"depth_std": np.ones(68)}, "depth_std needs a model with calibr"),
-    (write_viewer, {"origin": "left"}, "origin must be"),
-    (frame_poses, {"camera": None}, "angles need calibrated cameras"),
-    (distances, {"camera": None}, "distances need calibrated cameras"),
-    (distances, {"pairs": [(1, 99)]}, "no point 99; the 68 points"),
-    (distances, {"pairs": [(1, 1)]}, "two different points"),
-    (distances, {"length": 0.0}, "length must be a positive number; got 0"),
-    *(
-        (
-            point_distribution_model,
-            {"n_modes": each},
-            "n_modes.* must be an int in the range",
-        )
-        for each in (0, -1, 1.0, 1.5, 0.0, np.nan, True, "all")
-    ),
-]
-
-
-@pytest.mark.parametrize(("function", "options", "message"), CASES)
-def test_bad_options(tmp_path, function, options, message):
-    suffix = {write_glb: ".glb", write_viewer: ".html"}.get(function)
-    path = [] if suffix is None else [tmp_path / f"model{suffix}"]
-    refused(message, function, face_model(), *path, **options)
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("depth_std", "message"),
-    [
-        (np.ones(67), r"depth_std must have shape \(150, 68\) or \(68,\); got \(67,\)"),
-        (np.ones((149, 68)), r"must have shape .*; got \(149, 68\)"),
-        (np.full(68, -0.5), "must not be negative; its least value is -0.5"),
-        (np.full(68, np.inf), "depth_std contains infinity"),
-        ("wide", "could not convert string to float"),
-    ],
-)
-def test_bad_deviations(tmp_path, depth_std, message):
-    with pytest.raises(ValueError, match=message):
-        write_viewer(calibrated_model(), tmp_path / "a.html", depth_std=depth_std)
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("write", "suffixes"),
-    [
-        (write_glb, ".glb"),
-        (write_viewer, ".html or .htm"),
-        (write_shapes, ".npz or .mat"),
-        (write_pdm, ".txt or .mat or .npz"),
-    ],
-)
-def test_other_suffixes(tmp_path, write, suffixes):
-    model = face_model()
-    if write is write_pdm:
-        model = point_distribution_model(model)
-    with pytest.raises(ValueError, match=f"path must end in {suffixes}; got .*a.csv"):
-        write(model, tmp_path / "a.csv")
-
-
-def test_models_that_have_no_frames_of_their_own():
-    refused("model should be an AffineNRSfM; got PCA", frame_poses, PCA())
+def test_models_that_are_not_fitted_have_no_frames():
     refused(None, frame_poses, AffineNRSfM(), error=NotFittedError)
-    with pytest.raises(ValueError, match='camera must be "weak_perspective" or None'):
-        frame_poses(blob_model(), camera="orthographic")
-    table = faces().data[:40]
-    without = AffineNRSfM(1, refinement=None, random_state=0, keep_frames=False)
-    refused("exporting shapes needs the cameras", frame_poses, without.fit(table))
 
 
 # --- pages ---------------------------------------------------------------------------
@@ -566,9 +485,6 @@ class TestPointDistances:
         again = point_distances(model, [MOUTH], truth.data)
         assert_allclose(again, eyes, atol=2e-3)
 
-    def test_a_pair_alone_is_no_list_of_pairs(self, fitted):
-        refused(r"\[\(62, 66\)\].* got 48 instead", point_distances, fitted[1], MOUTH)
-
 
 def test_uncertainty_needs_calibrated_cameras(fitted):
     truth, model = fitted
@@ -697,8 +613,6 @@ def test_affine_shapes_have_as_many_modes_as_basis_shapes():
     model = face_model()
     pdm = point_distribution_model(model, camera=None, n_modes=0.999999)
     assert len(pdm.modes) == N_COMPONENTS
-    message, options = "at most 3, the number of principal", {"camera": None}
-    refused(message, point_distribution_model, model, n_modes=4, **options)
 
 
 def test_rows_without_points_are_left_out():
@@ -773,24 +687,7 @@ def test_texts_as_others_write_them_are_read(tmp_path):
     assert_array_equal(pdm.eigenvalues, [7])
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "as a point distribution model: where there should be the mean"),
-        ("# mean\n3 1 6 1 2\n", "where there should be the mean"),
-        ("3 1 6 1 2 3 3 1 6 1 one 1 1 1 6 1", "there should be the principal comp"),
-        ("3 1 6 1 2 3 3 1 6 1 1 1 1 2 6 1 1", r"should have a mean of 3n numbers"),
-    ],
-    ids=["empty", "short", "no number", "misfit"],
-)
-def test_other_texts_are_refused(tmp_path, text, message):
-    path = tmp_path / "other.txt"
-    path.write_text(text)
-    refused(message, read_pdm, path)
-
-
 def test_other_files_are_refused(pdm, tmp_path):
-    refused(r"must end in \.txt; got", read_pdm, tmp_path / "pdm.csv")
     misfit = PointDistributionModel(pdm.mean, pdm.modes, pdm.eigenvalues[1:])
     refused("eigenvalues", write_pdm, misfit, tmp_path / "a.txt")
     assert not (tmp_path / "a.txt").exists()
@@ -818,3 +715,6 @@ def test_arrays_have_the_size_of_their_file(tmp_path):
         refused(f"48 bytes; got {n_bytes}", read, changed)
     for size in (0, 8, 16, 24):
         refused("holds Python objects", read, head + bytes(size))
+
+
+test_refusals = refusals_of("export_files", globals())

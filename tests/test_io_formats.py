@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -10,7 +11,7 @@ import pandas as pd
 import pytest
 from landmark_files import EXPECTED, FRAME, MESH, TRACKS, WFLW, WRITERS, write_json
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 
 from isa_nrsfm.io import (
     FORMATS,
@@ -51,7 +52,7 @@ def individuals_of(landmarks):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-@pytest.mark.filterwarnings("ignore:the array", "ignore:.*shares of the width")
+@pytest.mark.filterwarnings("ignore:the array", "ignore:.*fractions of the width")
 @pytest.mark.filterwarnings("default")  # tables of HDF5 files stay open
 def test_files_read_back_as_they_were_written(name, tmp_path):
     path, format = WRITERS[name](tmp_path), name.partition("-")[0]
@@ -136,7 +137,7 @@ def test_pyfeat_has_empty_cells_where_no_face_is(detector, tmp_path):
 
 def test_shares_of_the_image_become_pixels(tmp_path):
     path = files.write_mesh(tmp_path / "a.csv", MESH)
-    refused(r"shares of the image's width.*--image-size", read_landmarks, path)
+    refused(r"fractions of the image's width.*--image-size", read_landmarks, path)
     landmarks = read_landmarks(path, image_size=files.IMAGE_SIZE)
     assert_allclose(tracks_of(landmarks), MESH)
     assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
@@ -241,7 +242,9 @@ def test_openpose_that_cannot_be_read_is_refused_with_the_way(tmp_path):
     shares[3, 0] = 1.02  # a foot that the image cuts off
     people = [[files.openpose_person(pose=shares)]]
     folder = files.write_openpose(tmp_path / "json", people)
-    refused("shares of the image's size.* --keypoint_scale 0", read_landmarks, folder)
+    refused(
+        "fractions of the image's size.* --keypoint_scale 0", read_landmarks, folder
+    )
     empty = files.write_openpose(tmp_path / "empty", [[], [files.openpose_person()]])
     refused("no visible points in pose_keypoints_2d", read_landmarks, empty)
     refused("no files with names", read_landmarks, tmp_path, "openpose")
@@ -358,20 +361,6 @@ def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"y": "z"}, "'snout' has a z"),
-        ({"y": "b"}, "'snout' has no x or no y"),
-        ({"y": "b", "x": "a", "likelihood": "c"}, "no columns x and y"),
-        ({"y": "x"}, "more than one column 'x' of 'snout'"),
-    ],
-)
-def test_bad_deeplabcut_columns_are_named(change, message, tmp_path):
-    path = files.write_deeplabcut(tmp_path / "a.csv", FRAME.rename(columns=change))
-    refused(message, read_landmarks, path)
-
-
-@pytest.mark.parametrize(
     ("order", "named"),
     [("txnf", True), ("ftnx", True), ("nfxt", True), ("txnf", False), ("fnxt", False)],
     ids=str,
@@ -482,37 +471,6 @@ def test_coco_results_have_confidences(tmp_path):
     refused("more than one category_id: 1, 2", read_landmarks, path)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({}, "expected an object with the lists images"),
-        (3, "expected an object"),
-        ([3], "all results must be objects"),
-        ([], "no frames"),
-        ([{"keypoints": [1] * 3, "image_id": [1]}], "a number or a text"),
-        ([{"keypoints": [1, 2]}], "for each point; got 2 numbers"),
-        ([{"keypoints": [1, 2, True]}], "a list of finite numbers; got"),
-        ([{"keypoints": [1, 2, "3"]}], "a list of finite numbers; got"),
-        ([{"keypoints": [1, 2, 10**400]}], "a list of finite numbers; got"),
-        ([{"keypoints": [1] * 6}, {"keypoints": [1] * 9}], "have 2 keypoints; got 3"),
-        (
-            {"images": [{"id": 1}], "annotations": [{"image_id": 1}]},
-            "no frames in it: no annotation has keypoints",
-        ),
-        (
-            files.coco_annotations(TRACKS) | {"images": [{"id": 1}]},
-            "annotation 101 is of image 2, which is not among",
-        ),
-        (files.coco_annotations(TRACKS) | {"images": [{}]}, "images needs an id"),
-    ],
-)
-def test_json_that_is_not_coco_is_refused(content, message, tmp_path):
-    path = files.write_json(tmp_path / "a.json", content)
-    told = str(refused(message, read_landmarks, path, "coco"))
-    assert f"{path} cannot be read as coco" in told
-    assert "Expected images, annotations" in told
-
-
 def test_tables_keep_options_of_their_own(tmp_path):
     path = tmp_path / "a.tsv"
     names = [f"{axis}{j}" for axis in "ab" for j in range(8)]
@@ -563,25 +521,6 @@ def test_options_of_other_formats_are_refused(tmp_path):
     for threshold in (np.nan, "0.5", True, np.inf):
         message = "min_confidence must be a finite number"
         refused(message, read_landmarks, path, min_confidence=threshold)
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda text: text[:-40], "line 13 has .* values, but .* truncated"),
-        (lambda text: text.replace("face_id", "frame"), "one column .* 'frame'"),
-        (lambda text: text.replace(",y_3,", ",why,"), "'x_3' has no partner"),
-        (lambda text: text.partition("\n")[0], "a header but no rows"),
-        (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",?,", 1), "'x_2'.*'\\?'"),
-        (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",inf,", 1), "infinite"),
-        (lambda text: text.replace("0.98", "0.9\xe9"), "'confidence'.*in row 0"),
-    ],
-    ids="truncated twice unpaired empty text inf letter".split(),
-)
-def test_damaged_tables_are_refused(damage, message, tmp_path):
-    path = files.write_openface(tmp_path / "a.csv", TRACKS)
-    path.write_text(damage(path.read_text()))
-    assert str(path) in str(refused(message, read_landmarks, path, "openface"))
 
 
 def landmarker_result(part, faces, **extra):
@@ -710,3 +649,13 @@ class TestSkeletons:
         table = pd.DataFrame(faces.reshape(4, -1), columns=names)
         table.to_csv(tmp_path / "b.csv", index=False)
         assert read_landmarks(tmp_path / "b.csv", "table").skeleton is None
+
+
+def openface_text():
+    """Return a table of OpenFace."""
+    with TemporaryDirectory() as folder:
+        path = files.write_openface(Path(folder, "a.csv"), TRACKS)
+        return path.read_text()
+
+
+test_refusals = refusals_of("io_formats", globals())

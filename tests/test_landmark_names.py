@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from landmark_files import openface_names
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 
 from isa_nrsfm.io._landmark_columns import (
     MIN_POINTS,
@@ -126,29 +126,6 @@ def test_small_sets_do_not_compete_and_do_not_suffice():
     assert len(find_landmark_columns(small, columns="*_x,*_y").x) == MIN_POINTS - 1
 
 
-@pytest.mark.parametrize(
-    ("names", "columns", "message"),
-    [
-        (["age", "sex"], None, "2 columns are 'age', 'sex'. If"),
-        ([f"x{j}" for j in range(20)], None, "'x0', 'x1', 'x2', 'x3', ...."),
-        ([], None, "no landmark columns"),
-        ([*named("{a}{p}"), "x9"], None, "'x9' has no partner among the columns 'y#':"),
-        ([*named("{a}{p}"), "y9"], None, "'y9' has no partner among the columns 'x#':"),
-        ([*named("{a}{p}"), "x9", "x10"], None, r"'y#' \(nor have 1 more\)"),
-        ([*named("{a}{p}"), "x00"], None, "'x0' and 'x00' name the same coordinate"),
-        ([*named("{a}{p}"), "y8"], None, "'y8' and 'y8' name the same coordinate"),
-        (["x", "y", *named("{a}.{p}")], None, "a header that repeats the same names"),
-        (named("{a}{p}"), "x_#,y_#", "no column matches 'x_#'; the table's 18 columns"),
-        (named("{a}{p}"), "x#", "x and y columns in turn.*got 'x#'"),
-        (named("{a}{p}"), "x#,", "x and y columns in turn"),
-        (named("{a}{p}"), [], "x and y columns in turn"),
-        (named("{a}{p}"), "x#,y#,x1,y1", "x#,y#,x1,y1 match 'x1' twice"),
-    ],
-)
-def test_errors_name_what_is_wrong(names, columns, message):
-    refused(message, find_landmark_columns, names, columns)
-
-
 OTHER_NAMES = "AU01_r pose_Tx p_rx FaceRectX x _x max0 frame index1 a,b_x x_ p_scale"
 
 
@@ -203,3 +180,6 @@ def test_columns_that_are_named_one_by_one_are_a_choice():
     names = named("{a}_{p}")
     chosen = named("{a}_{p}", points=range(1, 8))
     assert find_landmark_columns(names, columns=chosen).interleaved == chosen
+
+
+test_refusals = refusals_of("landmark_names", globals())

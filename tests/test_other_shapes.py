@@ -273,7 +273,7 @@ LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
     ],
 )
 def test_columns_scaled_one_by_one(tmp_path, scaled):
-    told = "Each column was scaled by itself"
+    told = "Each column was scaled separately"
     with pytest.warns(match=told):
         AffineNRSfM(1, refinement=None, random_state=0).fit(scaled)
     wide("{axis}{part}", scaled, range(68)).to_csv(tmp_path / "a.csv", index=False)

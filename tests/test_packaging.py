@@ -19,8 +19,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 CORE = {"numpy", "scipy", "scikit-learn", "joblib"}
 # Files of the package that are no Python code.
-DATA = "py.typed cli/report.html datasets/face_model.csv datasets/face_prior.npz"
-DATA += " export/viewer.html export/viewer.js io/formats.toml skeletons/layouts.toml"
+DATA = "py.typed cli/options.toml cli/report.html datasets/face_model.csv"
+DATA += " datasets/face_prior.npz export/viewer.html export/viewer.js io/formats.toml"
+DATA += " skeletons/layouts.toml"
 DATA = {f"isa_nrsfm/{name}" for name in DATA.split()}
 FOUND_AT_IMPORT = """
 import sys, sklearn.decomposition

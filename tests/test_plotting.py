@@ -12,7 +12,7 @@ from cameras import lorentz_cameras
 from layers import may_not_converge, slow_after
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refusals_of, refused
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
@@ -57,6 +57,13 @@ DISPLAYS = {
         6,
     ),
 }
+
+
+def given(kind, **changed):
+    """Return a display with changed arguments."""
+    return kind(**DISPLAYS[kind][0] | changed)
+
+
 EACH = pytest.mark.parametrize("kind", DISPLAYS)
 
 
@@ -116,54 +123,6 @@ def test_displays_take_keywords_and_fitted_estimators(kind):
 def test_points_can_have_another_style():
     shapes = BasisShapeDisplay(**DISPLAYS[BasisShapeDisplay][0])
     assert shapes.plot(point_kw={"s": 11}).plus_[0].get_sizes() == [11]
-
-
-@pytest.mark.parametrize(
-    ("kind", "changed", "message"),
-    [
-        (BasisShapeDisplay, {"mean_shape": np.zeros((4, 2))}, r"got \(4, 2\) and"),
-        (BasisShapeDisplay, {"basis": np.zeros((2, 5, 3))}, r"and \(2, 5, 3\)"),
-        (BasisShapeDisplay, {"energy_share": [1.0]}, r"3 numbers.*got shape \(1,\)"),
-        (BasisShapeDisplay, {"component_names": ["a"]}, "must hold 3 names.*got 1"),
-        (BasisShapeDisplay, {"edges": [[0, 20]]}, "points 0 to 19; got 0 to 20"),
-        (BasisShapeDisplay, {"edges": [[0.0, 1.0]]}, "must be integers"),
-        (BasisShapeDisplay, {"edges": "tree"}, "the skeletons are .*; got 'tree'"),
-        (BasisShapeDisplay, {"edges": "hand-21"}, "has 21 points, the shape 20"),
-        (BasisShapeDisplay, {"origin": "left"}, "got 'left'"),
-        (CoefficientsDisplay, {"alpha": [1.0, 2.0]}, r"got shape \(2,\)"),
-        (CoefficientsDisplay, {"alpha_std": np.eye(3)}, r"of alpha; got \(3, 3\)"),
-        (CoefficientsDisplay, {"y": ["a"]}, "y must have one entry for each of the 30"),
-        (CoefficientsDisplay, {"component_names": ["a"]}, "must hold 2 names"),
-        *(
-            (ModeCovarianceDisplay, {"mode_covariance": np.zeros(shape)}, "a square")
-            for shape in ((4, 4), (3, 6), (0, 0), (3,))
-        ),
-        (ModeCovarianceDisplay, {"component_names": ["one"]}, "must hold 2 names"),
-        (ReprojectionDisplay, {"reprojected": POINTS[:, 1:]}, r"\(6, 9, 2\)"),
-        (ReprojectionDisplay, {"observed": np.zeros((2, 9))}, r"got \(2, 9\) and"),
-        (ReprojectionDisplay, {"frames": [1]}, r"the 6 frames; got shape \(1,\)"),
-        (ReprojectionDisplay, {"frame_names": ["a"]}, "must hold 6 names"),
-        (ReprojectionDisplay, {"edges": [[0, 10]]}, "points 0 to 9"),
-        (ReprojectionDisplay, {"origin": "down"}, "got 'down'"),
-        (ReprojectionDisplay, {"observed": 0 * POINTS}, "seen points are in one place"),
-    ],
-)
-def test_bad_arguments_are_refused(kind, changed, message):
-    refused(message, kind, **DISPLAYS[kind][0] | changed)
-
-
-@pytest.mark.parametrize(
-    ("kind", "arguments", "message"),
-    [
-        *(
-            (BasisShapeDisplay, {"components": each}, "basis shapes, from 0 to 2")
-            for each in ([3], [-1], [], 0, [0.0])
-        ),
-        (CoefficientsDisplay, {"kind": "classes"}, "kind='classes' needs y"),
-    ],
-)
-def test_bad_arguments_of_plot_are_refused(kind, arguments, message):
-    refused(message, kind(**DISPLAYS[kind][0]).plot, **arguments)
 
 
 def drawn_shapes(mean_shape, basis=None, **options):
@@ -758,3 +717,6 @@ def test_missing_points_are_left_out():
     hidden.plot().figure_.canvas.draw()
     assert np.isfinite(hidden.axes_[0].get_xlim()).all()
     assert len(hidden.reprojected_[0].get_offsets()) == 10
+
+
+test_refusals = refusals_of("plotting", globals())

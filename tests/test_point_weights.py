@@ -15,7 +15,7 @@ from layers import slow_after, start_may_not_converge
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scenes import waving_scene
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
@@ -328,22 +328,6 @@ class TestRefusals:
         refused(message, estimator().fit, noisy().X, point_weight=np.ones(shape))
         refused(message, fitted().transform, noisy().X, point_weight=np.ones(shape))
 
-    @pytest.mark.parametrize(
-        ("params", "message"),
-        [
-            ({"refinement": "alternating"}, "of the paper has no weights. Set"),
-            ({"refinement": None}, "needs a fit with refinement='joint'"),
-            ({"loss": "cauchy"}, "needs loss='linear'.* got loss='cauchy'. Set"),
-            (
-                {"refinement": "consensus", "camera": "weak_perspective"},
-                "not supported by the fit with refinement='consensus'",
-            ),
-        ],
-    )
-    def test_parameters(self, params, message):
-        with pytest.raises(ValueError, match=message):
-            estimator(**params).fit(noisy().X, point_weight=noisy().weights)
-
     def test_tables_that_are_not_in_memory(self, tmp_path):
         np.save(tmp_path / "table.npy", noisy().X)
         mapped = np.load(tmp_path / "table.npy", mmap_mode="r")
@@ -420,3 +404,6 @@ class TestCommandLine:
         frame.assign(**scores).to_csv(table, index=False)
         message = fails("fit", table, *options, "-k", "2")
         assert "column 'c_3' should hold numbers, but in row 0" in message
+
+
+test_refusals = refusals_of("point_weights", globals())

@@ -1,7 +1,10 @@
 """Fits of the tables in tests/data, compared with the truth and with stored numbers."""
 
+from functools import cache
+
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -42,7 +45,7 @@ ERRORS = {"calibrated": 0.045, "missing": 0.044, "consensus": 0.054}
 
 @pytest.fixture(scope="module")
 def fits(load_data):
-    """Return a table, its true shapes if known and the model, by the kind of fit."""
+    """Return a function from a kind of fit to table, true shapes and model."""
     faces, hands = load_data("ict_bu3dfe_like_68"), load_data("hands_kazuhito_21")
     tracks, shapes = faces["W2d"], faces["S3d"]
     hidden = np.random.RandomState(0).rand(228, 68, 1) > 0.8
@@ -52,41 +55,43 @@ def fits(load_data):
         "robust": (hands["W2d"][::3], None),
         "consensus": (tracks[::4, ::3], shapes[::4, ::3]),
     }
-    found = {}
-    for kind, (points, truth) in tables.items():
+
+    @cache
+    def fitted(kind):
+        points, truth = tables[kind]
         X = points.reshape(len(points), -1)
-        model = AffineNRSfM(random_state=0, **FITS[kind])
-        found[kind] = X, truth, model.fit(X)
-    return found
+        return X, truth, AffineNRSfM(random_state=0, **FITS[kind]).fit(X)
+
+    return fitted
 
 
-@pytest.mark.parametrize("kind", FITS)
+@pytest.mark.parametrize("kind", slow_after(3, FITS))
 def test_numbers_of_fits(fits, kind):
-    X, _, model = fits[kind]
+    X, _, model = fits(kind)
     energies = model.noise_variance_, model.inverse_snr_, model.score(X[::8])
     numbers = *energies, np.abs(model.alpha_).mean()
     assert_allclose(numbers, NUMBERS[kind], rtol=1e-6)
 
 
 def test_stated_errors_of_calibrated_cameras(fits):
-    X, _, model = fits["calibrated"]
+    X, _, model = fits("calibrated")
     _, depth_std = model.reconstruct(X, return_std=True)
     covariance = model.rotation_covariance(X).mean(axis=0)
     numbers = [model.depth_uncertainty_, depth_std.mean(), *np.diag(covariance)]
     assert_allclose(numbers, STATED_ERRORS, rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ERRORS)
+@pytest.mark.parametrize("kind", slow_after(2, ERRORS))
 def test_true_shapes(fits, kind):
-    X, shapes, model = fits[kind]
+    X, shapes, model = fits(kind)
     camera = "orthographic" if model.camera == "affine" else None
     found = model.reconstruct(X, camera=camera)
     assert mean_shape_error_3d(shapes, found, convention="frame") < ERRORS[kind]
 
 
-@pytest.mark.parametrize("kind", ["calibrated", "consensus"])
+@pytest.mark.parametrize("kind", slow_after(1, ["calibrated", "consensus"]))
 def test_deviations_of_rotations_are_the_errors(fits, load_data, kind):
-    X, _, model = fits[kind]
+    X, _, model = fits(kind)
     true = load_data("ict_bu3dfe_like_68")["R"][:: 228 // len(X)]
     errors = []
     for mirror in (np.eye(3), np.diag([1.0, 1.0, -1.0])):

@@ -20,7 +20,7 @@ AS_USERS = ["few_frames", "widths"]
 CALIBRATED = {"camera": "weak_perspective", "random_state": 0}
 
 
-def faces(n_frames=120, seed=0):
+def faces(n_frames=80, seed=0):
     """Return a table of faces, and coefficients that its points do not follow.
 
     They move along the first basis shape by the coefficient, and slide by the yaw.

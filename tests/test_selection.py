@@ -8,7 +8,7 @@ import pytest
 import sklearn
 from layers import may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refusals_of, refused
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.model_selection import (
     GridSearchCV,
@@ -202,23 +202,6 @@ def test_fewest_basis_shapes_are_fitted():
     assert search.n_components_ == len(search.best_estimator_.basis_) == 2
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"n_components": (1, 8)}, "largest possible n_components is 5"),
-        ({"n_components": (1, 1)}, "different numbers of at least 1"),
-        ({"n_components": (0, 1)}, "different numbers of at least 1"),
-        ({"n_components": ()}, "must be numbers of basis shapes"),
-        ({"n_components": (1.5,)}, "must be numbers of basis shapes"),
-        ({"n_components": "auto"}, "must be an array-like"),
-        ({"estimator": FunctionTransformer()}, "should be an AffineNRSfM"),
-        ({"select": "smallest"}, "select"),
-    ],
-)
-def test_what_cannot_be_tried_is_refused(parameters, message):
-    refused(message, AffineNRSfMCV(**parameters).fit, X)
-
-
 def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
     monkeypatch.delattr("isa_nrsfm._selection.cross_validate")
     refused("n_components=500", AffineNRSfMCV((1, 500)).fit, X)
@@ -269,3 +252,6 @@ def test_the_best_mean_score_ranks_first_and_unknown_ones_last():
     parts = [dict.fromkeys(NAMES, np.full(2, mean)) for mean in means]
     results = results_of(range(1, 6), parts)
     assert_array_equal(results["rank_test_score"], [2, 5, 1, 2, 4])
+
+
+test_refusals = refusals_of("selection", globals())

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refusals_of, refused
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm.calibration import canonical_pose
@@ -263,21 +263,6 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
         refused(message, read_skeleton, config, ["a", "b"])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"kind": "tree"}, "kind must be one of"),
-        ({"curves": ((0, 4),)}, "are 0 to 3; got 4"),
-        ({"up": ((-1, 2),)}, "are 0 to 3; got -1"),
-        ({"point_names": ("a", "b", "b", "c")}, "4 different names; got 3"),
-        ({"left": (1, 2), "right": (3,)}, "point by point; got 2 and 1 points"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(change, message):
-    given = {"name": "x", "kind": "other", "n_points": 4, "curves": ()} | change
-    refused(message, Skeleton, source="mine", **given)
-
-
 def test_bad_questions():
     refused(r"skeletons are ibug-68, .*; got 'cat'", get_skeleton, "cat")
     refused("names must hold 3 names; got 2", find_skeleton, 3, ["a", "b"])
@@ -355,3 +340,11 @@ def test_parts_of_curves_and_sides_are_kept():
     assert part.contour == (4,)
     assert skeleton.reordered(list("gfedcba")).contour == (4, 2)
     refused("0 to 6; got 7", dataclasses.replace, skeleton, contour=(7,))
+
+
+def skeleton(**change):
+    given = {"name": "x", "kind": "other", "n_points": 4, "curves": ()} | change
+    return Skeleton(source="mine", **given)
+
+
+test_refusals = refusals_of("skeletons", globals())

@@ -4,6 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
+from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -33,7 +34,9 @@ def fitted(camera="affine", independence="shapes"):
 
 @pytest.mark.parametrize(
     ("camera", "independence"),
-    [("affine", "shapes"), ("weak_perspective", "shapes"), ("affine", None)],
+    slow_after(
+        2, [("affine", "shapes"), ("affine", None), ("weak_perspective", "shapes")]
+    ),
 )
 def test_clear_coefficients_are_stable(camera, independence):
     model = fitted(camera, independence)

@@ -187,7 +187,7 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
     tracks = tracks - tracks.min((0, 1))
     shares = tracks / tracks[..., 1].max() / seen * [0.53, 0.95] + [0.2, 0.02]
-    path, told = tmp_path / "pose.csv", "like shares of the width and height"
+    path, told = tmp_path / "pose.csv", "like fractions of the width and height"
     table_of("LM{part}_{axis}", shares, range(17)).to_csv(path, index=False)
     text, plain = warnings_of(read_landmarks, path)
     assert told in text

@@ -4,13 +4,14 @@ import gzip
 import json
 import re
 import warnings
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import fit, write_landmarks
 from landmark_files import deeplabcut_frame, scene, write_deeplabcut, write_openface
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from sklearn.base import clone
 
 import isa_nrsfm
@@ -39,21 +40,21 @@ def read_by_fit(path, *options):
     return args, read_frames(args)
 
 
+def asked_in(folder, columns, *options, suffix=".csv"):
+    """Read a table with some columns as the command fit does, without a fit."""
+    columns = pd.DataFrame(columns)
+    table = pd.concat([landmarks(len(columns)), columns], axis=1)
+    path = folder / f"table{suffix}"
+    if suffix == ".csv":
+        table.to_csv(path, index=False)
+    else:
+        table.to_parquet(path, index=False)
+    return asked_columns(*read_by_fit(path, *options))
+
+
 @pytest.fixture
 def asked(tmp_path):
-    """Return a function that reads a table as the command fit does, without a fit."""
-
-    def read(columns, *options, suffix=".csv"):
-        columns = pd.DataFrame(columns)
-        table = pd.concat([landmarks(len(columns)), columns], axis=1)
-        path = tmp_path / f"table{suffix}"
-        if suffix == ".csv":
-            table.to_csv(path, index=False)
-        else:
-            table.to_parquet(path, index=False)
-        return asked_columns(*read_by_fit(path, *options))
-
-    return read
+    return partial(asked_in, tmp_path)
 
 
 def seconds(times):
@@ -90,26 +91,6 @@ def test_times_are_read_in_the_one_way_that_reads_all(asked, cells, steps):
     columns = {"t": cells * n_groups, "g": np.repeat(range(n_groups), len(cells))}
     found = asked(columns, "--time", "t", "--group", "g").times
     np.testing.assert_allclose(seconds(found)[: len(cells)], steps, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("cell", "message"),
-    [
-        (
-            "{:02d}/02/2024",
-            r"'01/02/2024' in row 0 can be 2024-02-01 \(.*'%d/%m/%Y'\) or "
-            r"2024-01-02 \(.*'%m/%d/%Y'\), and no other row decides",
-        ),
-        ("{:02d}.02.24", r"2024-02-01 .*%d\.%m\.%y.* or 2024-01-02 .* or 2001-02-24 "),
-        ("0:{:02d}", r"'0:01' in row 0 can be 1 s .*'%M:%S'\) or 60 s .*'%H:%M'\)"),
-        ("T{}", "expected numbers or dates, .* 12 of 12 are not .*row 0, 'T1'"),
-        ("{}st", "expected numbers or dates, .* 12 of 12 are not .*row 0, '1st'"),
-        ("00:00:01:{:02d}", "expected numbers or dates, .*'00:00:01:01'"),
-    ],
-)
-def test_times_of_several_readings_or_none_are_refused(asked, cell, message):
-    cells = {"t": [cell.format(i) for i in range(1, 13)]}
-    refused(f"--time t: .*{message}", asked, cells, "--time", "t")
 
 
 def test_times_of_several_ways_of_writing_are_refused(asked):
@@ -174,20 +155,6 @@ FACES = {"face": np.where(ROWS % 2, "right", "left")}
 def test_fps_counts_images(asked, columns, options, numbers):
     found = asked(pd.DataFrame(columns, index=ROWS), "--fps", 25, *options).times
     np.testing.assert_allclose(seconds(found), numbers / 25, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("columns", "options", "message"),
-    [
-        (FACES | {"frame": ROWS // 2}, [], "12 of 24 .*same image .*frame, first: row"),
-        (FACES | {"image": ROWS // 2}, [], "12 of 24 .*same image .*image, first: row"),
-        ({"frame": ROWS % 12}, [], "12 of 24 .*frame, first: row 12.*--group"),
-        (FACES, ["--group", "face"], "rows .* are 2 rows apart: .* column frame"),
-        (FACES, ["--skip-rows", "face=left"], "rows .* are 2 rows apart"),
-    ],
-)
-def test_fps_of_several_faces_is_refused(asked, columns, options, message):
-    refused(f"^--fps.*{message}", asked, columns, "--fps", 25, *options)
 
 
 LONG_NAMES = "123456789012345678901", "123456789012345678902"
@@ -356,13 +323,6 @@ def test_several_codes_are_missing_together(tracks_read):
     assert found.points.isna().to_numpy().tolist() == [[True, True, False, False] * 4]
 
 
-@pytest.mark.parametrize("number", ["nan", "inf", "x"])
-def test_codes_are_finite_numbers(number, capsys):
-    with pytest.raises(SystemExit):
-        build_parser().parse_args(["fit", "t", "-o", "f", "--missing-value", number])
-    assert "--missing-value: expected a number, such as -1" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
     path, folder = tmp_path / "table.csv", tmp_path / "out"
@@ -466,28 +426,6 @@ def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
     assert len(frames.X) == 8
 
 
-NO_PAIRS = r"config\.yaml .* no list of pairs of bodyparts .* such as \[\[nose, chin\]"
-
-
-@pytest.mark.parametrize(
-    ("skeleton", "message"),
-    [
-        ("[[[x, y], z]]", NO_PAIRS),
-        ("[[[[x]]]]", NO_PAIRS),
-        ("[x, y]", NO_PAIRS),
-        ("{x: y}", NO_PAIRS),
-        ("&all [*all]", r"config\.yaml .* "),
-        ("[&one [*one, NO]]", r"config\.yaml .* "),
-        ("[[NO, 7]]", r"config\.yaml .* points NO, 1, x; got \('NO', '7'\)"),
-        ("[" * 600 + "]" * 600, r"config\.yaml .* RecursionError"),
-    ],
-)
-def test_skeletons_with_a_list_too_many_are_refused(tmp_path, skeleton, message):
-    path = tmp_path / "config.yaml"
-    path.write_text(f"Task: a\nskeleton: {skeleton}\n")
-    refused(f"^[^\n]*{message}[^\n]*$", read_skeleton, path, ["NO", "1", "x"])
-
-
 def test_skeletons_are_read_in_bounded_time(tmp_path):
     """Each key is merged nine times into the next one: 9^12 in all."""
     lines = ["a0: &a0 {x: 1}"]
@@ -500,37 +438,7 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
 
 WIDE = landmarks(2).round(1)
 TEXT = WIDE.to_csv(index=False)
-
-
-@pytest.mark.parametrize(
-    ("name", "contents", "message"),
-    [
-        ("a.csv", WIDE.to_csv(index=False, header=False), "line with column names"),
-        ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
-        ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
-        ("a.csv", b"PK\3\4", r"a spreadsheet or .*: save it as \.csv"),
-        ("a.csv", gzip.compress(TEXT.encode()), "compressed file, in spite .* unpack"),
-        ("a.csv.gz", gzip.compress(TEXT.encode()), "known .* Unpack compressed files"),
-        ("a.npy", b"\x93NUMPY", "as array .* Expected one array"),
-        ("a.pkl", b"\x80", r"Save other tables and arrays as \.csv, in pandas: "),
-        ("a.csv", "my experiment of May\n" + TEXT, "line 2 .* delete titles"),
-        ("a.csv", "# made by T, version 2\n" + TEXT, "line 2 .* delete .* comments"),
-        ("a.csv", re.sub("(?m)^([0-9])", r'"1",\1', TEXT), "2 .* that of row names"),
-        ("a.csv", re.sub("(?m)^(.*)$", r'"\1"', TEXT), "quotation marks: remove them"),
-        ("a.csv", ",".join("xy" * 12) + TEXT[TEXT.index("\n") :], "called 'x': each"),
-        ("a.csv", TEXT.replace("\n", "\n" + "px," * 23 + "px\n", 1), "of units"),
-        ("a.csv", "p,,q,\nx,y,x,y\n1,2,3,4\n", "two lines; .* nose_y is needed$"),
-        ("a.csv", TEXT + TEXT, r"row 2 .* 'x0'\. .* repeated names"),
-        ("a.csv", WIDE.astype(str).add("%").to_csv(index=False), r"like 1234\.5"),
-        ("a.csv", WIDE.map("1,{:.1f}".format).to_csv(index=False), r"like 1234\.5"),
-    ],
-)
-def test_tables_of_another_form_are_told_the_way(tmp_path, name, contents, message):
-    path = tmp_path / name
-    if isinstance(contents, str):
-        contents = contents.encode()
-    path.write_bytes(contents)
-    refused(message, read_by_fit, path)
+PACKED = gzip.compress(TEXT.encode())
 
 
 def followed(call, given, /, **scope):
@@ -639,3 +547,11 @@ def test_words_for_missing_points_are_missing(tmp_path, word):
     text = table.to_csv(index=False, na_rep="@").replace("@", word)
     (tmp_path / "a.csv").write_text(text)
     np.testing.assert_array_equal(read_landmarks(tmp_path / "a.csv").points, table)
+
+
+def skeletons(text):
+    """Return a configuration with lists of bodyparts."""
+    return f"Task: a\nskeleton: {text}\n"
+
+
+test_refusals = refusals_of("tables_of_people", globals())

@@ -1,4 +1,4 @@
-"""Arrays in NumPy's format: in one file, in bytes, and each in a file of its own."""
+"""Arrays in NumPy's format: in one file, in bytes, and each in its own file."""
 
 import contextlib
 import io

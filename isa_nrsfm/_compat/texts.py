@@ -85,8 +85,8 @@ def have_times(names: Sequence[str]) -> bool:
     >>> have_times(["2023-05-01_12-00-30.png", "2023-05-01_12-00-31.png"])
     True
     """
-    rest = {_TIME.sub("", name) for name in names}
-    return all(map(_TIME.search, names)) and len(rest) < len({*names})
+    stems = {_TIME.sub("", name) for name in names}
+    return all(map(_TIME.search, names)) and len(stems) < len({*names})
 
 
 def frame_numbers(names: Sequence[str]) -> list[int] | None:
@@ -102,11 +102,11 @@ def frame_numbers(names: Sequence[str]) -> list[int] | None:
     if have_times(names):
         return None
     parts = [re.split("([0-9]+)", name) for name in names]
-    least, found = max(len(set(names)) // 2, 1), None
+    minimum, found = max(len(set(names)) // 2, 1), None
     for place in range(-2, -min(map(len, parts)), -2):
         videos = {(*each[:place], *each[place + 1 :]) for each in parts}
-        if len(videos) <= least:
-            least, found = len(videos) - 1, [int(each[place]) for each in parts]
+        if len(videos) <= minimum:
+            minimum, found = len(videos) - 1, [int(each[place]) for each in parts]
     return found
 
 

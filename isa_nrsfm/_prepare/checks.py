@@ -65,9 +65,9 @@ def check_table(X: Any, layout: Layout) -> None:
 def validated_table(estimator: Any, X: Any, layout: Layout, reset: bool) -> NDArray:
     """Return a table as an array of numbers, checked by scikit-learn and by name."""
     check_table(X, layout)
-    least = dict.fromkeys(("ensure_min_samples", "ensure_min_features"), 1 + reset)
+    minimum = dict.fromkeys(("ensure_min_samples", "ensure_min_features"), 1 + reset)
     try:
-        X = validate_data(estimator, unmasked(X), reset=reset, **least, **CHECKS)
+        X = validate_data(estimator, unmasked(X), reset=reset, **minimum, **CHECKS)
     except ValueError as error:
         if "could not convert" in str(error):
             raise ValueError(f"X has texts: {error}. {ONLY_POINTS}") from error
@@ -90,7 +90,7 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
             f"{len(others)} of the {len(names)} columns are not named as the x or "
             f"y of a point (first: {others[0]!r}). {ONLY_POINTS}"
         )
-    shown = ", ".join(map(str, names[:4]))
+    examples = ", ".join(map(str, names[:4]))
     order = (
         "neither interleaved nor planar; isa_nrsfm.io.landmark_table(X).points has "
         "them interleaved"
@@ -98,7 +98,7 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
         else said
     )
     raise ValueError(
-        f"layout={layout!r} contradicts the column names ({shown}, ...), "
+        f"layout={layout!r} contradicts the column names ({examples}, ...), "
         f"whose order is {order}"
     )
 
@@ -194,12 +194,12 @@ def check_points(
     patterns, counts = np.unique(visible, axis=0, return_counts=True)
     seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)
     n_frames, n_shapes = counts @ seen, n_components + 1
-    least = -(-3 * n_shapes // 2)
-    few = n_frames < least
+    minimum = -(-3 * n_shapes // 2)
+    few = n_frames < minimum
     if few.any():
         point = int(few.argmax())
         raise ValueError(
-            f"n_components={n_components} needs every point in at least {least} "
+            f"n_components={n_components} needs every point in at least {minimum} "
             f"frames; fewer show {few.sum()} of {n_points} points (first: "
             f"{describe_point(point, layout, names)}, in {n_frames[point]} of "
             f"{counts.sum()} frames). Leave out these points, or take fewer basis "
@@ -216,15 +216,15 @@ def check_points(
     # Points seen together take the least number of their frames, until none changes.
     before, group = np.array(-1), np.arange(n_points)
     while (group != before).any():
-        least = np.where(seen, group, n_points).min(axis=1, keepdims=True)
-        before, group = group, np.where(seen, least, n_points).min(axis=0)
+        minimum = np.where(seen, group, n_points).min(axis=1, keepdims=True)
+        before, group = group, np.where(seen, minimum, n_points).min(axis=0)
     if (n_groups := len(np.unique(group))) > 1:
         raise ValueError(
             f"the points fall into {n_groups} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "
             f"{describe_point(int(group.argmax()), layout, names)} is never visible "
             f"with {describe_point(0, layout, names)} and its group). Add frames that "
-            "show points of both, or fit each group by itself"
+            "show points of both, or fit each group separately"
         )
 
 
@@ -279,10 +279,10 @@ def _visibility(parts: NDArray) -> float:
     others, fourth = parts[:, :3], parts[:, 3]
     if not (np.isnan(fourth) | ((fourth >= 0) & (fourth <= 1))).all():
         return 0.0
-    least, largest = np.nanmin(fourth), np.nanmax(fourth)
-    if least < largest < 0.5:  # y of points in a row
+    smallest, largest = np.nanmin(fourth), np.nanmax(fourth)
+    if smallest < largest < 0.5:  # y of points in a row
         return 0.0
-    return 1.0 if least == largest else float(np.mean((others < 0) | (others > 1)))
+    return 1.0 if smallest == largest else float(np.mean((others < 0) | (others > 1)))
 
 
 def _noise_ratio(
@@ -318,8 +318,8 @@ def _residual(rows: NDArray, rank: int) -> float:
     if np.isfinite(rows).all():
         W = rows.reshape(-1, rows.shape[2])
         energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
-        left = 1.0 - rank / (W.shape[1] - 1)  # of the dimensions
-        return max(float(energy[:-rank].sum()), 0.0) / W.size / left
+        remaining = 1.0 - rank / (W.shape[1] - 1)  # of the dimensions
+        return max(float(energy[:-rank].sum()), 0.0) / W.size / remaining
     return completion_model(rows, rank=rank)[1]
 
 

@@ -35,8 +35,8 @@ def complete_rows(
     3K + 4 points. With fewer points the prior fills the gap.
     """
     # With many points, fewer frames are enough.
-    most = int(np.clip(300 * model_frames // n_points, 200, model_frames))
-    some = rows.take(representative_frames(rows, most))
+    n_sample = int(np.clip(300 * model_frames // n_points, 200, model_frames))
+    some = rows.take(representative_frames(rows, n_sample))
     model = completion_model(some, 3 * n_components + 3)
     return rows.derive(partial(filled_in, model=model))
 
@@ -74,12 +74,12 @@ def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     A pattern (n_patterns, n_points) is 1.0 where a point is seen, otherwise 0.0. The
     last array is the index (n_frames,) of the pattern of each frame.
     """
-    seen = ~np.isnan(rows).any(axis=1)
+    complete = ~np.isnan(rows).any(axis=1)
     _, first, pattern = np.unique(
-        np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
+        np.packbits(complete, axis=1), axis=0, return_index=True, return_inverse=True
     )
-    patterns = seen[first].astype(float)
-    return np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1)
+    patterns = complete[first].astype(float)
+    return np.where(complete[:, None], rows, 0.0), patterns, pattern.reshape(-1)
 
 
 def _principal_axes(rows: NDArray, rank: int) -> Model:
@@ -137,16 +137,16 @@ def _em_step(
     upper = np.triu_indices(rank)
     z, t, covariance, cross = _posterior(rows, patterns, pattern, *model)
     # E step: residuals, E[z z^T] of each frame, packed, and E[(w - t) z] of each point
-    seen = patterns[pattern]
-    moved = (rows - t) * seen[:, None]
-    energy = float(np.sum((moved - (z @ B) * seen[:, None]) ** 2))
+    visible = patterns[pattern]
+    moved = (rows - t) * visible[:, None]
+    energy = float(np.sum((moved - (z @ B) * visible[:, None]) ** 2))
     squares = z.swapaxes(1, 2) @ z + 2.0 * noise * covariance[pattern]
     squares = squares[:, upper[0], upper[1]]
     products = moved.reshape(-1, n_points).T @ z.reshape(-1, rank)
-    products += seen.T @ (2.0 * noise * cross[pattern])
+    products += visible.T @ (2.0 * noise * cross[pattern])
     # M step: least squares for each point. A point that is seen in fewer rows than the
     # rank needs the ridge. The translation takes the mean of the points.
-    moments = _symmetric(seen.T @ squares)
+    moments = _symmetric(visible.T @ squares)
     moments[:, range(rank), range(rank)] += OF_DIFFERENCES * n_frames
     B = np.linalg.solve(moments, products[..., None])[..., 0].T
     B -= B.mean(axis=1, keepdims=True)
@@ -158,7 +158,7 @@ def _em_step(
     # of EM's own step for the variance (MacKay 1992). The parameters of a row are its
     # translation and the coefficients that its points determine, rather than the prior.
     determined = rank - noise * np.trace(covariance, axis1=1, axis2=2)
-    n_numbers = 2.0 * seen.sum()
+    n_numbers = 2.0 * visible.sum()
     freedom = n_numbers - 2.0 * np.sum(determined[pattern] + 1.0)
     variance = energy / max(freedom, 0.02 * n_numbers)
     return (B, variance), energy / n_numbers

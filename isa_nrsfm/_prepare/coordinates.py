@@ -1,7 +1,6 @@
-"""Coordinates that are no places in an image, or of no object.
+"""Detect sentinel values, normalised coordinates, and points of no object.
 
-Codes of missing points, shares of the image, columns that were scaled one by one, and
-points that stand still while the object moves.
+Columns may have been scaled one by one. Some points stand still while the object moves.
 """
 
 from collections.abc import Hashable
@@ -18,7 +17,7 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Rows of a fit, and points, that are compared at most.
 MOST_ROWS = 1000
-# Points of a lower confidence are seldom where they are said to be.
+# Confidence below which points are unreliable.
 UNSURE = 0.6
 # Largest part of the coordinates of shares that are beyond all borders but one.
 FEW = 0.05
@@ -37,7 +36,7 @@ TOLD = "warned of coordinates"
 
 
 class CoordinateWarning(UserWarning):
-    """Coordinates are probably codes of missing points, or shares of an image."""
+    """Coordinates are probably sentinel values, or normalised."""
 
 
 def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> None:
@@ -46,8 +45,8 @@ def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> N
     These absorb the stretch of shares. The attributes of a DataFrame may have `TOLD`.
     The model knows the names of the points.
     """
-    few = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
-    tracks = rows.take(few).mT
+    sample = np.arange(0, rows.n_frames, -(-rows.n_frames // MOST_ROWS) or 1)
+    tracks = rows.take(sample).mT
     if len(still := still_points(tracks)):
         names = names_of_points(model, tracks.shape[1])
         warn_caller(
@@ -60,7 +59,9 @@ def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> N
         return
     if are_scaled(tracks, SIMILAR) and warn_of_scaled_columns(rows.whole().mT):
         return
-    warn_of_codes(tracks, "rows" if len(few) == rows.n_frames else "rows of a sample")
+    warn_of_codes(
+        tracks, "rows" if len(sample) == rows.n_frames else "rows of a sample"
+    )
     if model.camera != "affine":
         warn_of_shares(tracks)
 
@@ -73,8 +74,8 @@ def still_points(tracks: NDArray) -> NDArray:
     """
     n_frames, n_points, _ = tracks.shape
     tracks = tracks / (np.nanmax(np.abs(tracks), initial=0.0) or 1.0)  # no overflow
-    seen = np.isfinite(tracks[..., 0]).sum(axis=0) > 1
-    if n_frames < 10 or seen.sum() < n_points:
+    visible = np.isfinite(tracks[..., 0]).sum(axis=0) > 1
+    if n_frames < 10 or visible.sum() < n_points:
         return np.arange(0)
     way = np.linalg.norm(tracks - np.nanmedian(tracks, axis=0), axis=2)
     way = np.nanmedian(way, axis=0)
@@ -111,9 +112,9 @@ def warn_of_scaled_columns(tracks: NDArray) -> bool:
         return False
     warn_caller(
         "all columns have the same spread, as after z-scores, StandardScaler or "
-        "MinMaxScaler. Each column was scaled by itself, which stretches each point in "
-        "x and y by another factor: shapes will be wrong. Give the coordinates as they "
-        "were before, in a pipeline without the scaler",
+        "MinMaxScaler. Each column was scaled separately, which stretches each point "
+        "in x and y by another factor: shapes will be wrong. Give the coordinates as "
+        "they were before, in a pipeline without the scaler",
         CoordinateWarning,
     )
     return True
@@ -154,11 +155,11 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     coordinates is one point in all frames, and others are around it.
     """
     places = np.ascontiguousarray(tracks, dtype=float).view(complex)[..., 0]
-    known = np.flatnonzero(~np.isnan(places))
-    shown = places.ravel()[known[:: -(-len(known) // 1_000_000) or 1]]
-    shown += 0  # -0.0 + 0.0 is 0.0
+    finite = np.flatnonzero(~np.isnan(places))
+    sample = places.ravel()[finite[:: -(-len(finite) // 1_000_000) or 1]]
+    sample += 0  # -0.0 + 0.0 is 0.0
     found, warned = {0j}, False
-    for some in (shown, shown[shown.real == shown.imag]):
+    for some in (sample, sample[sample.real == sample.imag]):
         if len(some):
             values, counts = np.unique(some, return_counts=True)
             found |= {*values[[0, int(counts.argmax()), -1]]}
@@ -200,8 +201,8 @@ def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
     """Warn, and return True, if tracks (n_frames, n_points, 2) look like shares."""
     if not are_shares(tracks):
         return False
-    known = tracks[~np.isnan(tracks)]
-    inside = np.mean((known >= 0) & (known <= 1))
+    finite = tracks[~np.isnan(tracks)]
+    inside = np.mean((finite >= 0) & (finite <= 1))
     reader = "mediapipe" if format == "table" else format
     way = (
         f": isa_nrsfm.io.read_landmarks with format={reader!r} and "
@@ -215,7 +216,7 @@ def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
         )
     warn_caller(
         f"{100 * inside:.3g} % of the coordinates are between 0 and 1 (all between "
-        f"{known.min():.2g} and {known.max():.2g}), like shares of the width and "
+        f"{finite.min():.2g} and {finite.max():.2g}), like fractions of the width and "
         "height of an image. Such shares stretch the shapes, which changes their "
         "proportions and rotations. If they have another unit, such as metres, ignore "
         "this. If these are shares, multiply x by the width and y by the height of the "
@@ -226,7 +227,7 @@ def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
 
 
 def are_shares(tracks: NDArray) -> bool:
-    """Return whether tracks (n_frames, n_points, 2) look like shares of an image.
+    """Return whether tracks (n_frames, n_points, 2) look like normalised coordinates.
 
     Positions in an image are apart in both directions. Trackers also place points
     that it cuts off, such as the legs of a body at a desk, beyond one of its borders;
@@ -235,22 +236,24 @@ def are_shares(tracks: NDArray) -> bool:
     Points at (0, 0) are missing.
     """
     x, y = np.moveaxis(tracks, 2, 0)
-    seen = ~(np.isnan(x) | np.isnan(y)) & ((x != 0) | (y != 0))
-    if not seen.any():
+    visible = ~(np.isnan(x) | np.isnan(y)) & ((x != 0) | (y != 0))
+    if not visible.any():
         return False
-    sides = [[(c < 0) & seen, (c > 1) & seen] for c in (x, y)]
-    beyond = np.sum(sides, axis=(2, 3)) / seen.sum()  # of two borders, in x and y
+    sides = [[(c < 0) & visible, (c > 1) & visible] for c in (x, y)]
+    beyond = np.sum(sides, axis=(2, 3)) / visible.sum()  # of two borders, in x and y
     if beyond.sum() - beyond.max() > 2 * FEW:
         return False
     # Half of the points of a centred body are on either side.
-    centred = any(abs(np.median(c[seen])) < CENTRED for c in (x, y))
-    inside = ((tracks >= 0) & (tracks <= 1)).all(axis=2) & seen
-    zero, one = (((tracks == end).any(axis=2) & seen) for end in (0, 1))
-    ends, few = (zero.sum(), one.sum()), 4 + seen.sum() / 1000
+    centred = any(abs(np.median(c[visible])) < CENTRED for c in (x, y))
+    inside = ((tracks >= 0) & (tracks <= 1)).all(axis=2) & visible
+    zero, one = (((tracks == end).any(axis=2) & visible) for end in (0, 1))
+    ends, tolerance = (zero.sum(), one.sum()), 4 + visible.sum() / 1000
     scaled = [np.mean(zero.any(axis) & one.any(axis)) > 0.5 for axis in (0, 1)]
     aligned = (
-        zero.all(axis=0).any() or any(scaled) or (0 < min(ends) and sum(ends) < few)
+        zero.all(axis=0).any()
+        or any(scaled)
+        or (0 < min(ends) and sum(ends) < tolerance)
     )
-    if centred or aligned or inside.sum() < LEAST * seen.sum():
+    if centred or aligned or inside.sum() < LEAST * visible.sum():
         return False
     return bool(np.ptp(tracks[inside], axis=0).min() > 0.1)

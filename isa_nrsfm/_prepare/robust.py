@@ -110,22 +110,22 @@ def spatial_median(rows: NDArray) -> NDArray:
     convergence of a class of iterative methods for solving the Weber location problem",
     1978). Unlike the medians of x and y it does not depend on the axes of the image.
     """
-    seen = seen_points(rows)
+    visible = seen_points(rows)
     points = np.nan_to_num(rows.swapaxes(0, 1))
-    half: NDArray = seen * 1.0
+    half: NDArray = visible * 1.0
     for _ in range(5):
-        half, distance, _ = _nearest_half(points, half, seen)
+        half, distance, _ = _nearest_half(points, half, visible)
     # Subtract the innermost point: equal points then differ by exactly zero.
     innermost = distance.argmin(axis=1)[None, :, None]
     origin = np.take_along_axis(points, innermost, axis=2)
-    points = np.where(seen, points - origin, 0.0)
-    weights, distance, median = _nearest_half(points, half, seen)
+    points = np.where(visible, points - origin, 0.0)
+    weights, distance, median = _nearest_half(points, half, visible)
     # If half of the points coincide, their place is the median.
-    least = np.where(median > 0, OF_DISTANCES * median, 1.0)
-    counted = np.where(median > 0, seen, distance <= median)
+    floor = np.where(median > 0, OF_DISTANCES * median, 1.0)
+    counted = np.where(median > 0, visible, distance <= median)
     middle = _middles(points, weights)
     for _ in range(20):
-        weights = counted / np.maximum(_distances(points, middle), least)
+        weights = counted / np.maximum(_distances(points, middle), floor)
         middle += 1.8 * (_middles(points, weights) - middle)
     return (origin[..., 0] + middle).T
 
@@ -173,7 +173,7 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     Returns a mask of hidden points (I, J), orthonormal axes (J, 3), and the threshold
     of the distance of each point (J,). Factorisation and hiding alternate.
     """
-    seen, hidden = seen_points(rows), distant_points(rows)
+    visible, hidden = seen_points(rows), distant_points(rows)
     filled = np.where(hidden[:, None], 0.0, rows)
     for _ in range(100):
         # Rigid factorisation, rank 3, of the filled rows
@@ -182,8 +182,8 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         axes = eigh(W.T @ W, subset_by_index=last)[1]
         rigid, distance = _rigid_part(rows, hidden, axes)
         # Typical distances, of the table and of each point
-        typical = max(median_noise(distance[seen]), OF_DISTANCES)
-        of_point = lower_medians(distance.T, seen.T)[:, 0] / MEDIAN_DISTANCE
+        typical = max(median_noise(distance[visible]), OF_DISTANCES)
+        of_point = lower_medians(distance.T, visible.T)[:, 0] / MEDIAN_DISTANCE
         limit = 4.5 * np.fmax(typical, of_point)  # NaN: points in no frame
         # Hide points that are too far, and fill them in
         previous, hidden = hidden, ~(distance <= limit)
@@ -206,9 +206,9 @@ def _far_points(rows: NDArray, axes: NDArray, limit: NDArray) -> NDArray:
 
 def _unless_many(rows: NDArray, hidden: NDArray) -> NDArray:
     """Return the seen ones of hidden points (n, J); none if a frame has too many."""
-    seen = seen_points(rows)
-    gross = hidden & seen
-    few = gross.sum(axis=1) <= 0.4 * seen.sum(axis=1)
+    visible = seen_points(rows)
+    gross = hidden & visible
+    few = gross.sum(axis=1) <= 0.4 * visible.sum(axis=1)
     return gross & few[:, None]
 
 

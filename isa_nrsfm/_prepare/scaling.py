@@ -88,23 +88,23 @@ def scaled_table(
         blocks = blocks.derive(lambda rows: without_half_points(rows)[0])
     report = FrameReport(*rest)
     check_frames(report, n_points)
-    shown = report.n_seen > 0
-    if not shown.all():
-        if not shown.any():
+    usable = report.n_seen > 0
+    if not usable.all():
+        if not usable.any():
             raise ValueError(
-                f"no point is visible: all {len(shown)} rows of X are NaN. Check how "
+                f"no point is visible: all {len(usable)} rows of X are NaN. Check how "
                 "the table was read"
             )
         warn_caller(
-            f"no point is visible in {np.count_nonzero(~shown)} of {len(shown)} rows "
-            f"(first: row {shown.argmin()}). They are left out of the fit, and their "
+            f"no point is visible in {np.count_nonzero(~usable)} of {len(usable)} rows "
+            f"(first: row {usable.argmin()}). They are left out of the fit, and their "
             "results are NaN"
         )
         if determines:
-            check_size(int(shown.sum()), n_points, n_components, camera)
-        blocks = blocks.subset(shown)
-        visible, largest, *rest = (part[shown] for part in (visible, largest, *rest))
-        weights = None if weights is None else weights[shown]
+            check_size(int(usable.sum()), n_points, n_components, camera)
+        blocks = blocks.subset(usable)
+        visible, largest, *rest = (part[usable] for part in (visible, largest, *rest))
+        weights = None if weights is None else weights[usable]
     if determines:
         check_points(visible, n_points, n_components, layout, names)
         if weights is not None:
@@ -127,7 +127,7 @@ def scaled_table(
     unit_rows = partial(_unit_rows, dtype=np.float32 if single else np.float64)
     spacing = np.finfo(dtype).eps * largest.astype(np.float64)
     return ScaledTable(
-        shown,
+        usable,
         blocks,
         blocks.derive(unit_rows, translation, size, kept=False),
         size,
@@ -145,11 +145,11 @@ def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
     """Return half points, visible points, magnitudes, reports of rows (n, 2, J)."""
     rows, *half = without_half_points(rows)
     _, report = centred_frames(rows)
-    shown = report.n_seen > 0
-    if robust and shown.any():
+    usable = report.n_seen > 0
+    if robust and usable.any():
         # Outliers must not shift the other points.
-        centred, report.translation[shown] = robustly_centred(rows[shown])
-        report.size[shown] = robust_sizes(centred)
+        centred, report.translation[usable] = robustly_centred(rows[usable])
+        report.size[usable] = robust_sizes(centred)
     largest = np.fmax.reduce(np.abs(rows), axis=(1, 2), initial=0.0)
     visible = np.packbits(seen_points(rows), axis=1)
     return *half, visible, largest, *report
@@ -229,13 +229,15 @@ def weighted_rows(
             f"point {point}. Give points without information the weight 0"
         )
     nan = rows.empty.dtype.type(np.nan)
-    shown = rows.derive(lambda r, w: np.where(w, r, nan), weights[:, None], kept=False)
-    seen = shown.joined(seen_points)
-    weights = np.where(seen, weights, 0.0)
+    weighted = rows.derive(
+        lambda r, w: np.where(w, r, nan), weights[:, None], kept=False
+    )
+    visible = weighted.joined(seen_points)
+    weights = np.where(visible, weights, 0.0)
     # Curvatures of the shapes must exceed rounding errors.
-    least = 1e-8 * weights.max(axis=1, keepdims=True, initial=0.0)
-    weights = np.where(weights > 0, np.maximum(weights, least), 0.0)
-    return shown, () if (weights == seen).all() else (weights,)
+    minimum = 1e-8 * weights.max(axis=1, keepdims=True, initial=0.0)
+    weights = np.where(weights > 0, np.maximum(weights, minimum), 0.0)
+    return weighted, () if (weights == visible).all() else (weights,)
 
 
 def check_weights(weights: NDArray, n_components: int, camera: str | None) -> None:

@@ -24,7 +24,7 @@ LARGEST_DEVIATION = 0.1
 # to 4 (``python -m benchmarks.accuracy cameras``).
 SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
 SAME_UNIT = (
-    "x and y have the same unit, unlike shares of the width and height of an image"
+    "x and y have the same unit, unlike fractions of the width and height of an image"
 )
 # Errors of held-out points, as shares of the energy, up to which a fit is good, and
 # above which it is poor; errors of depths likewise, of which the second withholds them.
@@ -240,13 +240,13 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, float, NDArray]:
     which the model fits badly as a whole.
     """
     none = np.empty((0, 2), dtype=np.intp)
-    if distance is None or not (shown := np.isfinite(distance)).any():
+    if distance is None or not (finite := np.isfinite(distance)).any():
         return np.nan, np.nan, none
-    median = float(np.median(distance[shown]))
+    median = float(np.median(distance[finite]))
     if not median > 0:
         return 0.0, 0.0, none
     limit = GROSS * median / MEDIAN_DISTANCE
-    found = np.argwhere(shown & (distance > limit))
+    found = np.argwhere(finite & (distance > limit))
     relative = distance[tuple(found.T)]
     for axis, numbers in enumerate(found.T):  # medians of few rows and points
         some, places = np.unique(numbers, return_inverse=True)
@@ -254,8 +254,8 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, float, NDArray]:
         relative = relative / np.maximum(1.0, own / median)[places]
     found, relative = found[relative > limit], relative[relative > limit]
     order = np.argsort(-relative, kind="stable")
-    energy = np.sum(distance[tuple(found.T)] ** 2) / np.sum(distance[shown] ** 2)
-    return len(found) / np.count_nonzero(shown), float(energy), found[order]
+    energy = np.sum(distance[tuple(found.T)] ** 2) / np.sum(distance[finite] ** 2)
+    return len(found) / np.count_nonzero(finite), float(energy), found[order]
 
 
 def camera_meaning(ratio: float) -> str:

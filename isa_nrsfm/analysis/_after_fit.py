@@ -67,9 +67,9 @@ def mirrored_rows(model: Any, prior: Any, motion: NDArray) -> tuple[NDArray, str
         return np.zeros(0, dtype=int), ""
     images = motion @ axes.T / np.linalg.norm(motion, axis=(1, 2), keepdims=True)
     area = np.linalg.det(images)  # negative from the front, if y points down
-    least = LEAST_AREA * np.nanquantile(np.abs(area), 0.9)
-    rows, n = np.flatnonzero(area > least), np.count_nonzero(np.isfinite(area))
-    alike = not (area < -least).any()
+    threshold = LEAST_AREA * np.nanquantile(np.abs(area), 0.9)
+    rows, n = np.flatnonzero(area > threshold), np.count_nonzero(np.isfinite(area))
+    alike = not (area < -threshold).any()
     if not len(rows) or (alike and prior is None):  # which is right for another y
         return rows[:0], ""
     (x, _), (y, up) = np.median(images[rows], axis=0)

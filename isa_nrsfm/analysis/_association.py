@@ -301,8 +301,8 @@ def _known_frames(
     features = check_array(
         features, dtype=np.float64, ensure_all_finite="allow-nan", input_name="alpha"
     )
-    known = np.flatnonzero(np.isfinite(features).all(axis=1))
-    if not len(known):
+    finite = np.flatnonzero(np.isfinite(features).all(axis=1))
+    if not len(finite):
         raise ValueError("no frame has coefficients: all rows of alpha have NaN")
     labels = checked_column("y", y, len(features))
     refuse_infinite("y", labels, np.arange(len(features)))
@@ -310,11 +310,11 @@ def _known_frames(
     if groups is None and time is not None:  # gaps are no jumps of a clip
         groups = runs_between_gaps(seconds)
     numbers = group_numbers(groups, len(features))
-    classes = np.unique(labels, return_inverse=True)[1][known]
-    rows = np.column_stack([_rounded(features[known]), classes])
-    known = known[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
-    order = FrameOrder(numbers[known], seconds[known])
-    return features[known], labels[known], numbers[known], order
+    classes = np.unique(labels, return_inverse=True)[1][finite]
+    rows = np.column_stack([_rounded(features[finite]), classes])
+    finite = finite[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
+    order = FrameOrder(numbers[finite], seconds[finite])
+    return features[finite], labels[finite], numbers[finite], order
 
 
 def _reliability(alpha: Any, alpha_std: Any) -> NDArray:
@@ -337,8 +337,8 @@ def _rounded(features: NDArray) -> NDArray:
     thousandth of the standard deviations: about one of 100 other frames has an equal.
     """
     (n, k), size = features.shape, features.std(axis=0)
-    least = min(1e-3, 2.0 * (0.02 / n) ** (1.0 / k))
-    return np.rint(features / (least * np.where(size > 0, size, 1.0)))
+    precision = min(1e-3, 2.0 * (0.02 / n) ** (1.0 / k))
+    return np.rint(features / (precision * np.where(size > 0, size, 1.0)))
 
 
 def _step_down_p_values(energies: NDArray) -> NDArray:
@@ -377,8 +377,8 @@ def _dependent_frames(
 ) -> NDArray | None:
     """Return the block of each frame (n_frames,), None for independent frames."""
     columns = _label_columns(labels, kind)[order.rows]
-    rest = unexplained(_unit_columns(features)[order.rows], columns, order)
-    length = independent_length(rest)
+    residuals = unexplained(_unit_columns(features)[order.rows], columns, order)
+    length = independent_length(residuals)
     if length == 1:
         return None
     blocks = np.empty(len(labels), dtype=int)

@@ -145,10 +145,10 @@ class Diagnostics(NamedTuple):
         if self.pose_removed.any():
             columns["removed"] = [*map(percent, self.pose_removed)]
         columns["in another fit"] = self.stability
-        known = "" if not self.fit else f"{self.fit.upper()}, "
-        known += f"{percent(self.held_out_error)} of left-out points unexplained"
+        quality = "" if not self.fit else f"{self.fit.upper()}, "
+        quality += f"{percent(self.held_out_error)} of left-out points unexplained"
         lines = [
-            f"fit: {known if self.fit else 'not known without the table'}",
+            f"fit: {quality if self.fit else 'not known without the table'}",
             f"depth: {self.depth.upper() or 'not known for affine cameras'}",
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
@@ -217,9 +217,9 @@ def diagnose(
         distance = table.joined(model.distances, *fit, *weights)
     fitted = np.isfinite(sizes)
     motion = np.asarray(estimator.motion_)[fitted] / sizes[fitted, None, None]
-    left = np.asarray(estimator.alpha_, dtype=np.float64)
-    coefficients = left + removed_part(estimator, estimator.motion_)
-    alpha, left = coefficients[fitted], left[fitted]
+    remaining = np.asarray(estimator.alpha_, dtype=np.float64)
+    coefficients = remaining + removed_part(estimator, estimator.motion_)
+    alpha, remaining = coefficients[fitted], remaining[fitted]
     mean_shape = estimator.mean_shape_.astype(np.float64)
     basis = estimator.basis_.astype(np.float64)
     images = motion.reshape(-1, 3)
@@ -230,19 +230,19 @@ def diagnose(
     square = np.sum(alpha**2, axis=0) ** 2
     # The traces of the V_k, one direction each, are not determined. Leave them out.
     information = weak_information(mean_shape, basis, motion, alpha)
-    known = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
+    eigenvalues = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
     floats = np.finfo(float)
-    known = np.maximum(known, max(floats.eps * known[0], floats.tiny))
+    eigenvalues = np.maximum(eigenvalues, max(floats.eps * eigenvalues[0], floats.tiny))
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
-    share, variance = pose_share(motion, left), alpha.var(axis=0)
-    removed = variance - left.var(axis=0)
+    share, variance = pose_share(motion, remaining), alpha.var(axis=0)
+    removed = variance - remaining.var(axis=0)
     found = Diagnostics(
         np.linalg.svd(images, compute_uv=False) / np.sqrt(len(images)),
         float(np.sqrt(deformation / np.sum(mean_shape**2))),
         estimator.reliability_,
         stability_words(estimator),
         np.divide(square, fourth, where=fourth > 0, out=np.zeros_like(square)),
-        np.sqrt(frames.noise_variance / known),
+        np.sqrt(frames.noise_variance / eigenvalues),
         frames.certainty.total,
         ratio,
         camera_meaning(ratio),
@@ -315,13 +315,13 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
     # Smallest numbers without outliers, on the tables named at MOST_GROSS: 20 of 307 to
     # 320 of 1000 frames. With outliers: 1 to 20.
     few = (effective > 0) & (effective < min(10.0, 0.1 * n_frames))
-    shown = [
+    phrases = [
         f"alpha_{k + 1} ({effective[k]:.1f} effective frames, most row "
         f"{rows[np.nanargmax(np.abs(alpha[:, k]))]})"
         for k in np.flatnonzero(few)
     ]
-    text = f"a few of the {n_frames} frames determine {first_items(shown, 5)}"
-    return text if shown else ""
+    text = f"a few of the {n_frames} frames determine {first_items(phrases, 5)}"
+    return text if phrases else ""
 
 
 def _of_pose(
@@ -335,11 +335,11 @@ def _of_pose(
     large = np.flatnonzero(found.pose_share > MOST_POSE)
     if not len(large):
         return ""
-    shown = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
-    text = f"the pose predicts {first_items(shown, 5)}"
+    phrases = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
+    text = f"the pose predicts {first_items(phrases, 5)}"
     shape = basis[np.nanargmax(found.pose_share)]
-    rest = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
-    if 2 * np.sum(rest**2) < np.sum(shape**2):
+    deformation = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
+    if 2 * np.sum(deformation**2) < np.sum(shape**2):
         return f"{text}: they stretch the whole shape. Make sure that {SAME_UNIT}"
     if model.remove_pose:
         return (

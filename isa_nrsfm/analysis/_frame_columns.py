@@ -116,10 +116,10 @@ def runs_between_gaps(time: NDArray) -> NDArray | None:
     """
     order = np.argsort(time, kind="stable")
     steps = np.diff(time[order])
-    known = steps[steps > 0]
-    if not len(known):
+    gaps = steps[steps > 0]
+    if not len(gaps):
         return None
-    runs = np.append(0, np.cumsum(steps > 1.5 * np.median(known)))
+    runs = np.append(0, np.cumsum(steps > 1.5 * np.median(gaps)))
     numbers = np.empty(len(time), dtype=int)
     numbers[order] = runs
     return numbers if 0 < runs[-1] < len(time) / 10 else None

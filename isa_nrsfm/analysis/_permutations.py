@@ -98,13 +98,13 @@ def independent_length(rest: NDArray) -> int:
     means that are.
     """
     n_scales = max(1, int(np.log2(len(rest) / 8)) + 1)
-    least = norm.isf(0.05 / (rest.shape[1] * n_scales))
+    threshold = norm.isf(0.05 / (rest.shape[1] * n_scales))
     length, scale = 1, 1
     while len(rest) >= 8:
         energy = np.sum(rest**2, axis=0)
         r = np.sum(rest[1:] * rest[:-1], axis=0) * np.sqrt(len(rest))
         scale *= 2
-        if np.any(r > least * energy):
+        if np.any(r > threshold * energy):
             length = 5 * scale
         rest = rest[: len(rest) // 2 * 2].reshape(-1, 2, rest.shape[1]).mean(axis=1)
         rest = rest - rest.mean(axis=0)
@@ -171,8 +171,8 @@ def permuted_energies(
             energies += _studentised(centres, _unit(of_labels), permuted_centres)
         permuted.append("groups")
     if inside:
-        rest = unexplained(alpha, labels, order)
-        length, in_runs = independent_length(rest), _are_sorted(labels, order)
+        residuals = unexplained(alpha, labels, order)
+        length, in_runs = independent_length(residuals), _are_sorted(labels, order)
     runs = _runs(labels, order) if inside and len(means) > 1 else None
     by_group = indicators(order.groups).T
     varying = np.sum((by_group @ labels.power(2)) - sizes * of_labels.power(2), axis=1)
@@ -200,7 +200,7 @@ def permuted_energies(
         if length > 1 and not permuted:
             untested = ONE_EVENT * one_event
             if len(means) == 1:
-                cuts = np.intersect1d(seams(values[order.rows]), seams(rest))
+                cuts = np.intersect1d(seams(values[order.rows]), seams(residuals))
                 if len(cuts):
                     untested = JUMPS.format(len(cuts), cuts[0])
         if length == len(means) == 1 and _people_repeat(alpha, labels):
@@ -395,10 +395,10 @@ def _people_repeat(alpha: NDArray, labels: csr_array) -> bool:
         return False
     scores = []
     for number, size in enumerate(np.bincount(classes)):
-        own = z[classes == number]
-        rest = own - own.mean(axis=0)
-        covariance = (rest.T @ rest + np.eye(K)) / (size + 1)
-        d = z - own.mean(axis=0)
+        members = z[classes == number]
+        residuals = members - members.mean(axis=0)
+        covariance = (residuals.T @ residuals + np.eye(K)) / (size + 1)
+        d = z - members.mean(axis=0)
         off = np.vecdot(d, d @ np.linalg.inv(covariance))
         scores.append(np.log(size) - (off + np.linalg.slogdet(covariance)[1]) / 2)
     errors = (classes[:, None] == np.arange(len(scores))) - softmax(scores, axis=0).T

@@ -17,7 +17,7 @@ intercept in the alternative without dynamics only.
 
 Parameters of cameras are integrated random walks, ``(w, v)_t+1 = (w + v, v)_t`` plus
 noise of the covariance ``q [[1/3, 1/2], [1/2, 1]]``. They are relative to the camera of
-each frame by itself.
+each frame alone.
 
 A frame is observed through its likelihood as a function of its coefficients and camera.
 Near the fit ``f_t = (alpha_t, 0)`` of the frame by itself, its logarithm at ``f_t + d``
@@ -98,11 +98,11 @@ class Dynamics(NamedTuple):
         States (D,) are x and w (p,), y and v (p,), u (K,) or (0,). The map is (p, D).
         """
         K, n = len(self.shares), len(self.rates) + len(self.walks)
-        rest = np.ones(K), np.zeros(K), self.between
+        steady = np.ones(K), np.zeros(K), self.between
         blocks = ([[np.diag(b) for b in row] for row in each] for each in self.blocks())
         F, Q, first = (
             block_diag(np.block(each), np.diag(r))
-            for each, r in zip(blocks, rest, strict=True)
+            for each, r in zip(blocks, steady, strict=True)
         )
         return F, Q, first, np.hstack([np.eye(n), np.zeros((n, n)), np.eye(n, K)])
 
@@ -179,13 +179,13 @@ def _smoothed_frames(
     and there are no rates.
     """
     K, none = alone.alpha.shape[1], np.empty(0)
-    known = np.isfinite(alone.precision[:, 0, 0])
-    if not known.any():
+    fitted = np.isfinite(alone.precision[:, 0, 0])
+    if not fitted.any():
         return alone, none
     pairs = (_observations(alone, camera, *each) for each in sequences)
     origins, observed = zip(*pairs, strict=True)
     # Parameters of cameras in units of their changes and deviations
-    precision = np.median(np.diagonal(alone.precision[known], 0, 1, 2), axis=0)
+    precision = np.median(np.diagonal(alone.precision[fitted], 0, 1, 2), axis=0)
     square = np.mean(np.concatenate([each[2] for each in observed]) ** 2, axis=0)
     square += np.divide(1.0, precision, where=precision > 0, out=0.0 * precision)
     square[:K], square[square == 0] = 1.0, 1.0
@@ -199,7 +199,7 @@ def _smoothed_frames(
         return alone, none
     motion, translation, alpha, covariance = map(np.copy, alone[:4])
     for (rows, steps), origin, each in zip(sequences, origins, observed, strict=True):
-        if not known[rows].any():
+        if not fitted[rows].any():
             continue
         states, covariances, *_ = smoothed(each, dynamics)
         mean = scale * states[steps]
@@ -208,7 +208,7 @@ def _smoothed_frames(
         motion[rows] = frames_first(moved)
         mean[:, :K] -= alone.alpha[rows]
         translation[rows] -= np.einsum("ip,ipr->ir", mean, alone.slope[rows])
-        translation[rows[~known[rows]]] = np.nan
+        translation[rows[~fitted[rows]]] = np.nan
     frames = LinearisedFrames(motion, translation, alpha, covariance, *alone[4:])
     return frames, np.exp(np.sort(dynamics.rates))
 
@@ -222,14 +222,14 @@ def _observations(
     """
     n_steps, (_, n, _), K = steps[-1] + 1, alone.precision.shape, alone.alpha.shape[1]
     precision, fit, change = np.zeros((n_steps, n, n)), *np.zeros((2, n_steps, n))
-    seen = np.isfinite(alone.precision[rows, 0, 0])
-    chosen, at = rows[seen], steps[seen]
+    fitted = np.isfinite(alone.precision[rows, 0, 0])
+    chosen, at = rows[fitted], steps[fitted]
     if len(chosen) > 1:
         motion = alone.motion[chosen]
         change[at[1:], K:] = camera.steps_between(motion[:-1], motion[1:])
     if len(chosen):
         precision[at], fit[at, :K] = alone.precision[chosen], alone.alpha[chosen]
-        rows = chosen[np.maximum(np.cumsum(seen) - 1, 0)]
+        rows = chosen[np.maximum(np.cumsum(fitted) - 1, 0)]
     return rows, (precision, fit, change)
 
 
@@ -242,7 +242,7 @@ def smoothed(
     up to a constant of each frame, and moments (4, D, D) of the states z: sums over t
     of ``E z_t+1 z_t+1^T``, ``E z_t+1 z_t^T``, ``E z_t z_t^T``, and ``E z_1 z_1^T``.
     """
-    F, Q, first, shown = dynamics.matrices()
+    F, Q, first, readout = dynamics.matrices()
     precision, fits, change = observed
     n_steps, n = fits.shape
     mean, covariance = np.empty((n_steps, len(F))), np.empty((n_steps, *F.shape))
@@ -252,12 +252,12 @@ def smoothed(
     for t, (L, fit) in enumerate(zip(precision, fits, strict=True)):
         if t:
             m, P = F @ m - change[t], F @ P @ F.T + Q
-        across, far = shown @ P, shown @ m - fit
-        growth, off = np.eye(n) + L @ across @ shown.T, fit - L @ far
+        across, far = readout @ P, readout @ m - fit
+        growth, off = np.eye(n) + L @ across @ readout.T, fit - L @ far
         solved = np.linalg.solve(growth, np.column_stack([L @ across, off]))
         step = across.T @ solved[:, -1]
         # Integral of the likelihood over the predicted density
-        square = far @ (fit + off) + off @ shown @ step
+        square = far @ (fit + off) + off @ readout @ step
         log_likelihood += 0.5 * float(square - np.linalg.slogdet(growth)[1])
         m, P = m + step, _symmetric(P - across.T @ solved[:, :-1])
         mean[t], covariance[t] = m, P
@@ -276,7 +276,7 @@ def smoothed(
         early += covariance[t] + np.outer(mean[t], mean[t])
     first = covariance[0] + np.outer(mean[0], mean[0])
     moments = np.stack([late, lagged, early, first])
-    return mean @ shown.T, shown @ covariance @ shown.T, log_likelihood, moments
+    return mean @ readout.T, readout @ covariance @ readout.T, log_likelihood, moments
 
 
 def estimated_dynamics(
@@ -303,10 +303,10 @@ def estimated_dynamics(
     options = {"maxiter": max_iter, "gtol": tol, "ftol": 1e-12}
     # With dynamics, and independent frames with an intercept
     for rate, shares in (LEAST_RATE, intercepts), (LARGEST_RATE, True):
-        least = np.log(rate)
+        lower = np.log(rate)
         lengths = n_components, n_walks, n_components * shares
-        start = np.repeat([max(least, FIRST_RATE), 0.0, 0.0], lengths)
-        limits = [(least, np.log(LARGEST_RATE)), (-40.0, 10.0), (-7.0, 7.0)]
+        start = np.repeat([max(lower, FIRST_RATE), 0.0, 0.0], lengths)
+        limits = [(lower, np.log(LARGEST_RATE)), (-40.0, 10.0), (-7.0, 7.0)]
         bounds = np.repeat(limits, lengths, axis=0)
         found.append(search(start, bounds=bounds, options=options))
     # Akaike's criterion: one rate for each coefficient

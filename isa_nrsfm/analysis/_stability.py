@@ -44,8 +44,10 @@ def stability(
     whole, found = scores(gauge), list[NDArray]()
     for shapes, half in zip(tables.shapes, tables.halves, strict=True):
         motion, alpha = tables.motion[half], tables.alpha[half]
-        own = scores(independent_gauge(shapes, motion, alpha, *tables.kind)[2])
-        found.append(own[:, linear_sum_assignment(-np.abs(whole.T @ own))[1]])
+        own_scores = scores(independent_gauge(shapes, motion, alpha, *tables.kind)[2])
+        found.append(
+            own_scores[:, linear_sum_assignment(-np.abs(whole.T @ own_scores))[1]]
+        )
     every, n, K = np.hstack(found), len(found), n_components
     cross = (every.T @ every).reshape(n, K, n, K).swapaxes(1, 2)
     within, others = cross[np.arange(n), np.arange(n)], ~np.eye(n, dtype=bool)
@@ -60,8 +62,8 @@ def stability(
     for k in range(K):
         chosen = [k]
         while same(k, chosen) < SAME and len(chosen) < min(MOST_TOGETHER, K):
-            rest = [i for i in range(K) if i not in chosen]
-            chosen.append(max(rest, key=lambda i: same(k, [*chosen, i])))
+            remaining = [i for i in range(K) if i not in chosen]
+            chosen.append(max(remaining, key=lambda i: same(k, [*chosen, i])))
         sets[k, chosen] = same(k, chosen) >= SAME
     return np.array([same(k, [k]) for k in range(K)]), sets
 

@@ -114,13 +114,13 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         X = validate_data(self, X, reset=False, **CHECKS)
         names = group_names(groups, len(X))
         place = np.searchsorted(self.groups_, names).clip(max=len(self.groups_) - 1)
-        known = self.groups_[place] == names
+        matched = self.groups_[place] == names
         means = np.asarray(self.means_[place], dtype=X.dtype)
-        if not known.all():
-            new = names[~known]
-            flags = None if neutral is None else np.asarray(neutral)[~known]
-            others, of_others = _group_means(X[~known], new, flags)
-            means[~known] = of_others[np.searchsorted(others, new)]
+        if not matched.all():
+            new = names[~matched]
+            flags = None if neutral is None else np.asarray(neutral)[~matched]
+            others, of_others = _group_means(X[~matched], new, flags)
+            means[~matched] = of_others[np.searchsorted(others, new)]
             if neutral is None:
                 _warn_of_single_frames(new)
         return np.asarray(X - means)
@@ -257,9 +257,9 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
     estimates are set to zero.
     """
     X = check_array(alpha, input_name="alpha", **CHECKS | {"dtype": np.float64})
-    known = np.isfinite(X).all(axis=1)
-    numbers = np.unique(group_numbers(groups, len(X))[known], return_inverse=True)[1]
-    X = X[known]
+    finite = np.isfinite(X).all(axis=1)
+    numbers = np.unique(group_numbers(groups, len(X))[finite], return_inverse=True)[1]
+    X = X[finite]
     sizes = np.bincount(numbers)
     n_frames, n_groups = len(X), len(sizes)
     if n_groups < 2 or n_frames == n_groups:

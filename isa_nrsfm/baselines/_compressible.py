@@ -64,8 +64,8 @@ def group_sparse_atoms(
         blocks = (P + P_dual).reshape(-1, 2, n_atoms, 3)
         norms = np.linalg.norm(blocks, axis=(1, 3), keepdims=True)
         # Minimisers Z of ``threshold * ||Z||_F + ||Z - P||_F^2 / 2``
-        rest = np.maximum(norms - penalty / rho, 0.0)
-        share = np.divide(rest, norms, out=np.zeros_like(norms), where=norms > 0)
+        lengths = np.maximum(norms - penalty / rho, 0.0)
+        share = np.divide(lengths, norms, out=np.zeros_like(norms), where=norms > 0)
         P_copy = (blocks * share).reshape(P.shape)
         right = P_copy.T @ W + rho * (D_copy - D_dual)
         D = np.linalg.solve(P_copy.T @ P_copy + rho * eye, right)
@@ -172,20 +172,20 @@ def update_atoms(
     n_replaced = 0
     for atom in range(len(atoms)):
         users = np.flatnonzero(active[:, atom])
-        rest = residuals[users] + blocks[users, atom] @ atoms[atom]
+        targets = residuals[users] + blocks[users, atom] @ atoms[atom]
         # An atom and its metric need three frames.
         if replace and len(users) < 3:
             active[users, atom], blocks[users, atom] = False, 0.0
-            residuals[users] = rest
+            residuals[users] = targets
             worst = np.argsort(-np.sum(residuals**2, axis=(1, 2)), kind="stable")
             pair = np.take(worst, 2 * n_replaced + np.arange(2), mode="wrap")
             atoms[atom] = _main_directions(frames[pair])
             n_replaced += 1
             continue
         if 2 * len(users) >= 3:
-            atoms[atom] = _main_directions(rest)
-        blocks[users, atom] = rest @ atoms[atom].T
-        residuals[users] = rest - blocks[users, atom] @ atoms[atom]
+            atoms[atom] = _main_directions(targets)
+        blocks[users, atom] = targets @ atoms[atom].T
+        residuals[users] = targets - blocks[users, atom] @ atoms[atom]
     return atoms, blocks, active, residuals
 
 
@@ -248,16 +248,16 @@ def chain_atoms(
     <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
     """
     n_frames, n_atoms = active.shape
-    cameras, seen = np.zeros((n_frames, 2, 3)), np.zeros(n_frames, dtype=bool)
+    cameras, has_camera = np.zeros((n_frames, 2, 3)), np.zeros(n_frames, dtype=bool)
     coefficients, shapes = np.zeros((n_frames, n_atoms)), np.zeros_like(atoms)
     n_users = active.sum(axis=0)
-    left = [atom for atom in np.argsort(-n_users, kind="stable") if n_users[atom]]
-    first = left[0]
-    while left:
-        n_shared = active[seen].sum(axis=0)
-        atom = left.pop(int(np.argmax(n_shared[left])))
+    remaining = [atom for atom in np.argsort(-n_users, kind="stable") if n_users[atom]]
+    first = remaining[0]
+    while remaining:
+        n_shared = active[has_camera].sum(axis=0)
+        atom = remaining.pop(int(np.argmax(n_shared[remaining])))
         users = np.flatnonzero(active[:, atom])
-        shared = seen[users]
+        shared = has_camera[users]
         G = metric_correction(blocks[users, atom])
         if n_shared[atom] >= FEWEST_SHARED:
             motion = blocks[users[shared], atom] @ G
@@ -267,7 +267,7 @@ def chain_atoms(
             G = G @ polar(shape @ shapes[first].T)[0]
         motion = blocks[users, atom] @ G
         cameras[users[~shared]] = polar(motion[~shared])[0]
-        seen[users] = True
+        has_camera[users] = True
         coefficients[users, atom] = np.einsum("irc,irc->i", motion, cameras[users]) / 2
         shapes[atom] = np.linalg.pinv(G) @ atoms[atom]
     return cameras, coefficients, shapes

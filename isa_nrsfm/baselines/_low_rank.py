@@ -22,7 +22,7 @@ def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
 
     The latter are in the span of the first ``3 * rank`` left singular vectors.
     """
-    S, Vt, rest = leading_triplets(W, 3 * rank)
+    S, Vt, residual = leading_triplets(W, 3 * rank)
     n_columns = int(np.sum(S > OF_RANKS * S[0]))
     if n_columns < 3:
         raise ValueError(
@@ -30,7 +30,7 @@ def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
             f"centred; X has rank {n_columns}, as of a flat object that does not deform"
         )
     n_left = (len(W) - 3 * rank) * (W.shape[1] - 1 - 3 * rank)
-    noise_variance = rest / n_left if n_left > 0 else 0.0
+    noise_variance = residual / n_left if n_left > 0 else 0.0
     motion = W @ Vt[:n_columns].T
     return polar(orthonormal_cameras(motion, noise_variance).cameras)[0]
 

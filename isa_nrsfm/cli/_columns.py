@@ -209,8 +209,8 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray
     table = np.where(X.isna(), estimator.reproject(X), X)
     aligned = analysis.AlignedFrames().fit_transform(table)
     n_shapes = len(estimator.basis_)
-    most = min(3 * n_shapes + 3, *aligned.shape)
-    scores = PCA(most, random_state=0).fit_transform(aligned)
+    n_scores = min(3 * n_shapes + 3, *aligned.shape)
+    scores = PCA(n_scores, random_state=0).fit_transform(aligned)
     return {"pca": scores[:, :n_shapes], "pca_of_rank": scores}
 
 
@@ -223,22 +223,22 @@ def _label_report(
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
     alpha = features["alpha"]
-    known, classes = label.notna().to_numpy(), has_classes(label)
+    labelled, classes = label.notna().to_numpy(), has_classes(label)
     options: dict[str, Any] = {
         "y": label.dropna().to_numpy(),
-        "groups": None if frames.groups is None else frames.groups[known],
-        "time": None if frames.times is None else frames.times[known],
+        "groups": None if frames.groups is None else frames.groups[labelled],
+        "time": None if frames.times is None else frames.times[labelled],
         "kind": "classes" if classes else "number",
         "random_state": seed,
     }
-    deviations = None if std is None else std[known]
-    found = analysis.association(alpha[known], alpha_std=deviations, **options)
+    deviations = None if std is None else std[labelled]
+    found = analysis.association(alpha[labelled], alpha_std=deviations, **options)
     report: dict[str, Any] = {
         "column": label.name,
         "kind": found.kind,
         "n_frames": found.n_frames,
-        "n_without_label": np.sum(~known),
-        "n_copies": np.sum(known) - found.n_frames,
+        "n_without_label": np.sum(~labelled),
+        "n_copies": np.sum(labelled) - found.n_frames,
         "statistic": "eta_squared" if classes else "spearman",
         "values": found.statistic,
         "corrected": found.corrected,
@@ -254,7 +254,7 @@ def _label_report(
         report["class_means"] = class_means(label, alpha)
     try:
         for name, values in features.items():
-            scores = analysis.predictability(values[known], **options)
+            scores = analysis.predictability(values[labelled], **options)
             key = "cross_validated" + f"_{name}" * (name != "alpha")
             report[key], n = scores.mean(), len(scores)
             report[f"{key}_standard_error"] = scores.std(ddof=1) / np.sqrt(n)

@@ -50,22 +50,22 @@ def run(args: Namespace, warned: list[str]) -> str:
 
 def _content(output: Path) -> str:
     """Return the content to write, by the suffix."""
-    known = {each: name for name, own in SUFFIXES.items() for each in own}
-    if output.suffix.lower() not in known:
+    contents = {each: name for name, suffixes in SUFFIXES.items() for each in suffixes}
+    if output.suffix.lower() not in contents:
         raise ValueError(
             "--output: expected a file with one of the suffixes "
-            f"{', '.join(known)}; got {output}"
+            f"{', '.join(contents)}; got {output}"
         )
-    return known[output.suffix.lower()]
+    return contents[output.suffix.lower()]
 
 
 def _given(args: Namespace, content: str) -> dict[str, Any]:
     """Return the options that are given; raise if the content does not have them."""
     given = {}
-    for name in [name for own in _OPTIONS.values() for name in own]:
+    for name in [name for options in _OPTIONS.values() for name in options]:
         if getattr(args, name) in (None, False):
             continue
-        having = [kind for kind, own in _OPTIONS.items() if name in own]
+        having = [kind for kind, options in _OPTIONS.items() if name in options]
         if content not in having:
             raise ValueError(
                 f"{flag_of(name)} is an option of {' and '.join(having)}; "

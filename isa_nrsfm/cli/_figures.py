@@ -77,8 +77,8 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     for name, (caption, draw) in figures.items():
         show_stage(name)
         try:
-            shown, image = draw(fit), io.BytesIO()
-            figure = getattr(shown, "figure_", None) or shown.figure
+            display, image = draw(fit), io.BytesIO()
+            figure = getattr(display, "figure_", None) or display.figure
             figure.savefig(image, format="png", dpi=150)
             plt.close(figure)
             write_whole(folder / name, image.getvalue())
@@ -107,7 +107,7 @@ def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
     alpha = alpha[:, :MOST_DRAWN]
-    shown = plotting.CoefficientsDisplay(
+    display = plotting.CoefficientsDisplay(
         alpha=alpha,
         alpha_std=None if deviation is None else deviation[:, :MOST_DRAWN],
         time=frames.times,
@@ -115,8 +115,8 @@ def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:
         component_names=names_of_components(None, alpha.shape[1]),
     ).plot(kind="time")
     if frames.time_unit == "seconds" and np.asarray(frames.times).dtype.kind != "M":
-        shown.axes_[-1].set_xlabel("time, seconds")
-    return shown
+        display.axes_[-1].set_xlabel("time, seconds")
+    return display
 
 
 def _shapes_by_label(label: "pd.Series", fit: Fit) -> plotting.BasisShapeDisplay:

@@ -98,8 +98,8 @@ def fit_table(
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
     frames = asked_columns(args, frames)
-    known = args.camera == "perspective" or args.focal_length is not None
-    if known and frames.principal_point is None:
+    needs_centre = args.camera == "perspective" or args.focal_length is not None
+    if needs_centre and frames.principal_point is None:
         option = "--focal-length" if args.focal_length else "--camera perspective"
         raise ValueError(
             f"{option} needs the size of the images, with --image-size "
@@ -123,8 +123,8 @@ def fit_table(
             whole_files.check_replaceable(folder / name)
         if not args.force:
             earlier = _outputs.entry_of_report(folder, "sha256")
-            own = {*earlier, _outputs.REPORT} if earlier else ()
-            _outputs.refuse_replacing([folder / name for name in files], own)
+            own_files = {*earlier, _outputs.REPORT} if earlier else ()
+            _outputs.refuse_replacing([folder / name for name in files], own_files)
         old = _outputs.entry_of_report(folder, "files")
         removed = {*figures, *(name for name in old if name.endswith(".png"))}
         used = {args.group, args.time, frames.images.name}
@@ -141,9 +141,12 @@ def fit_table(
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
             _outputs.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
-            shown = {"labels": first_classes(frames.labels), "times": frames.times}
+            viewer_data = {
+                "labels": first_classes(frames.labels),
+                "times": frames.times,
+            }
             if args.std and estimator.camera_ != "affine":
-                shown["depth_std"] = estimator.reconstruct(
+                viewer_data["depth_std"] = estimator.reconstruct(
                     X, return_std=True, **frames.weighting
                 )[1]
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
@@ -151,7 +154,7 @@ def fit_table(
             energy, error, _ = frame_energies(X, explained, estimator.layout)
             snr = error / energy
             fit = Fit(estimator, frames, smooth, drawn, explained, snr)
-            _outputs.write_results(new, fit, unit, **shown)
+            _outputs.write_results(new, fit, unit, **viewer_data)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
                 answers["prior"] = {"name": prior or FACE_PRIOR, "std": std}
             report = {

@@ -1,4 +1,4 @@
-"""The commands of the command line, their options, and the parser.
+"""The parser of the command line; `options.toml` has its commands and their help.
 
 ``--help`` must not wait for imports of the estimator or a reader. `tests/test_cli.py`
 compares the defaults with those of `AffineNRSfM` and its strategies.
@@ -7,7 +7,9 @@ compares the defaults with those of `AffineNRSfM` and its strategies.
 import argparse
 import math
 import re
+import tomllib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from isa_nrsfm import __version__
@@ -155,124 +157,17 @@ TYPES: dict[str, Callable[[str], Any]] = {
 # Arguments without a leading -- in the command line.
 POSITIONAL = ("table", "model")
 SHORT = {"output": ["-o"], "n_components": ["-k"]}
-# The help of each option, by its name and its value if it has one. An option may have
-# another help in one command.
-HELP = {
-    "model MODEL": "model.npz, written by fit",
-    # The table.
-    "table TABLE": "a .csv, .tsv, .txt or .parquet file, a file of another format, "
-    "or a folder of files",
-    "format FORMAT": "the program that wrote the table: "
-    f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for any table "
-    "with named columns (default: auto, recognised by the beginning of the file)",
-    "columns PATTERN": "patterns of the x and y columns, if their names are ambiguous: "
-    "# for a number, * for any text, such as 'x_#,y_#' or '*.px,*.py'; a pattern after "
-    "- leaves columns out, as in '*_x,*_y,-gaze_*'",
-    "individuals NAMES": "individuals in one row, such as 1,2 for nose_1_x and "
-    "nose_2_x: each gets a row of its own, with the column individual",
-    "row_per_point NAMES": "of a table with a row for each point, the columns that "
-    "tell frames apart and, last, that of the points, such as video,frame,landmark",
-    "skip_rows COLUMN=REGEX": "leave out rows whose column matches the expression, "
-    "such as 'name=^ir'",
-    "zeros_missing": "treat points at exactly (0, 0) as missing, also among others",
-    "keep_zeros": "do not treat points at (0, 0) as missing, even if all others are "
-    "elsewhere",
-    "missing_value VALUE": "treat points whose x and y are this number, such as -1, as "
-    "missing",
-    "min_confidence CONFIDENCE": "treat points with a lower confidence as missing",
-    "weights WEIGHTS": "weight the points of the joint refinement by their confidences "
-    "in the file (confidence); points of confidence zero are missing",
-    "image_size WIDTHxHEIGHT": "size of the images for MediaPipe and YOLO, in pixels, "
-    "such as 1920x1080",
-    "fit.image_size WIDTHxHEIGHT": "size of the images in pixels, such as 1920x1080: "
-    "for MediaPipe and YOLO, and for perspective cameras, which are then compared with "
-    "weak_perspective ones",
-    "part PART": "the points to read, if the files have several: of OpenPose "
-    f"{', '.join(choices.OPENPOSE_PARTS)}; of whole bodies of COCO and MMPose "
-    f"{', '.join(choices.WHOLE_PARTS)}",
-    "points POINTS": "fit some of the points: inner (without the visible outline of a "
-    "face, which slides over the surface as the head turns), or names, numbers and "
-    "ranges such as nose,36-47 or without:0-16",
-    # What is written.
-    "output DIR": "folder for the results, created if absent",
-    "transform.output FILE": "the .csv, .tsv or .parquet file to write",
-    "export.output FILE": "the file to write",
-    "demo.output DIR": "folder for the results (default: ./isa-nrsfm-demo)",
-    "force": "replace existing files (fit and demo: also those of no earlier run)",
-    "no_figures": "write no figures (png), and remove those of an earlier run",
-    "std": "add the standard deviation of each coefficient, in columns such as "
-    "alpha_1_std; with calibrated cameras the viewer has error bars of the depths",
-    "viewer FILE": "write a page that shows the new frames in 3D (.html)",
-    "edges FILE": "lines to draw between points: a .csv file with the names or numbers "
-    "of two points per line; 'none' draws only points",
-    "skeleton LAYOUT": "the layout of the points, if names, number and order of the "
-    f"points do not determine it: {', '.join(choices.SKELETON_NAMES)}, or the "
-    "config.yaml of DeepLabCut",
-    "origin": "where y is zero: upper in images, whose y points down, lower if y "
-    "points up (default: auto, lower for faces that would be upside down)",
-    # Other columns.
-    "label COLUMN": "a class or a number for each frame, such as an expression or an "
-    "age: reports the dependence of the coefficients on it. Whole numbers are classes "
-    "unless given as COLUMN:number",
-    "group COLUMN": "people, videos or files: reports the variance between and within "
-    "groups. Held-out frames come from other groups; smoothing stops at their borders",
-    "distance POINT,POINT": "add the distance of two points of the 3D shapes to "
-    "alpha.csv, in units of the distance between the outer corners of the eyes",
-    "unit POINT,POINT": "two points whose distance in the mean shape is the unit of "
-    "--distance",
-    "length NUMBER": "the length of that unit, such as 90 for millimetres (default: 1)",
-    "time COLUMN": "times of the frames, numbers or dates: adds smoothed coefficients",
-    "time_format FORMAT": "how the cells of --time are written, if that is ambiguous: "
-    "%%d/%%m/%%Y (day first), %%M:%%S (minutes and seconds), or other codes of "
-    "strptime",
-    "fps NUMBER": "instead of --time, the frames per second of a video; frames have "
-    "the numbers of the column frame, of the names of images, or of the rows",
-    # The method.
-    "n_components K": "number of basis shapes (default: auto, as many as the table "
-    "determines, at most twelve, or those of the prior). Of several, such as 1-8 or "
-    "3,6,9, the fewest within one standard error of the best in cross-validation",
-    "camera": "camera model: weak_perspective (a rotation and a scale per frame), "
-    "orthographic (one scale), perspective (for objects near the camera, as before a "
-    "webcam), or affine (no assumption, for stretched images), which leaves depth and "
-    "proportions open (default: what held-out points prefer; perspective needs the "
-    "size of the images)",
-    "focal_length NUMBER": "of the camera, in pixels (default: estimated with "
-    "perspective). Rotations, angles and depths are then in the axes of the camera",
-    "principal_point X Y": "the point of the image on the axis of the camera, in "
-    "pixels (default: the middle of the images)",
-    "prior MODEL": "a fitted model of a table in which the objects turn, such as "
-    f"model.npz, or {FACE_PRIOR} for faces: with it frontal photos and few frames have "
-    f"true depths. Its layouts are {', '.join(choices.FACE_PRIORS)} (default: that of "
-    f"faces, if their table does not determine depths). {NONE}: no prior",
-    "export.camera": "camera model for a model with affine cameras; none exports "
-    "affine shapes, whose angles and depth are not true (default: weak_perspective)",
-    "isa": "independent subspace analysis: FastICA with pooled components, or FastISA",
-    "n_init STARTS": "number of random starts (default: 16 of pooled, 30 of fast)",
-    "block_recovery": "algorithm that finds the block structure",
-    "refinement": "joint: cameras, coefficients and basis shapes together; consensus: "
-    "afterwards groups of neighbouring points, for the truest shapes of calibrated "
-    "cameras; alternating: the refinement of the paper, with cameras of the rigid part "
-    "(default: joint, or consensus if only that determines the depth)",
-    "independence": "joint refinement: independent basis shapes, or independent "
-    "coefficients",
-    "loss": "joint refinement: all but linear limit the influence of outliers "
-    "(default: linear, or cauchy if the table has outliers)",
-    "remove_pose": "calibrated cameras: coefficients minus what the yaw of the cameras "
-    "predicts, if points slide over the surface and people move alike in all views",
-    "no_scale_frames": "weight frames by their size in the image, as orthographic "
-    "cameras always do",
-    "no_hidden_points": "missing points are not hidden by the object: they do not "
-    "decide between the mirror images in depth",
-    "random_state SEED": "seed of the random starts (default: 0)",
-    "n_jobs N": "processes for the random starts, -1 for all processors (default: 1)",
-    # Export.
-    "n_modes MODES": "for a point distribution model, the number of modes, or the "
-    "share of the variance that they explain, such as 0.98 (default: number of basis "
-    "shapes)",
-    "names NAMES": "for .html and .glb, names of the basis shapes with commas",
-    "mirrored": "take the mirror image in depth, which has the same images; faces and "
-    "bodies of known layouts have the nose in front in any case",
+# The commands with their options, and the help of each option by its name and value.
+_DATA = tomllib.loads(Path(__file__).with_name("options.toml").read_text("utf-8"))
+_LISTS = {
+    "formats": [name for name in FORMATS if name != TABLE],
+    "openpose_parts": choices.OPENPOSE_PARTS,
+    "whole_parts": choices.WHOLE_PARTS,
+    "skeletons": choices.SKELETON_NAMES,
+    "face_priors": choices.FACE_PRIORS,
 }
+_WORDS = {name: ", ".join(values) for name, values in _LISTS.items()}
+HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
 # The values of options that have few.
 CHOICES: dict[str, Sequence[str]] = {
     "format": ("auto", *FORMATS),
@@ -295,115 +190,6 @@ DEFAULTS = {
     "demo.output": "isa-nrsfm-demo",
 }
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
-TABLE_OPTIONS = (
-    *("format", "columns", "individuals", "row_per_point", "skip_rows"),
-    *(("zeros_missing", "keep_zeros"), "missing_value", "min_confidence"),
-    *("image_size", "part"),
-)
-DRAWING = (("edges", "skeleton"), "origin")
-
-_OVERVIEW = """\
-Factorise a table of 2D landmarks (one row per frame) into a mean 3D shape, basis shapes
-and, for every frame, coefficients that do not depend on the viewpoint."""
-
-_EXAMPLES = """\
-examples:
-  isa-nrsfm demo
-      fit an artificial table of faces
-  isa-nrsfm fit faces.csv --n-components 9 --output results
-      fit a table and write coefficients, shapes, cameras, figures and the model
-  isa-nrsfm transform results/model.npz new.csv --output new-alpha.csv
-      coefficients of new frames
-  isa-nrsfm export results/model.npz --output faces.glb
-      the shapes for other programs
-
-Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
-such as x0, y0 or nose_x, nose_y; all other columns are copied to the results. Files of
-OpenFace, OpenPose, MMPose, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO, WFLW and tps,
-and folders of .pts files, are recognised automatically."""
-
-# Of each command: its line in the overview, description, examples, and the options of
-# each group. Of the options in a pair only one may be given.
-_COMMANDS: dict[str, tuple[str, str, str, dict[str, tuple]]] = {
-    "fit": (
-        "fit a table",
-        "Fit basis shapes and coefficients to a table of landmarks.",
-        """\
-examples:
-  isa-nrsfm fit faces.csv --n-components 9 --output results
-  isa-nrsfm fit body.csv -k auto --output results
-  isa-nrsfm fit photos.csv --prior face --output results
-  isa-nrsfm fit webcam.csv --image-size 1280x720 --output results
-
-Cells of missing points are empty. Rows with too few points are counted and have empty
-coefficients. The results replace those of an earlier run in the output folder.""",
-        {
-            "table": ("table", *TABLE_OPTIONS, "weights", "points"),
-            "output": ("output", "force", "no_figures", "std", *DRAWING),
-            "other columns": (
-                *("label", "group", "distance", "unit", "length", ("time", "fps")),
-                "time_format",
-            ),
-            "method": (
-                *("n_components", "camera", "focal_length", "principal_point"),
-                *("prior", "isa", "n_init", "block_recovery"),
-                *("refinement", "independence", "loss", "remove_pose"),
-                *("no_scale_frames", "no_hidden_points", "random_state", "n_jobs"),
-            ),
-        },
-    ),
-    "transform": (
-        "coefficients of new frames",
-        "Compute the coefficients of new frames with a fitted model.",
-        """\
-example:
-  isa-nrsfm transform results/model.npz new.csv --output new-alpha.csv
-
-The table must have the landmark columns of the fitted table. The output has a row for
-every row of the table; rows with too few points have empty coefficients.""",
-        {
-            "model": ("model",),
-            "table": ("table", *TABLE_OPTIONS, "weights"),
-            "output": ("output", "force", "std", "viewer", *DRAWING),
-        },
-    ),
-    "export": (
-        "shape models, animated 3D, a viewer",
-        """\
-Write a fitted model for other programs. The suffix of the output determines the format:
-  .html        a page that shows the shapes and frames in 3D, for any browser
-  .glb         glTF 2.0: the mean shape with the basis shapes as morph targets
-  .txt         a point distribution model for OpenFace and the CLM framework
-  .npz, .mat   the arrays of the model for NumPy, MATLAB and Octave""",
-        """\
-examples:
-  isa-nrsfm export results/model.npz --output faces.glb
-  isa-nrsfm export results/model.npz --output pdm.txt --n-modes 0.98
-  isa-nrsfm export results/model.npz --output faces.html
-
-Shapes are upright and frontal, with the proportions that weak-perspective cameras
-determine; .npz and .mat have the arrays of the model unchanged. Models that were
-fitted with --camera weak_perspective, orthographic or perspective keep their
-proportions.""",
-        {
-            "model": ("model",),
-            "output": (
-                *("output", "force", "n_modes", *DRAWING, "names"),
-                *("camera", "mirrored"),
-            ),
-        },
-    ),
-    "demo": (
-        "fit an artificial table of faces",
-        "Fit an artificial table of faces and compare the result with the truth.",
-        """\
-example:
-  isa-nrsfm demo --output faces
-
-The folder has the files of 'isa-nrsfm fit', and the table as tracks.csv.""",
-        {"output": ("output", "force", "no_figures", *DRAWING)},
-    ),
-}
 
 
 class Parser(argparse.ArgumentParser):
@@ -417,20 +203,20 @@ class Parser(argparse.ArgumentParser):
 
 def build_parser() -> Parser:
     """Return the parser of the command line."""
-    top = Parser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
+    top = Parser(PROGRAM, **_manners(_DATA))
     top.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     commands = top.add_subparsers(dest="command", required=True)
-    for command, (line, description, examples, groups) in _COMMANDS.items():
-        own = commands.add_parser(command, help=line, **_manners(description, examples))
+    for command, entry in _DATA["commands"].items():
+        parser = commands.add_parser(command, help=entry["line"], **_manners(entry))
         # For commands without these
         absent = dict.fromkeys(("weights", "points", "principal_point"))
-        own.set_defaults(**absent, missing_value=())
-        for title, entries in groups.items():
-            group = own.add_argument_group(title)
-            for entry in entries:
-                is_one = isinstance(entry, str)
+        parser.set_defaults(**absent, missing_value=())
+        for title, options in entry["groups"].items():
+            group = parser.add_argument_group(title)
+            for option in options:
+                is_one = isinstance(option, str)
                 place = group if is_one else group.add_mutually_exclusive_group()
-                for name in [entry] if is_one else entry:
+                for name in [option] if is_one else option:
                     flag = name if name in POSITIONAL else flag_of(name)
                     place.add_argument(
                         *SHORT.get(name, []), flag, **_settings(command, name)
@@ -466,11 +252,11 @@ def flag_of(name: str) -> str:
     return name.upper() if name in POSITIONAL else f"--{name.replace('_', '-')}"
 
 
-def _manners(description: str, epilog: str) -> dict[str, Any]:
+def _manners(entry: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of all parsers: help as it is written, exact options."""
     return {
-        "description": description,
-        "epilog": epilog,
+        "description": entry["description"],
+        "epilog": entry["examples"],
         "formatter_class": argparse.RawDescriptionHelpFormatter,
         "allow_abbrev": False,
     }

@@ -28,15 +28,15 @@ def shown_progress(since: float, shortest: float = SHORTEST) -> Iterator[None]:
     shown at once; those that end with a carriage return only in turn. Lines begin with
     the program's name and its time since `time.perf_counter` was `since`.
     """
-    shown = sys.stderr
-    latest = _LatestLine(shown if shown.isatty() else None)
+    stream = sys.stderr
+    latest = _LatestLine(stream if stream.isatty() else None)
     ended = threading.Event()
 
     def repeat() -> None:
         while not ended.wait(min(max(_seconds(since) / 20, shortest), LONGEST)):
             with contextlib.suppress(OSError, ValueError):
                 line = f"{PROGRAM}: {_seconds(since):.0f} s: {latest.line}"
-                print(line, file=shown, flush=True)
+                print(line, file=stream, flush=True)
 
     thread = threading.Thread(target=repeat, daemon=True)
     thread.start()

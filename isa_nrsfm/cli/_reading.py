@@ -130,17 +130,17 @@ def read_frames(
         layout = _part_of_layout(layout, [chosen.x.index(name) for name in columns.x])
     elif args.points is not None:
         layout = _layout(args, table[kept], columns, layout)
-        left = _kept_points(args.points, columns.points, layout)
-        points, x, y = (tuple(each[j] for j in left) for each in columns[1:4])
+        numbers = _kept_points(args.points, columns.points, layout)
+        points, x, y = (tuple(each[j] for j in numbers) for each in columns[1:4])
         dropped = [name for name in columns.interleaved if name not in {*x, *y}]
         columns = columns._replace(points=points, x=x, y=y)
-        layout = _part_of_layout(layout, left)
+        layout = _part_of_layout(layout, numbers)
         table = table.drop(columns=dropped)
         not_used[f"--points {args.points}"] = len(dropped) // 2
     rows, names = np.flatnonzero(kept), columns.interleaved
     stripped = [name.strip() for name in names]
-    shown = slice(None) if kept.all() else kept  # large tables are not copied
-    tracks = of_all_rows(tracks_in(table[shown], names, args.missing_value), kept)
+    rows_kept = slice(None) if kept.all() else kept  # large tables are not copied
+    tracks = of_all_rows(tracks_in(table[rows_kept], names, args.missing_value), kept)
     confidence = np.full(tracks.shape[:2], np.nan)
     if not sure.empty:
         confidence = sure[list(columns.x)].to_numpy(np.float64)
@@ -155,13 +155,13 @@ def read_frames(
             "are missing: other points are elsewhere. --keep-zeros keeps them",
             CoordinateWarning,
         )
-    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[shown]
-    tracks, confidence, weighting = cleaned.mT, confidence[shown], {}
+    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows_kept]
+    tracks, confidence, weighting = cleaned.mT, confidence[rows_kept], {}
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
-        if (least := np.nanmin(confidence, initial=0.0)) < 0:
+        if (smallest := np.nanmin(confidence, initial=0.0)) < 0:
             raise ValueError(
-                f"--weights: confidences of {args.table} are down to {least:g}, and "
+                f"--weights: confidences of {args.table} are down to {smallest:g}, and "
                 "weights not below 0. Save probabilities, such as numpy.exp of "
                 "log-likelihoods"
             )
@@ -203,9 +203,12 @@ def _warn_of_unsure(confidence: NDArray, seen: NDArray) -> None:
     """
     unsure = seen & (confidence < UNSURE)
     if unsure.any() and UNSURE <= np.nanmax(confidence) <= 1:
-        left = (seen & ~unsure).sum(axis=1)
-        least = max(seen.sum(), 1) / 2, (seen.sum(axis=1) >= FEWEST_POINTS).sum() / 2
-        enough = left.sum() >= least[0] and (left >= FEWEST_POINTS).sum() >= least[1]
+        remaining = (seen & ~unsure).sum(axis=1)
+        minimum = max(seen.sum(), 1) / 2, (seen.sum(axis=1) >= FEWEST_POINTS).sum() / 2
+        enough = (
+            remaining.sum() >= minimum[0]
+            and (remaining >= FEWEST_POINTS).sum() >= minimum[1]
+        )
         way = f"leave them out with --min-confidence {UNSURE:g}"
         warn_caller(
             f"{100 * unsure.sum() / seen.sum():.3g} % of the points have a confidence "
@@ -383,12 +386,13 @@ def _columns_of_model(
             for some, where in ((absent, "model"), (surplus, "table"))
             if some
         ]
-        own = individuals_with(table.columns, names[::2])
-        hint = f". Individuals in one row: --individuals {shlex.quote(','.join(own))}"
+        individuals = individuals_with(table.columns, names[::2])
+        option = shlex.quote(",".join(individuals))
+        hint = f". Individuals in one row: --individuals {option}"
         raise ValueError(
             "the table does not have the points of the model: "
             + "; ".join(differences)
-            + hint * bool(own)
+            + hint * bool(individuals)
         )
     columns = [in_table[name] for name in names]
     x, y = tuple(columns[::2]), tuple(columns[1::2])
@@ -457,8 +461,8 @@ def _part_of_layout(layout: Skeleton | None, points: Sequence[int]) -> Skeleton 
     if layout is None or {*points} == {*range(layout.n_points)}:
         return layout
     part = layout.subset(points)
-    known = (s for s in SKELETONS.values() if s.n_points == part.n_points)
-    return next((s for s in known if s.curves == part.curves), part)
+    layouts = (s for s in SKELETONS.values() if s.n_points == part.n_points)
+    return next((s for s in layouts if s.curves == part.curves), part)
 
 
 def _kept_points(
@@ -467,12 +471,12 @@ def _kept_points(
     """Return the numbers of the points that --points keeps, in their order."""
     if text == INNER:
         if layout is None or not layout.contour:
-            known = ", ".join(s.name for s in SKELETONS.values() if s.contour)
+            layouts = ", ".join(s.name for s in SKELETONS.values() if s.contour)
             found = "in no known layout" if layout is None else f"of {layout.name}"
             raise ValueError(
                 "--points inner leaves out the visible outline of a face, but the "
                 f"{len(names)} points are {found}: name the points to keep, or give "
-                f"--skeleton ({known})"
+                f"--skeleton ({layouts})"
             )
         return layout.inner.tolist()
     numbers = point_places(names)

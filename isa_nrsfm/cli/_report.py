@@ -80,7 +80,7 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     for message in getattr(found, "messages", ()):
         warn_caller(message)
     error = found.held_out_error if found else -estimator.score(X, **frames.weighting)
-    known = ("effective_frames", "pose_share", "pose_removed")
+    figures = ("effective_frames", "pose_share", "pose_removed")
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),
@@ -91,7 +91,7 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
             "row_of_max": X.index[alpha.argmax(axis=0)],
             "stability": getattr(estimator, "stability_", None),
             "stability_word": getattr(found, "stability", None),
-            **{name: getattr(found, name, None) for name in known},
+            **{name: getattr(found, name, None) for name in figures},
         }
     )
     outliers = None

@@ -75,8 +75,8 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
     rows += [["label", "", _answer(label)] for label in report.get("labels", ())]
     if "between" in report.get("groups", ()):
         groups = report["groups"]
-        most = int(np.argmax(groups["between"]))
-        name, share = model["alpha"][most]["name"], groups["between"][most]
+        largest = int(np.argmax(groups["between"]))
+        name, share = model["alpha"][largest]["name"], groups["between"][largest]
         text = f"{100 * share:.0f} % of the variance of {name} is between groups"
         rows.append(["group", "", f"{groups['column']}: {text}"])
     if "time" in report:
@@ -111,8 +111,8 @@ def _depth(model: dict[str, Any]) -> str:
     text = f"known to {100 * error:.2g} %"
     if not mirror or not math.isfinite(mirror):
         return f"{text}; its mirror image is as likely"
-    least = min(math.floor(1000 * mirror) / 10, 99.9)
-    return f"{text}; the right one of two mirror images with {least:g} %"
+    certainty = min(math.floor(1000 * mirror) / 10, 99.9)
+    return f"{text}; the right one of two mirror images with {certainty:g} %"
 
 
 def _answer(label: dict[str, Any]) -> str:
@@ -264,7 +264,7 @@ def _fit(report: dict[str, Any]) -> Section:
     """Return the numbers of the fit and its cameras, with what they mean."""
     model, table = report["model"], report["table"]
     square, mirror = model["noise_variance"], model["mirror_certainty"]
-    worst, known = model["largest_error"], model["depth_determined"]
+    worst, determined = model["largest_error"], model["depth_determined"]
     weighted = " Points count by their weights." * model["held_out_error_weighted"]
     parts = [
         f"held-out error {percent(model['held_out_error'])}: energy of the errors of "
@@ -293,7 +293,7 @@ def _fit(report: dict[str, Any]) -> Section:
             "viewer with --edges FILE or --skeleton LAYOUT. If they are upside down, "
             "use --origin lower."
         )
-    if known and mirror and math.isfinite(mirror):
+    if determined and mirror and math.isfinite(mirror):
         which = "missing points are farther away"
         if model["mirror_decided_by_perspective"]:
             which = "perspective fits"
@@ -301,7 +301,7 @@ def _fit(report: dict[str, Any]) -> Section:
             which = "the prior is alike"
         parts.append(f"mirror image in depth: the one for which {which}")
     parts += _perspective(model, report.get("position_unit"))
-    if known and not np.isnan(model["camera_noise_ratio"]):
+    if determined and not np.isnan(model["camera_noise_ratio"]):
         parts.append(_sentence(model["camera_meaning"]))
     return parts
 
@@ -313,13 +313,13 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
         return []
     if not math.isfinite(focal):
         return ["no perspective: the focal length is too long to estimate it"]
-    (x, y), shown, length = model["principal_point"], "given", "units of the shapes"
+    (x, y), origin, length = model["principal_point"], "given", "units of the shapes"
     if model["parameters"]["focal_length"] is None:
-        shown = f"estimated, standard deviation {model['focal_length_std']:.2g}"
+        origin = f"estimated, standard deviation {model['focal_length_std']:.2g}"
     if unit is not None:
         a, b = unit["points"]
         length = f"points {a} and {b} of the mean shape are {unit['length']:g} apart"
-    focal = f"focal length {focal:.4g} ({shown}), principal point ({x:g}, {y:g})"
+    focal = f"focal length {focal:.4g} ({origin}), principal point ({x:g}, {y:g})"
     return [focal, f"positions in cameras.csv: {length}"]
 
 
@@ -339,18 +339,18 @@ def _alpha(model: dict[str, Any]) -> Section:
         ]
         for row in model["alpha"]
     ]
-    shown = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
-    head, *rows = [[*compress(line, shown)] for line in (head, *rows)]
+    columns = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
+    head, *rows = [[*compress(line, columns)] for line in (head, *rows)]
     notes = [
         "energy: share of the deformation in the images (sum of squares)",
         "pose: variance that yaw, pitch and roll predict, cross-validated",
         "again: whether a fit of other people has the coefficient, with a correlation "
         "of at least .85",
     ]
-    parts: list[str | Cells] = [Cells(head, rows), *compress(notes, shown[5:])]
+    parts: list[str | Cells] = [Cells(head, rows), *compress(notes, columns[5:])]
     if model["parameters"]["remove_pose"]:
-        most = max(model["alpha"], key=lambda row: row["pose_removed"] or 0.0)
-        share = f"{100 * (most['pose_removed'] or 0.0):.0f} % of {most['name']}"
+        largest = max(model["alpha"], key=lambda row: row["pose_removed"] or 0.0)
+        share = f"{100 * (largest['pose_removed'] or 0.0):.0f} % of {largest['name']}"
         parts.append(
             f"--remove-pose: what yaw predicts was removed, up to {share}. It assumes "
             "that the objects move alike in all views"
@@ -420,11 +420,11 @@ def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
     lines = ["mean of each class if p < 0.05, in standard deviations:"]
     means = pd.DataFrame(label["class_means"], names)
-    rest = " (all in report.json)" * (len(means.columns) > MOST_CLASSES)
+    note = " (all in report.json)" * (len(means.columns) > MOST_CLASSES)
     for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
         largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
         listed = (f"{each} {mean:+z.1f}" for each, mean in largest.items())
-        lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{rest}.")
+        lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{note}.")
     return lines if len(lines) > 1 else []
 
 
@@ -450,7 +450,7 @@ def _time(time: dict[str, Any]) -> Section:
         return [f"{name}: no dynamics found, coefficients are not smoothed"]
     fading = scales[np.isfinite(scales)]
     listed = first_items(f"{each:.3g}" for each in fading)
-    found = [f"changes of the shape fade within {listed} {time['unit']}"] * (
+    found = [f"time constants of the deformation: {listed} {time['unit']}"] * (
         len(fading) > 0
     )
     if lasting := len(scales) - len(fading):

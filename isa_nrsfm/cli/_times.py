@@ -39,31 +39,31 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
     if column.dtype.kind == "M":
         dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
         return np.asarray(dates), "seconds"
-    known = column.dropna().astype(str)
-    numbers = as_numbers(known)
+    cells = column.dropna().astype(str)
+    numbers = as_numbers(cells)
     if format is None and numbers.notna().all():
         of_frames = re.fullmatch(FRAME, str(column.name).strip(), re.IGNORECASE)
         unit = "frames" if of_frames else f"in the unit of the column {column.name}"
         return np.asarray(numbers.reindex(column.index), dtype=float), unit
-    zoned = known.str.fullmatch(f".*{_ZONE}")
+    zoned = cells.str.fullmatch(f".*{_ZONE}")
     if zoned.any() and not zoned.all():
         raise ValueError(
-            f"{zoned.sum()} of {len(known)} frames have a time zone, such as Z or "
-            f"+01:00, and others have none (first: {_cell(known, ~zoned)})"
+            f"{zoned.sum()} of {len(cells)} frames have a time zone, such as Z or "
+            f"+01:00, and others have none (first: {_cell(cells, ~zoned)})"
         )
     readings = {
-        each: _read(known, each)
+        each: _read(cells, each)
         for each in ([format] if format else _FORMATS)
-        if format or _read(known.iloc[:1], each).notna().all()
+        if format or _read(cells.iloc[:1], each).notna().all()
     }
     whole = {each: read for each, read in readings.items() if read.notna().all()}
     if not whole:  # the format that reads most rows before it fails
         unread = [read.isna() for read in readings.values()]
-        wrong = max(unread, key=lambda each: each.argmax(), default=known.notna())
+        wrong = max(unread, key=lambda each: each.argmax(), default=cells.notna())
         expected = f"times written as {format}" if format else "numbers or dates"
         raise ValueError(
             f"expected {expected}, written alike in all frames; {wrong.sum()} of "
-            f"{len(column)} are not (first: {_cell(known, wrong)}). Name how they are "
+            f"{len(column)} are not (first: {_cell(cells, wrong)}). Name how they are "
             "written with --time-format, such as %d.%m.%Y, or use numbers"
         )
     chosen, first = next(iter(whole.items()))
@@ -74,7 +74,7 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
             for name, read in ({chosen: first} | others).items()
         ]
         raise ValueError(
-            f"{known[row]!r} in row {row} can be {' or '.join(listed)}, and no other "
+            f"{cells[row]!r} in row {row} can be {' or '.join(listed)}, and no other "
             "row decides it: choose one with --time-format"
         )
     return np.asarray(first.reindex(column.index)), "seconds"

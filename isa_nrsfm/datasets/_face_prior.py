@@ -19,9 +19,9 @@ def load_face_prior(
     """
     Return a model of faces, to be the prior of tables with landmarks of faces.
 
-    Frontal photos do not determine depths. With this prior they need not: it knows how
-    deep faces are, and how people and expressions differ. Coefficients of all tables
-    of a layout that are fitted with it can be compared.
+    Frontal photos do not determine depths. This prior supplies the depths of faces, and
+    how people and expressions differ. Coefficients of all tables of a layout that are
+    fitted with it can be compared.
 
     Parameters
     ----------
@@ -76,9 +76,9 @@ def model_of_points(
     path = files("isa_nrsfm.datasets") / "face_prior.npz"
     with path.open("rb") as file, np.load(file) as arrays:
         stored = {name: arrays[name].astype(np.float64) for name in arrays.files}
-    most = len(stored["shapes"]) - 1
-    K = most if n_components is None else n_components
-    check_scalar(K, "n_components", Integral, min_val=1, max_val=most)
+    n_stored = len(stored["shapes"]) - 1
+    K = n_stored if n_components is None else n_components
+    check_scalar(K, "n_components", Integral, min_val=1, max_val=n_stored)
     C, every = stored["moments"], stored["shapes"]
     some, ibug = (
         B - B.mean(axis=1, keepdims=True)

@@ -79,14 +79,14 @@ def see_in_perspective(
     ratio = 1 + shapes @ depth.mT / focal_length  # of a point's depth to the object's
     edge = ratio * IMAGE / 2
     # Translations from the principal point for which all points are in the image
-    least, most = np.max(-edge - flat, axis=1), np.min(edge - flat, axis=1)
-    if (least > most).any():
+    lower, upper = np.max(-edge - flat, axis=1), np.min(edge - flat, axis=1)
+    if (lower > upper).any():
         raise ValueError(
             f"the image of {IMAGE[0]:g} x {IMAGE[1]:g} pixels is too small for the "
-            f"object in {np.sum((least > most).any(axis=1))} frames; take a larger "
+            f"object in {np.sum((lower > upper).any(axis=1))} frames; take a larger "
             "distance or a smaller focal_length"
         )
-    translation = (least + most + place * (most - least)) / 2
+    translation = (lower + upper + place * (upper - lower)) / 2
     return (flat + translation[:, None]) / ratio + IMAGE / 2, {
         "translation": translation + IMAGE / 2,
         "positions": np.insert(translation, 2, focal_length, axis=1) / scales,
@@ -645,7 +645,7 @@ default="weak_perspective"
         labels : ndarray of shape (n_frames,), dtype=str
             The action: "walk", "reach" or "squat"; in a transition the nearer one.
         groups : ndarray of shape (n_frames,), dtype=int
-            The number of the person, from 0. Each has lengths of bones of their own.
+            The number of the person, from 0. Each has their own lengths of bones.
         time : ndarray of shape (n_frames,)
             Seconds since the person was first seen, at 25 frames per second.
         positions : ndarray of shape (n_frames, 3)
@@ -871,7 +871,7 @@ default="weak_perspective"
         labels : ndarray of shape (n_frames,), dtype=str
             The pose: "open", "fist" or "point"; in a transition the nearer one.
         groups : ndarray of shape (n_frames,), dtype=int
-            The number of the person, from 0. Each has lengths of bones of their own.
+            The number of the person, from 0. Each has their own lengths of bones.
         time : ndarray of shape (n_frames,)
             Seconds since the person was first seen, at 25 frames per second.
         positions : ndarray of shape (n_frames, 3)

@@ -198,9 +198,12 @@ def _netcdf(
         values = points.determined if kind == "i1" else np.nan * points.determined
         file.createVariable(name, kind, axes[:1] + axes[2:])[:] = values[..., None]
     file.variables["determined"].dtype = "bool"
-    known = {"source_software": "isa_nrsfm", "ds_type": "poses", "fps": fps}
-    known |= {"time_unit": "seconds" if fps else "frames", "mirror_certainty": sign}
-    for name, value in known.items():
+    attributes = {"source_software": "isa_nrsfm", "ds_type": "poses", "fps": fps}
+    attributes |= {
+        "time_unit": "seconds" if fps else "frames",
+        "mirror_certainty": sign,
+    }
+    for name, value in attributes.items():
         if value is not None:
             setattr(file, name, value)
     file.flush()

@@ -70,7 +70,7 @@ def upright_space(
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
     check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
-    known: str | None = camera if fitted == "affine" else fitted
+    calibration: str | None = camera if fitted == "affine" else fitted
     if camera is not None and not frames_of(model).certainty.determined:
         warn_caller(depth_advice(facts_of(model)))
     to_metric = np.eye(3)
@@ -95,7 +95,7 @@ def upright_space(
     transform = upright_turn(shape, layout, "upper") @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
-    return UprightSpace(known, metric, transform, image_axes, lines)
+    return UprightSpace(calibration, metric, transform, image_axes, lines)
 
 
 def upright_frames(
@@ -132,10 +132,10 @@ def viewed_shapes(space: UprightSpace, model: Any) -> NDArray[np.float64]:
         for block in gen_batches(len(model.alpha_), max(1, 2**23 // size)):
             motion, alpha = model.motion_[block], model.alpha_[block]
             frames = upright_frames(space, model, motion, alpha).shapes
-            known = np.isfinite(frames).all(axis=(1, 2))
-            weights = np.insert(alpha[known].astype(np.float64), 0, 1.0, axis=1)
+            finite = np.isfinite(frames).all(axis=(1, 2))
+            weights = np.insert(alpha[finite].astype(np.float64), 0, 1.0, axis=1)
             gram += weights.T @ weights
-            product += weights.T @ frames[known].reshape(-1, size)
+            product += weights.T @ frames[finite].reshape(-1, size)
         # Basis shapes of zeros have coefficients of zero.
         fit = np.linalg.pinv(gram, hermitian=True) @ product
         shapes = fit.reshape(shapes.shape)

@@ -192,8 +192,8 @@ def write_viewer(
         weights = None if point_weight is None else taken_rows(point_weight, rows)
         motion, alpha = frames_of_table(model, taken_rows(X, rows), weights)
     motion, alpha = np.asarray(motion), np.asarray(alpha)
-    seen = np.isfinite(alpha).all(axis=1)
-    rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
+    finite = np.isfinite(alpha).all(axis=1)
+    rows, motion, alpha = rows[finite], motion[finite], alpha[finite]
     seconds = np.empty(0) if times is None else _seconds(times, n_rows)[rows]
 
     shapes = viewed_shapes(space, model)
@@ -204,8 +204,8 @@ def write_viewer(
         rotations = upright_frames(space, model, motion, alpha).rotations
         rotations = UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
     labelled = hasattr(X, "iloc")  # pandas: rows have names
-    known = space.camera if frames_of(model).certainty.determined else "unknown"
-    about = ABOUT[known] + MIRRORED * (not sees_perspective(model))
+    kind = space.camera if frames_of(model).certainty.determined else "unknown"
+    about = ABOUT[kind] + MIRRORED * (not sees_perspective(model))
     if lines is not None and lines.name == SPANNING_TREE:
         about += f" Points without a known layout are joined by a {SPANNING_TREE}."
     content = {
@@ -215,7 +215,7 @@ def write_viewer(
         "categories": categories,
         "rows": [str(name) for name in (X.index[rows] if labelled else rows)],
         "labels": codes[rows].tolist() if categories else [],
-        "count": _count(n_rows, len(seen), len(rows)),
+        "count": _count(n_rows, len(finite), len(rows)),
         "shapes": _encoded(shapes / size, "<f4"),
         "edges": _encoded(np.empty(0) if lines is None else lines.edges, "<u4"),
         "sides": lines.sides.tolist() if lines is not None and lines.left else [],

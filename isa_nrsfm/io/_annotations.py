@@ -87,7 +87,7 @@ def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmark
     A line has the class, the box (middle, width, height) and x, y and mostly a third
     number of each point; predictions may have the score and the number of a track
     after them. The third number is 0, 1 or 2 in labels, a confidence in predictions.
-    All are shares of the image's width and height, multiplied by ``image_size``.
+    All are fractions of the image's width and height, multiplied by ``image_size``.
     """
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     rows = [floats_of(line.split()) for line in lines if line.strip()]
@@ -148,8 +148,8 @@ def read_labelme(path: Path) -> Landmarks:
                 warn_caller("shapes that are no points, such as boxes, are left out")
             image = as_utf8(str(content.get("imagePath") or file.name))
             for group in dict.fromkeys(s.get("group_id") for s in points) or [None]:
-                own = [s for s in points if s.get("group_id") == group]
-                places = [(str(s["label"]), s["points"][0]) for s in own]
+                group_shapes = [s for s in points if s.get("group_id") == group]
+                places = [(str(s["label"]), s["points"][0]) for s in group_shapes]
                 rows.append(({"image": image, "individual": group}, _named(places)))
     return _rows_of_names(rows, "labelme")
 

@@ -19,15 +19,15 @@ def read_array(path: Path) -> Landmarks:
     It is (n_frames, n_points, 2), (n_frames, 2, n_points), or a table (n_frames,
     2 * n_points) of x and y in turn. A warning says how it is read.
     """
-    seen = _arrays_in(path)
+    arrays = _arrays_in(path)
     # (n_frames, 1, n_points, 2) of one individual
-    found = {n: a.squeeze() if a.ndim > 3 else a for n, a in seen.items()}
+    found = {n: a.squeeze() if a.ndim > 3 else a for n, a in arrays.items()}
     found = {n: a for n, a in found.items() if a.ndim in (2, 3) and a.size > 2}
     found = {n: a for n, a in found.items() if a.dtype.kind in "fiu"}
     if len(found) > 1:
         found = {name: array for name, array in found.items() if array.ndim == 3}
     if len(found) != 1:
-        shapes = (f"{n} {a.shape} of {a.dtype}" for n, a in (found or seen).items())
+        shapes = (f"{n} {a.shape} of {a.dtype}" for n, a in (found or arrays).items())
         raise ValueError(
             f"one array of points is needed; got {', '.join(shapes) or 'none'}. Save "
             "that of the points with np.save('new.npy', array)"

@@ -205,11 +205,11 @@ def _in_pixels(
 ) -> NDArray[np.float64]:
     """Return tracks (n_frames, n_points, 2) in pixels, by the size of the images."""
     n_known = np.count_nonzero(~np.isnan(tracks))
-    # Pixels of a face reach beyond this, and shares of the image's size do not.
+    # Pixels of a face reach beyond this, and fractions of the image's size do not.
     if 2 * np.count_nonzero((tracks >= -2) & (tracks <= 2)) > n_known:
         if image_size is None and sizes is None:
             raise ValueError(
-                "its coordinates are shares of the image's width and height: give "
+                "its coordinates are fractions of the image's width and height: give "
                 "image_size=(width, height) in pixels (command line: --image-size "
                 "1920x1080), or columns image_width and image_height"
             )
@@ -221,7 +221,7 @@ def _in_pixels(
             return np.asarray(tracks * np.asarray(scale).reshape(-1, 1, 2))
     if image_size is not None:
         raise ValueError(
-            "image_size is for coordinates that are shares of the image's width and "
+            "image_size is for coordinates that are fractions of the image's width and "
             "height; these are in pixels (median "
             f"{np.nanmedian(np.abs(tracks)):.3g}), for the format table"
             if n_known
@@ -237,7 +237,7 @@ def _check_inside(shares: NDArray[np.float64]) -> None:
     if 2 * n_outside > n_shown and not are_shares(shares):
         raise ValueError(
             f"{n_outside} of {n_shown} points are outside the image: the coordinates "
-            "are no shares of the width and height of an image. Read them without "
+            "are no fractions of the width and height of an image. Read them without "
             "image_size, in the format table"
         )
 

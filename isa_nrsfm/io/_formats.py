@@ -159,7 +159,7 @@ def read_landmarks(
         Points with a lower confidence become NaN, where the format has confidences.
     **options : dict
         Options of the format: ``image_size`` (width, height) of "mediapipe" and
-        "mediapipe_json", in pixels, and of "yolo", for shares of the image's size;
+        "mediapipe_json", in pixels, and of "yolo", for fractions of the image's size;
         ``part`` of "openpose", one of "pose", "face", "hand_left" and "hand_right", and
         of "mediapipe_json", also "left_hand" and "right_hand"; of whole bodies of
         "coco" and "mmpose", one of "body", "feet", "face", "left_hand", "right_hand"
@@ -185,7 +185,7 @@ def read_landmarks(
     -----
     UserWarning
         If points are probably missing, such as those at (0, 0), or coordinates are
-        probably shares of the width and height of an image.
+        probably fractions of the width and height of an image.
 
     See Also
     --------

@@ -65,8 +65,8 @@ def json_kind(path: Path) -> str:
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         text = file.read(2**16).lstrip()
         found = _kind_of(text)
-        if found in ("none", "other") and (rest := file.read()):
-            found = _kind_of(text + rest)
+        if found in ("none", "other") and (remainder := file.read()):
+            found = _kind_of(text + remainder)
     return found if text[:1] in ("{", "[") else ""
 
 
@@ -125,8 +125,8 @@ def entries_as_rows(
 
     A point is missing if x and y, or its third number, are zero.
     """
-    seen = [bool(entry.get("keypoints")) for entry in entries]
-    if names is None and not any(seen):
+    has_points = [bool(entry.get("keypoints")) for entry in entries]
+    if names is None and not any(has_points):
         others = first_items(dict.fromkeys(name for each in entries for name in each))
         raise ValueError(
             f"there are no frames in it: no {what} has keypoints, but {others}"
@@ -134,7 +134,7 @@ def entries_as_rows(
     given = [entry for entry in entries if entry.get("keypoints")]
     found, names = _keypoints(given, names, part, what)
     values = np.full((len(entries), *found.shape[1:]), np.nan)
-    values[seen] = found
+    values[has_points] = found
     absent = (values[..., :2] == 0).all(axis=2) | (values[..., 2] == 0)
     rows = [_scalars(entry) for entry in entries]
     columns = dict.fromkeys(name for row in rows for name in row)
@@ -173,12 +173,12 @@ def _results(entries: list[Any]) -> list[dict[str, Any]]:
 def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
     """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
-    seen = first_items(content) if isinstance(content, dict) else content
+    contents = first_items(content) if isinstance(content, dict) else content
     content = {"categories": []} | content if isinstance(content, dict) else {}
     if not all(isinstance(content.get(part), list) for part in lists):
         raise ValueError(
             "expected an object with the lists images, annotations and categories, or "
-            f"a list of results; got {seen!r:.60}"
+            f"a list of results; got {contents!r:.60}"
         )
     for part in lists:
         _refuse_non_objects(content[part], part)
@@ -193,14 +193,14 @@ def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
                 f"annotation {entry.get('id')!r} is of image {where!r}, which is not "
                 "among the images"
             )
-        known = {"annotation_id": entry.get("id")}
+        origin = {"annotation_id": entry.get("id")}
         if isinstance(of, int | str) and of in chosen:
-            known["category"] = str(chosen[of].get("name"))
+            origin["category"] = str(chosen[of].get("name"))
         elif content["categories"] and entry.get("keypoints"):
             others.append(str(of))
             continue
         if entry.get("keypoints"):
-            of_images[where].append(known | entry)
+            of_images[where].append(origin | entry)
     if others:
         listed = first_items(dict.fromkeys(others))
         text = (
@@ -251,7 +251,7 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
     if twice is not None:
         raise ValueError(
             f"two of the {what} have the id {twice['id']!r}, as in files that were "
-            "joined: give each an id of its own, and its annotations as well"
+            "joined: give each its own id, also in the annotations"
         )
     return found
 
@@ -361,16 +361,16 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     absent = "the folder has no files with names ..._keypoints.json, or of people"
     names, people = _each_file(path, _openpose_files(path), absent, _people_in)
     names_in = {name for persons in people for person in persons for name in person}
-    known = [name for name in OPENPOSE_PARTS if name in names_in]
-    listed = ", ".join(known)
-    if not known:
+    parts = [name for name in OPENPOSE_PARTS if name in names_in]
+    listed = ", ".join(parts)
+    if not parts:
         raise ValueError("it has no visible points in pose_keypoints_2d, ...")
-    if len(known) > 1 and part is None:
+    if len(parts) > 1 and part is None:
         raise ValueError(
             f"it has points of {listed}: choose one with part (command line: --part)"
         )
     part = part or listed
-    if part not in known:
+    if part not in parts:
         raise ValueError(f"it has no points of {part}, but of {listed}")
     of_files = frame_numbers(names) or []
     if len(set(of_files)) < len(names):
@@ -378,18 +378,18 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     entries: list[dict[str, Any]] = []
     for name, number, persons in zip(names, of_files, people, strict=True):
         of_file = {"file": as_utf8(name), "frame": number}
-        shown = [
+        rows = [
             of_file | {"person": k} | each | {"keypoints": each[part].ravel().tolist()}
             for k, each in enumerate(persons)
             if part in each
         ]
-        entries += shown or [of_file]
+        entries += rows or [of_file]
     found = entries_as_rows(entries, None, None, "openpose", "person")
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
-            "the coordinates are shares of the image's size, which stretch the shapes. "
-            "Run OpenPose with --keypoint_scale 0 for pixels"
+            "the coordinates are fractions of the image's size, which stretch the "
+            "shapes. Run OpenPose with --keypoint_scale 0 for pixels"
         )
     return found
 
@@ -467,9 +467,9 @@ def _instances_in(file: Path) -> list[dict[str, Any]]:
     for number, frame in enumerate(content):
         if not isinstance(frame, dict):
             frame = {"frame_id": number, "instances": frame}
-        known = {"file": as_utf8(file.name)}
+        origin = {"file": as_utf8(file.name)}
         if "frame_id" in frame:
-            known["frame"] = frame["frame_id"]
+            origin["frame"] = frame["frame_id"]
         for person, each in enumerate(frame["instances"]):
             if {*map(len, each["keypoints"])} - {2} or "keypoint_scores" not in each:
                 raise ValueError(
@@ -478,9 +478,9 @@ def _instances_in(file: Path) -> list[dict[str, Any]]:
                 )
             pairs = zip(each["keypoints"], each["keypoint_scores"], strict=True)
             values = [float(v) for (x, y), score in pairs for v in (x, y, score)]
-            entries.append(known | each | {"person": person, "keypoints": values})
+            entries.append(origin | each | {"person": person, "keypoints": values})
         if not frame["instances"]:
-            entries.append(known)
+            entries.append(origin)
     return entries
 
 
@@ -520,8 +520,10 @@ def read_tps(path: Path) -> Landmarks:
             if entries and not entries[0][1]:
                 raise ValueError(f"there are more than {count} landmarks")
         n_left += sum(not equals for _, equals, _ in entries)
-        known = {name.strip().lower(): value.strip() for name, _, value in entries}
-        rows.append({name: known[name] for name in _TPS_ENTRIES if name in known})
+        values_of = {name.strip().lower(): value.strip() for name, _, value in entries}
+        rows.append(
+            {name: values_of[name] for name in _TPS_ENTRIES if name in values_of}
+        )
     if n_left and not any(len(each[0]) for each in tracks):
         raise ValueError(
             f"all its {n_left} points are on curves, which are left out: append them "

@@ -122,7 +122,7 @@ def find_landmark_columns(
     if pattern.startswith(f"{axis}.#") and axis in names:  # as pandas reads x, y, x, y
         raise ValueError(
             f"the columns '{axis}', '{axis}.1', ... come from a header that repeats "
-            "the same names: give every point a name of its own, such as x0, y0, x1, y1"
+            "the same names: give each point its own name, such as x0, y0, x1, y1"
         )
     patterns, others = pattern.split(","), {*all_names}.difference(names)
     of_set = [n for n in others if any(matches(n, each) for each in patterns)]
@@ -165,8 +165,8 @@ def _refuse_copies(names: Sequence[Hashable]) -> None:
             if other is not None and not word.isdigit():
                 pairs.setdefault(word.lower(), []).append((other, text))
     plain = len(texts) - sum(map(len, pairs.values()))
-    least = max(MIN_POINTS, 0.8 * plain)
-    copies = [found[0] for found in pairs.values() if len(found) >= least]
+    minimum = max(MIN_POINTS, 0.8 * plain)
+    copies = [found[0] for found in pairs.values() if len(found) >= minimum]
     words = []
     for point, copy in copies:
         same = [a == b for a, b in zip(f"{point}\n", copy, strict=False)].index(False)
@@ -405,15 +405,15 @@ def _warn_of_left_out(
     """Warn if patterns match only a part of a set of x and y columns."""
     sets = {point[0] for _, _, point in _coordinates(chosen)}
     used = {*chosen}
-    left = [
+    omitted = [
         name
         for name, axis, point in _coordinates(names)
         if name not in used and axis < 2 and point[0] in sets
     ]
-    if left:
+    if omitted:
         warn_caller(
             f"the patterns {pattern!r} match {len(chosen)} columns and leave out "
-            f"{len(left)} that are named alike; the first is {left[0]!r}"
+            f"{len(omitted)} that are named alike; the first is {omitted[0]!r}"
         )
 
 

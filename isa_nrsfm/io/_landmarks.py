@@ -25,7 +25,7 @@ class Landmarks:
     Landmarks read from a file or from the results of another program.
 
     All tables have one row per frame and the same index, 0, 1, .... Where a frame shows
-    several individuals, each has a row of its own.
+    several individuals, each has its own row.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def assemble_individuals(
     of_instances: dict[str, NDArray[np.float64]] | None = None,
     **known: Any,
 ) -> Landmarks:
-    """Give each individual that a frame shows a row of its own.
+    """Give each individual that a frame shows its own row.
 
     A single individual has a row in every frame. Of several, those without a visible
     point have none. A frame in which nobody is seen has one row without points.
@@ -203,12 +203,12 @@ def assemble_individuals(
     """
     if tracks.shape[1] == 0:
         raise ValueError("expected points of one individual or more; got none")
-    shown = np.asarray(~np.isnan(tracks).all(axis=(2, 3)))
-    several = shown.shape[1] > 1
-    rows = shown.copy() if several else np.ones_like(shown)
-    rows[~shown.any(axis=1), 0] = True
+    visible = np.asarray(~np.isnan(tracks).all(axis=(2, 3)))
+    several = visible.shape[1] > 1
+    rows = visible.copy() if several else np.ones_like(visible)
+    rows[~visible.any(axis=1), 0] = True
     frame, individual = np.nonzero(rows)
-    nobody = several & ~shown[frame, individual]
+    nobody = several & ~visible[frame, individual]
     columns: dict[str, Any] = {
         name: [values[i] for i in frame.tolist()] for name, values in frames.items()
     }
@@ -236,9 +236,11 @@ def stacked(
     `persons` are those of each image by their numbers, `names` those of the images. An
     image without persons has a row of NaN.
     """
-    shown = [(i, values) for i, each in enumerate(persons) for values in each.values()]
-    first, points = shown[0]
-    for i, values in shown:
+    persons_seen = [
+        (i, values) for i, each in enumerate(persons) for values in each.values()
+    ]
+    first, points = persons_seen[0]
+    for i, values in persons_seen:
         if len(values) != len(points):
             raise ValueError(
                 f"{names[first]} has {len(points)} points, {names[i]} has "
@@ -271,14 +273,14 @@ def checked_sizes(name: str, sizes: Any, n_images: int) -> NDArray[np.float64]:
 
 def refuse_same_names(names: Sequence[str]) -> None:
     """Raise if two columns have the same name."""
-    seen: set[str] = set()
+    names_before: set[str] = set()
     for name in map(str.strip, names):
-        if name and name in seen:
+        if name and name in names_before:
             raise ValueError(
                 f"more than one column is called {name!r}: each needs its own name, "
                 "such as x0, y0, x1, y1"
             )
-        seen.add(name)
+        names_before.add(name)
 
 
 def from_mediapipe(
@@ -296,7 +298,7 @@ def from_mediapipe(
         that has, for each face, a list of objects with ``x`` and ``y`` are taken.
     image_sizes : array-like of shape (2,) or (n_results, 2)
         Width and height of all images, or of each, in pixels. MediaPipe gives x in
-        shares of the width and y in shares of the height.
+        fractions of the width and y in fractions of the height.
     part : {"face", "hand", "pose", "left_hand", "right_hand"}, optional
         The part to take, if the results have several, as those of holistic landmarkers.
 
@@ -330,13 +332,13 @@ def from_mediapipe(
     array([False,  True])
     """
     results = list(results)
-    known = list(dict.fromkeys(each for result in results for each in _parts(result)))
-    if results and part not in (known if part or len(known) > 1 else [None]):
+    parts = list(dict.fromkeys(each for result in results for each in _parts(result)))
+    if results and part not in (parts if part or len(parts) > 1 else [None]):
         raise ValueError(
-            f"the results have {', '.join(known)}: choose one with part, such as "
-            f"part={known[0]!r}; got part={part!r}"
+            f"the results have {', '.join(parts)}: choose one with part, such as "
+            f"part={parts[0]!r}; got part={part!r}"
         )
-    part = part or "".join(known)
+    part = part or "".join(parts)
     sizes = checked_sizes("image_sizes", image_sizes, len(results))
     names = [f"result {i} (counted from 0)" for i in range(len(results))]
     persons = [
@@ -355,13 +357,13 @@ def from_mediapipe(
         side = [sides[i][k] if 0 <= k < len(sides[i]) else None for i, k in places]
         frames |= {"handedness": side} if any(side) else {}
     # Faces and hands have no visibility, though some versions set it to zero.
-    seen = part == "pose" and not np.isnan(values[..., 2]).all()
+    has_visibility = part == "pose" and not np.isnan(values[..., 2]).all()
     return assemble(
         values[..., :2] * sizes[frame][:, None],
         None,
         frames,
         format="mediapipe",
-        confidence=values[..., 2] if seen else None,
+        confidence=values[..., 2] if has_visibility else None,
     )
 
 
@@ -458,8 +460,13 @@ def from_sleap_io(labels: Any) -> Landmarks:
             file, found = frame.video.filename, list(frame.instances)
             video = file if isinstance(file, str) else str([*file, ""][0])
             corrected = [id(getattr(each, "from_predicted", None)) for each in found]
-            left = [each for each in found if id(each) not in corrected] or [None]
-            rows += [(video, frame.frame_idx, k, each) for k, each in enumerate(left)]
+            kept_instances = [each for each in found if id(each) not in corrected] or [
+                None
+            ]
+            rows += [
+                (video, frame.frame_idx, k, each)
+                for k, each in enumerate(kept_instances)
+            ]
         skeletons = [row[3].skeleton for row in rows if row[3] is not None]
         kinds = {(tuple(s.node_names), tuple(s.edge_names)) for s in skeletons}
         ((nodes, edges),) = kinds
@@ -520,8 +527,8 @@ def _persons(result: Any, part: str, where: str) -> list[NDArray[np.float64]]:
         faces = [] if found is None else list(getattr(found, "landmark", found))
         for face in [faces] if faces and hasattr(faces[0], "x") else faces:
             points = getattr(face, "landmark", face)
-            seen = [(p.x, p.y, getattr(p, "visibility", None)) for p in points]
-            values.append(np.array(seen, dtype=np.float64).reshape(-1, 3))
+            coordinates = [(p.x, p.y, getattr(p, "visibility", None)) for p in points]
+            values.append(np.array(coordinates, dtype=np.float64).reshape(-1, 3))
         return values
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(
@@ -531,7 +538,7 @@ def _persons(result: Any, part: str, where: str) -> list[NDArray[np.float64]]:
 
 
 def _side(hand: Any) -> str | None:
-    """Return the side of a hand, from what MediaPipe tells of it."""
+    """Return the side of a hand in a result of MediaPipe."""
     first = next(iter(getattr(hand, "classification", hand)), None)
     return getattr(first, "category_name", None) or getattr(first, "label", None)
 

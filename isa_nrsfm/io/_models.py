@@ -332,8 +332,8 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "further_basis": model.basis[model.n_components :],
     }
     for name in ("pinhole", "axes"):
-        if (known := getattr(model, name)) is not None:
-            f, (x, y), *kinds = known
+        if (pinhole := getattr(model, name)) is not None:
+            f, (x, y), *kinds = pinhole
             entries[name] = np.array([f, x, y, *kinds], dtype=float)
     if isinstance(frames, RigidFrames):
         return {**entries, "mean_shape": frames.mean_shape, "basis": frames.basis}

@@ -153,14 +153,18 @@ def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
             axes = texts.map({t: "xyz"[c[0]] for t, c in coordinates.items() if c})
         if not {"x", "y"} <= {*axes} <= {"x", "y", "z", *CONFIDENCES}:
             continue
-        rest = frame.drop(columns=name).assign(**known)
-        keys = [n for n in rest if 1 < rest[n].nunique() < len(rest) / 2 or n in known]
-        others = [n for n in rest if n not in keys and n not in CONFIDENCES]
-        value = ([n for n in rest if _VALUE.search(str(n))] or others)[-1]
+        columns = frame.drop(columns=name).assign(**known)
+        keys = [
+            n
+            for n in columns
+            if 1 < columns[n].nunique() < len(columns) / 2 or n in known
+        ]
+        others = [n for n in columns if n not in keys and n not in CONFIDENCES]
+        value = ([n for n in columns if _VALUE.search(str(n))] or others)[-1]
         keys = [n for n in keys if n not in (value, *CONFIDENCES)]
-        table = rest[axes == "x"].rename(columns={value: "x"})
+        table = columns[axes == "x"].rename(columns={value: "x"})
         for axis in {*axes} - {"x"}:
-            part = rest[axes == axis][[*keys, value]].rename(columns={value: axis})
+            part = columns[axes == axis][[*keys, value]].rename(columns={value: axis})
             table = table.merge(part, how="left", on=keys, validate="one_to_one")
         return table
     return frame
@@ -220,15 +224,15 @@ def _points_apart(
     others = [name for name in frame if name not in {*values.values(), *by_point}]
     codes = {name: pd.factorize(frame[name])[0] for name in others}
     of_frame = [n for n, code in codes.items() if (code[first][row] == code).all()]
-    left = [name for name in others if name not in of_frame]
-    told = f"; left out, as they differ between its points: {first_items(left)}"
-    if given is None or left:
+    unassigned = [name for name in others if name not in of_frame]
+    told = f"; left out, as they differ between its points: {first_items(unassigned)}"
+    if given is None or unassigned:
         option = ",".join([*by_frame, "+".join(by_point)])
         warn_caller(
             f"the table has a row for each point: {', '.join(by_frame) or 'nothing'} "
             f"tells {len(first)} frames apart, {', '.join(by_point)} {len(labels)} "
             f"points (row_per_point={option!r}; command line: --row-per-point "
-            f"{option}){told * bool(left)}"
+            f"{option}){told * bool(unassigned)}"
         )
     kept = frame[of_frame].iloc[first].reset_index(drop=True)
     points = _names(labels, "xy") if len(by_point) < 2 else None
@@ -249,14 +253,14 @@ def _keys_as_given(frame: "pd.DataFrame", given: str | Sequence[str]) -> Keys:
     listed = given.split(",") if isinstance(given, str) else list(given)
     *by_frame, point = [name.strip() for name in listed]
     keys = [*by_frame, *point.split("+")]
-    known = [name for name in keys if name in frame]
+    present = [name for name in keys if name in frame]
     absent = [name for name in keys if name not in frame]
     if len(absent) > 1:
         raise ValueError(
             "row_per_point must name the columns that tell frames apart, and then that "
             f"of the points, such as 'frame,landmark'; the table has no {absent}"
         )
-    groups = frame.groupby(known or np.zeros(len(frame)), dropna=False)
+    groups = frame.groupby(present or np.zeros(len(frame)), dropna=False)
     counts = {name: groups.cumcount() for name in absent}
     return frame.assign(**counts), by_frame, point.split("+")
 
@@ -308,8 +312,8 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
     by = [name for name in keys if sizes[name] <= len(frame) / 2]
     counted = "point" if not named else "individual" if len(by) > 1 else "frame"
     alike = codes.groupby(by).size() if by else pd.Series([1])
-    least = 2 if named else MIN_POINTS if image in by else np.inf
-    if alike.nunique() > 1 or alike.iloc[0] < least:
+    minimum = 2 if named else MIN_POINTS if image in by else np.inf
+    if alike.nunique() > 1 or alike.iloc[0] < minimum:
         return None
     by = [name for name in by if name not in named[:1]]
     return _keys_as_given(frame, [*by, counted, *named[:1]])

@@ -58,8 +58,8 @@ def open_table(path: str | os.PathLike[str]) -> "StoredTable | NDArray":
     """
     path = Path(path)
     if path.is_dir():
-        shown = (p for p in path.iterdir() if not p.name.startswith((".", "_")))
-        files = sorted(shown, key=by_number)
+        visible = (p for p in path.iterdir() if not p.name.startswith((".", "_")))
+        files = sorted(visible, key=by_number)
     else:
         files = [path]
     if not files:

@@ -192,7 +192,7 @@ def landmark_table(
         several numbers, a point has one.
     individuals : str or sequence of str, optional
         The individuals in one row, such as ``"1,2"`` for nose_1_x and nose_2_x: the
-        parts by which their columns differ. Each has a row of its own, and the other
+        parts by which their columns differ. Each has its own row, and the other
         columns have ``frame``, the number of the row, and ``individual``.
     row_per_point : str or sequence of str, optional
         Of a table with a row for each point, the columns that tell frames apart and,
@@ -247,9 +247,11 @@ def individuals_as_rows(
     """Return a table with a row for each individual of each row, if there are any."""
     if individuals is None:
         return frame
-    own = columns_of_individuals(frame.columns, individuals)
+    columns_of = columns_of_individuals(frame.columns, individuals)
     frame = frame.reset_index(drop=True)
-    common = frame.drop(columns=[name for names in own.values() for name in names])
+    common = frame.drop(
+        columns=[name for names in columns_of.values() for name in names]
+    )
     if "individual" in common:
         raise ValueError(
             "the table has a column 'individual' already, which individuals would "
@@ -268,7 +270,7 @@ def individuals_as_rows(
         common.insert(0, "frame", common.index)
     parts = [
         common.assign(individual=name).join(frame[[*columns]].rename(columns=columns))
-        for name, columns in own.items()
+        for name, columns in columns_of.items()
     ]
     return pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
 
@@ -331,19 +333,19 @@ def confidences_in(
         with warnings.catch_warnings(action="ignore"):  # of commas, as in coordinates
             frame = with_points(frame, names)
         texts = [name for name in names if frame[name].dtype.kind not in "iuf"]
-        seen = {n: frame[n].map(lambda cell: _SEEN.get(cell, cell)) for n in texts}
-        found = {name: _as_numbers(seen.get(name, frame[name])) for name in names}
+        flags = {n: frame[n].map(lambda cell: _SEEN.get(cell, cell)) for n in texts}
+        found = {name: _as_numbers(flags.get(name, frame[name])) for name in names}
         values = pd.DataFrame(found, frame.index)
         # p may be a pressure, and v a velocity; in COCO it is 0, 1 or 2.
         is_letter = bool(names) and len(names[0].strip()) == len(x[0].strip())
-        known = values.to_numpy()[values.notna()]
-        if is_letter and not ((known == known.clip(0, 1)) | (known == 2)).all():
+        numbers = values.to_numpy()[values.notna()]
+        if is_letter and not ((numbers == numbers.clip(0, 1)) | (numbers == 2)).all():
             raise ValueError(
                 f"{names[0]}, ... are no confidences: they are not all from 0 to 1"
             )
         # MediaPipe writes zeros for faces and hands.
-        if names and not known.any():
-            empty = "0" if len(known) else "empty"
+        if names and not numbers.any():
+            empty = "0" if len(numbers) else "empty"
             raise ValueError(f"{names[0]}, ... are no confidences: all are {empty}")
         return values
     except ValueError:
@@ -626,8 +628,8 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         for row in (header, second)
     )
     # Numbers may be names, of columns whose cells hold points, or beside coordinates.
-    most = 2 * n_header > len(header) and not any(map(parse_coordinate, header))
-    if n_second and (n_header == len(header) or (n_header >= 14 and most)):
+    has_numbers = 2 * n_header > len(header) and not any(map(parse_coordinate, header))
+    if n_second and (n_header == len(header) or (n_header >= 14 and has_numbers)):
         raise ValueError(
             "its first line has numbers; a first line with column names is needed, "
             "such as x0, y0, x1, y1"

@@ -326,7 +326,7 @@ def mean_shape_error_3d(
       coordinates of the true shape over its points: a mean distance, in units of the
       extent of the object along an axis (Akhter et al. 2008; Dai et al. 2014);
 
-    - "frame": an orthogonal matrix :math:`O_i` and a scale :math:`c_i` of its own align
+    - "frame": an orthogonal matrix :math:`O_i` and its own scale :math:`c_i` align
       each frame,
 
       .. math:: \frac{1}{I} \sum_i \frac{\|S_i - c_i X_i O_i\|_F}{\|S_i\|_F},

@@ -307,8 +307,8 @@ class BasisShapeDisplay:
             pair[0].set_title(title, loc="left", fontsize="small")
             pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
         if ax is None:
-            shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
-            _axes.add_legend(self.figure_, shown, self.skeleton, markerscale=3.0)
+            entries = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
+            _axes.add_legend(self.figure_, entries, self.skeleton, markerscale=3.0)
         return self
 
     def _draw(self, axis: Any, points: NDArray, style: Any, sided: bool) -> Any:

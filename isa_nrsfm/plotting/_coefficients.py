@@ -238,13 +238,13 @@ class CoefficientsDisplay:
         """Draw box plots and the frames of each class, scattered sideways."""
         assert self.y is not None
         classes, members = _rows_of_largest(self.y)
-        known = [rows[np.isfinite(self.alpha[rows, k])] for rows in members]
+        finite_rows = [rows[np.isfinite(self.alpha[rows, k])] for rows in members]
         rng = np.random.default_rng(0)  # horizontal positions have no meaning
-        x = np.repeat(np.arange(0.0, len(classes)), [len(rows) for rows in known])
+        x = np.repeat(np.arange(0.0, len(classes)), [len(rows) for rows in finite_rows])
         x += 0.18 * rng.uniform(-1, 1, len(x))
-        _scatter(axes, x, self.alpha[np.concatenate(known), k])
+        _scatter(axes, x, self.alpha[np.concatenate(finite_rows), k])
         axes.boxplot(
-            [self.alpha[rows, k] for rows in known],
+            [self.alpha[rows, k] for rows in finite_rows],
             positions=range(len(classes)),
             widths=0.6,
             showfliers=False,

@@ -74,8 +74,8 @@ def lines_of_model(
     Points without a layout are near each other if they are near in the images.
     """
     gram = _metric.mean_gram(_metric.unit_cameras(np.asarray(estimator.motion_)))
-    seen = estimator.mean_shape_ @ _metric.symmetric_power(gram, 0.5)
-    return choose_lines(edges, origin, shape, names_of_points(estimator), seen)
+    points = estimator.mean_shape_ @ _metric.symmetric_power(gram, 0.5)
+    return choose_lines(edges, origin, shape, names_of_points(estimator), points)
 
 
 def depth_note(estimator: Any) -> str:
@@ -85,8 +85,8 @@ def depth_note(estimator: Any) -> str:
         return "depth up to an affinity"
     if not certainty.determined:
         return "depth not determined"
-    known = np.isfinite(certainty.total)
-    return f"depth error {100 * certainty.total:.2g} %" if known else ""
+    estimated = np.isfinite(certainty.total)
+    return f"depth error {100 * certainty.total:.2g} %" if estimated else ""
 
 
 def euclidean_axes(estimator: Any) -> NDArray:

@@ -94,21 +94,21 @@ def names_layout(
     other order, incomplete points, or further columns. None if x or y is missing, or if
     the other columns are pairs that differ in these letters alone, such as lx1, ly1.
     """
-    axes, points, rest = [], [], []
+    axes, points, stems = [], [], []
     for name in names:
         coordinate = parse_coordinate(name)
         if coordinate is None:
-            rest.append(str(name).lower().replace("x", "y"))
+            stems.append(str(name).lower().replace("x", "y"))
             continue
         axis, _, [((before, _, after), key), *_] = coordinate
         axes.append(axis)
         points.append((before, after, key))
-    pairs = [a == b for a, b in zip_longest(rest[0::2], rest[1::2])]
+    pairs = [a == b for a, b in zip_longest(stems[0::2], stems[1::2])]
     if 0 not in axes or 1 not in axes:
         # lx1, ly1 beside columns that are no pairs
-        alike = any(a == b for a, b in pairwise(rest))
+        alike = any(a == b for a, b in pairwise(stems))
         return "other" if not axes and alike and not all(pairs) else None
-    if rest:
+    if stems:
         return None if all(pairs) else "other"
     n = len(set(points))
     if axes == [0, 1] * n and points[0::2] == points[1::2]:
@@ -172,8 +172,8 @@ def _divisions(names: Iterable[Hashable]) -> Iterator[dict[str, dict[str, Hashab
                 if len(parts) > max(place, -place - 1, 1):
                     others = [*parts]
                     key = others.pop(place).strip(" _.-")
-                    rest = "".join(others).rstrip(" _.-")
-                    found.setdefault(key, {})[rest] = name
+                    stem = "".join(others).rstrip(" _.-")
+                    found.setdefault(key, {})[stem] = name
             yield found
 
 
@@ -239,11 +239,13 @@ def columns_of_individuals(
     who, names = [str(name).strip() for name in listed], list(names)
     best: dict[str, dict[Hashable, str]] = {}
     for division in _divisions(names):
-        own = [division.get(name, {}) for name in who]
-        common = [rest for rest in own[0] if all(rest in each for each in own)]
+        divisions = [division.get(name, {}) for name in who]
+        common = [
+            stem for stem in divisions[0] if all(stem in each for each in divisions)
+        ]
         if len(common) > max(map(len, best.values()), default=0):
-            pairs = zip(who, own, strict=True)
-            best = {name: {each[rest]: rest for rest in common} for name, each in pairs}
+            pairs = zip(who, divisions, strict=True)
+            best = {name: {each[stem]: stem for stem in common} for name, each in pairs}
     if not best or len({*who}) < len(who):
         raise ValueError(
             f"no columns have the same names but for {', '.join(who)} (individuals)"
