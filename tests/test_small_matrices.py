@@ -14,9 +14,9 @@ from isa_nrsfm._frames.point_sums import (
 )
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
-    FEW,
     LANES,
     ROWS,
+    SMALL,
     diagonal_of,
     inverse3,
     invert_positive,
@@ -152,9 +152,10 @@ def test_nan_is_not_positive(n):
 
 
 class TestSweep:
+    @pytest.mark.parametrize("k", [5, SMALL + 3])
     @pytest.mark.parametrize("first", [0, 1, 3, 5])
-    def test_identity(self, first):
-        A = positive_matrices(0, 5, 7)
+    def test_identity(self, first, k):
+        A = positive_matrices(0, k, 7)
         swept = packed(A)
         log_determinant, positive = sweep(swept, first)
         swept = last_to_first(unpacked(swept))
@@ -168,8 +169,9 @@ class TestSweep:
         assert_allclose(log_determinant, np.linalg.slogdet(last_to_first(B))[1])
         assert positive.all()
 
-    def test_a_row_without_a_positive_pivot_is_zero_in_the_end(self):
-        A = positive_matrices(0, 5, 7)
+    @pytest.mark.parametrize("k", [5, SMALL + 3])
+    def test_a_row_without_a_positive_pivot_is_zero_in_the_end(self, k):
+        A = positive_matrices(0, k, 7)
         A[3] = A[:, 3] = 0.0
         swept = packed(A)
         _, positive = sweep(swept, 1)
@@ -177,11 +179,12 @@ class TestSweep:
         assert_array_equal(unpacked(swept)[3], 0)
 
 
-def test_a_matrix_is_solved_alike_whatever_its_neighbours_are():
+@pytest.mark.parametrize("k", [6, SMALL + 3])
+def test_a_matrix_is_solved_alike_whatever_its_neighbours_are(k):
     """Also beside one that is not positive definite."""
-    n = FEW + 2  # the parts are swept in the way of few matrices
-    A = packed(positive_matrices(0, 6, n))
-    b = np.random.default_rng(0).normal(size=(6, n))
+    n = 258
+    A = packed(positive_matrices(0, k, n))
+    b = np.random.default_rng(0).normal(size=(k, n))
     A[:, 50] *= -1
     many, inverses = solve_positive(A, b)[0], invert_positive(A)[0]
     for frames in (slice(10, 26), slice(40, 56)):

@@ -111,6 +111,9 @@ def fit_jointly(
         if settings.prior is not None:
             rough = {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, first.cameras, **rough)
+        if whole:
+            n = n_directions(first, paper_shapes.shape[2], few=True)
+            fit = extended(first, fit, n)
     elif whole:
         fit = _likeliest_fit(first, table, paper_shapes)
     else:
@@ -121,12 +124,11 @@ def fit_jointly(
     if whole:
         few = bool(table.parts) or not every_point or table.outliers is not None
         most = n_directions(first, paper_shapes.shape[2], few)
-        n = min(most, FEW_DIRECTIONS)
-        fit, widths = whole_distribution(first, extended(first, fit, n))
-        fit = steadiest(first, table, fit._replace(widths=widths), n)
+        fit = steadiest(first, table, fit)
         widths, rivals = fit.widths, fit.rivals
         assert widths is not None
-        if len(widths.variances) == n < most:  # the table supports all of them
+        # More directions, if the table supports all of the first ones
+        if len(widths.variances) == FEW_DIRECTIONS < most:
             fit, widths = whole_distribution(first, extended(first, fit, most))
         # Directions that explain the table up to rounding leave no noise.
         if table.explained_by(len(widths.variances), LEAST_NOISE):
@@ -213,9 +215,9 @@ def _likeliest_fit(
 
 
 def steadiest(
-    problem: JointProblem, table: FactorisedTable, fit: JointFit, n: int
+    problem: JointProblem, table: FactorisedTable, first: JointFit
 ) -> JointFit:
-    """Return a fit of n directions, or a more evident one.
+    """Return the fit from one at the first noise, or a more evident one.
 
     The others start from cameras that turn less: wings that beat look like a bird that
     rolls. The objective counts coefficients, but not rotations, and its minima lead
@@ -224,8 +226,11 @@ def steadiest(
     """
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
-    first, free = extended(problem, fit, n), replace(problem, penalty=0.0)
+    n = min(len(first.state.shapes) - 1, FEW_DIRECTIONS)
     before, held = evidence(problem, first), AffineCameras(held=True)
+    free = replace(problem, penalty=0.0)
+    fit, widths = whole_distribution(problem, first)
+    fit = fit._replace(widths=widths)
     if not np.isfinite(before):  # nothing turns
         return fit
     found, latest = [(evidence(problem, fit) - LEAST_GAIN, before, fit)], fit

@@ -1,7 +1,7 @@
 """Algebra of many small matrices, symmetric ones packed, and of rows of numbers.
 
 The index of a packed matrix is the last one: each operation is one pass over long rows
-of numbers, faster than a call of LAPACK for each matrix of up to fifteen rows. The k (k
+of numbers, faster than a call of LAPACK for each matrix of up to `SMALL` rows. The k (k
 + 1) / 2 entries of a matrix are packed by rows from the diagonal on; those of 3x3
 matrices of space are xx, xy, xz, yy, yz, zz.
 
@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv, dpotri
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
 
@@ -24,9 +25,9 @@ ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 UNPACKED = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 DIAGONAL = [0, 3, 5]
 
-# Up to this number of matrices calls cost more than numbers: sweeping all rows at once
-# takes half the time for 16 matrices, 0.7 for 256 and as long for 512.
-FEW = 256
+# Number of rows up to which elimination is as fast as LAPACK. With 60 rows LAPACK takes
+# a quarter to a half of the time.
+SMALL = 30
 
 
 def unpack3(packed: NDArray) -> NDArray:
@@ -151,23 +152,48 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
     Returns ``log det A`` (n,) of the positive pivots, and whether all pivots are
     positive (n,).
     """
+    k = math.isqrt(2 * len(packed))
+    return (_swept if k - first > SMALL else _eliminated)(packed, first)
+
+
+def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
+    """Sweep each matrix by its Cholesky factor, or by `_eliminated` without one."""
+    places = _places(math.isqrt(2 * len(packed)))
+    across, own = places[:first, first:], places[first:, first:]
+    G, A = packed[across], np.ascontiguousarray(packed[own].T)
+    X, upper = np.moveaxis(G, 2, 0).copy(), np.triu_indices(len(own))
+    failed = [dposv(a.T, x.T, 1, 1, 1)[2] for a, x in zip(A, X, strict=True)]
+    pivots, least = A.diagonal(axis1=1, axis2=2).T ** 2, OF_STEPS * packed[np.diag(own)]
+    positive = (np.array(failed) == 0) & (pivots > least).all(axis=0)
+    others = np.flatnonzero(~positive)
+    left, X = packed.take(others, -1), np.moveaxis(X, 0, 2)
+    for a in A:
+        dpotri(a.T, 1, 1)
+    packed[own[upper]], packed[across] = -A[:, *upper].T, X
+    packed[places[:first, :first]] -= np.einsum("rcn,scn->rsn", G, X)
+    log_determinant = np.log(np.where(positive, pivots, 1.0)).sum(axis=0)
+    log_determinant[others], positive[others] = _eliminated(left, first)
+    packed[:, others] = left
+    return log_determinant, positive
+
+
+def _eliminated(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
+    """Sweep rows of all matrices, one after the other."""
     rows, n = packed_rows(packed), packed.shape[1]
     k = len(rows)
     places, (first_of, second_of) = _places(k), pair_indices(k)
     least = OF_STEPS * packed[diagonal_of(packed)]
     inverses = np.empty((k - first, n))
     positive = np.ones(n, dtype=bool)
-    room = np.empty((k, n))
+    product, factor = np.empty((2, *packed.shape))  # new ones cost more than calls
     for i in range(first, k):
         inverse = _inverse_pivot(rows[i][0], least[i], positive)
         inverses[i - first] = inverse
         column = packed.take(places[i], 0)
         scaled = column * inverse
-        if n <= FEW:  # calls cost more than numbers
-            packed -= scaled.take(second_of, 0) * column.take(first_of, 0)
-        else:
-            for j in range(k):
-                rows[j] -= np.multiply(scaled[j:], column[j], out=room[: k - j])
+        scaled.take(second_of, 0, out=product, mode="clip")
+        product *= column.take(first_of, 0, out=factor, mode="clip")
+        packed -= product
         packed[places[i]] = scaled
         np.negative(inverse, out=rows[i][0])
     # With where=... NumPy rounds differently next to entries that are left out.
