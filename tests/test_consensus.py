@@ -1,5 +1,6 @@
 """The consensus of groups: neighbours, fits, merge, and the refinement as a whole."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -570,7 +571,10 @@ class TestEstimator:
         others[np.linspace(0, 103, 100).round().astype(int)] = False
         z, errors = centred(truth[:, :, 2]), []
         for name in ("joint", "consensus"):
-            model = consensus_fit(table, 3, refinement=name, tol=0.5)
+            with warnings.catch_warnings():  # of the joint fit, rightly: 0.68
+                text = "the depth of the shapes is not determined: its expected error"
+                warnings.filterwarnings("ignore" if name == "joint" else "error", text)
+                model = consensus_fit(table, 3, refinement=name, tol=0.5)
             d = centred(in_camera(model, table)[:, :, 2])
             off = np.sign(np.sum(z * d)) * d - z
             errors.append(np.mean(off[:, others] ** 2))

@@ -136,6 +136,8 @@ def fit_jointly(
             least_noise = NOISE_FLOOR
             shapes = fit.state.shapes[: 1 + widths.n_relevant]
             fit = unregularised(first, fit.state._replace(shapes=shapes))
+            free = replace(first, penalty=0.0)
+            fit = free.refined(fit.state, least_noise=least_noise, tol=settings.tol)
             widths = widths.of_points(paper_shapes.shape[2], len(shapes) - 1)
         else:
             least_noise = LEAST_NOISE
