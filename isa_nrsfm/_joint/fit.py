@@ -132,7 +132,9 @@ def fit_jointly(
         if len(widths.variances) == n < most:  # the table supports all of them
             fit, widths = whole_distribution(first, extended(first, fit, most))
         # Directions that explain the table up to rounding leave no noise.
-        if table.explained_by(len(widths.variances), LEAST_NOISE):
+        # Points that were filled in have errors: room for three directions more.
+        n_known = len(widths.variances) + (0 if every_point else 3)
+        if table.explained_by(n_known, LEAST_NOISE):
             least_noise = NOISE_FLOOR
             shapes = fit.state.shapes[: 1 + widths.n_relevant]
             fit = unregularised(first, fit.state._replace(shapes=shapes))
