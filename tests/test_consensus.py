@@ -1,5 +1,6 @@
 """The consensus of groups: neighbours, fits, merge, and the refinement as a whole."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -479,8 +480,13 @@ class TestEstimator:
 
     @pytest.mark.slow
     def test_automatic_number_of_components(self):
-        """Automatic numbers of components exceed the twelve of the joint fit."""
-        assert 12 < len(consensus_fit(n_components="auto").basis_) <= 60
+        """As many coefficients as the joint fit are reported; the model has more."""
+        found, joint = (
+            consensus_fit(n_components="auto", refinement=name)
+            for name in ("consensus", "joint")
+        )
+        assert len(found.basis_) == len(joint.basis_) <= 12
+        assert 12 < len(found._model.basis) <= 60
 
     def test_deviations_have_the_size_of_errors(self, body):
         """Errors of depths are half to twice their standard deviations."""
@@ -565,7 +571,10 @@ class TestEstimator:
         others[np.linspace(0, 103, 100).round().astype(int)] = False
         z, errors = centred(truth[:, :, 2]), []
         for name in ("joint", "consensus"):
-            model = consensus_fit(table, 3, refinement=name, tol=0.5)
+            with warnings.catch_warnings():  # of the joint fit, rightly: 0.68
+                text = "the depth of the shapes is not determined: its expected error"
+                warnings.filterwarnings("ignore" if name == "joint" else "error", text)
+                model = consensus_fit(table, 3, refinement=name, tol=0.5)
             d = centred(in_camera(model, table)[:, :, 2])
             off = np.sign(np.sum(z * d)) * d - z
             errors.append(np.mean(off[:, others] ** 2))

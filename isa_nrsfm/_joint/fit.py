@@ -76,6 +76,11 @@ FIRST_COMPONENTS = 3, 1, 12
 HOPELESS, LEAST_GAIN = 5.0, 1.0
 # Numbers of groups of similar frames that may be reversed in depth, on the same page
 GROUPS = 2, 4
+# Most steps of fits that are only starts, on the same page: later steps follow flat
+# valleys, along which rounding errors grow until the order of the frames matters.
+START_STEPS = 100
+# Largest error variance of a point that others predict, over that of the noise: there.
+LARGEST_SPREAD = 5.0
 
 
 def fit_jointly(
@@ -131,10 +136,14 @@ def fit_jointly(
         if len(widths.variances) == FEW_DIRECTIONS < most:
             fit, widths = whole_distribution(first, extended(first, fit, most))
         # Directions that explain the table up to rounding leave no noise.
-        if table.explained_by(len(widths.variances), LEAST_NOISE):
+        # Points that were filled in have errors: room for three directions more.
+        n_known = len(widths.variances) + (0 if every_point else 3)
+        if table.explained_by(n_known, LEAST_NOISE):
             least_noise = NOISE_FLOOR
             shapes = fit.state.shapes[: 1 + widths.n_relevant]
             fit = unregularised(first, fit.state._replace(shapes=shapes))
+            free = replace(first, penalty=0.0)
+            fit = free.refined(fit.state, least_noise=least_noise, tol=settings.tol)
             widths = widths.of_points(paper_shapes.shape[2], len(shapes) - 1)
         else:
             least_noise = LEAST_NOISE
@@ -196,7 +205,9 @@ def _likeliest_fit(
     n = n_directions(problem, paper_shapes.shape[2], few=True)
     most = min(len(paper_shapes) - 1, n)
     few, *more = dict.fromkeys(min(k, most) for k in FIRST_COMPONENTS)
-    rough, cameras = {"tol": problem.settings.tol}, problem.cameras
+    settings, cameras = problem.settings, problem.cameras
+    max_iter = min(settings.max_iter, START_STEPS)
+    rough: dict[str, Any] = {"tol": settings.tol, "max_iter": max_iter}
     fits = [_first_fit(problem, table, paper_shapes[: few + 1], **rough)[0]]
     for k in more:
         paper = paper_shapes[: k + 1]
@@ -574,7 +585,7 @@ def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
     rows (n, 2, J): of size one. To first order, ``(I - H_jj)^-1 r_j`` with the residual
     r_j of a point and the hat matrix H of its frame. Directions of the shapes that
     follow a wrong point explain it, but not from the others. NaN if these are fewer
-    than `LEAST_POINTS`.
+    than `LEAST_POINTS`, or do not predict the point.
     """
     fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
     state = JointState(model.shapes, fit.motion, model.noise_variance)
@@ -583,8 +594,10 @@ def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
     for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, camera):
         Z, Y = (x.reshape(len(x), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
         left = (1.0 + OF_DIFFERENCES) * np.eye(2) - np.einsum("iprj,ipsj->ijrs", Y, Z)
-        error = np.linalg.solve(left, rest[part].mT[..., None])[..., 0]
-        distance[part] = np.linalg.norm(error, axis=2)
+        spread = np.linalg.inv(left)  # covariance of the errors over that of the noise
+        error = np.linalg.norm(spread @ rest[part].mT[..., None], axis=(2, 3))
+        known = np.trace(spread, axis1=2, axis2=3) < 2 * LARGEST_SPREAD
+        distance[part] = np.where(known, error, np.nan)
     enough = w.sum(axis=1, keepdims=True) > LEAST_POINTS
     return np.where((w > 0) & enough, distance, np.nan)
 

@@ -102,6 +102,8 @@ def determined(
 ) -> tuple[JointState, Widths]:
     """Return a state along its principal directions, and their prior variances."""
     n_numbers = 3 * problem.frames.points(state.shapes).shape[2]
+    if problem.frames.directions is None:  # positions of shapes have no images
+        state = state._replace(shapes=centred(state.shapes))
     # Basis shapes whose images are orthogonal on average
     C, images = image_moments(state)
     energy, axes = np.linalg.eigh(images)
