@@ -76,10 +76,8 @@ FIRST_COMPONENTS = 3, 1, 12
 HOPELESS, LEAST_GAIN = 5.0, 1.0
 # Numbers of groups of similar frames that may be reversed in depth, on the same page
 GROUPS = 2, 4
-# Most steps of fits that are only starts, on the same page: later steps follow flat
-# valleys, along which rounding errors grow until the order of the frames matters.
-START_STEPS = 100
-# Largest error variance of a point that others predict, over that of the noise: there.
+# Largest error variance of a point that others predict, over that of the noise, in
+# frames with missing points: there.
 LARGEST_SPREAD = 5.0
 
 
@@ -205,9 +203,7 @@ def _likeliest_fit(
     n = n_directions(problem, paper_shapes.shape[2], few=True)
     most = min(len(paper_shapes) - 1, n)
     few, *more = dict.fromkeys(min(k, most) for k in FIRST_COMPONENTS)
-    settings, cameras = problem.settings, problem.cameras
-    max_iter = min(settings.max_iter, START_STEPS)
-    rough: dict[str, Any] = {"tol": settings.tol, "max_iter": max_iter}
+    rough, cameras = {"tol": problem.settings.tol}, problem.cameras
     fits = [_first_fit(problem, table, paper_shapes[: few + 1], **rough)[0]]
     for k in more:
         paper = paper_shapes[: k + 1]
@@ -585,7 +581,7 @@ def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
     rows (n, 2, J): of size one. To first order, ``(I - H_jj)^-1 r_j`` with the residual
     r_j of a point and the hat matrix H of its frame. Directions of the shapes that
     follow a wrong point explain it, but not from the others. NaN if these are fewer
-    than `LEAST_POINTS`, or do not predict the point.
+    than `LEAST_POINTS`, or if with missing points they do not predict the point.
     """
     fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
     state = JointState(model.shapes, fit.motion, model.noise_variance)
@@ -597,6 +593,7 @@ def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
         spread = np.linalg.inv(left)  # covariance of the errors over that of the noise
         error = np.linalg.norm(spread @ rest[part].mT[..., None], axis=(2, 3))
         known = np.trace(spread, axis1=2, axis2=3) < 2 * LARGEST_SPREAD
+        known |= w[part].all(axis=1, keepdims=True)
         distance[part] = np.where(known, error, np.nan)
     enough = w.sum(axis=1, keepdims=True) > LEAST_POINTS
     return np.where((w > 0) & enough, distance, np.nan)
