@@ -218,7 +218,8 @@ def _likeliest_fit(
         for c in (problem.cameras, CAMERAS["affine"])
     )
     ratio = max(fits[0].camera_noise_ratio * own / affine, 1.0)
-    return best._replace(camera_noise_ratio=ratio)
+    # With as many steps again, as only the best one is refined further
+    return extended(problem, best, n)._replace(camera_noise_ratio=ratio)
 
 
 def steadiest(
