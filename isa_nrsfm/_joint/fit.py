@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
-    AffineCameras,
     CameraModel,
     residuals,
 )
@@ -45,7 +44,7 @@ from isa_nrsfm._joint.starts import (
     FIXED_STEPS,
     affine_start,
     best_starts,
-    first_state,
+    held_fit,
     lifted_shapes,
     other_depths,
     reversed_groups,
@@ -74,10 +73,11 @@ FIRST_COMPONENTS = 3, 1, 12
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains are those of two fits of one minimum.
 HOPELESS, LEAST_GAIN = 5.0, 1.0
-# Numbers of groups of similar frames that may be reversed in depth, on the same page
+# Numbers of groups of similar frames that may be reversed in depth:
+# docs/benchmarks/README.md, "Thresholds".
 GROUPS = 2, 4
 # Largest error variance of a point that others predict, over that of the noise, in
-# frames with missing points: there.
+# frames with missing points: docs/benchmarks/README.md, "Thresholds".
 LARGEST_SPREAD = 5.0
 
 
@@ -134,7 +134,8 @@ def fit_jointly(
         if len(widths.variances) == FEW_DIRECTIONS < most:
             fit, widths = whole_distribution(first, extended(first, fit, most))
         # Directions that explain the table up to rounding leave no noise.
-        # Points that were filled in have errors: room for three directions more.
+        # Points that were filled in have errors: room for three directions more
+        # (docs/benchmarks/README.md, "Thresholds").
         n_known = len(widths.variances) + (0 if every_point else 3)
         if table.explained_by(n_known, LEAST_NOISE):
             least_noise = NOISE_FLOOR
@@ -235,8 +236,7 @@ def steadiest(
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
     n = min(len(first.state.shapes) - 1, FEW_DIRECTIONS)
-    before, held = evidence(problem, first), AffineCameras(held=True)
-    free = replace(problem, penalty=0.0)
+    before = evidence(problem, first)
     fit, widths = whole_distribution(problem, first)
     fit = fit._replace(widths=widths)
     if not np.isfinite(before):  # nothing turns
@@ -245,8 +245,8 @@ def steadiest(
 
     def lifted(motion: NDArray, k: int) -> JointFit:
         """Return the fit of n directions from cameras, first with k of them."""
-        state = first_state(problem, rows, motion, lifted_shapes(rows, motion, k))
-        state = free.refined(state, held, max_iter=FIXED_STEPS).state
+        shapes = lifted_shapes(rows, motion, k)
+        state = held_fit(problem, rows, motion, shapes).state
         other = extended(problem, fit._replace(state=state), k)
         return extended(problem, other, n) if k < n else other
 

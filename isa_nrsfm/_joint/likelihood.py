@@ -48,6 +48,7 @@ from isa_nrsfm._frames.point_sums import (
 )
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._linalg.small_matrices import (
+    centred,
     diagonal_of,
     energies,
     frames_last,
@@ -156,6 +157,10 @@ class JointFrames:
     def points(self, shapes: NDArray) -> NDArray:
         """Return shapes (..., n_points) from the result of `coordinates`."""
         return shapes if self.directions is None else shapes @ self.directions
+
+    def centred(self, shapes: NDArray) -> NDArray:
+        """Return shapes centred over their points. Directions have sum zero already."""
+        return centred(shapes) if self.directions is None else shapes
 
     def take(self, frames: NDArray) -> Self:
         """Return some of the frames, in the order of the table."""

@@ -222,9 +222,7 @@ class JointProblem:
 
     def aligned(self, state: JointState, cameras: CameraModel) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes."""
-        shapes, _, noise = state
-        if self.frames.directions is None:
-            shapes = centred(shapes)
+        shapes, noise = self.frames.centred(state.shapes), state.noise
         search = frame_search(cameras.name, shapes)
         motion = self.frames.blocks.joined(
             lambda block: search.fit(block, noise, covariances=False, rough=True).motion

@@ -23,7 +23,12 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._joint.prior import STEP, ShapePrior
-from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState
+from isa_nrsfm._joint.problem import (
+    FactorisedTable,
+    JointFit,
+    JointProblem,
+    JointState,
+)
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._paper.pipeline import Factorisation, rigid_energy
@@ -142,17 +147,15 @@ def reversed_groups(
     others. alpha (I, K): coefficients, for the groups (Ward, "Hierarchical grouping to
     optimize an objective function", 1963).
     """
-    free, held = replace(problem, penalty=0.0), AffineCameras(held=True)
     group = fcluster(linkage(alpha, "ward"), n_groups, "maxclust")
     for number in range(1, group.max() + 1):
         own, rest = group == number, np.flatnonzero(group != number)
         if 2 * own.sum() > len(own):
             continue
-        others = free.part(rest, problem.settings.tol)
+        others = problem.part(rest, problem.settings.tol)
         shapes = lifted_shapes(rows[rest], motion[rest], alpha.shape[1])
-        state = first_state(others, rows[rest], motion[rest], shapes)
-        state = others.refined(state, held, max_iter=FIXED_STEPS).state
-        state, _ = free.reversed_back(state._replace(motion=motion), problem.cameras)
+        state = held_fit(others, rows[rest], motion[rest], shapes).state
+        state, _ = problem.reversed_back(state._replace(motion=motion), problem.cameras)
         motion = np.where(own[:, None, None], state.motion, motion)
     return motion
 
@@ -208,8 +211,7 @@ def best_starts(
         """Refine shapes, or lifted ones, with fixed cameras, and add the trial."""
         if shapes is None:
             shapes = lifted_shapes(seen, motion[few], n_components)
-        state = first_state(part, seen, motion[few], shapes)
-        fit = part.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
+        fit = held_fit(part, seen, motion[few], shapes)
         trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
@@ -238,6 +240,20 @@ def best_starts(
         freed.append((fit.history[-1], fit.state._replace(motion=motion)))
     freed.sort(key=itemgetter(0))
     return [with_prior(problem, state) for _, state in freed[:3]]
+
+
+def held_fit(
+    problem: JointProblem, rows: NDArray, motion: NDArray, shapes: NDArray
+) -> JointFit:
+    """Return the fit of shapes after some steps with cameras held, without the prior.
+
+    With the large noise of a start, the prior would make basis shapes vanish.
+    """
+    state, free = (
+        first_state(problem, rows, motion, shapes),
+        replace(problem, penalty=0.0),
+    )
+    return free.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
 
 
 def first_state(

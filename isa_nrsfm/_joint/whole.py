@@ -35,7 +35,7 @@ from isa_nrsfm._joint.problem import (
 )
 from isa_nrsfm._joint.starts import camera_moments
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import centred, frames_last, unpacked
+from isa_nrsfm._linalg.small_matrices import frames_last, unpacked
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Largest number of directions: of small complete tables, and of others, where each
@@ -71,8 +71,7 @@ def extended(problem: JointProblem, fit: JointFit, n: int) -> JointFit:
     if n_more > 0:
         _, _, n_points = state.shapes.shape
         more = np.random.RandomState(0).standard_normal((n_more, 3, n_points))
-        if problem.frames.directions is None:
-            more = centred(more)
+        more = problem.frames.centred(more)
         size = FIRST_SIZE * np.linalg.norm(state.shapes[0])
         more *= size / np.linalg.norm(more, axis=(1, 2))[:, None, None]
         state = state._replace(shapes=np.concatenate([state.shapes, more]))
@@ -102,8 +101,8 @@ def determined(
 ) -> tuple[JointState, Widths]:
     """Return a state along its principal directions, and their prior variances."""
     n_numbers = 3 * problem.frames.points(state.shapes).shape[2]
-    if problem.frames.directions is None:  # positions of shapes have no images
-        state = state._replace(shapes=centred(state.shapes))
+    # Positions of shapes have no images.
+    state = state._replace(shapes=problem.frames.centred(state.shapes))
     # Basis shapes whose images are orthogonal on average
     C, images = image_moments(state)
     energy, axes = np.linalg.eigh(images)

@@ -25,8 +25,8 @@ ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 UNPACKED = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 DIAGONAL = [0, 3, 5]
 
-# Number of rows up to which elimination is as fast as LAPACK. With 60 rows LAPACK takes
-# a quarter to a half of the time.
+# Number of rows up to which elimination is as fast as LAPACK:
+# docs/benchmarks/README.md, "Thresholds".
 SMALL = 30
 
 
@@ -172,8 +172,9 @@ def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
     packed[own[upper]], packed[across] = -A[:, *upper].T, X
     packed[places[:first, :first]] -= np.einsum("rcn,scn->rsn", G, X)
     log_determinant = np.log(np.where(positive, pivots, 1.0)).sum(axis=0)
-    log_determinant[others], positive[others] = _eliminated(left, first)
-    packed[:, others] = left
+    if len(others):
+        log_determinant[others], positive[others] = _eliminated(left, first)
+        packed[:, others] = left
     return log_determinant, positive
 
 

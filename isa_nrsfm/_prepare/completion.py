@@ -74,12 +74,12 @@ def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     A pattern (n_patterns, n_points) is 1.0 where a point is seen, otherwise 0.0. The
     last array is the index (n_frames,) of the pattern of each frame.
     """
-    complete = ~np.isnan(rows).any(axis=1)
+    seen = ~np.isnan(rows).any(axis=1)
     _, first, pattern = np.unique(
-        np.packbits(complete, axis=1), axis=0, return_index=True, return_inverse=True
+        np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
     )
-    patterns = complete[first].astype(float)
-    return np.where(complete[:, None], rows, 0.0), patterns, pattern.reshape(-1)
+    patterns = seen[first].astype(float)
+    return np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1)
 
 
 def _principal_axes(rows: NDArray, rank: int) -> Model:

@@ -27,8 +27,13 @@ PAGE = "report.html"
 REPORT = "report.json"
 # The files of every fit; docs/command_line.md has their contents.
 RESULTS = (
-    *(PAGE, "model.npz", "alpha.csv", "cameras.csv"),
-    *("shapes.csv", "shapes.npz", "viewer.html"),
+    PAGE,
+    "model.npz",
+    "alpha.csv",
+    "cameras.csv",
+    "shapes.csv",
+    "shapes.npz",
+    "viewer.html",
 )
 
 
