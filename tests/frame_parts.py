@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from isa_nrsfm._frames.models import frame_search
+from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.search import FrameSearch
 
 # What a fitted model has of its shapes, and of each frame.
 OF_SHAPES = ("mean_shape_", "basis_", "singular_values_", "mode_covariance_")
@@ -22,7 +23,7 @@ def numbers_of(fits):
 
 def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     """Return the fit of frames by a new search."""
-    return frame_search(camera, shapes).fit_rows(
+    return FrameSearch(shapes, CAMERAS[camera]).fit_rows(
         tracks.transpose(0, 2, 1), noise, **given
     )
 

@@ -20,14 +20,14 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rotated,
 )
-from isa_nrsfm._frames.newton import (
+from isa_nrsfm._frames.point_sums import coefficient_posterior, frame_sums, frame_tracks
+from isa_nrsfm._frames.search import (
     LARGE_RISE,
     REVERSED,
-    CalibratedSearch,
+    FrameSearch,
     _rise,
     calibrated_starts,
 )
-from isa_nrsfm._frames.point_sums import coefficient_posterior, frame_sums, frame_tracks
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     ROWS,
@@ -283,7 +283,7 @@ def fitted(scene, camera, noise=NOISE**2, **options):
 
 def problem_of(scene, camera, noise):
     """Return the search, its frames, and cameras in its coordinates."""
-    search = CalibratedSearch(scene.shapes, CAMERAS[camera].scaled)
+    search = FrameSearch(scene.shapes, CAMERAS[camera])
     seen = np.isfinite(scene.tracks[..., 0])
     weights = None if seen.all() else 1.0 * seen
     products = frame_sums(
@@ -461,11 +461,12 @@ class TestReversal:
         return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
 
     def search(self, scene, camera, noise, motion):
-        search = CalibratedSearch(scene.shapes, CAMERAS[camera].scaled)
+        search = FrameSearch(scene.shapes, CAMERAS[camera])
         products = frame_sums(
             frame_tracks(scene.tracks.transpose(0, 2, 1)), search.shared
         )
-        return search.reversed_cameras(products, noise, motion)
+        problem = search.problem(products, np.full(len(motion), noise))
+        return search.reversed_cameras(problem, motion)
 
     def test_cameras_that_start_reversed_are_turned_back(self, camera):
         scene = self.scene(camera)

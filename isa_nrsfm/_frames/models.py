@@ -21,7 +21,6 @@ from isa_nrsfm._frames.camera_models import (
     full_rotations,
     rigid_cameras,
 )
-from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
@@ -297,13 +296,6 @@ class RigidFrames:
         return motion, translation, alpha
 
 
-def frame_search(camera: str, shapes: NDArray) -> FrameSearch:
-    """Return the search of a camera model for centred shapes with alpha ~ N(0, I)."""
-    if camera == "affine":
-        return AffineSearch(shapes)
-    return CalibratedSearch(shapes, camera == "weak_perspective")
-
-
 @dataclass(frozen=True, eq=False)
 class PosteriorFrames:
     """The joint refinement's model of a frame: its posterior, camera and coefficients.
@@ -326,7 +318,7 @@ class PosteriorFrames:
     @cached_property
     def _search(self) -> FrameSearch:
         """The search for frames, shared by all tables."""
-        return frame_search(self.camera, self.shapes)
+        return FrameSearch(self.shapes, CAMERAS[self.camera])
 
     @cached_property
     def without_starts(self) -> "PosteriorFrames":

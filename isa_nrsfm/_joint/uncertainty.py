@@ -36,10 +36,9 @@ from isa_nrsfm._frames.models import (
     Decomposition,
     DepthCertainty,
     PosteriorFrames,
-    frame_search,
     leverages,
 )
-from isa_nrsfm._frames.search import FramePosterior
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem, JointState, Widths, refine_joint
@@ -105,7 +104,8 @@ def fitted_frames(
     sum of the squared residuals.
     """
     if model.loss == "linear":
-        search = frame_search(model.camera, frames.coordinates(model.shapes))
+        shapes, camera = frames.coordinates(model.shapes), CAMERAS[model.camera]
+        search = FrameSearch(shapes, camera)
         fitted = partial(search.fit, noise=model.noise_variance, starts=model.starts)
         posteriors = frames.blocks.derive(fitted)
     else:
