@@ -468,24 +468,29 @@ class PosteriorFrames:
         median = lower_medians(distance, seen_points(rows))[:, 0]
         poor = np.flatnonzero(median > MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
         if len(poor):
-            fitted = partial(fitted, starts=self.starts)
-            fit.put(poor, self._reweighted(rows[poor], fitted))
+            fit.put(poor, self._reweighted(rows[poor], fitted, self.starts))
         return fit
 
     def _reweighted(
-        self, rows: NDArray, fitted: Callable[..., FramePosterior]
+        self,
+        rows: NDArray,
+        fitted: Callable[..., FramePosterior],
+        starts: NDArray | None = None,
     ) -> FramePosterior:
-        """Return the fit of rows (n, 2, J) with a robust loss."""
+        """Return the fit of rows (n, 2, J) with a robust loss.
+
+        Only the first pass starts again from `starts`: later ones go on from it.
+        """
         quick = partial(fitted, covariances=False)
         sizes, deviation = robust_sizes(rows), np.sqrt(self.noise_variance)
         # First without gross outliers
         weights = frame_weights("linear", lengths(rows), 1.0, sizes)
-        fit = quick(rows, weights=weights)
+        fit = quick(rows, weights=weights, starts=starts)
         # If too few points remain, use the distant ones.
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
         if len(lost):
             weights[lost] = 1.0
-            fit.put(lost, quick(rows[lost]))
+            fit.put(lost, quick(rows[lost], starts=starts))
         # Then iteratively reweighted, for the frames whose weights still change
         changing = np.flatnonzero(np.isfinite(fit.objective))
         for _ in range(50):
