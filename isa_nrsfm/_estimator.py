@@ -29,7 +29,7 @@ from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
 from isa_nrsfm._frames import camera_models
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
-from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, leading
+from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
 from isa_nrsfm._frames.pinhole import focal_shares, pinhole_of, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._other_tables import checked_prior, fitted_prior, warn_if_foreign
@@ -1137,10 +1137,10 @@ default="affine"
         table, weights = (None, ()) if X is None else self._opened(X, point_weight)
         return diagnose(self, table, weights, rows)
 
-    def _jointly_fitted(self, name: str, calibrated: bool = False) -> PosteriorFrames:
+    def _jointly_fitted(self, name: str, calibrated: bool = False) -> FrameModel:
         """Return the model of a frame with noise, and calibrated cameras, or raise."""
         frames = self._model.frames
-        if not isinstance(frames, PosteriorFrames):
+        if not frames.joint:
             raise ValueError(
                 f"{name} needs a model with refinement='joint', which has a noise "
                 f"variance; got refinement={self.refinement!r}"
@@ -1163,7 +1163,7 @@ default="affine"
         if not reset:
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
-            joint, loss = isinstance(frames, PosteriorFrames), frames.loss
+            joint, loss = frames.joint, frames.loss
         if point_weight is not None:
             grouped = reset and self.refinement == "consensus"
             check_weightable(X, joint, loss, grouped)

@@ -39,8 +39,7 @@ from isa_nrsfm._frames.models import (
     MIRROR,
     Decomposition,
     FrameMap,
-    PosteriorFrames,
-    RigidFrames,
+    FrameModel,
     spread_starts,
 )
 from isa_nrsfm._gauge import (
@@ -167,7 +166,7 @@ def fit_table(
         (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
         settings = settings._replace(shape_prior=fit.prior)
         gauge = FrameMap.identity(len(shapes) - 1)
-        model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
+        model = FrameModel(shapes, noise, starts, settings.loss, gauge, camera)
         progress(JOINT_STAGE)
         attributes = {
             "camera_noise_ratio_": fit.camera_noise_ratio,
@@ -328,7 +327,6 @@ def _started(
     frames, (own, other) = model.frames, (model.unit, table.unit)
     # Frames have size one, unless all have one scale.
     unit = own / other if own and other else 1.0
-    assert isinstance(frames, PosteriorFrames)
     n_more = max(n_components + 1 - len(frames.shapes), 0)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance
     if n_more:
@@ -359,7 +357,7 @@ def _paper_frames(
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
 
     def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
-        frames = RigidFrames(mean_shape, basis, s.camera)
+        frames = FrameModel.rigid(mean_shape, basis, s.camera)
         K = len(basis)
         return TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
 
@@ -378,7 +376,7 @@ def _paper_frames(
 
 def _joint_frames(
     table: ScaledTable,
-    model: PosteriorFrames,
+    model: FrameModel,
     fits: FrameFits,
     s: FitSettings,
     n_components: int,

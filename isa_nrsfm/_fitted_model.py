@@ -16,9 +16,8 @@ from isa_nrsfm._frames.camera_models import (
 from isa_nrsfm._frames.models import (
     MIRROR,
     Decomposition,
+    FrameModel,
     LinearisedFrames,
-    PosteriorFrames,
-    RigidFrames,
     leading,
 )
 from isa_nrsfm._frames.pinhole import Pinhole, turns_to, zoomed
@@ -57,7 +56,7 @@ class TableModel(NamedTuple):
     `axes` is a camera of known focal length that has taken weak-perspective images.
     """
 
-    frames: RigidFrames | PosteriorFrames
+    frames: FrameModel
     mean_shape: NDArray
     basis: NDArray
     n_components: int
@@ -136,7 +135,6 @@ class TableModel(NamedTuple):
             return rows
         images = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
-        assert isinstance(self.frames, PosteriorFrames)
         weak = self._replace(frames=self.frames.without_starts, pinhole=None)
         moving = np.arange(len(rows))
         for _ in range(30 if pinhole.near else 0):
@@ -227,7 +225,6 @@ class TableModel(NamedTuple):
     ) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
         rows = self.straightened(rows, weights)
-        assert isinstance(self.frames, PosteriorFrames)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
         whole = FramePosterior.unknown(len(rows), len(self.basis))
         unit = centred / sizes[:, None, None]
@@ -240,7 +237,6 @@ class TableModel(NamedTuple):
         Noise and errors of the shapes are expected, and distances that are tiny for the
         size of a frame. Few outliers have no effect.
         """
-        assert isinstance(self.frames, PosteriorFrames)
         constant, slope = self.frames.certainty.images
         ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
         expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)
@@ -252,7 +248,6 @@ class TableModel(NamedTuple):
     ) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
         rows = self.straightened(rows, weights)
-        assert isinstance(self.frames, PosteriorFrames)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.linearised(centred, sizes, weights)
         fit = fit._replace(translation=fit.translation + translation)
@@ -310,7 +305,6 @@ class TableModel(NamedTuple):
 
         They are along the axes of the camera.
         """
-        assert isinstance(self.frames, PosteriorFrames)
         straight = self.straightened(rows, weights)
         weak = self._replace(pinhole=None)
         virtual = weak.decompose(straight, weights, False, dtype=np.float64)
@@ -403,7 +397,7 @@ class TableModel(NamedTuple):
             if not len(usable):
                 continue
             mean, others = self.mean_shape[held], self.basis[:, held]
-            if complete and isinstance(frames, PosteriorFrames):
+            if complete and frames.joint:
                 kept = frames.of_points(~held)  # their centroid is the origin
                 visible = np.compress(~held, rows[usable], axis=2)
                 fit = kept.fit(visible, sizes[usable], False, None)

@@ -11,7 +11,6 @@ from sklearn.base import clone
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import distances, full_rotations
-from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
@@ -119,8 +118,7 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
             f"prior must be a fitted AffineNRSfM; got {prior!r}. A search over several "
             "priors clones them: give sklearn.frozen.FrozenEstimator(prior)"
         )
-    calibrated = isinstance(model.frames, PosteriorFrames) and prior.camera_ != "affine"
-    if not calibrated:
+    if not model.frames.joint or prior.camera_ == "affine":
         raise ValueError(
             "prior must be fitted with calibrated cameras and the joint refinement; "
             f"got camera={prior.camera_!r}, refinement={prior.refinement!r}. Fit it "

@@ -30,7 +30,7 @@ from isa_nrsfm._fit import (
     supported_components,
 )
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.pinhole import Pinhole, common, pinhole_of
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
@@ -384,7 +384,7 @@ def fit_perspective(
         return table.fit(None, n_components or 1, **options)[:4]
     model, _, converged, attributes, *_ = fit
     f = best.pinhole.focal_length
-    if errors and isinstance(model.frames, PosteriorFrames):
+    if errors and model.frames.joint:
         certainty = model.frames.certainty
         error = focal_error(fits, 1.0 / f, deviation, table.source.slices)
         total = float(np.hypot(certainty.total, error))
@@ -444,6 +444,6 @@ def _straight(
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
     square = model.distances(rows, *model.in_table_cameras(rows, *fit)[:3]) ** 2
-    if isinstance(model.frames, PosteriorFrames) and model.frames.loss != "linear":
+    if model.frames.loss != "linear":
         square = robust_square(square, model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

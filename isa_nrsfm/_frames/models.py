@@ -1,15 +1,14 @@
 """Camera, position and coefficients of single frames for given shapes.
 
-The result of a frame does not depend on the others. `RigidFrames`, the paper's model,
-fits the camera to the mean shape alone, then the coefficients by least squares.
-`PosteriorFrames`, the joint refinement's model, finds the most probable camera and
-coefficients together.
+The result of a frame does not depend on the others. The joint refinement's model of a
+frame finds the most probable camera and coefficients together. The paper's model fits
+the camera to the mean shape alone, then the coefficients by least squares.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
@@ -222,89 +222,43 @@ class LinearisedFrames(NamedTuple):
     slope: NDArray
 
 
-@dataclass(frozen=True, eq=False)
-class RigidFrames:
-    """The paper's model of a frame: rigid camera, coefficients by least squares.
+def rigid_fit(
+    rows: NDArray, shapes: NDArray, camera: str
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return motion, translation and alpha of rows (n, 2, J) that show the same points.
 
-    Shapes are centred, ``B_k B_l^T = 0`` (3x3) for different k and l, with the mean
-    shape as B_0. If no point is missing, each coefficient is then fitted by itself.
-    Calibrated cameras are the nearest to the cameras of the rigid fit.
+    The paper's fit: the camera of the mean shape alone, calibrated ones the nearest to
+    it. Then the coefficients by least squares, the solution of least norm.
     """
-
-    mean_shape: NDArray
-    basis: NDArray
-    camera: str = "affine"
-
-    loss: ClassVar[str] = "linear"
-    certainty: ClassVar[DepthCertainty] = NOT_ESTIMATED  # there is no noise variance
-
-    def mirrored(self) -> "RigidFrames":
-        """Return the model with shapes mirrored in depth."""
-        return RigidFrames(self.mean_shape * MIRROR, self.basis * MIRROR, self.camera)
-
-    def fit(
-        self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
-    ) -> Decomposition:
-        """Return the camera of the rigid fit and the coefficients of least squares.
-
-        If no point is missing, ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2``, or zero
-        if the camera does not show B_k. Otherwise the solution of least norm. Ignores
-        the other parameters.
-        """
-        shapes = (2, 3), (2,), (len(self.basis),), (len(self.basis),)
-        fit = Decomposition(*(np.full((len(rows), *size), np.nan) for size in shapes))
-        complete = np.asarray(seen_points(rows).all(axis=1))
-        parts = [(np.array([i]), self._together) for i in np.flatnonzero(~complete)]
-        for frames, fitted in [(complete, self._separately), *parts]:
-            part = fitted(rows[frames])
-            fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
-        return fit
-
-    def _separately(self, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return motion, translation and alpha of complete frames (n, 2, n_points)."""
-        translation = rows.mean(axis=2)
-        W = (rows - translation[..., None]).reshape(-1, rows.shape[2])
-        motion = CAMERAS[self.camera].nearest(rigid_cameras(W, self.mean_shape))
-        n_components, n_points, _ = self.basis.shape
-        stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
-        P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
-        along = np.einsum("irkc,irc->ik", P, motion)
-        # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q_k R_k. The Gram matrix of B_k would
-        # give only half the digits.
-        R = np.linalg.qr(self.basis, mode="r")
-        images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
-        energy = np.einsum("ikrd,ikrd->ik", images, images)
-        largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
-        visible = energy > 1e-28 * largest  # less is rounding errors
-        alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
-        return motion, translation, alpha
-
-    def _together(self, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the fit of one frame (1, 2, n_points), all coefficients at once."""
-        (seen,) = seen_points(rows)
-        points, mean_shape = rows[0][:, seen].T, self.mean_shape[seen]
-        centre, centroid = points.mean(axis=0), mean_shape.mean(axis=0)
-        motion = rigid_cameras((points - centre).T, mean_shape - centroid)
-        motion = CAMERAS[self.camera].nearest(motion)
-        # Least squares for the residuals of the mean shape
-        basis = self.basis[:, seen]
-        middles = basis.mean(axis=1)
-        images = (basis - middles[:, None]) @ motion[0].T
-        rest = points - centre - (mean_shape - centroid) @ motion[0].T
-        alpha = np.linalg.lstsq(images.reshape(len(basis), -1).T, rest.ravel())[0]
-        translation = centre - motion[0] @ (centroid + alpha @ middles)
-        return motion, translation, alpha
+    seen = seen_points(rows)[0]
+    shapes = shapes[:, :, seen]
+    middles, centre = shapes.mean(axis=2), rows[:, :, seen].mean(axis=2)
+    W, shapes = rows[:, :, seen] - centre[..., None], centred(shapes)
+    # Directions of all shapes in the place of points, as these may be many
+    axes = np.linalg.qr(shapes.reshape(-1, shapes.shape[2]).T)[0]
+    W, shapes = W @ axes, shapes @ axes
+    motion = rigid_cameras(W.reshape(-1, W.shape[2]), shapes[0].T)
+    motion = CAMERAS[camera].nearest(motion)
+    images = (motion[:, None] @ shapes[1:]).reshape(len(rows), len(shapes) - 1, -1)
+    rest = (W - motion @ shapes[0]).reshape(len(rows), -1, 1)
+    # Smaller images are rounding errors.
+    alpha = (np.linalg.pinv(images.mT, rcond=OF_PRODUCTS) @ rest)[..., 0]
+    middle = middles[0] + alpha @ middles[1:]
+    return motion, centre - (motion @ middle[..., None])[..., 0], alpha
 
 
 @dataclass(frozen=True, eq=False)
-class PosteriorFrames:
-    """The joint refinement's model of a frame: its posterior, camera and coefficients.
+class FrameModel:
+    """The model of a frame: its posterior, camera and coefficients.
 
     shapes (K + 1, 3, J): centred, with coefficients that are drawn from N(0, I).
     noise_variance: that of a coordinate, for frames of size one. starts (n_starts, K):
     further coefficients to start from if the fit from zero is bad. gauge: maps cameras
     and coefficients to those of the public shapes. certainty: uncertainty of the fit of
     the shapes, with calibrated cameras.
+
+    Models of the paper's refinement have no noise variance, NaN: frames are fitted by
+    `rigid_fit`, in units of the table.
     """
 
     shapes: NDArray
@@ -315,13 +269,25 @@ class PosteriorFrames:
     camera: str = "affine"
     certainty: DepthCertainty = NOT_ESTIMATED
 
+    @classmethod
+    def rigid(cls, mean_shape: NDArray, basis: NDArray, camera: str) -> Self:
+        """Return the paper's model of a mean shape (J, 3) and a basis (K, J, 3)."""
+        shapes, K = np.concatenate([mean_shape[None], basis]).mT, len(basis)
+        gauge = FrameMap.identity(K)
+        return cls(shapes, np.nan, np.empty((0, K)), "linear", gauge, camera)
+
+    @property
+    def joint(self) -> bool:
+        """Whether it is the joint refinement's model, with a noise variance."""
+        return not np.isnan(self.noise_variance)
+
     @cached_property
     def _search(self) -> FrameSearch:
         """The search for frames, shared by all tables."""
         return FrameSearch(self.shapes, CAMERAS[self.camera])
 
     @cached_property
-    def without_starts(self) -> "PosteriorFrames":
+    def without_starts(self) -> "FrameModel":
         """The model that fits each frame from zero only."""
         return replace(self, starts=self.starts[:0])
 
@@ -329,12 +295,12 @@ class PosteriorFrames:
         """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def mirrored(self) -> "PosteriorFrames":
+    def mirrored(self) -> "FrameModel":
         """Return the model whose public shapes are mirrored in depth."""
         space = MIRROR[:, None] * self.gauge.space
         return replace(self, gauge=self.gauge._replace(space=space))
 
-    def of_points(self, kept: NDArray) -> "PosteriorFrames":
+    def of_points(self, kept: NDArray) -> "FrameModel":
         """Return the model of frames that have only some of the points (n_points,)."""
         return replace(self, shapes=centred(self.shapes[:, :, kept]))
 
@@ -345,8 +311,19 @@ class PosteriorFrames:
 
         With a robust loss the weights follow from the residuals of the fit.
         """
-        unit = rows / sizes[:, None, None]
-        return self.shown(self.posterior(unit, deviations, weights), sizes)
+        if self.joint:
+            unit = rows / sizes[:, None, None]
+            return self.shown(self.posterior(unit, deviations, weights), sizes)
+        K, complete = len(self.shapes) - 1, seen_points(rows).all(axis=1)
+        empty = (np.full((len(rows), *n), np.nan) for n in ((2, 3), (2,), (K,), (K,)))
+        fit = Decomposition(*empty)
+        # Complete frames together, others one by one
+        single = np.flatnonzero(~complete)[:, None]
+        for frames in (np.flatnonzero(complete), *single):
+            if len(frames):
+                part = rigid_fit(rows[frames], self.shapes, self.camera)
+                fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
+        return fit._replace(motion=fit.motion @ np.linalg.inv(self.gauge.space))
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""

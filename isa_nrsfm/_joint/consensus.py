@@ -33,7 +33,7 @@ from isa_nrsfm._frames.camera_models import (
     full_rotations,
     residuals,
 )
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, spread_starts
+from isa_nrsfm._frames.models import FrameMap, FrameModel, spread_starts
 from isa_nrsfm._joint.common_depths import (
     LAST_SHARE,
     WEIGHT_OF_WHOLE,
@@ -106,12 +106,12 @@ class Group(NamedTuple):
 
 
 def consensus(
-    model: PosteriorFrames,
+    model: FrameModel,
     table: ScaledTable,
     settings: FitSettings,
     errors: bool,
     joint: JointFit,
-) -> PosteriorFrames:
+) -> FrameModel:
     """Fit groups of neighbouring points, and return the model that merges them.
 
     The given model is a joint fit of the table with calibrated cameras. The result has
@@ -152,7 +152,7 @@ def consensus(
     possible = most_components(len(table.sizes), n_points, model.camera)
     most = min(possible, MOST_COMPONENTS)
 
-    def modelled(S: NDArray, noise: float) -> PosteriorFrames:
+    def modelled(S: NDArray, noise: float) -> FrameModel:
         """Return the model of shapes (I, 3, J): their principal components."""
         found, alpha, rest = principal_shapes(S, most, LEFT * noise)
         starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(found) - 1)
@@ -172,7 +172,7 @@ def consensus(
     others = np.setdiff1d(np.arange(n_points), chosen)
     off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
 
-    def merged(joined: NDArray) -> PosteriorFrames:
+    def merged(joined: NDArray) -> FrameModel:
         """Return the model of coordinates (I, 3, n) in the axes of the cameras."""
         change = (joined - scene.first) @ weights
         change[:, :2, others] = off[:, :, others]
@@ -195,9 +195,7 @@ def consensus(
     return replace(result, certainty=certainty)
 
 
-def share_of_first(
-    first: PosteriorFrames, second: PosteriorFrames, rows: NDArray
-) -> float:
+def share_of_first(first: FrameModel, second: FrameModel, rows: NDArray) -> float:
     """Return the share of the first of two models in the mean of both, at most a half.
 
     Half the share with which their mean predicts hidden points of rows (n, 2, J) best
@@ -210,7 +208,7 @@ def share_of_first(
     return float(0.5 * np.clip(best, 0.0, 1.0))
 
 
-def hidden_residuals(model: PosteriorFrames, rows: NDArray) -> NDArray:
+def hidden_residuals(model: FrameModel, rows: NDArray) -> NDArray:
     """Return residuals (n, 2, J) of points from fits of their frames without them.
 
     Every fifth point of rows (n, 2, J) is left out at a time.

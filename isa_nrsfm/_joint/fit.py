@@ -27,7 +27,7 @@ from isa_nrsfm._frames.camera_models import (
     CameraModel,
     residuals,
 )
-from isa_nrsfm._frames.models import LEAST_POINTS, PosteriorFrames
+from isa_nrsfm._frames.models import LEAST_POINTS, FrameModel
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.prior import SETTLED_WIDTH, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
@@ -576,7 +576,7 @@ def own_unknowns(
         yield part, flat, weighed, np.linalg.inv(regular(gram))
 
 
-def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
+def left_out_distances(model: FrameModel, rows: NDArray) -> NDArray:
     """Return distances (n, J) of points from fits of the others of their frame.
 
     rows (n, 2, J): of size one. To first order, ``(I - H_jj)^-1 r_j`` with the residual

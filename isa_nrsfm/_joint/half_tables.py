@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
 from isa_nrsfm._frames.camera_models import distances, residuals, stacked_motion
-from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.models import FrameModel
 from isa_nrsfm._linalg.small_matrices import centred
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
 from isa_nrsfm._prepare.scaling import ScaledTable
@@ -45,7 +45,7 @@ class HalfTables(NamedTuple):
 
 def half_tables(
     table: ScaledTable,
-    model: PosteriorFrames,
+    model: FrameModel,
     motion: NDArray,
     alpha: NDArray,
     inverse: NDArray,

@@ -35,7 +35,7 @@ from isa_nrsfm._frames.models import (
     NOT_ESTIMATED,
     Decomposition,
     DepthCertainty,
-    PosteriorFrames,
+    FrameModel,
     leverages,
 )
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
@@ -77,7 +77,7 @@ FrameFits = tuple[FrameBlocks, NDArray, NDArray, NDArray, float]
 
 
 def inlying_rows(
-    model: PosteriorFrames, rows: FrameBlocks, most: int, weights: NDArray | None = None
+    model: FrameModel, rows: FrameBlocks, most: int, weights: NDArray | None = None
 ) -> tuple[NDArray, FramePosterior, NDArray | None]:
     """Return about `most` frames (n, 2, J) of size one with a camera, and their fit.
 
@@ -96,7 +96,7 @@ def inlying_rows(
 
 
 def fitted_frames(
-    model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
+    model: FrameModel, frames: JointFrames, rows: FrameBlocks
 ) -> FrameFits:
     """Return the fits of all frames in blocks of FramePosterior, before the gauge.
 
@@ -142,7 +142,7 @@ def shape_information(
 
 
 def frame_certainty(
-    frames: PosteriorFrames,
+    frames: FrameModel,
     fits: FrameFits,
     n_seen: NDArray,
     weight: NDArray,
@@ -177,7 +177,7 @@ def shown_frames(
     sizes: NDArray,
     n_seen: NDArray,
     weight: NDArray,
-    frames: PosteriorFrames,
+    frames: FrameModel,
     uncertainty: NDArray,
 ) -> tuple[Decomposition, NDArray, float]:
     """Return fits in the gauge, and the effect of their noise on their coefficients.
@@ -252,7 +252,7 @@ def n_reliable(reliability: NDArray) -> int:
 
 
 def depth_certainty(
-    frames: PosteriorFrames,
+    frames: FrameModel,
     rows: FrameBlocks,
     weights: NDArray | None,
     settings: FitSettings,
