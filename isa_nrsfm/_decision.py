@@ -457,7 +457,7 @@ def decided(
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    robust, used, estimator._known = False, 0, {}
+    robust, used, estimator._continued = False, 0, {"known": {}}
     best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras")
     trials = [best.trial]
     for name, setting, proposal in PROPOSALS:
@@ -473,13 +473,13 @@ def decided(
             try:
                 model = clone(best.model).set_params(**changes)
                 if name == "refinement":
-                    model._known = best.model._known
+                    model._continued = best.model._continued
                 elif model.camera == "perspective":
-                    model._known = {"weak": best.model._model}
+                    model._continued = {"known": {"weak": best.model._model}}
                 elif name not in FOR_DEPTH:
-                    model._known, model._errors = {}, False
+                    model._continued = {"known": {}, "errors": False}
                 if model.camera == "orthographic":
-                    model._start = best.model._model
+                    model._continued["start"] = best.model._model
                 found = fitted(model, setting)
             except ValueError as error:  # such as points that too few frames show
                 changes = str(error)
@@ -493,9 +493,10 @@ def decided(
             better = not off > MOST_ERROR[name] * best.trial.held_out_error
         if name in FOR_DEPTH:
             better &= depth < best.trial.depth_uncertainty
-        if better and not found.model._errors:
+        continued = found.model._continued or {}
+        if better and not continued.get("errors", True):
             model = clone(found.model)
-            model._known = found.model._known
+            model._continued = {"known": continued["known"]}
             found = fitted(model, setting, found)
             if model.camera == "orthographic":  # compared with affine ones before
                 model.camera_noise_ratio_ = best.model.camera_noise_ratio_
@@ -510,7 +511,6 @@ def decided(
         model.set_params(n_components=model.n_components_)
     for each in best.caught:  # made before the comparison
         warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
-    for name in ("_known", "_start", "_errors"):
-        model.__dict__.pop(name, None)
+    model._continued = None
     model._trials = trials
     return model, trials

@@ -141,7 +141,7 @@ def consensus(
         begun = group_fits(scene, distances, n_components, settings)
     if errors:
         certainty = depth_certainty(
-            model, table.rows, table.weights, settings, joint.widths, joint.rivals
+            model, table.rows, table.weights, joint.widths, joint.rivals, settings
         )
     groups = []
     for (points, count), result in zip(*begun, strict=True):

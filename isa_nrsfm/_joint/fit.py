@@ -84,8 +84,8 @@ LARGEST_SPREAD = 5.0
 def fit_jointly(
     table: FactorisedTable,
     paper_shapes: NDArray,
+    start: JointState | None,
     settings: FitSettings,
-    start: JointState | None = None,
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
@@ -99,7 +99,7 @@ def fit_jointly(
     every_point = table.scaled.complete and table.scaled.weights is None
     problems = _problems(table, paper_shapes, settings)
     first = next(problems)
-    whole = first.cameras.calibrated and settings.whole and settings.prior is None
+    whole = settings.all_directions
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is not None:
         start = start._replace(shapes=first.frames.coordinates(start.shapes))

@@ -255,9 +255,9 @@ def depth_certainty(
     frames: FrameModel,
     rows: FrameBlocks,
     weights: NDArray | None,
+    widths: Widths | None,
+    rivals: float,
     settings: FitSettings,
-    widths: Widths | None = None,
-    rivals: float = 0.0,
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
