@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
+    compose,
     distances,
     full_rotations,
     rigid_cameras,
@@ -247,6 +248,19 @@ def rigid_fit(
     return motion, centre - (motion @ middle[..., None])[..., 0], alpha
 
 
+def derivatives(
+    shapes: NDArray, motion: NDArray, alpha: NDArray, camera: str
+) -> NDArray:
+    """Return derivatives (n, K + p, r, J) of points by coefficients and cameras.
+
+    Shapes are (K + 1, 3, J). Cameras (n, r, 3) have two rows, for images, or three.
+    """
+    tangents = CAMERAS[camera].tangents(frames_last(motion))
+    shaped = compose(shapes[0], shapes[1:], alpha)
+    turned = np.moveaxis(tangents, 3, 0) @ shaped[:, None]
+    return np.concatenate([motion[:, None] @ shapes[1:], turned], axis=1)
+
+
 @dataclass(frozen=True, eq=False)
 class FrameModel:
     """The model of a frame: its posterior, camera and coefficients.
@@ -359,11 +373,7 @@ class FrameModel:
             deviation = np.sqrt(self.noise_variance)
             weights = frame_weights(self.loss, distance, deviation, robust_sizes(unit))
         motion = fit.motion * sizes[:, None, None]
-        shapes = self.shapes[0] + np.tensordot(fit.alpha, self.shapes[1:], 1)
-        tangents = CAMERAS[self.camera].tangents(frames_last(motion))
-        bent = np.einsum("ira,kaj->ikrj", motion, self.shapes[1:])
-        turned = np.einsum("prai,iaj->iprj", tangents, shapes)
-        T = np.concatenate([bent, turned], axis=1)
+        T = derivatives(self.shapes, motion, fit.alpha, self.camera)
         share = weights / np.maximum(weights.sum(axis=1), 1e-300)[:, None]
         slope = np.einsum("iprj,ij->ipr", T, share)
         T -= slope[..., None]
@@ -390,24 +400,21 @@ class FrameModel:
         """
         unit = rows / sizes[:, None, None]
         fit = self.posterior(unit, covariances=False, weights=weights)
-        seen, free = seen_points(rows), CAMERAS[self.camera].scaled
-        weights = seen.astype(float) if weights is None else weights
-        covariances = np.full((*seen.shape, 3, 3), np.nan)
+        weights = 1.0 * seen_points(rows) if weights is None else weights
+        covariances = np.full((*weights.shape, 3, 3), np.nan)
         rotations, scales = full_rotations(fit.motion)
-        prior = np.diag([0.0] * (3 + free) + [1.0] * fit.alpha.shape[1])
-        for i in np.flatnonzero(np.isfinite(scales)):
-            w = weights[i, seen[i]]
-            middle = (self.shapes[:, :, seen[i]] @ w / w.sum())[..., None]
-            mean_shape, basis = np.split(self.shapes - middle, [1])
-            shape = mean_shape[0] + np.tensordot(fit.alpha[i], basis, 1)
-            turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
-            changes = np.stack([*turned, *([shape] if free else []), *basis])
-            changes = scales[i] * rotations[i] @ changes
-            T = (changes[:, :2, seen[i]] * np.sqrt(w)).reshape(len(changes), -1)
-            information = T @ T.T / self.noise_variance + prior
-            covariance = np.linalg.pinv(information, hermitian=True)
-            Z = changes.transpose(2, 1, 0)
-            covariances[i] = Z @ covariance @ Z.mT
+        motion, known = scales[:, None, None] * rotations, np.isfinite(scales)
+        # Few frames at a time: their derivatives take much memory.
+        for frames in np.array_split(np.flatnonzero(known), len(rows) // 16 + 1):
+            w = weights[frames, None, None]
+            Z = derivatives(self.shapes, motion[frames], fit.alpha[frames], self.camera)
+            Z -= (Z * w).sum(axis=3, keepdims=True) / w.sum(axis=3, keepdims=True)
+            T = (Z[:, :, :2] * np.sqrt(w)).reshape(*Z.shape[:2], -1)
+            prior = np.arange(Z.shape[1]) < fit.alpha.shape[1]
+            information = T @ T.mT / self.noise_variance + np.diag(1.0 * prior)
+            covariance = np.linalg.pinv(information, hermitian=True)[:, None]
+            Z = Z.transpose(0, 3, 2, 1)
+            covariances[frames] = Z @ covariance @ Z.mT
         # Errors of the shapes, in the image and in depth, and of the middle of frames.
         weight = weights.sum(axis=1)
         image = self.certainty.images[1] * leverages(fit.alpha) + 1 / weight
