@@ -583,7 +583,9 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
         given = shapes, noise**2, starts, loss, gauge
         frames = FrameModel(*given, camera="weak_perspective")
         blocks = FrameBlocks.of_array(rows, 8)
-        return depth_certainty(frames, blocks, None, None, 0.0, FitSettings()).total
+        return depth_certainty(
+            frames, blocks, None, None, 0.0, FitSettings(camera="weak_perspective")
+        ).total
 
     expected = error(hidden)
     assert_allclose(error(spoilt), expected, rtol=0.002)

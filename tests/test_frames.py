@@ -1,0 +1,761 @@
+"""The most probable camera, position and coefficients of frames, by Newton's method.
+
+One contract for all cameras, complete, missing and weighted points: derivatives are
+those of a dense objective, the fit is its minimum, covariances are inverse Hessians,
+and the fit of a frame does not depend on the others.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import scenes
+from frame_parts import (
+    assert_calibrated,
+    assert_same_fits,
+    camera_and_alpha,
+    fit_posterior,
+    numbers_of,
+)
+from layers import slow_after
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scenes import images, random_rotation, with_gaps
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.models import spread_starts
+from isa_nrsfm._frames.point_sums import coefficient_posterior, frame_sums, frame_tracks
+from isa_nrsfm._frames.search import (
+    LARGE_RISE,
+    MAX_STEPS,
+    REVERSED,
+    FrameSearch,
+    State,
+    _rise,
+    calibrated_starts,
+    scale_of,
+)
+from isa_nrsfm._linalg.small_matrices import LANES, frames_first, frames_last, unpacked
+from isa_nrsfm._tables.blocks import block_slices
+
+AS_USERS = ["few_frames", "widths"]
+NOISE = 0.02
+CAMERA = pytest.mark.parametrize("camera", CAMERAS)
+CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+GAPS = pytest.mark.parametrize("gaps", [False, True])
+KINDS = pytest.mark.parametrize("kind", ["complete", "gaps", "weighted"])
+
+
+def scene_of(camera, kind="complete", noise=NOISE, n_frames=20, depth=1.0):
+    """Return a scene of three basis shapes, maybe with missing or weighted points."""
+    options = {"noise": noise, "camera": camera, "deformation": 0.2}
+    options["extent"] = (1.0, 0.8, 0.6 * depth)
+    if kind == "weighted":
+        options["kind"] = "missing"
+    scene = scenes.random_scene(0, n_frames, **options)
+    return scene._replace(tracks=with_gaps(scene.tracks)) if kind == "gaps" else scene
+
+
+def fitted(scene, camera, noise=NOISE**2, **given):
+    given = {"weights": scene.weights} | given
+    return fit_posterior(scene.tracks, scene.shapes, noise, camera, **given)
+
+
+def problem_of(scene, camera, noise):
+    """Return the search, its frames, and cameras in its coordinates."""
+    search = FrameSearch(scene.shapes, CAMERAS[camera])
+    weights, seen = scene.weights, np.isfinite(scene.tracks[..., 0])
+    if weights is None and not seen.all():
+        weights = 1.0 * seen
+    tracks = frame_tracks(scene.tracks.swapaxes(1, 2), weights)
+    sums = frame_sums(tracks, search.shared)
+    problem = search.problem(sums, np.full(len(scene.tracks), noise))
+    return search, problem, frames_last(scene.motion @ np.linalg.inv(search.space))
+
+
+class Regression(NamedTuple):
+    """A frame in a known camera, ``y ~ x_0 + X a``, as dense linear algebra."""
+
+    y: NDArray
+    first: NDArray
+    X: NDArray
+
+    @classmethod
+    def of(cls, scene, i, M, shapes=None):
+        seen = np.isfinite(scene.tracks[i, :, 0])
+        w = np.ones(seen.sum()) if scene.weights is None else scene.weights[i, seen]
+        points = scene.tracks[i, seen] - np.average(scene.tracks[i, seen], 0, w)
+        shapes = (scene.shapes if shapes is None else shapes)[..., seen]
+        moved = shapes - np.average(shapes, 2, w)[..., None]
+        columns = (np.sqrt(w) * (M @ moved)).reshape(len(shapes), -1)
+        return cls((np.sqrt(w) * points.T).ravel(), columns[0], columns[1:].T)
+
+    def precision(self, noise):
+        return self.X.T @ self.X + noise * np.eye(self.X.shape[1])
+
+    def mean(self, noise):
+        """Return the posterior mean of the coefficients."""
+        right = self.X.T @ (self.y - self.first)
+        return np.linalg.solve(self.precision(noise), right)
+
+    def square(self, alpha, noise):
+        rest = self.y - self.first - self.X @ alpha
+        return rest @ rest + noise * alpha @ alpha
+
+    def value(self, noise):
+        """Return F: minus two log marginal likelihoods, up to a constant."""
+        _, determinant = np.linalg.slogdet(self.precision(noise) / noise)
+        return self.square(self.mean(noise), noise) / noise + determinant
+
+
+def value(scene, i, M, noise=NOISE**2):
+    return Regression.of(scene, i, M).value(noise)
+
+
+def moved(camera, M, step):
+    """Return a camera (2, 3) after a step of its parameters."""
+    return CAMERAS[camera].moved(M[..., None], np.reshape(step, (-1, 1)))[..., 0]
+
+
+def hessian_of(f, n, h=1e-3):
+    """Return the Hessian (n, n) of a function of a step, by central differences."""
+    hessian, steps = np.empty((n, n)), h * np.eye(n)
+    for p, q in np.ndindex(n, n):
+        a, b = steps[p], steps[q]
+        hessian[p, q] = f(a + b) + f(-a - b) - f(a - b) - f(b - a)
+    return hessian / (4 * h * h)
+
+
+@KINDS
+@CAMERA
+class TestMinimum:
+    def test_objective_rises_in_every_direction(self, camera, kind):
+        scene = scene_of(camera, kind)
+        fits = fitted(scene, camera)
+        assert fits.converged.all()
+        if camera != "affine":
+            assert_calibrated(fits.motion, camera)
+        rng = np.random.default_rng(1)
+        for i, M in enumerate(fits.motion):
+            least = value(scene, i, M)
+            for _ in range(5):
+                step = 1e-4 * rng.normal(size=CAMERAS[camera].n_parameters)
+                ends = (moved(camera, M, sign * step) for sign in (1, -1))
+                rises = [value(scene, i, end) - least for end in ends]
+                assert min(rises) > 0
+                # Equal on both sides: the slope is zero, not only small.
+                assert_allclose(rises[0], rises[1], rtol=1e-2)
+
+    def test_coefficients_and_position(self, camera, kind):
+        scene = scene_of(camera, kind)
+        fits = fitted(scene, camera)
+        for i, M in enumerate(fits.motion):
+            frame = Regression.of(scene, i, M)
+            assert_allclose(fits.alpha[i], frame.mean(NOISE**2), rtol=1e-9, atol=1e-12)
+            square = frame.square(fits.alpha[i], NOISE**2)
+            assert fits.objective[i] == pytest.approx(square, rel=1e-9)
+        rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
+        if scene.weights is not None:
+            rest *= scene.weights[..., None]
+        assert_allclose(np.nansum(rest, axis=1), 0.0, atol=1e-11)
+
+    def test_covariances_are_those_of_camera_and_coefficients_together(
+        self, camera, kind
+    ):
+        deviation = 2e-3
+        scene = scene_of(camera, kind, noise=deviation, n_frames=4)
+        noise, n = deviation**2, CAMERAS[camera].n_parameters
+        fits = fitted(scene, camera, noise)
+        for i, M in enumerate(fits.motion):
+
+            def f(x, i=i, M=M):
+                frame = Regression.of(scene, i, moved(camera, M, x[:n]))
+                return frame.square(fits.alpha[i] + x[n:], noise)
+
+            # The posterior density is exp(-f / (2 s2)).
+            expected = np.linalg.inv(hessian_of(f, n + 3) / (2 * noise))
+            parts = [(fits.covariance[i], expected[n:, n:])]
+            if camera != "affine":
+                parts.append((fits.turn_covariance[i], expected[:3, :3]))
+            for got, part in parts:
+                assert_allclose(got, part, atol=2e-3 * np.abs(part).max())
+        assert np.isnan(fits.turn_covariance).all() == (camera == "affine")
+
+    @pytest.mark.parametrize("depth", slow_after(1, [0.1, 1.0]))
+    def test_is_no_higher_than_from_many_other_starts(self, camera, kind, depth):
+        scene = scene_of(camera, kind, noise=0.1, n_frames=2, depth=depth)
+        noise = 0.1**2
+        fits = fitted(scene, camera, noise)
+        rng = np.random.default_rng(1)
+        for i, M in enumerate(fits.motion):
+            scale = np.linalg.norm(M) / np.sqrt(2)
+            found, ends = value(scene, i, M, noise), []
+            for _ in range(6):
+                start = scale * Rotation.random(None, rng).as_matrix()[:2]
+                ends.append(self.minimum(scene, camera, i, start, noise))
+            assert found <= min(ends) + 1e-6
+            assert min(ends) == pytest.approx(found, abs=1e-4)
+
+    @staticmethod
+    def minimum(scene, camera, i, start, noise):
+        """Return the least objective of a frame that a search from a camera reaches."""
+
+        def f(step):
+            return value(scene, i, moved(camera, start, step), noise)
+
+        return minimize(f, np.zeros(CAMERAS[camera].n_parameters)).fun
+
+
+@CAMERA
+class TestDerivatives:
+    """Away from the minimum, where the gradient is not zero."""
+
+    H = 1e-5
+
+    @staticmethod
+    def disturbed(M, cameras, size=0.1):
+        rng = np.random.default_rng(1)
+        step = size * rng.normal(size=(cameras.n_parameters, M.shape[2]))
+        return cameras.moved(M, step)
+
+    def states(self, search, problem, M):
+        """Yield the states above and below along each tangent."""
+        n = search.model.n_parameters
+        for c in range(n):
+            step = np.zeros((n, M.shape[2]))
+            step[c] = self.H
+            yield tuple(
+                search.evaluate(problem, search.model.moved(M, sign * step))
+                for sign in (1, -1)
+            )
+
+    @KINDS
+    def test_value_by_dense_algebra(self, camera, kind):
+        scene = scene_of(camera, kind)
+        search, problem, M = problem_of(scene, camera, NOISE**2)
+        got = search.evaluate(problem, M).value
+        expected = [value(scene, i, each) for i, each in enumerate(scene.motion)]
+        assert_allclose(got, NOISE**2 * np.array(expected), rtol=1e-9)
+
+    @KINDS
+    @pytest.mark.parametrize("noise", [1e-4, 10.0])
+    def test_slope_by_differences(self, camera, kind, noise):
+        search, problem, M = problem_of(scene_of(camera, kind), camera, noise)
+        M = self.disturbed(M, CAMERAS[camera])
+        slope = search.evaluate(problem, M).slope
+        for c, (above, below) in enumerate(self.states(search, problem, M)):
+            expected = -(above.value - below.value) / (4 * self.H)
+            assert_allclose(slope[c], expected, rtol=1e-6, atol=1e-5)
+
+    def numerical_hessian(self, search, problem, M):
+        """Return half the Hessian of s2 F (p, p, n), by differences of the slope."""
+        rows = [
+            (below.slope - above.slope) / (2 * self.H)
+            for above, below in self.states(search, problem, M)
+        ]
+        # Differences of the slope along tangents that turn along: what is not
+        # symmetric is the commutator of two rotations.
+        hessian = np.array(rows)
+        return 0.5 * (hessian + hessian.swapaxes(0, 1))
+
+    @KINDS
+    def test_hessian_is_exact_but_for_the_determinant(self, camera, kind):
+        # What is left falls like the noise.
+        scene = scene_of(camera, kind)
+        errors = []
+        for noise in (1e-2, 1e-3, 1e-4):
+            search, problem, M = problem_of(scene, camera, noise)
+            M = self.disturbed(M, CAMERAS[camera], 0.03)
+            got = unpacked(search.evaluate(problem, M).hessian)
+            expected = self.numerical_hessian(search, problem, M)
+            size = np.abs(expected).max(axis=(0, 1))
+            errors.append((np.abs(got - expected).max(axis=(0, 1)) / size).max())
+        assert errors[0] < 0.1
+        assert errors[1] < 0.15 * errors[0]
+        assert errors[2] < 0.15 * errors[1]
+
+    @pytest.mark.parametrize("noise", [1e-3, 0.1, 10.0])
+    def test_hessian_of_the_determinant_is_a_bound(self, camera, noise):
+        search, problem, M = problem_of(scene_of(camera), camera, noise)
+        M = self.disturbed(M, CAMERAS[camera])
+        got = unpacked(search.evaluate(problem, M).hessian)
+        excess = got - self.numerical_hessian(search, problem, M)
+        assert (np.linalg.eigvalsh(frames_first(excess))[:, 0] > -1e-5).all()
+        assert np.abs(excess).max() > 1e-5
+
+
+@GAPS
+@CAMERA
+class TestExact:
+    def test_truth_is_found(self, camera, gaps):
+        scene = scene_of(camera, "gaps" if gaps else "complete", noise=0.0)
+        fits = fitted(scene, camera, 0.0)
+        for got, true in zip(
+            camera_and_alpha(fits), camera_and_alpha(scene), strict=True
+        ):
+            assert_allclose(got, true, atol=1e-8)
+        assert fits.converged.all()
+        assert_allclose(fits.objective, 0, atol=1e-9)
+
+    def test_prepared_and_rough_frames(self, camera, gaps):
+        scene = scene_of(camera, "gaps" if gaps else "complete")
+        weights = np.isfinite(scene.tracks[..., 0]) * 1.0
+        frames = frame_tracks(scene.tracks.swapaxes(1, 2), weights)
+        search = FrameSearch(scene.shapes, CAMERAS[camera])
+        expected = fitted(scene, camera)
+        assert_same_fits(search.fit(frames, NOISE**2), expected, 1e-8)
+        rough = search.fit(frames, NOISE**2, rough=True)
+        away = np.abs(rough.motion - expected.motion).max(axis=(1, 2))
+        assert np.median(away) < 0.1
+
+
+@CAMERA
+class TestInvariance:
+    def test_frames_are_separate(self, camera):
+        scene = scene_of(camera)
+        scene.tracks[10:] = with_gaps(scene.tracks[10:])
+        scene.tracks[15, 3:] = np.nan
+        noise = np.geomspace(1e-6, 1.0, 20)
+        together = fitted(scene, camera, noise)
+        assert np.isnan(together.alpha[15]).all()
+        for i in range(20):
+            one = scene._replace(tracks=scene.tracks[i : i + 1])
+            alone = fitted(one, camera, noise[i])
+            for got, expected in zip(alone, together, strict=True):
+                assert_allclose(got[0], expected[i], rtol=1e-8, atol=1e-9)
+
+    def test_more_frames_than_a_block(self, camera):
+        scene = scene_of(camera, n_frames=8)
+        scene.tracks[::2] = with_gaps(scene.tracks[::2])
+        often = np.tile(np.arange(8), 520)
+        got = fitted(scene._replace(tracks=scene.tracks[often]), camera)
+        assert_same_fits(got, fitted(scene, camera).take(often), 1e-10)
+
+    def test_fits_are_the_same_without_covariances(self, camera):
+        scene = scene_of(camera)
+        scene.tracks[10:] = with_gaps(scene.tracks[10:])
+        starts = np.ones((2, 3))
+        expected = fitted(scene, camera, starts=starts)._asdict()
+        got = fitted(scene, camera, starts=starts, covariances=False)._asdict()
+        assert got.pop("covariance").shape == (20, 0, 0)
+        assert np.isnan(got.pop("turn_covariance")).all()
+        for name, value in got.items():
+            assert_array_equal(value, expected[name])
+
+    @GAPS
+    @pytest.mark.parametrize("unit", [1e-100, 1e100])
+    def test_units(self, camera, gaps, unit):
+        # Of single images, or of the whole table and the shapes
+        scene = scene_of(camera, "gaps" if gaps else "complete")
+        units, shapes = unit ** np.random.default_rng(1).random(20), scene.shapes
+        if camera == "orthographic":
+            units, shapes = np.full(20, unit), unit * shapes
+        tracks = units[:, None, None] * scene.tracks
+        expected = fitted(scene, camera)
+        got = fitted(
+            scene._replace(tracks=tracks, shapes=shapes), camera, (units * NOISE) ** 2
+        )
+        scale = 1.0 if camera == "orthographic" else units[:, None, None]
+        assert_allclose(got.motion / scale, expected.motion, atol=1e-9)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-9)
+        assert_allclose(got.covariance, expected.covariance, atol=1e-9)
+
+
+# What is done to shapes (4, 3, n_points), in place
+SHAPES = {
+    "flat mean shape": lambda B: B[0, 2].fill(0),
+    "flat": lambda B: B[:, 2].fill(0),
+    "on a line": lambda B: B[:, 1:].fill(0),
+    "no mean shape": lambda B: B[0].fill(0),
+    "no basis shape": lambda B: B[2].fill(0),
+    "rigid": lambda B: B[1:].fill(0),
+    "a point": lambda B: B.fill(0),
+    "equal basis shapes": lambda B: np.copyto(B[2], B[1]),
+    "basis shape that a camera makes": lambda B: np.copyto(
+        B[1], np.diag([1.0, 2.0, 3.0]) @ B[0]
+    ),
+    "basis shape that a scale makes": lambda B: np.copyto(B[1], 0.5 * B[0]),
+    "basis shape that a turn makes": lambda B: np.copyto(
+        B[1], np.array([[0, -0.2, 0], [0.2, 0, 0], [0, 0, 0]]) @ B[0]
+    ),
+    "huge basis shapes": lambda B: np.multiply(B[1:], 1e6, out=B[1:]),
+    "tiny basis shapes": lambda B: np.multiply(B[1:], 1e-9, out=B[1:]),
+}
+
+
+@CAMERA
+class TestDegenerate:
+    @pytest.mark.parametrize("kind", SHAPES)
+    @pytest.mark.parametrize("variance", slow_after(1, [0.0, NOISE**2]))
+    def test_stays_finite_and_no_worse_than_rigid(self, camera, kind, variance):
+        scene = scene_of(camera)
+        shapes = scene.shapes.copy()
+        SHAPES[kind](shapes)
+        shapes = random_rotation(5) @ shapes
+        scene.tracks[10:] = with_gaps(scene.tracks[10:])
+        starts = np.ones((2, 3))
+        fits = fit_posterior(scene.tracks, shapes, variance, camera, starts=starts)
+        for each in numbers_of(fits):
+            assert np.isfinite(each).all()
+        variances = np.diagonal(fits.covariance, axis1=1, axis2=2)
+        assert (variances >= 0).all()
+        if camera == "affine":
+            rigid = fit_posterior(scene.tracks, shapes[:1], 1.0)
+            assert (fits.objective <= rigid.objective * (1 + 1e-6)).all()
+
+    def test_no_basis_shape_is_the_rigid_fit(self, camera):
+        scene = scene_of(camera)
+        fits = fitted(scene._replace(shapes=scene.shapes[:1]), camera)
+        assert fits.alpha.shape == (20, 0)
+        assert fits.covariance.shape == (20, 0, 0)
+        assert fits.converged.all()
+        if camera == "affine":
+            W = scene.centred.swapaxes(1, 2)
+            expected = W @ np.linalg.pinv(scene.shapes[0])
+            assert_allclose(fits.motion, expected, atol=1e-11)
+
+    def test_basis_shape_of_zeros_has_the_prior(self, camera):
+        scene = scene_of(camera)
+        padded = np.concatenate([scene.shapes, np.zeros_like(scene.shapes[:1])])
+        expected = fitted(scene, camera)
+        fits = fitted(scene._replace(shapes=padded), camera)
+        assert_array_equal(fits.alpha[:, 3], 0.0)
+        assert_allclose(fits.covariance[:, 3, 3], 1.0)
+        assert_allclose(fits.alpha[:, :3], expected.alpha, atol=1e-8)
+
+    def test_frames_that_determine_no_camera(self, camera):
+        scene = scene_of(camera, n_frames=8)
+        scene.shapes[0, 0, :6] = 0.3  # six points in a plane
+        scene.shapes[0] -= scene.shapes[0].mean(axis=1, keepdims=True)
+        tracks = scene.tracks
+        tracks[0] = np.nan
+        tracks[1, 1:] = np.nan
+        tracks[2, 3:] = np.nan
+        tracks[3, 6:] = np.nan
+        tracks[4, :-4] = np.nan
+        tracks[5, ::2, 0] = np.nan
+        fits = fitted(scene, camera, starts=np.ones((1, 3)))
+        expected = np.arange(8) >= 4
+        for each in numbers_of(fits):
+            finite = np.isfinite(each.reshape(8, -1))
+            assert_array_equal(finite.all(axis=1), expected)
+            assert_array_equal(finite.any(axis=1), expected)
+        assert not fits.converged[~expected].any()
+
+    @pytest.mark.parametrize("variance", [0.0, NOISE**2])
+    def test_all_points_of_a_frame_equal(self, camera, variance):
+        scene = scene_of(camera, n_frames=3)
+        scene.tracks[1] = scene.tracks[1, 0]
+        fits = fitted(scene, camera, variance)
+        for each in numbers_of(fits):
+            assert np.isfinite(each).all()
+        # The centroids are what it shows.
+        rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
+        assert_allclose(rest.mean(axis=1), 0.0, atol=1e-12)
+        if camera == "affine":
+            assert_allclose(fits.motion[1], 0, atol=1e-12)
+            assert_allclose(fits.alpha[1], 0, atol=1e-12)
+
+    def test_no_frames(self, camera):
+        scene = scene_of(camera)
+        fits = fitted(scene._replace(tracks=np.zeros((0, 20, 2))), camera)
+        assert fits.motion.shape == (0, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("n", "length"), [(0, 5), (1, 5), (2, 1), (11, 5), (12, 11), (13, 12), (13, 40)]
+)
+def test_no_block_of_several_has_one_frame(n, length):
+    slices = block_slices(n, length)
+    assert [i for part in slices for i in range(n)[part]] == list(range(n))
+    lengths = [part.stop - part.start for part in slices]
+    assert all(1 < each <= length + 1 for each in lengths[-1:] if n > 1)
+    assert lengths[:-1] == [length] * (len(slices) - 1)
+
+
+class TestSpecial:
+    def test_flat_shapes_have_cameras_that_are_zero_across(self):
+        scene = scenes.random_scene(0, noise=NOISE)
+        scene.shapes[:, 2] = 0
+        R = random_rotation(0)
+        for n in (4, 1):
+            fits = fit_posterior(scene.tracks, (R @ scene.shapes)[:n], NOISE**2)
+            assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def mocap(load_data):
+    """Return the tracks of a moving body, and shapes that explain them."""
+    return fitted_shapes(load_data("akhter_yoga")["W2d"], 2)
+
+
+def fitted_shapes(tracks, n_components):
+    """Return unit-scaled tracks, shapes, starts and noise variance of a fit to them."""
+    model = AffineNRSfM(n_components, random_state=0)
+    model.fit(tracks.reshape(len(tracks), -1).astype(float))
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    size = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+    frames = model._model.frames
+    return centred / size, frames.shapes, frames.starts, frames.noise_variance
+
+
+class TestStarts:
+    def best(self, tracks, shapes, variance):
+        """Return the least objectives from twenty random starts."""
+        rng = np.random.default_rng(0)
+        starts = rng.normal(size=(20, len(shapes) - 1)) * np.repeat([1, 2], 10)[:, None]
+        found = [fit_posterior(tracks, shapes, variance).objective]
+        for start in starts:
+            initial = np.tile(start, (len(tracks), 1))
+            fits = fit_posterior(tracks, shapes, variance, initial=initial)
+            found.append(fits.objective)
+        return np.min(found, axis=0)
+
+    def test_large_motion_needs_them(self, mocap):
+        tracks, shapes, starts, variance = mocap
+        least = self.best(tracks, shapes, variance)
+        zero = fit_posterior(tracks, shapes, variance)
+        fits = fit_posterior(tracks, shapes, variance, starts=starts)
+        assert (fits.objective <= zero.objective).all()
+        assert (zero.objective > 1.1 * least).any()
+        assert np.mean(fits.objective <= 1.001 * least) >= 0.995
+
+    def test_every_search_ends_in_a_minimum(self, mocap):
+        tracks, shapes, _, variance = mocap
+        scene = scenes.Scene(tracks, shapes, np.zeros((len(tracks), 2, 3)), None, None)
+        search, problem, _ = problem_of(scene, "affine", variance)
+        rng = np.random.default_rng(0)
+        for size in (0.0, 1.0, 3.0):
+            alpha = size * rng.normal(size=(len(shapes) - 1, len(tracks)))
+            before = search.evaluate(problem, search.start(problem, alpha))
+            found, there = search.descend(problem, before, MAX_STEPS)
+            state = search.evaluate(problem, found)
+            assert (state.value <= before.value + 1e-12 * scale_of(problem)).all()
+            assert there.mean() > 0.995
+            assert (np.linalg.eigvalsh(unpacked(state.hessian).T)[there] > 0).all()
+            step, _ = search.step(state, np.zeros(len(tracks)))
+            assert np.abs(step[:, there]).max() < 1e-7
+
+    def test_frames_that_the_noise_explains_keep_theirs(self):
+        tracks, shapes, *_ = scenes.random_scene(0, noise=NOISE)
+        starts = np.random.default_rng(1).normal(size=(5, 3))
+        tracks[3] += 0.5 * np.random.default_rng(2).normal(size=(20, 2))
+        # By the chi-squared distribution of their objectives
+        poor = fit_posterior(tracks, shapes, NOISE**2).objective > 3 * 32 * NOISE**2
+        assert poor[3]
+        assert np.sum(poor) <= 2
+        expected = fit_posterior(tracks, shapes, NOISE**2)
+        fits = fit_posterior(tracks, shapes, NOISE**2, starts=starts)
+        assert_same_fits(fits, expected, atol=1e-11)
+
+
+class TestSpreadStarts:
+    def test_by_hand(self):
+        alpha = np.array([[1.0, 0], [0, 4], [0, -3], [3, 0], [np.nan, 9], [0, 3.9]])
+        assert_array_equal(spread_starts(alpha, 3), [[0, 4], [0, -3], [3, 0]])
+
+    def test_order_of_the_frames(self):
+        alpha = np.random.default_rng(0).normal(size=(50, 3))
+        assert_array_equal(spread_starts(alpha[::-1], 5), spread_starts(alpha, 5))
+
+    def test_fewer_than_wanted(self):
+        assert_array_equal(spread_starts(np.array([[1.0], [1.0]]), 4), [[1.0]])
+        assert spread_starts(np.zeros((5, 2)), 4).shape == (0, 2)
+        assert spread_starts(np.zeros((0, 2)), 4).shape == (0, 2)
+        assert spread_starts(np.zeros((5, 0)), 4).shape == (0, 0)
+
+
+@CALIBRATED
+class TestReversal:
+    """Of a nearly flat object, whose reversed images are nearly the same."""
+
+    def scene(self, camera, deviation=0.01):
+        return scene_of(camera, noise=deviation, depth=0.1, n_frames=40)
+
+    def reversed(self, scene):
+        """Return cameras reflected at the plane of the mean shape."""
+        axes = np.linalg.svd(scene.shapes[0], full_matrices=False)[0]
+        return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
+
+    def search(self, scene, camera, noise, motion):
+        search, problem, _ = problem_of(scene, camera, noise)
+        return search.reversed_cameras(problem, motion)
+
+    def test_cameras_that_start_reversed_are_turned_back(self, camera):
+        scene = self.scene(camera)
+        found, better = self.search(scene, camera, 1e-4, self.reversed(scene))
+        expected = fitted(scene, camera, 1e-4).motion
+        assert better.mean() > 0.9
+        # A few steps lead there, not all of them to the minimum.
+        away = np.abs(found - expected).max(axis=(1, 2))[better]
+        assert away.max() < 0.2
+        assert np.median(away) < 1e-4
+        assert_calibrated(found, camera)
+
+    def test_reversals_are_tried_over_a_large_rise(self, camera):
+        # In a joint fit cameras can be in high minima, where the bound does not hold.
+        scene = scenes.random_scene(
+            n_frames=1500,
+            noise=0.01,
+            camera=camera,
+            deformation=0.4,
+            extent=(1.0, 0.8, 0.3),
+        )
+        search, problem, M = problem_of(scene, camera, 1e-4)
+        M = M * REVERSED
+        _, better = self.search(scene, camera, 1e-4, frames_first(M) @ search.space)
+        M, _ = search.descend(problem, search.evaluate(problem, M), 6)
+        posterior = coefficient_posterior(problem[0], M, problem[1])
+        value = search.evaluate(problem, M).value
+        steep = _rise(problem, M, posterior) > LARGE_RISE * value
+        assert (better & steep).sum() >= 3
+
+    def test_cameras_at_the_minimum_stay(self, camera):
+        scene = self.scene(camera)
+        expected = fitted(scene, camera, 1e-4).motion
+        found, better = self.search(scene, camera, 1e-4, expected)
+        assert not better.any()
+        assert_array_equal(found, expected)
+
+    def test_fit_takes_the_better_of_the_two(self, camera):
+        # The depth of the object is that of the noise: the start can be reversed.
+        scene = self.scene(camera, deviation=0.05)
+        noise = 0.05**2
+        fits = fitted(scene, camera, noise)
+        turned = scene._replace(motion=fits.motion)
+        for i, start in enumerate(self.reversed(turned)[:10]):
+            end = TestMinimum.minimum(scene, camera, i, start, noise)
+            assert value(scene, i, fits.motion[i], noise) <= end + 1e-6
+
+    def test_rise_on_the_way_is_that_of_the_quadratic_approximation(self, camera):
+        scene = scene_of(camera, noise=0.0, n_frames=3)
+        search, problem, M = problem_of(scene, camera, 1e-9)
+        posterior = coefficient_posterior(problem[0], M, problem[1])
+        for i, rise in enumerate(_rise(problem, M, posterior)):
+
+            def f(change, i=i):
+                changed = M[..., i] + change.reshape(2, 3)
+                frame = Regression.of(scene, i, changed, search.shared.shapes)
+                return frame.square(frame.mean(1e-9), 1e-9)
+
+            Y, z = hessian_of(f, 6) / 2, (M[..., i] * [0, 0, 1]).ravel()
+            assert_allclose(rise, (z @ z) ** 2 / (z @ np.linalg.solve(Y, z)), rtol=1e-3)
+
+    def test_solid_objects_are_not_reversed(self, camera, monkeypatch):
+        scene = scene_of(camera)
+        search, problem, M = problem_of(scene, camera, NOISE**2)
+        monkeypatch.setattr(search, "evaluate", None)  # no search from reversed cameras
+        converged = np.ones(len(scene.tracks), dtype=bool)
+        assert_array_equal(search.solution(problem, M, converged, 10)[0], M)
+
+
+def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):
+    """Also of equal singular values, of one, of none, and of axes in the columns."""
+    M = rng.standard_normal((2, 3, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
+    M[:, :2, :4] = 0.0
+    M[:, :2, 0] = np.eye(2)
+    M[0, 0, 1] = M[1, 1, 2] = M[0, 1, 3] = 2.0
+    M[:, :2, 4] = 0.0
+    affine = M.copy()
+    completed = calibrated_starts(CAMERAS["weak_perspective"], M)[1]
+    assert_array_equal(M, affine)
+    size = np.linalg.norm(M[:, :2], axis=(0, 1), ord=2)
+    size[4] = 1.0
+    products = (
+        np.einsum("rci,sci->irs", completed, completed) / size[:, None, None] ** 2
+    )
+    assert_allclose(products, np.broadcast_to(np.eye(2), products.shape), atol=1e-12)
+    some = np.arange(40) != 4
+    assert_allclose(completed[:, :2, some] / size[some], M[:, :2, some] / size[some])
+    assert (np.einsum("ri,ri->i", completed[:, 2], M[:, 2]) >= 0).all()
+
+
+class Frames(NamedTuple):
+    a: np.ndarray
+    energy: np.ndarray
+
+
+class Wells(FrameSearch):
+    """The functions ``x^4 / 4 - a x^2 / 2`` of frames, with minima ``+- sqrt(a)``."""
+
+    def __init__(self, a, energy=1.0):
+        a = np.array(a, dtype=float)
+        self.problem = Frames(a, np.full_like(a, energy)), np.zeros_like(a)
+        self.tried = []  # numbers of frames
+        self.model = CAMERAS["affine"]  # steps are added
+
+    def value(self, x, a):
+        return x[0] ** 4 / 4 - a * x[0] ** 2 / 2
+
+    def evaluate(self, problem, x):
+        self.tried.append(x.shape[1])
+        a = problem[0].a
+        slope, hessian, value = a * x - x**3, 3 * x**2 - a, self.value(x, a)
+        return State(x, value, slope / 2, np.ones_like(x), hessian / 2)
+
+
+def ended(wells, start, max_steps=60, known=None):
+    start = wells.evaluate(wells.problem, np.array([start], dtype=float))
+    found, converged = wells.descend(wells.problem, start, max_steps, known)
+    return found[0], converged
+
+
+class TestMinima:
+    def test_steps_that_raise_the_value_are_refused(self):
+        # The Newton step from here, x = 0.6, is beyond the other minimum and higher.
+        problem = Wells([1.0])
+        state = problem.evaluate(problem.problem, np.array([[0.6]]))
+        step, _ = problem.step(state, np.zeros(1))
+        assert problem.value(state.position + step, 1.0) > state.value
+        found, converged = ended(problem, [0.6])
+        assert_allclose(np.abs(found), 1.0, rtol=1e-7)
+        assert converged.all()
+        assert_array_equal(ended(problem, [0.6], 1)[0], [0.6])
+
+
+class TestEnds:
+    def test_frames_that_have_ended_are_not_evaluated(self):
+        # Those that are left are filled up to a multiple of LANES.
+        problem = Wells([1.0] * 3 * LANES)
+        ended(problem, np.repeat([1.0, 1.0 + 1e-3, 20.0], LANES))
+        assert problem.tried[:2] == [3 * LANES, 2 * LANES]
+        assert problem.tried == sorted(problem.tried, reverse=True)
+        assert problem.tried[-1] == LANES
+
+    def test_tolerance_is_a_share_of_the_energy(self):
+        exact, _ = ended(Wells([1.0]), [3.0])
+        rough, _ = ended(Wells([1.0], energy=1e10), [3.0])
+        assert 1e-9 < abs(rough[0] - 1.0) < 0.1
+        assert abs(exact[0] - 1.0) < 1e-12
+
+    def test_search_is_given_up_where_the_known_minimum_is_out_of_reach(self):
+        # The minimum of both is -1/4.
+        known = np.zeros((1, 2)), np.array([-10.0, -0.2]), np.zeros(2)
+        found, converged = ended(Wells([1.0, 1.0]), [1.1, 1.1], known=known)
+        assert_array_equal(converged, [False, True])
+        assert found[0] == 1.1
+        assert_allclose(found[1], 1.0, rtol=1e-7)
+
+    def test_search_is_given_up_in_the_well_of_the_known_minimum(self):
+        known = np.ones((1, 2)), np.full(2, -0.3), np.array([0.2, 0.01])
+        found, converged = ended(Wells([1.0, 1.0]), [1.5, 1.5], 3, known)
+        steps = [ended(Wells([1.0]), [1.5], n)[0][0] for n in range(4)]
+        first = next(x for x in steps if abs(x - 1.0) < 0.2)
+        assert found[0] == first
+        assert abs(found[1] - 1.0) < abs(found[0] - 1.0)
+        assert not converged[0]
+
+    def test_largest_damping_ends_the_search(self):
+        # A value that is always higher than at the start: no step is taken.
+        class Walls(Wells):
+            def value(self, x, a):
+                return np.where(x[0] == 0.5, 0.0, 1.0)
+
+        problem = Walls([1.0])
+        found, converged = ended(problem, [0.5], 1000)
+        assert_array_equal(found, [0.5])
+        assert not converged.any()
+        assert len(problem.tried) < 30
