@@ -217,6 +217,11 @@ def _joint_fit(
         of = model, table.rows, table.weights, widths, fit.rivals
         certainty = settings.remembered("certainty", depth_certainty, *of)
         model, needed = replace(model, certainty=certainty), False
+    import os
+    if widths is not None and not grouped and not os.environ.get("NOAVG") and fit.state.noise > 1e-8:
+        from isa_nrsfm._joint.parts import mean_of_parts
+        model, widths = mean_of_parts(model, table, settings, widths)
+        tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
         model, widths = consensus(model, table, settings, needed, fit), None
         tracks = JointFrames.from_points(table.rows, table.complete)
