@@ -486,9 +486,6 @@ def mirror_image(
     model: TableModel, frames: Decomposition, attributes: dict[str, Any]
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return the mirror image in depth of a fit."""
-    K = model.n_components
-    model, signs = model.mirrored(), np.tile(MIRROR, K)
-    shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis[:K]}
-    covariance = attributes.get("mode_covariance_", 0.0) * np.outer(signs, signs)
-    attributes = attributes | shapes | {"mode_covariance_": covariance}
-    return model, frames._replace(motion=frames.motion * MIRROR), attributes
+    attributes = attributes | model.mirrored_attributes(attributes)
+    frames = frames._replace(motion=frames.motion * MIRROR)
+    return attributes.pop("_model"), frames, attributes

@@ -178,7 +178,7 @@ class TableModel(NamedTuple):
             length = np.square(sight).sum(axis=1)[:, None, None]
             across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
             found["rotations_"] = (across @ R * signs).astype(R.dtype)
-        found["mirror_certainty_"] = 1.0 - known["mirror_certainty_"]
+        found["mirror_certainty_"] = 1.0 - known.get("mirror_certainty_", np.nan)
         return found | {"_model": self.mirrored()}
 
     def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
