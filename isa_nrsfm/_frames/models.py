@@ -314,10 +314,6 @@ class FrameModel:
         space = MIRROR[:, None] * self.gauge.space
         return replace(self, gauge=self.gauge._replace(space=space))
 
-    def of_points(self, kept: NDArray) -> "FrameModel":
-        """Return the model of frames that have only some of the points (n_points,)."""
-        return replace(self, shapes=centred(self.shapes[:, :, kept]))
-
     def fit(
         self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
     ) -> Decomposition:
@@ -454,6 +450,20 @@ class FrameModel:
         if len(poor):
             fit.put(poor, self._reweighted(rows[poor], fitted, self.starts))
         return fit
+
+    def posterior_without(
+        self, rows: NDArray, hidden: NDArray, weights: NDArray | None = None
+    ) -> FramePosterior:
+        """Return the fit of rows (n, 2, J) without some of the points (J,)."""
+        if weights is not None or not seen_points(rows).all():
+            visible = np.where(hidden, np.nan, rows)
+            return self.posterior(visible, False, weights)
+        shapes = self.shapes[:, :, ~hidden]
+        fit = replace(self, shapes=centred(shapes)).posterior(rows[..., ~hidden], False)
+        middles = shapes.mean(axis=2)
+        middle = middles[0] + fit.alpha @ middles[1:]
+        shift = (fit.motion @ middle[..., None])[..., 0]
+        return fit._replace(translation=fit.translation - shift)
 
     def _reweighted(
         self,

@@ -215,10 +215,8 @@ def hidden_residuals(model: FrameModel, rows: NDArray) -> NDArray:
     """
     rest = np.full(rows.shape, np.nan)
     for first in range(5):
-        hidden = slice(first, None, 5)
-        visible = rows.copy()
-        visible[:, :, hidden] = np.nan
-        fit = model.posterior(visible, covariances=False)
+        hidden = np.arange(rows.shape[2]) % 5 == first
+        fit = model.posterior_without(rows, hidden)
         off = residuals(rows, model.shapes, fit.motion, fit.alpha)
         rest[:, :, hidden] = (off - fit.translation[:, :, None])[:, :, hidden]
     return rest
