@@ -51,7 +51,6 @@ from isa_nrsfm._gauge import (
 )
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
-from isa_nrsfm._joint.half_tables import half_tables
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import FitSettings
@@ -61,20 +60,21 @@ from isa_nrsfm._joint.uncertainty import (
     depth_certainty,
     fitted_frames,
     frame_certainty,
+    half_tables,
     n_reliable,
     reliabilities,
     shape_information,
     shown_frames,
 )
 from isa_nrsfm._other_tables import prior_start
-from isa_nrsfm._paper.pipeline import (
+from isa_nrsfm._paper import (
     Factorisation,
     block_triplets,
     factorise,
     run_paper_pipeline,
     sample_frames,
 )
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
@@ -491,9 +491,6 @@ def mirror_image(
     model: TableModel, frames: Decomposition, attributes: dict[str, Any]
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return the mirror image in depth of a fit."""
-    K = model.n_components
-    model, signs = model.mirrored(), np.tile(MIRROR, K)
-    shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis[:K]}
-    covariance = attributes.get("mode_covariance_", 0.0) * np.outer(signs, signs)
-    attributes = attributes | shapes | {"mode_covariance_": covariance}
-    return model, frames._replace(motion=frames.motion * MIRROR), attributes
+    attributes = attributes | model.mirrored_attributes(attributes)
+    frames = frames._replace(motion=frames.motion * MIRROR)
+    return attributes.pop("_model"), frames, attributes

@@ -22,7 +22,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.pinhole import Pinhole, turns_to, zoomed
 from isa_nrsfm._frames.search import FramePosterior
-from isa_nrsfm._linalg.small_matrices import padded
+from isa_nrsfm._linalg import padded
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import (
@@ -178,7 +178,7 @@ class TableModel(NamedTuple):
             length = np.square(sight).sum(axis=1)[:, None, None]
             across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
             found["rotations_"] = (across @ R * signs).astype(R.dtype)
-        found["mirror_certainty_"] = 1.0 - known["mirror_certainty_"]
+        found["mirror_certainty_"] = 1.0 - known.get("mirror_certainty_", np.nan)
         return found | {"_model": self.mirrored()}
 
     def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
@@ -379,12 +379,10 @@ class TableModel(NamedTuple):
         seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
         counts = counts * sizes[:, None] ** -2.0
-        # Complete frames are fitted without these points, others with NaN instead. With
-        # perspective the other points keep their depths.
+        # With perspective the other points keep their depths.
         frames, weak = self.frames, self._replace(pinhole=None)
         straight = self.straightened(rows, weights)
-        linear = self.pinhole is None and frames.loss == "linear"
-        complete = linear and weights is None and bool(seen.all())
+        linear = self.pinhole is None and frames.joint and frames.loss == "linear"
         tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
         mean_of = np.mean if seen.all() else np.nanmean  # which takes a copy
         signal = np.square(tracks - mean_of(tracks, 1, keepdims=True)).sum(axis=2)
@@ -396,22 +394,16 @@ class TableModel(NamedTuple):
             usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
             if not len(usable):
                 continue
-            mean, others = self.mean_shape[held], self.basis[:, held]
-            if complete and frames.joint:
-                kept = frames.of_points(~held)  # their centroid is the origin
-                visible = np.compress(~held, rows[usable], axis=2)
-                fit = kept.fit(visible, sizes[usable], False, None)
-                mean = mean - self.mean_shape[~held].mean(axis=0)
-                others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
+            own = None if weights is None else weights[usable]
+            if linear:
+                unit = rows[usable] / sizes[usable, None, None]
+                posterior = frames.posterior_without(unit, held, own)
+                fit = frames.shown(posterior, sizes[usable])
             else:
-                own = None if weights is None else weights[usable]
-                if linear:
-                    fit = frames.fit(visible[usable], sizes[usable], False, own)
-                else:
-                    fit = weak.decompose(visible[usable], own, False)
-                    fit = self.in_table_cameras(rows[usable], *fit)
+                fit = weak.decompose(visible[usable], own, False)
+                fit = self.in_table_cameras(rows[usable], *fit)
             # Prediction of the held-out points, and its error
-            shapes = compose(mean, others, fit.alpha)
+            shapes = compose(self.mean_shape[held], self.basis[:, held], fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
             places = np.ix_(usable, np.flatnonzero(held))
             error = np.square(tracks[places] - predicted).sum(axis=2)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from frame_parts import (
+    Regression,
     assert_calibrated,
     assert_same_fits,
     camera_and_alpha,
@@ -19,7 +20,6 @@ from frame_parts import (
 )
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 from scenes import images, random_rotation, with_gaps
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
@@ -38,7 +38,7 @@ from isa_nrsfm._frames.search import (
     calibrated_starts,
     scale_of,
 )
-from isa_nrsfm._linalg.small_matrices import LANES, frames_first, frames_last, unpacked
+from isa_nrsfm._linalg import LANES, frames_first, frames_last, unpacked
 from isa_nrsfm._tables.blocks import block_slices
 
 AS_USERS = ["few_frames", "widths"]
@@ -74,41 +74,6 @@ def problem_of(scene, camera, noise):
     sums = frame_sums(tracks, search.shared)
     problem = search.problem(sums, np.full(len(scene.tracks), noise))
     return search, problem, frames_last(scene.motion @ np.linalg.inv(search.space))
-
-
-class Regression(NamedTuple):
-    """A frame in a known camera, ``y ~ x_0 + X a``, as dense linear algebra."""
-
-    y: NDArray
-    first: NDArray
-    X: NDArray
-
-    @classmethod
-    def of(cls, scene, i, M, shapes=None):
-        seen = np.isfinite(scene.tracks[i, :, 0])
-        w = np.ones(seen.sum()) if scene.weights is None else scene.weights[i, seen]
-        points = scene.tracks[i, seen] - np.average(scene.tracks[i, seen], 0, w)
-        shapes = (scene.shapes if shapes is None else shapes)[..., seen]
-        moved = shapes - np.average(shapes, 2, w)[..., None]
-        columns = (np.sqrt(w) * (M @ moved)).reshape(len(shapes), -1)
-        return cls((np.sqrt(w) * points.T).ravel(), columns[0], columns[1:].T)
-
-    def precision(self, noise):
-        return self.X.T @ self.X + noise * np.eye(self.X.shape[1])
-
-    def mean(self, noise):
-        """Return the posterior mean of the coefficients."""
-        right = self.X.T @ (self.y - self.first)
-        return np.linalg.solve(self.precision(noise), right)
-
-    def square(self, alpha, noise):
-        rest = self.y - self.first - self.X @ alpha
-        return rest @ rest + noise * alpha @ alpha
-
-    def value(self, noise):
-        """Return F: minus two log marginal likelihoods, up to a constant."""
-        _, determinant = np.linalg.slogdet(self.precision(noise) / noise)
-        return self.square(self.mean(noise), noise) / noise + determinant
 
 
 def value(scene, i, M, noise=NOISE**2):

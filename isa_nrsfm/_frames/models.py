@@ -22,8 +22,7 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS
-from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
+from isa_nrsfm._linalg import OF_PRODUCTS, centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
     frame_weights,
@@ -314,10 +313,6 @@ class FrameModel:
         space = MIRROR[:, None] * self.gauge.space
         return replace(self, gauge=self.gauge._replace(space=space))
 
-    def of_points(self, kept: NDArray) -> "FrameModel":
-        """Return the model of frames that have only some of the points (n_points,)."""
-        return replace(self, shapes=centred(self.shapes[:, :, kept]))
-
     def fit(
         self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
     ) -> Decomposition:
@@ -454,6 +449,20 @@ class FrameModel:
         if len(poor):
             fit.put(poor, self._reweighted(rows[poor], fitted, self.starts))
         return fit
+
+    def posterior_without(
+        self, rows: NDArray, hidden: NDArray, weights: NDArray | None = None
+    ) -> FramePosterior:
+        """Return the fit of rows (n, 2, J) without some of the points (J,)."""
+        if weights is not None or not seen_points(rows).all():
+            visible = np.where(hidden, np.nan, rows)
+            return self.posterior(visible, False, weights)
+        shapes = self.shapes[:, :, ~hidden]
+        fit = replace(self, shapes=centred(shapes)).posterior(rows[..., ~hidden], False)
+        middles = shapes.mean(axis=2)
+        middle = middles[0] + fit.alpha @ middles[1:]
+        shift = (fit.motion @ middle[..., None])[..., 0]
+        return fit._replace(translation=fit.translation - shift)
 
     def _reweighted(
         self,
