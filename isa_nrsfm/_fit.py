@@ -49,6 +49,7 @@ from isa_nrsfm._gauge import (
     reorder_blocks,
     rigid_gauge,
 )
+from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
 from isa_nrsfm._joint.likelihood import JointFrames
@@ -217,10 +218,8 @@ def _joint_fit(
         of = model, table.rows, table.weights, widths, fit.rivals
         certainty = settings.remembered("certainty", depth_certainty, *of)
         model, needed = replace(model, certainty=certainty), False
-    import os
-    if widths is not None and not grouped and not os.environ.get("NOAVG") and fit.state.noise > 1e-8:
-        from isa_nrsfm._joint.parts import mean_of_parts
-        model, widths = mean_of_parts(model, table, settings, widths)
+    if errors and widths is not None and not grouped:
+        model, widths = bagged(model, table, settings, widths)
         tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
         model, widths = consensus(model, table, settings, needed, fit), None

@@ -1,0 +1,126 @@
+"""The mean of joint fits of parts of the points.
+
+Deformation that resembles a rotation shifts the cameras of a joint fit and its depths.
+How much depends on its points: fits of others have other errors. Their mean has smaller
+ones (bagging: Breiman, "Bagging predictors", Machine Learning, 1996):
+
+1. Five fits each leave out a group of neighbouring points, as in `depth_certainty`.
+   They start from the joint fit, and have at most `MOST_DIRECTIONS` of its directions.
+2. The mean of their depths, less those of a fit of all points with as many directions,
+   changes the depths of the joint fit.
+3. The mean and the principal components of these shapes are the new model.
+
+The errors are those of `depth_certainty` for the joint fit, which are larger.
+docs/benchmarks/README.md, "Thresholds", has the errors of both.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.models import FrameMap, FrameModel, spread_starts
+from isa_nrsfm._joint.consensus import (
+    LEFT,
+    MOST_COMPONENTS,
+    MOST_POINTS,
+    aligning_rotations,
+    interpolation,
+    principal_shapes,
+)
+from isa_nrsfm._joint.likelihood import JointFrames
+from isa_nrsfm._joint.problem import JointProblem, JointState, Widths
+from isa_nrsfm._joint.settings import FitSettings
+from isa_nrsfm._joint.uncertainty import N_GROUPS, inlying_rows, neighbours
+from isa_nrsfm._joint.whole import LEAST_NOISE, determined
+from isa_nrsfm._linalg import centred
+from isa_nrsfm._prepare.scaling import ScaledTable
+from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._tables.tracks import FEWEST_POINTS
+
+# Largest numbers of frames and directions, and steps: docs/benchmarks/README.md,
+# "Thresholds".
+MOST_FRAMES, MOST_DIRECTIONS, MOST_STEPS = 600, 24, 50
+
+
+def bagged(
+    model: FrameModel, table: ScaledTable, settings: FitSettings, widths: Widths
+) -> tuple[FrameModel, Widths]:
+    """Return the model of the mean of fits of parts of the points, and its widths.
+
+    The given ones are those of a joint fit with calibrated cameras. Without noise they
+    are returned: all fits would be equal.
+    """
+    part, fit, w = inlying_rows(model, table.rows, MOST_FRAMES, table.weights)
+    n_points = part.shape[2]
+    chosen = spread(np.arange(n_points), MOST_POINTS)
+    least_noise = LEAST_NOISE * np.nanmean(part**2)
+    if model.noise_variance < 0.5 * least_noise or len(chosen) < N_GROUPS + 4:
+        return model, widths
+    n_directions = min(len(model.shapes) - 1, MOST_DIRECTIONS)
+    settings = settings._replace(on_step=None)
+
+    def fitted(points: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the frames that show enough of the points, and their depths."""
+        seen = np.isfinite(part[:, 0, points]).sum(axis=1)
+        frames = np.flatnonzero(seen >= FEWEST_POINTS)
+        problem = _problem(part, w, settings, frames, points)
+        own = widths.of_points(len(points), n_directions)
+        problem = replace(problem, widths=own)
+        shapes = centred(model.shapes[: n_directions + 1, :, points])
+        state = JointState(shapes, fit.motion[frames], model.noise_variance)
+        ends = {"max_iter": MOST_STEPS, "tol": settings.tol}
+        state = problem.refined(state, least_noise=LEAST_NOISE, **ends).state
+        depths = centred(state.depths(problem.likelihood(*state).alpha))
+        return frames, depths
+
+    # Depths of the joint fit, and changes of them
+    rotations, scales = full_rotations(fit.motion)
+    S = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
+    z = scales[:, None] * np.einsum("ia,iaj->ij", rotations[:, 2], S[:, :, chosen])
+    frames, depths = fitted(chosen)
+    z[frames] = depths * np.copysign(1.0, np.sum(depths * z[frames]))
+    change, count = np.zeros_like(z), np.zeros_like(z)
+    groups = neighbours(model.shapes[0][:, chosen])
+    for group in range(N_GROUPS):
+        kept = np.flatnonzero(groups != group)
+        frames, depths = fitted(chosen[kept])
+        at = np.ix_(frames, kept)
+        own = centred(z[at])
+        change[at] += depths * np.copysign(1.0, np.sum(depths * own)) - own
+        count[at] += 1
+    change = centred(change / np.maximum(count, 1))
+    change = change @ interpolation(model.shapes[0], chosen) / scales[:, None]
+    S = S + rotations[:, 2, :, None] * change[:, None]
+    # The model of the changed shapes
+    noise = model.noise_variance
+    R = aligning_rotations(centred(S[:, :, chosen]), noise)
+    most = min(3 * n_points - 7, MOST_COMPONENTS)
+    shapes, _, rest = principal_shapes(centred(R.mT @ S), most, LEFT * noise)
+    every = np.arange(n_points)
+    problem = _problem(part, w, settings, np.arange(len(part)), every)
+    state = JointState(shapes, fit.motion @ R, noise)
+    state, widths = determined(problem, state, None)
+    alpha = replace(problem, widths=widths).likelihood(*state).alpha
+    gauge = FrameMap.identity(len(state.shapes) - 1)
+    starts, noise = spread_starts(alpha, 8), noise + rest
+    model = replace(
+        model, shapes=state.shapes, noise_variance=noise, starts=starts, gauge=gauge
+    )
+    return model, widths
+
+
+def _problem(
+    rows: NDArray,
+    weights: NDArray | None,
+    settings: FitSettings,
+    frames: NDArray,
+    points: NDArray,
+) -> JointProblem:
+    """Return the problem of some frames and points of rows (n, 2, J)."""
+    rows = rows[np.ix_(frames, np.arange(2), points)]
+    blocks = FrameBlocks.of_array(rows, len(rows))
+    own = None if weights is None else weights[np.ix_(frames, points)]
+    complete = bool(np.isfinite(rows).all())
+    return JointProblem(JointFrames.from_points(blocks, complete, own), settings)
