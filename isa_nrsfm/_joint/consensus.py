@@ -420,7 +420,9 @@ def group_fits(
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
     sizes = [size for size in SIZES if size <= largest]
     tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
-    quiet, rows, first = settings._replace(on_step=None), scene.rows, scene.first
+    rows, first = scene.rows, scene.first
+    # What other processes need: no other fits
+    quiet = settings._replace(on_step=None, start=None, placed=None, known=None)
     # In the order of memory that pickled arrays have, else rounding errors differ.
     parts = (
         scene._replace(rows=rows.take(points, 2), first=first.take(points, 2))
