@@ -485,6 +485,7 @@ class TestTurnedFaces:
         X[1] = np.nan
         _, deviation = model.reconstruct(X, return_std=True)
         assert np.isnan(deviation).all(axis=1).tolist() == [False, True, False]
+        assert np.isnan(model.reconstruct(X[[1, 1]], return_std=True)[1]).all()
 
     def test_models_keep_their_certainty_in_files(self, turned, tmp_path):
         X, *_, model = turned
