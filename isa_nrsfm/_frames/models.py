@@ -22,7 +22,8 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
-from isa_nrsfm._linalg import OF_PRODUCTS, centred, frames_last, lengths
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
     frame_weights,
