@@ -68,14 +68,14 @@ from isa_nrsfm._joint.uncertainty import (
     shown_frames,
 )
 from isa_nrsfm._other_tables import prior_start
-from isa_nrsfm._paper import (
+from isa_nrsfm._paper.pipeline import (
     Factorisation,
     block_triplets,
     factorise,
     run_paper_pipeline,
     sample_frames,
 )
-from isa_nrsfm._parameters import JOINT_REFINEMENTS
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers

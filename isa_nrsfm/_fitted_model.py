@@ -22,7 +22,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.pinhole import Pinhole, turns_to, zoomed
 from isa_nrsfm._frames.search import FramePosterior
-from isa_nrsfm._linalg import padded
+from isa_nrsfm._linalg.small_matrices import padded
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import (

@@ -30,7 +30,8 @@ from isa_nrsfm._frames.camera_models import (
     stacked_motion,
 )
 from isa_nrsfm._frames.models import Decomposition, FrameMap
-from isa_nrsfm._linalg import OF_DIFFERENCES, OF_RANKS, orientations, polar
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
+from isa_nrsfm._linalg.small_matrices import orientations, polar
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
 
 

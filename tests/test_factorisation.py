@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames
 
-from isa_nrsfm._linalg import orientations
-from isa_nrsfm._paper import (
+from isa_nrsfm._linalg.small_matrices import orientations
+from isa_nrsfm._paper.pipeline import (
     block_triplets,
     factorise,
     leading_triplets,

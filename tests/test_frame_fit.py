@@ -34,7 +34,7 @@ from isa_nrsfm._joint.uncertainty import (
     neighbours,
     shape_information,
 )
-from isa_nrsfm._parameters import LOSSES
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
@@ -485,6 +485,7 @@ class TestTurnedFaces:
         X[1] = np.nan
         _, deviation = model.reconstruct(X, return_std=True)
         assert np.isnan(deviation).all(axis=1).tolist() == [False, True, False]
+        assert np.isnan(model.reconstruct(X[[1, 1]], return_std=True)[1]).all()
 
     def test_models_keep_their_certainty_in_files(self, turned, tmp_path):
         X, *_, model = turned

@@ -19,7 +19,7 @@ from isa_nrsfm._gauge import (
     independent_gauge,
     reorder_blocks,
 )
-from isa_nrsfm._parameters import INDEPENDENCE
+from isa_nrsfm._parameters.choices import INDEPENDENCE
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 

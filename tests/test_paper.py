@@ -9,7 +9,7 @@ from sklearn.base import BaseEstimator
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
-from isa_nrsfm._parameters import BLOCK_RECOVERIES
+from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
 both = pytest.mark.parametrize("refinement", ["alternating", None])
 

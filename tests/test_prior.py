@@ -30,7 +30,7 @@ from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._other_tables import prior_start
-from isa_nrsfm._parameters import FACE_PRIORS
+from isa_nrsfm._parameters.choices import FACE_PRIORS
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, save_model

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._linalg import (
+from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     DIAGONAL,
     ROWS,

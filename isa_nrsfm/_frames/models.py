@@ -22,7 +22,8 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
-from isa_nrsfm._linalg import OF_PRODUCTS, centred, frames_last, lengths
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
     frame_weights,
@@ -398,9 +399,12 @@ class FrameModel:
         weights = 1.0 * seen_points(rows) if weights is None else weights
         covariances = np.full((*weights.shape, 3, 3), np.nan)
         rotations, scales = full_rotations(fit.motion)
-        motion, known = scales[:, None, None] * rotations, np.isfinite(scales)
+        motion = scales[:, None, None] * rotations
+        known = np.flatnonzero(np.isfinite(scales))
         # Few frames at a time: their derivatives take much memory.
-        for frames in np.array_split(np.flatnonzero(known), len(rows) // 16 + 1):
+        length = max(2**17 // self.shapes.size, 1)
+        for first in range(0, len(known), length):
+            frames = known[first : first + length]
             w = weights[frames, None, None]
             Z = derivatives(self.shapes, motion[frames], fit.alpha[frames], self.camera)
             Z -= (Z * w).sum(axis=3, keepdims=True) / w.sum(axis=3, keepdims=True)

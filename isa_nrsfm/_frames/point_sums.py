@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.cached import cached_property
-from isa_nrsfm._linalg import (
+from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     DIAGONAL,
     ROWS,

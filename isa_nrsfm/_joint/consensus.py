@@ -54,9 +54,9 @@ from isa_nrsfm._joint.problem import JointFit, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._joint.uncertainty import depth_certainty, inlying_rows
-from isa_nrsfm._linalg import (
+from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
-    OF_DISTANCES,
     ROWS,
     centred,
     frames_first,
@@ -420,7 +420,9 @@ def group_fits(
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
     sizes = [size for size in SIZES if size <= largest]
     tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
-    quiet, rows, first = settings._replace(on_step=None), scene.rows, scene.first
+    rows, first = scene.rows, scene.first
+    # What other processes need: no other fits
+    quiet = settings._replace(on_step=None, start=None, placed=None, known=None)
     # In the order of memory that pickled arrays have, else rounding errors differ.
     parts = (
         scene._replace(rows=rows.take(points, 2), first=first.take(points, 2))

@@ -47,7 +47,7 @@ from isa_nrsfm._frames.point_sums import (
     joined_frames,
 )
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._linalg import (
+from isa_nrsfm._linalg.small_matrices import (
     centred,
     diagonal_of,
     energies,

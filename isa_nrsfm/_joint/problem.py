@@ -24,14 +24,9 @@ from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._linalg import (
-    OF_DIFFERENCES,
-    OF_SUMS,
-    centred,
-    frames_first,
-    frames_last,
-)
-from isa_nrsfm._paper import Factorisation
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
+from isa_nrsfm._linalg.small_matrices import centred, frames_first, frames_last
+from isa_nrsfm._paper.pipeline import Factorisation
 from isa_nrsfm._prepare.scaling import ScaledTable
 
 # Lower bound of the noise variance, as a share of the mean square of the tracks. It

@@ -10,8 +10,8 @@ from sklearn.utils import check_array
 from sklearn.utils.validation import validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._linalg import OF_DIFFERENCES
-from isa_nrsfm._parameters import JOINT_REFINEMENTS
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import CHECKS, checked_range, unmasked

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._linalg import energies
+from isa_nrsfm._linalg.small_matrices import energies
 
 # Frames that are worked on at a time. Threads wait for each other between operations,
 # which should thus take long: with 2**11, 2**13 and 2**14 two threads take 1.1, .88 and

@@ -17,7 +17,8 @@ from isa_nrsfm._compat.scikit_learn import CoefficientsMixin
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._joint.uncertainty import HalfTables
-from isa_nrsfm._linalg import OF_RANKS, polar
+from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.analysis._advice import (
     DEPTH,

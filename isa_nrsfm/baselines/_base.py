@@ -33,7 +33,7 @@ from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._gauge import canonical_rotation
 from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._linalg import orientations
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.sources import open_table

@@ -33,7 +33,7 @@ from isa_nrsfm._frames.models import (
 )
 from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._other_tables import fitted_prior
-from isa_nrsfm._parameters import LOSSES
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.sources import SMALLEST
 from isa_nrsfm._tables.tracks import LAYOUTS
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.special import gammaln
 
-from isa_nrsfm._linalg import OF_RANKS, OF_STEPS, orientations
+from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._tables.blocks import spread
 from isa_nrsfm.isa._strategies import orthogonalise
 

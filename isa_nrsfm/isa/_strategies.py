@@ -32,7 +32,7 @@ from isa_nrsfm._compat.scikit_learn import (
     fit_context,
     with_numpy_defaults,
 )
-from isa_nrsfm._linalg import OF_DIFFERENCES, OF_PRODUCTS
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
 from isa_nrsfm._tables.sources import unmasked
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from isa_nrsfm._linalg import OF_STEPS
+from isa_nrsfm._linalg.rounding import OF_STEPS
 from isa_nrsfm.metrics._checks import as_finite, check_same_shape
 
 # Places of matched true and estimated basis shapes, and absolute cosines of the pairs.

@@ -1,0 +1,1 @@
+"""The pipeline of Brandt, Ackermann and Grasshof (2018)."""

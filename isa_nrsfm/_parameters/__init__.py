@@ -1,0 +1,1 @@
+"""Permitted values of the parameters of the public classes."""
