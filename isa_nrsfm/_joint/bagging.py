@@ -49,14 +49,16 @@ def bagged(
 ) -> tuple[FrameModel, Widths]:
     """Return the model of the mean of fits of parts of the points, and its widths.
 
-    The given ones are those of a joint fit with calibrated cameras. Without noise they
-    are returned: all fits would be equal.
+    The given ones are those of a joint fit with calibrated cameras. Without noise all
+    fits would be equal, and groups have at least two points: otherwise these are
+    returned.
     """
     part, fit, w = inlying_rows(model, table.rows, MOST_FRAMES, table.weights)
     n_points = part.shape[2]
     chosen = spread(np.arange(n_points), MOST_POINTS)
-    least_noise = LEAST_NOISE * np.nanmean(part**2)
-    if model.noise_variance < 0.5 * least_noise or len(chosen) < N_GROUPS + 4:
+    # A fit with noise ends at its floor or above it, up to rounding.
+    exact = model.noise_variance < 0.5 * LEAST_NOISE * np.nanmean(part**2)
+    if exact or len(chosen) < 2 * N_GROUPS:
         return model, widths
     n_directions = min(len(model.shapes) - 1, MOST_DIRECTIONS)
     settings = settings._replace(on_step=None)
@@ -98,8 +100,7 @@ def bagged(
     R = aligning_rotations(centred(S[:, :, chosen]), noise)
     most = min(3 * n_points - 7, MOST_COMPONENTS)
     shapes, _, rest = principal_shapes(centred(R.mT @ S), most, LEFT * noise)
-    every = np.arange(n_points)
-    problem = _problem(part, w, settings, np.arange(len(part)), every)
+    problem = _problem(part, w, settings, np.arange(len(part)), np.arange(n_points))
     state = JointState(shapes, fit.motion @ R, noise)
     state, widths = determined(problem, state, None)
     alpha = replace(problem, widths=widths).likelihood(*state).alpha
