@@ -20,6 +20,7 @@ from refusals import refusals_of, refused
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model
@@ -452,7 +453,7 @@ def test_standard_deviations_are_written(
     assert not (tmp_path / "no").exists()
     path = fits(table, *UNREFINED).path
     message = fails("transform", path, table, "-o", tmp_path / "a.csv", "--std")
-    assert "was fitted with refinement=None" in message
+    assert "--std needs refinement='joint' or 'consensus'; got" in message
 
 
 def test_origin_is_not_a_missing_point(begins, faces, tmp_path):
@@ -698,8 +699,9 @@ def test_warnings_are_shown_once_with_options(fits, table, monkeypatch):
     fit = AffineNRSfM.fit
 
     def warn_and_fit(self, X, y=None, groups=None):
-        given = "got camera='affine';\n  n_components=2 of a/camera=1.csv, layout='x'"
-        given += ". Use refinement=None"
+        given = f"got {named('camera', 'affine')};\n  {named('n_components')} of "
+        given += f"a/camera=1.csv, {named('layout', 'x')}. Use "
+        given += named("refinement", None, "joint")
         for _ in range(2):
             warnings.warn(given, UserWarning, stacklevel=1)
         warnings.warn("for developers", DeprecationWarning, stacklevel=1)
@@ -707,8 +709,8 @@ def test_warnings_are_shown_once_with_options(fits, table, monkeypatch):
 
     monkeypatch.setattr(AffineNRSfM, "fit", warn_and_fit)
     found = fits(table, *UNREFINED)
-    text = "got --camera affine; --n-components 2 of a/camera=1.csv, layout='x'"
-    text += ". Use --refinement none"
+    text = "got --camera affine; --n-components of a/camera=1.csv, layout='x'"
+    text += ". Use --refinement none or joint"
     assert found.err == f"isa-nrsfm: warning: {text}\n"
     assert found.report["warnings"] == [text]
 

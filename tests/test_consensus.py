@@ -584,7 +584,7 @@ class TestEstimator:
 
     def test_affine_cameras_are_refused(self):
         """Depths of groups with affine cameras have no common unit."""
-        message = "needs calibrated cameras.*camera='weak_perspective'"
+        message = "refinement='consensus' needs camera='weak_perspective' or "
         with pytest.raises(ValueError, match=message):
             consensus_fit(camera="affine")
 

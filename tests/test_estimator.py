@@ -618,7 +618,9 @@ def test_too_few_basis_shapes_are_better_than_none(variant):
 @pytest.mark.parametrize("refinement", ["alternating", None])
 def test_options_that_need_the_joint_refinement(refinement, option):
     ((name, value),) = option.items()
-    message = rf"{name}={value!r} needs refinement='joint'; got refinement="
+    message = (
+        rf"{name}={value!r} needs refinement='joint' or 'consensus'; got refinement="
+    )
     model = AffineNRSfM(refinement=refinement, **option)
     refused(message, model.fit, TABLE)
     refused(None, model.transform, TABLE, error=NotFittedError)

@@ -106,7 +106,7 @@ def warnings_of(call, *args, **kwargs):
         ("{who}{part} {axis}", "12"),
     ],
 )
-def test_individuals_in_a_row_are_a_question(tmp_path, begins, name, who):
+def test_individuals_in_a_row_are_a_question(tmp_path, begins, fails, name, who):
     own = [name.replace("{who}", each) for each in who]
     tables = [table_of(each, POINTS + 300 * i) for i, each in enumerate(own)]
     scores = [f"{each.format(part=p, axis='p')}" for each in own for p in BODYPARTS]
@@ -119,7 +119,8 @@ def test_individuals_in_a_row_are_a_question(tmp_path, begins, name, who):
     for i in (0, 1):
         assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
     assert (rows.confidence == 1).all(axis=None)
-    options = re.findall(r"command line: (--\w+ .*?)\)", told)
+    told = fails("fit", path, *QUICK, "1", "-o", tmp_path / "b")
+    options = re.findall(r"use (--\w+ .*?)(?:\. |$)", told)
     assert len(options) == 2
     for option in options:
         begins(path, *shlex.split(option))
@@ -297,7 +298,7 @@ def test_parts_are_chosen_as_messages_say(tmp_path, begins, fails):
     both = {"pose": files.SCORED[0], "face": files.SCORED[1]}
     files.write_openpose(folder, [[files.openpose_person(**both)]] * 9)
     told = fails("fit", folder, *QUICK, "1", "-o", tmp_path / "b")
-    part, option = re.search(r"of (\w+), .*command line: (--part)\)", told).groups()
+    part, option = re.search(r"of (\w+), .* with (--part)", told).groups()
     begins(folder, option, part)
 
 
@@ -485,12 +486,12 @@ SIZE = "--camera affine --image-size 640x480"
 @pytest.mark.parametrize(
     ("table", "options", "told", "advised"),
     [
-        (SETS, "", r"command line: (.*?)\), such as (.*)", "{} {}"),
+        (SETS, "", r"Choose with (.*?), such as (.*)", "{} {}"),
         (VIDEOS, "--fps 25", "apart with (.*?),", "--fps 25 {} who"),
         (VIDEOS, "--fps 25", "others out with (.*)", "--fps 25 {} who=bob"),
         (PLAIN, "--time day", r"\((.*?)\) or", "--time day {}"),
         (PLAIN, "--time day", r" or .* \((.*?)\)", "--time day {}"),
-        (PLAIN, "--label age", r"command line: --label COLUMN(.*)\)", "--label age{}"),
+        (PLAIN, "--label age", r"use --label COLUMN(.*)", "--label age{}"),
         (PLAIN, "--group team", "rows out with (.*)", "--group team {} team=^$"),
         (PLAIN, "--distance neck,hip", "such as (--unit .*)", "--distance neck,hip {}"),
         (PLAIN, "--unit neck,hip", "needs (.*?),", "--unit neck,hip {} neck,hip"),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import n_reliable
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
@@ -160,7 +161,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         return  # wrong cameras look like coefficients that depend on the pose
     if n_supported < n_components and not (facts.prior or facts.decided):
         yield (
-            f"the table does not support n_components={n_components}: "
+            f"the table does not support {named('n_components', n_components)}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
             f"probably noise{facts.compare}"
         )

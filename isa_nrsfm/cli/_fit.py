@@ -24,6 +24,7 @@ from isa_nrsfm._parameters.choices import (
     FACE_PRIORS as LAYOUTS,
     JOINT_REFINEMENTS,
 )
+from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
@@ -211,20 +212,15 @@ def _check_options(args: Namespace) -> None:
         )
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
-    for name in ("focal_length", "principal_point"):
-        unused = args.focal_length is None and args.camera in CALIBRATED_CAMERAS
-        if getattr(args, name) is not None and (unused or args.camera == "affine"):
-            raise ValueError(
-                f"{flag_of(name)} has no effect on --camera {args.camera}"
-                f"{' without --focal-length' * unused}"
-            )
-    joint = {"--std": args.std, "--n-components auto": args.n_components == (AUTO,)}
-    for option, is_given in joint.items():
-        if is_given and args.refinement not in (None, *JOINT_REFINEMENTS):
-            raise ValueError(
-                f"{option} needs --refinement joint or consensus; got --refinement "
-                f"{args.refinement}"
-            )
+    given = {name: each for name, each in vars(args).items() if each is not None}
+    given = {name: None if each == NONE else each for name, each in given.items()}
+    auto = {"n_components": AUTO} if args.n_components == (AUTO,) else {}
+    check_requirements(given | auto | {"point_weight": args.weights})
+    lens = args.focal_length is not None or args.camera not in CALIBRATED_CAMERAS
+    if args.principal_point is not None and not lens:
+        raise ValueError(
+            f"--principal-point needs --focal-length with --camera {args.camera}"
+        )
     one = {
         "weights": "numbers are compared without weights",
         "prior": "a fit has those of the prior",

@@ -9,7 +9,9 @@ import numpy as np
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._fitted_model import removed_part
+from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._outputs import (
     read_model,
@@ -28,11 +30,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     output = Path(args.output)
     table_suffix(output)
     estimator = read_model(args)
-    if args.std and not hasattr(estimator, "noise_variance_"):
-        raise ValueError(
-            f"--std: {args.model} was fitted with refinement={estimator.refinement!r}, "
-            "which gives no standard deviations"
-        )
+    with errors_of(args.model):
+        check_requirements({"std": args.std, "refinement": estimator.refinement})
     if args.viewer is None and _reading.drawing_options(args):
         raise ValueError("--edges, --skeleton and --origin need --viewer")
     frames = _reading.read_frames(args, estimator)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
     MIN_POINTS,
@@ -182,8 +183,8 @@ def _points_apart(
     plain = [each for each in pairs if "".join(each[:2]).lower() == "xy"]
     if given is not None and not pairs:
         raise ValueError(
-            "with row_per_point, columns named x and y are needed, or their names in "
-            "columns (command line: --columns), such as 'u,v'"
+            f"with {named('row_per_point')}, columns named x and y are needed, or "
+            f"their names in {named('columns')}, such as 'u,v'"
         )
     if not 0 < len(pairs) < MIN_POINTS:
         return None
@@ -200,7 +201,7 @@ def _points_apart(
         listed = " or ".join(repr(f"{x},{y}") for x, y, _ in pairs)
         raise ValueError(
             "the table has a row for each point, and several pairs of coordinates. "
-            f"Choose with columns (command line: --columns), {listed}"
+            f"Choose with {named('columns')}, {listed}"
         )
     frame, by_frame, by_point = found
     row = np.zeros(len(frame), int)
@@ -231,8 +232,7 @@ def _points_apart(
         warn_caller(
             f"the table has a row for each point: {', '.join(by_frame) or 'nothing'} "
             f"tells {len(first)} frames apart, {', '.join(by_point)} {len(labels)} "
-            f"points (row_per_point={option!r}; command line: --row-per-point "
-            f"{option}){told * bool(unassigned)}"
+            f"points ({named('row_per_point', option)}){told * bool(unassigned)}"
         )
     kept = frame[of_frame].iloc[first].reset_index(drop=True)
     points = _names(labels, "xy") if len(by_point) < 2 else None
