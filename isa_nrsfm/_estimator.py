@@ -63,7 +63,7 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._after_fit import warn_after_fit
+from isa_nrsfm.analysis._advice import warn_after_fit
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
@@ -401,6 +401,7 @@ default="affine"
     _start: TableModel | None = None  # from which a fit starts
     _known: dict[str, Any] | None = None  # results of the joint fit, kept or reused
     _errors = True  # whether fits have errors of depths, and warn
+    _held: tuple[Any, Any, Any] | None = None  # a fitted table, weights, both opened
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
@@ -1159,6 +1160,8 @@ default="affine"
         """
         layout = self.layout
         if not reset:
+            if self._held and self._held[0] is X and self._held[1] is point_weight:
+                return self._held[2]
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
             known = "joint" if isinstance(frames, PosteriorFrames) else None

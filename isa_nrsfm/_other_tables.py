@@ -61,6 +61,12 @@ def of_fits(
     return result(fit, *shares)
 
 
+def hold_open(estimator: Any, X: Any, point_weight: Any = None) -> None:
+    """Open a fitted table once for all methods that it is given to."""
+    opened = estimator._opened(X, point_weight, judged=False)
+    estimator._held = X, point_weight, opened
+
+
 def warn_if_foreign(
     estimator: Any, table: FrameBlocks, fit: Decomposition | None, *weights: NDArray
 ) -> None:
@@ -69,8 +75,8 @@ def warn_if_foreign(
     Without fits of all frames, some are fitted.
     The noise of a weighted fit is not comparable to unweighted residuals.
     """
-    model = estimator._model
-    if not isinstance(model.frames, PosteriorFrames):
+    model, held = estimator._model, estimator._held
+    if not isinstance(model.frames, PosteriorFrames) or (held and held[2][0] is table):
         return
     certainty, camera = model.frames.certainty, model.frames.camera
     if table.n_frames < FEWEST_COMPARED or (certainty.weighted and not weights):

@@ -217,7 +217,7 @@ def write_shares(folder, change=lambda shares: shares):
 def test_shares_of_an_image_are_named(begins, tmp_path, change, is_named):
     err = begins(write_shares(tmp_path, change))
     assert (SHARES in err) == is_named
-    assert ("--format mediapipe --image-size" in err) == is_named
+    assert ("--format mediapipe and --image-size" in err) == is_named
 
 
 def test_most_points_are_inside_of_the_image(begins, fails, tmp_path):

@@ -85,7 +85,7 @@ def test_several_sets_are_refused_with_the_ways_to_choose():
     assert "'eye_lmk_x_#,eye_lmk_y_#' (56 points: " in message
     assert "'X_#,Y_#' (68 points, with a z each: X_0 to X_67)" in message
     assert "gaze" not in message
-    assert "--columns" in message
+    assert "Choose with columns, such as" in message
     found = find_landmark_columns(names, columns="x_#,y_#")
     assert found.x == tuple(f" x_{j}" for j in range(68))
     assert found.z == ()

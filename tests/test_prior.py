@@ -458,9 +458,9 @@ def test_squeezed_images_are_named():
         ({"camera": "affine"}, {}, "fitted with calibrated cameras"),
         ({"refinement": None}, {}, "fitted with calibrated cameras and the joint"),
         ({}, {"camera": "orthographic"}, "was fitted with camera='weak_perspective'"),
-        ({}, {"camera": "affine"}, "prior needs calibrated cameras"),
-        ({}, {"refinement": "consensus"}, "prior needs calibrated cameras"),
-        ({}, {"n_components": 3}, "must be that of the prior, 2, or 'auto'"),
+        ({}, {"camera": "affine"}, "prior needs camera='weak_perspective' or"),
+        ({}, {"refinement": "consensus"}, "prior needs refinement='joint', "),
+        ({}, {"n_components": 3}, "must be that of the prior, 2, or auto"),
     ],
 )
 def test_refused(turned, frontal, of_prior, params, message):

@@ -274,9 +274,7 @@ def test_parts_of_whole_bodies(tmp_path, lists, part):
     found = read_landmarks(path, part=part).points
     assert_array_equal(found, BODIES[:, first:end].reshape(4, -1))
     if len(lists) > 1:
-        told = (
-            "those in foot_kpts, face_kpts, .* choose with part, one of body, .*--part"
-        )
+        told = "those in foot_kpts, face_kpts, .* choose with part, one of body, "
         assert len(warned(told, read_landmarks, path).point_names) == 17
     refused("'nose' is none of body, ", read_landmarks, path, part="nose")
 
@@ -534,7 +532,7 @@ def test_corners_of_boxes_are_no_points(box, name):
     table = table_of(name, TRACKS).assign(**dict.fromkeys(box.split(), 5.0))
     options = {}
     if "_" not in name:
-        told = str(refused("--columns", landmark_table, table))
+        told = str(refused("give columns, such as", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
     assert_array_equal(landmark_table(table, **options).points, FLAT)
 
@@ -543,6 +541,6 @@ def test_corners_of_boxes_are_no_points(box, name):
 def test_points_w_and_h_are_no_sizes_of_boxes(name):
     table, options = table_of(name, files.scene(2, 26), ascii_lowercase), {}
     if not {*"_."} & {*name}:
-        told = str(refused("--columns", landmark_table, table))
+        told = str(refused("give columns, such as", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
     assert_array_equal(landmark_table(table, **options).points, table)

@@ -286,7 +286,7 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
     assert re.match(rf"{shown} \({n_points} in all\)", warning)
-    option = re.search(r"with (--missing-value \S+),", warning)[1].replace(" ", "=")
+    number = re.search(r"with missing=(\S+)", warning)[1]
     table = pd.DataFrame(tracks.reshape(200, -1), columns=POINTS)
     found = isa_nrsfm.io.landmark_table(table, missing=code).points.to_numpy()
     np.testing.assert_array_equal(np.isnan(found[:, ::2]), hidden)
@@ -295,7 +295,7 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
         AffineNRSfM(1, refinement=None).fit,
         table,
     )
-    points, texts = tracks_read(tracks, option)
+    points, texts = tracks_read(tracks, f"--missing-value={number}")
     assert texts == []
     expected = np.where(hidden[..., None], np.nan, tracks)
     np.testing.assert_array_equal(points.reshape(tracks.shape), expected)
@@ -510,7 +510,7 @@ def test_names_of_another_form_are_told_their_pattern(name, pattern):
     points = enumerate("abcdefghijkl")
     names = [name.format(a=a, j=j, letter=letter) for j, letter in points for a in "xy"]
     table = WIDE.set_axis(names, axis=1)
-    told = str(refused("--columns", landmark_table, table))
+    told = str(refused("give columns, such as", landmark_table, table))
     assert told.endswith(f"such as {pattern!r}")
     found = landmark_table(table, columns=pattern).points
     np.testing.assert_array_equal(found, WIDE)

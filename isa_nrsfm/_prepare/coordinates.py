@@ -183,8 +183,7 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
             continue
         number, way = f"{xy[0]:.15g}", "before coordinates are shifted or scaled"
         if equal:
-            given = named("missing", float(number))
-            way = f"with {given}, where landmarks are read from a file or a table"
+            way = f"as readers of tables do with {named('missing', float(number))}"
         warn_caller(
             f"in {n_rows} of {len(there)} {rows} points are at exactly ({number}, "
             f"{xy[1]:.15g}) ({there.sum()} in all). If these points are missing, make "

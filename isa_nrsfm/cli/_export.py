@@ -7,8 +7,8 @@ from typing import Any
 from isa_nrsfm import export
 from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._options import NONE, SUFFIXES, flag_of
-from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, refuse_replacing
-from isa_nrsfm.cli._sections import text_of
+from isa_nrsfm.cli._outputs import check_outputs, read_model
+from isa_nrsfm.cli._report import text_of
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # The options of each content.
@@ -27,9 +27,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     content = _content(output)
     options = _given(args, content)
     estimator = read_model(args)
-    refuse_overwriting([args.model, *_reading.drawing_files(args)], [output])
-    if not args.force:
-        refuse_replacing([output])
+    check_outputs(args, [args.model], [output])
     if "edges" in _OPTIONS[content]:
         options |= _reading.drawing(args, names_of_points(estimator), None)
     if args.mirrored:

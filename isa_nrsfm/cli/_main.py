@@ -78,6 +78,7 @@ def _as_option(args: Namespace, name: str, *values: Any) -> str:
         return in_python(name, *values)
     sizes = ("x".join(map(str, v)) if isinstance(v, tuple) else v for v in values)
     values = tuple(f"{v:.15g}" if isinstance(v, float) else v for v in sizes)
+    values = values if values != (True,) else ()
     texts = [shlex.quote(NONE if v is None else str(v)) for v in values]
     return f"{flag_of(option)} {' or '.join(texts)}".strip()
 

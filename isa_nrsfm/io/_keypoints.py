@@ -227,10 +227,10 @@ def _chosen_categories(
 
     Where no category has names of keypoints, all are read.
     """
-    named = [entry for entry in categories if entry.get("keypoints")] or categories
-    names = [str(entry.get("name")) for entry in named]
+    used = [entry for entry in categories if entry.get("keypoints")] or categories
+    names = [str(entry.get("name")) for entry in used]
     points: list[str] = []
-    for entry in named:
+    for entry in used:
         found = entry.get("keypoints") or []
         if not isinstance(found, list) or not all(isinstance(p, str) for p in found):
             raise ValueError("the keypoints of a category must be a list of names")
@@ -240,7 +240,7 @@ def _chosen_categories(
                 "the others from the categories of the file"
             )
         points = found
-    return _by_id(named, "categories"), points or None
+    return _by_id(used, "categories"), points or None
 
 
 def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]]:
@@ -410,8 +410,8 @@ def _each_file(
 def _openpose_files(path: Path) -> list[Path]:
     """Return the files of OpenPose in a folder, by their names or entries."""
     files = json_files(path) if path.is_dir() else []
-    named = [file for file in files if file.stem.lower().endswith("_keypoints")]
-    return named or json_files(path, "openpose")
+    by_name = [file for file in files if file.stem.lower().endswith("_keypoints")]
+    return by_name or json_files(path, "openpose")
 
 
 def _people_in(file: Path) -> list[dict[str, Any]]:

@@ -217,7 +217,7 @@ def _points_apart(
     if (twice := pd.DataFrame({"row": row, "point": point}).duplicated()).any():
         raise ValueError(
             f"a frame has several rows for the point {texts[twice].iloc[0]!r}: name "
-            "all columns that tell frames apart in row_per_point (--row-per-point)"
+            f"all columns that tell frames apart in {named('row_per_point')}"
         )
     wide = frame.set_index([row, point])[[*values.values()]].unstack()
     wide = wide.set_axis([n for a in values for n in _names(labels, [a])], axis=1)
@@ -278,10 +278,10 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
     def count(names: list[str]) -> int:
         return len(codes[names].drop_duplicates()) if names else 1
 
-    named = [name for name in keys if _POINT.search(name)]
+    of_points = [name for name in keys if _POINT.search(name)]
     image = next(filter(_IMAGE.fullmatch, keys), None)
     others = [n for n in keys[::-1] if not (is_frame[n] or no_point[n])]
-    for point in dict.fromkeys([*named, *others]):
+    for point in dict.fromkeys([*of_points, *others]):
         by_frame, by_point = [name for name in keys if name != point], [point]
         if count(keys) < len(frame):
             break
@@ -310,10 +310,10 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
             return frame, by_frame, by_point
     # What no column tells apart is counted, if there is the same number of each.
     by = [name for name in keys if sizes[name] <= len(frame) / 2]
-    counted = "point" if not named else "individual" if len(by) > 1 else "frame"
+    counted = "point" if not of_points else "individual" if len(by) > 1 else "frame"
     alike = codes.groupby(by).size() if by else pd.Series([1])
-    minimum = 2 if named else MIN_POINTS if image in by else np.inf
+    minimum = 2 if of_points else MIN_POINTS if image in by else np.inf
     if alike.nunique() > 1 or alike.iloc[0] < minimum:
         return None
-    by = [name for name in by if name not in named[:1]]
-    return _keys_as_given(frame, [*by, counted, *named[:1]])
+    by = [name for name in by if name not in of_points[:1]]
+    return _keys_as_given(frame, [*by, counted, *of_points[:1]])

@@ -13,7 +13,26 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm.metrics._checks import as_finite, check_same_shape
+from isa_nrsfm._tables.sources import unmasked
+
+
+def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
+    """Return an array of floats; refuse NaN and infinity."""
+    values = np.asarray(unmasked(array), dtype=np.float64)
+    if not np.isfinite(values).all():
+        n_bad = int(np.sum(~np.isfinite(values)))
+        raise ValueError(f"{name} must be finite; {n_bad} entries are NaN or infinite")
+    return values
+
+
+def check_same_shape(name_a: str, a: NDArray, name_b: str, b: NDArray) -> None:
+    """Refuse arrays of different shapes."""
+    if a.shape != b.shape:
+        raise ValueError(
+            f"{name_a} and {name_b} must be of the same shape; got {a.shape} and "
+            f"{b.shape}"
+        )
+
 
 # Places of matched true and estimated basis shapes, and absolute cosines of the pairs.
 Matched = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]
