@@ -100,9 +100,10 @@ def warn_if_foreign(
             before, after = adapting_errors(estimator, rows, *own)
             if after < before:
                 way = (
-                    "Adapt the model to X: AutoNRSfM(model, prior=model).fit(X), or "
-                    "isa-nrsfm fit TABLE --prior model.npz. Held-out points of some "
-                    f"rows then have an inverse SNR of {after:.2g}, now {before:.2g}"
+                    "Adapt the model to X: AutoNRSfM(model, prior=model).fit(X). Held-"
+                    "out points of some rows then have an inverse SNR of "
+                    f"{after:.2g}, now {before:.2g} (isa-nrsfm fit TABLE --prior "
+                    "model.npz)"
                 )
         warn_caller(
             f"the points of X lie {misfit:.2g} times as far from the shapes of the "

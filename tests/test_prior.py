@@ -22,6 +22,7 @@ from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, AutoNRSfM
 from isa_nrsfm._estimator import limited
+from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._joint.fit import widened
@@ -29,7 +30,7 @@ from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.settings import LIMITS
-from isa_nrsfm._other_tables import prior_start
+from isa_nrsfm._other_tables import hold_open, prior_start
 from isa_nrsfm._parameters.choices import FACE_PRIORS
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm.datasets import load_face_prior
@@ -559,6 +560,30 @@ def test_foreign_tables_are_warned_of_once(turned, params, other):
         assert told.startswith("eld-out points of some rows")
         names = {"AutoNRSfM": AutoNRSfM, "model": model, "X": X}
         assert eval(code, names).best_estimator_.prior_std_[0] > 0.01
+
+
+def test_rows_of_a_table_are_fitted_once(turned, monkeypatch):
+    decompose, numbers = TableModel.decompose, []
+
+    def counted(self, rows, *args, **params):
+        numbers.append(len(rows))
+        return decompose(self, rows, *args, **params)
+
+    monkeypatch.setattr(TableModel, "decompose", counted)
+    model, X = turned.model, np.roll(turned.X, 2, axis=1)
+    warned("as far from", model.transform, X)
+    assert sum(numbers) == len(X)
+
+
+def test_a_table_that_is_held_is_opened_once(turned):
+    model, X = copy.copy(turned.model), turned.X.copy()
+    expected, other = model.reproject(X), np.roll(X, 2, axis=1)
+    hold_open(model, X)
+    opened = model._opened(X)
+    assert model._opened(X) is opened
+    assert_array_equal(model.reproject(X), expected)
+    warned("as far from", model.reproject, other)
+    assert model._opened(X, np.ones((len(X), N_POINTS))) is not opened
 
 
 def test_weights_of_points_and_other_tables():

@@ -125,8 +125,7 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
-        together = whole_files.files_together(folder, removed=removed)
-        with together as new, parallel_config(n_jobs=2):  # threads for blocks of frames
+        with whole_files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
@@ -278,7 +277,8 @@ def _fitted(
         **frames.weighting,
     )
     estimator.set_params(verbose=0)
-    hold_open(estimator, X, **frames.weighting)
+    with parallel_config(n_jobs=2):  # threads for blocks of frames
+        hold_open(estimator, X, **frames.weighting)
     diagnostics = None
     if estimator.refinement in JOINT_REFINEMENTS:
         diagnostics = estimator.diagnostics(X, **frames.weighting)
