@@ -131,7 +131,7 @@ def test_diagnostics_say_what_was_removed_and_what_is_left(model, plain):
     before, after = plain.diagnostics(), model.diagnostics()
     assert before.pose_share.max() > 0.3
     assert not before.pose_removed.any()
-    message = "the pose predicts .* alike in all views, use --remove-pose"
+    message = "the pose predicts .* alike in all views, use remove_pose=True"
     assert re.search(message, before.messages[-1])
     assert after.pose_share.max() < 0.3
     assert after.messages == ()
