@@ -82,7 +82,7 @@ TABLES = {
         LONG.drop(columns="frame").assign(
             POSITION_T=FRAMES / 25 + 0.01, ID=range(N * J)
         ),
-        "--row-per-point",
+        "row_per_point",
     ),
     "ImageJ, multi-point": (
         LONG[["x", "y"]].assign(**{" ": range(1, N * J + 1), "Slice": FRAMES + 1}),
@@ -111,8 +111,8 @@ TABLES = {
     "DeepLabCut stacked": (tidy().assign(scorer="net"), FLAT),
     "tidyr": (wide().assign(frame=range(N)).melt("frame", var_name="name"), FLAT),
     "pixels and millimetres": (BESIDE, "'px_x,px_y' or 'mm_x,mm_y'"),
-    "gaze": (LONG[["x", "y"]].assign(frame=range(N * J)), "--row-per-point"),
-    "trials of gaze": (LONG[["x", "y"]].assign(trial=FRAMES), "--row-per-point"),
+    "gaze": (LONG[["x", "y"]].assign(frame=range(N * J)), "row_per_point"),
+    "trials of gaze": (LONG[["x", "y"]].assign(trial=FRAMES), "row_per_point"),
     "lists": (cells("[{}, {}]".format), FLAT),
     "numbers above tuples": (cells("({}, {})".format, map(str, range(J))), FLAT),
     "json": (cells(lambda x, y: json.dumps({"x": x, "y": y})), FLAT),
@@ -208,7 +208,7 @@ def test_tables_of_other_shapes(tmp_path, name, suffix):
         pd.testing.assert_frame_equal(again.points, found.points)
         pd.testing.assert_frame_equal(again.frames, found.frames)
     if left := re.search("the columns (.*) are no points", told):
-        every = re.search("such as '(.*)'", told)[1]
+        every = re.search("columns='(.*)'", told)[1]
         more = len(read_landmarks(path, columns=every).point_names) - J
         assert 2 * more == len([n for n in left[1].split(", ") if n[-1] != "z"])
 

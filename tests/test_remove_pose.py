@@ -124,7 +124,7 @@ def test_a_prior_keeps_its_origin(plain):
 
 def test_needs_calibrated_cameras(table):
     fit = AffineNRSfM(2, remove_pose=True).fit
-    refused("remove_pose needs calibrated cameras, .*camera='weak", fit, table)
+    refused("remove_pose needs camera='weak_perspective' or .* have a yaw", fit, table)
 
 
 def test_diagnostics_say_what_was_removed_and_what_is_left(model, plain):

@@ -245,8 +245,9 @@ def _answer(label: dict[str, Any]) -> str:
 
 
 def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
-    """Return the sections of the report of a fit, answers first, without the files."""
+    """Return the sections of the page of a fit, answers first, without figures."""
     labels = map(_label, report.get("labels", ()))
+    versions = (f"{name} {each}" for name, each in report["versions"].items())
     return {
         "Labels": [part for parts in labels for part in parts],
         "Groups": _groups(report["groups"]) if "groups" in report else (),
@@ -254,6 +255,8 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
         "Alpha": _alpha(report["model"]),
         "Fit": _fit(report),
         "Table": table_section(report["table"]),
+        "Command": [shlex.join([PROGRAM, *report["arguments"]])],
+        "Versions": [", ".join(versions)],
     }
 
 
@@ -339,22 +342,16 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     for warning in report["warnings"]:
         parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
     parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
-    sections = fit_sections(report)
-    for name in ("Labels", "Groups", "Time", "Alpha"):
-        parts += _markup(name, sections.pop(name))
-    for name, content in report["files"].items():
-        if name.endswith(".png"):
+    figures = {n: text for n, text in report["files"].items() if n.endswith(".png")}
+    for section, content in fit_sections(report).items():
+        parts += _markup(section, content)
+        for name in figures if section == "Alpha" else ():  # after the answers
             image = base64.b64encode((folder / name).read_bytes()).decode()
-            caption = escape(content)
+            caption = escape(figures[name])
             parts.append(
                 f'<figure><img src="data:image/png;base64,{image}" alt="{caption}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
-    sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
-    found = report["versions"].items()
-    sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
-    for name, section in sections.items():
-        parts += _markup(name, section)
     page = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
     page = page.replace("{{title}}", title).replace("{{content}}", "\n".join(parts))
     write_whole(folder / PAGE, page.encode(errors="replace"))
