@@ -164,8 +164,9 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
     if not calibrated:
         raise ValueError(
             "prior must be fitted with calibrated cameras and the joint refinement; "
-            f"got camera={prior.camera_!r}, refinement={prior.refinement!r}. Fit it "
-            "with camera='weak_perspective'"
+            f"got {named('camera', prior.camera_)}, "
+            f"{named('refinement', prior.refinement)}. Fit it with "
+            f"{named('camera', 'weak_perspective')}"
         )
     if not model.frames.certainty.determined:
         raise ValueError(
