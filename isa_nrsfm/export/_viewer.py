@@ -43,19 +43,6 @@ MIRRORED = " The mirror image in depth fits the images as well."
 FLOATS, INTEGERS = 5126, 5125
 VERTICES, INDICES = 34962, 34963
 POINTS, LINES, TRIANGLES = 0, 1, 4
-# Matt materials, seen from both sides.
-MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.8}
-MATERIALS = [
-    {
-        "name": name,
-        "doubleSided": True,
-        "pbrMetallicRoughness": {"baseColorFactor": [*colour, 1.0]} | MATT,
-    }
-    for name, colour in (
-        ("points and edges", (0.05, 0.12, 0.25)),
-        ("surface", (0.80, 0.66, 0.55)),
-    )
-]
 
 
 class ViewerPage(str):
@@ -255,12 +242,14 @@ def _deviations(values: Any, n_rows: int, model: Any) -> NDArray:
     return np.broadcast_to(found, shape)
 
 
+def _resource(name: str) -> str:
+    """Return the text of a file beside this module."""
+    return (files("isa_nrsfm.export") / name).read_text(encoding="utf-8")
+
+
 def _page(content: dict[str, Any]) -> str:
     """Return the page with a content."""
-    page, script = (
-        (files("isa_nrsfm.export") / name).read_text(encoding="utf-8")
-        for name in ("viewer.html", "viewer.js")
-    )
+    page, script = map(_resource, ("viewer.html", "viewer.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     # Escape data that would end its HTML element.
     data = json.dumps(content, separators=(",", ":"), allow_nan=False)
@@ -405,15 +394,10 @@ def write_glb(
         "samplers": [sampler | {"output": file.add(weights.ravel())}],
         "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
     }
-    document = {
-        "asset": {"version": "2.0", "generator": f"isa_nrsfm {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "shape", "mesh": 0}],
-        "meshes": [mesh],
-        "materials": MATERIALS,
-        "animations": [animation],
-    }
+    # One node, and matt materials that are seen from both sides
+    document = json.loads(_resource("scene.gltf"))
+    document["asset"]["generator"] = f"isa_nrsfm {__version__}"
+    document |= {"meshes": [mesh], "animations": [animation]}
     write_whole(path, file.with_document(document))
 
 
