@@ -208,11 +208,9 @@ def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]
 
 def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> _metric.MetricFit:
     """Return the best metric of usable cameras (n_frames, 2, 3), from two starts."""
-    gram = (
-        _metric.mean_gram(_metric.unit_cameras(cameras))
-        if len(cameras)
-        else np.zeros((3, 3))
-    )
+    gram = np.zeros((3, 3))
+    if len(cameras):
+        gram = _metric.mean_gram(_metric.unit_cameras(cameras))
     eigenvalues = np.linalg.eigvalsh(gram)
     n_seen = np.count_nonzero(eigenvalues > OF_RANKS * eigenvalues[-1])
     if n_seen < 3:
