@@ -9,6 +9,7 @@ start from its shapes. Most fits have errors of depths only if they are used.
 import time
 import warnings
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -325,6 +326,17 @@ class _Fit(NamedTuple):
         gain = np.subtract(*(np.nanmedian if robust else np.nanmean)(pairs, axis=2))
         return len(gain) > 0 and gain.mean() > CLEAR * gain.std() / np.sqrt(len(gain))
 
+    def is_better(self, best: "_Fit", name: str, robust: bool) -> bool:
+        """Return whether the fit is better than the best one, for what it changes."""
+        if name == "camera":
+            better = self.clearly_better(best, robust)
+        else:
+            limit = MOST_ERROR[name] * best.trial.held_out_error
+            better = not self.trial.held_out_error > limit
+        if name in FOR_DEPTH:
+            better &= self.trial.depth_uncertainty < best.trial.depth_uncertainty
+        return better
+
     @property
     def determined(self) -> bool:
         """Whether the depth is determined."""
@@ -441,24 +453,12 @@ def decided(
     groups and weights are those of `AffineNRSfM.fit`.
     Returns the fit that is kept, with warnings, and what was tried.
     """
-
-    def fitted(model: AffineNRSfM, setting: str, first: _Fit | None = None) -> _Fit:
-        since = time.perf_counter() - (first.trial.seconds if first else 0.0)
-        with warnings.catch_warnings(record=True, action="always") as caught:
-            if not hasattr(model, "_model"):
-                model.fit(X, groups=groups, **weights)
-        seconds = time.perf_counter() - since
-        squares = first.squares if first else rows.squares(model)
-        error = unexplained_share(squares, robust or model.loss != "linear")
-        depth = float(getattr(model, "depth_uncertainty_", np.nan))
-        trial = Trial(setting, error, depth, seconds, "used")
-        return _Fit(model, trial, caught, squares)
-
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    robust, used, estimator._known = False, 0, {}
-    best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras")
+    fitted = partial(_fitted, X, {"groups": groups, **weights}, rows)
+    robust, used, estimator._continued = False, 0, {"known": {}}
+    best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras", robust)
     trials = [best.trial]
     for name, setting, proposal in PROPOSALS:
         if name not in free:
@@ -471,32 +471,17 @@ def decided(
                 trials[used] = best.trial._replace(held_out_error=median)
                 best = best._replace(trial=trials[used])
             try:
-                model = clone(best.model).set_params(**changes)
-                if name == "refinement":
-                    model._known = best.model._known
-                elif model.camera == "perspective":
-                    model._known = {"weak": best.model._model}
-                elif name not in FOR_DEPTH:
-                    model._known, model._errors = {}, False
-                if model.camera == "orthographic":
-                    model._start = best.model._model
-                found = fitted(model, setting)
+                found = fitted(_changed(best, name, changes), setting, robust)
             except ValueError as error:  # such as points that too few frames show
                 changes = str(error)
         if isinstance(changes, str):
             trials.append(Trial(setting, np.nan, np.nan, 0.0, changes))
             continue
-        _, off, depth, *_ = found.trial
-        if name == "camera":
-            better = found.clearly_better(best, robust)
-        else:
-            better = not off > MOST_ERROR[name] * best.trial.held_out_error
-        if name in FOR_DEPTH:
-            better &= depth < best.trial.depth_uncertainty
-        if better and not found.model._errors:
+        better, continued = found.is_better(best, name, robust), found.model._continued
+        if better and continued and not continued.get("errors", True):
             model = clone(found.model)
-            model._known = found.model._known
-            found = fitted(model, setting, found)
+            model._continued = {"known": continued["known"]}
+            found = fitted(model, setting, robust, found)
             if model.camera == "orthographic":  # compared with affine ones before
                 model.camera_noise_ratio_ = best.model.camera_noise_ratio_
         trials.append(found.trial)
@@ -510,7 +495,41 @@ def decided(
         model.set_params(n_components=model.n_components_)
     for each in best.caught:  # made before the comparison
         warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
-    for name in ("_known", "_start", "_errors"):
-        model.__dict__.pop(name, None)
-    model._trials = trials
+    model._continued, model._trials = None, trials
     return model, trials
+
+
+def _fitted(
+    X: Any,
+    given: dict[str, Any],
+    rows: _Rows,
+    model: AffineNRSfM,
+    setting: str,
+    robust: bool,
+    first: _Fit | None = None,
+) -> _Fit:
+    """Return the fit of a model, and its trial. Figures may be those of a first fit."""
+    since = time.perf_counter() - (first.trial.seconds if first else 0.0)
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        if not hasattr(model, "_model"):
+            model.fit(X, **given)
+    seconds = time.perf_counter() - since
+    squares = first.squares if first else rows.squares(model)
+    error = unexplained_share(squares, robust or model.loss != "linear")
+    depth = float(getattr(model, "depth_uncertainty_", np.nan))
+    trial = Trial(setting, error, depth, seconds, "used")
+    return _Fit(model, trial, caught, squares)
+
+
+def _changed(best: _Fit, name: str, changes: dict[str, Any]) -> AffineNRSfM:
+    """Return the model with a change, which continues the best fit where it can."""
+    model = clone(best.model).set_params(**changes)
+    if name == "refinement":
+        model._continued = best.model._continued
+    elif model.camera == "perspective":
+        model._continued = {"known": {"weak": best.model._model}}
+    elif name not in FOR_DEPTH:
+        model._continued = {"known": {}, "errors": False}
+    if model.camera == "orthographic":
+        model._continued = (model._continued or {}) | {"start": best.model._model}
+    return model

@@ -29,7 +29,7 @@ from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
 from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
 from isa_nrsfm._frames import camera_models
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
-from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, leading
+from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
 from isa_nrsfm._frames.pinhole import focal_shares, pinhole_of, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
 from isa_nrsfm._other_tables import (
@@ -397,10 +397,8 @@ default="affine"
     _model: TableModel
     _frame_sizes: NDArray
     _limits: ClassVar[Limits] = LIMITS  # others: `limited`
-    _whole: ClassVar[bool] = True  # whether joint fits have all directions of a shape
-    _start: TableModel | None = None  # from which a fit starts
-    _known: dict[str, Any] | None = None  # results of the joint fit, kept or reused
-    _errors = True  # whether fits have errors of depths, and warn
+    # Settings of a fit that continues another one: whole, errors, start, known
+    _continued: dict[str, Any] | None = None
     _held: tuple[Any, Any, Any] | None = None  # a fitted table, weights, both opened
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
@@ -570,7 +568,6 @@ default="affine"
         groups: Any = None,
     ) -> None:
         """Fit a table."""
-        start, errors = self._start, self._errors
         source, weights, settings = self._ready(X, point_weight)
         if groups is not None:
             settings = settings._replace(groups=group_numbers(groups, source.n_frames))
@@ -583,9 +580,7 @@ default="affine"
         auto, f, point = n_components == "auto", self.focal_length, self.principal_point
         if self.camera == "perspective":
             images = PerspectiveTable(source, weights, isa, settings, point, progress)
-            number = None if auto else n_components
-            options = start, errors, self.remove_pose, (self._known or {}).get("weak")
-            fit = fit_perspective(images, number, f, *options)
+            fit = fit_perspective(images, None if auto else n_components, f)
         else:
             if auto and self.camera == "affine":
                 with warnings.catch_warnings(action="ignore"):  # the fit warns again
@@ -593,9 +588,7 @@ default="affine"
                 n_components = supported_components(table, isa, settings, progress)
             number = 1 if n_components == "auto" else n_components
             table = scaled_table(source, weights, number, settings)
-            of_table = progress, start, auto, errors, self.remove_pose
-            args = table, number, isa, settings, *of_table
-            fit = fit_table(*args, known=self._known)
+            fit = fit_table(table, number, isa, settings, progress)
         model, frames, converged, fitted = fit
         if point is not None and model.pinhole is None:
             f = np.array(np.inf if f is None else f, dtype=float)[()]
@@ -631,7 +624,7 @@ default="affine"
         else:
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
-        if errors and settings.joint:
+        if settings.errors and settings.joint:
             warn_after_fit(self, fitted_prior(self.prior), frames.motion, left_out)
 
     def _ready(
@@ -658,8 +651,9 @@ default="affine"
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),
             silent_isa=joint and self.isa is None,
-            whole=self._whole,
+            free=self.n_components == "auto" and self.prior is None,
             limits=self._limits,
+            **(self._continued or {}),
         )
         if self.camera == "orthographic":  # one scale
             settings = settings._replace(scale_frames=False)
@@ -1137,10 +1131,10 @@ default="affine"
         table, weights = (None, ()) if X is None else self._opened(X, point_weight)
         return diagnose(self, table, weights, rows)
 
-    def _jointly_fitted(self, name: str, calibrated: bool = False) -> PosteriorFrames:
+    def _jointly_fitted(self, name: str, calibrated: bool = False) -> FrameModel:
         """Return the model of a frame with noise, and calibrated cameras, or raise."""
         frames = self._model.frames
-        if not isinstance(frames, PosteriorFrames):
+        if not frames.joint:
             raise ValueError(
                 f"{name} needs a model with refinement='joint', which has a noise "
                 f"variance; got refinement={self.refinement!r}"
@@ -1164,7 +1158,7 @@ default="affine"
                 return self._held[2]
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
-            known = "joint" if isinstance(frames, PosteriorFrames) else None
+            known = "joint" if frames.joint else None
             given = {"point_weight": point_weight, "refinement": known}
             check_requirements(given | {"loss": frames.loss})
         if is_read_later(X):

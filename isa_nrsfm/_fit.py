@@ -39,8 +39,7 @@ from isa_nrsfm._frames.models import (
     MIRROR,
     Decomposition,
     FrameMap,
-    PosteriorFrames,
-    RigidFrames,
+    FrameModel,
     spread_starts,
 )
 from isa_nrsfm._gauge import (
@@ -52,7 +51,6 @@ from isa_nrsfm._gauge import (
 )
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
-from isa_nrsfm._joint.half_tables import half_tables
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import FitSettings
@@ -62,6 +60,7 @@ from isa_nrsfm._joint.uncertainty import (
     depth_certainty,
     fitted_frames,
     frame_certainty,
+    half_tables,
     n_reliable,
     reliabilities,
     shape_information,
@@ -89,11 +88,14 @@ PERSPECTIVE_STAGE = "perspective"
 # Stages that report steps.
 STEPWISE = JOINT_STAGE, CONSENSUS_STAGE, PERSPECTIVE_STAGE
 
+# Model, frames, convergence and other attributes of a fit
+TableFit = tuple[TableModel, Decomposition, bool, dict[str, Any]]
+
 
 def stages_of(estimator: Any) -> list[str]:
     """Return the names of the stages of a fit, in order."""
     stages = ["table", "factorisation"]
-    if estimator.prior is None and estimator._start is None:
+    if estimator.prior is None and "start" not in (estimator._continued or ()):
         if estimator.n_components == "auto" and estimator.camera == "affine":
             stages.insert(0, "number of basis shapes")
         stages += ["independent subspaces", "block structure and refinement"]
@@ -112,32 +114,16 @@ def fit_table(
     isa: Any,
     settings: FitSettings,
     progress: FitProgress | NoProgress,
-    start: TableModel | None = None,
-    free: bool = False,
-    errors: bool = False,
-    remove_pose: bool = False,
-    placed: Decomposition | None = None,
-    known: dict[str, Any] | None = None,
-) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
+) -> TableFit:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
-
-    The joint fit starts from the model of a similar table, if `start` is given, instead
-    of the paper's result. `free`: K is the number of directions that the table
-    determines, or with affine cameras falls until all directions of the coefficients
-    are reliable. `errors`: estimate the errors of the depths. `remove_pose`: report the
-    directions of the part of the coefficients that the pose does not predict. `placed`:
-    frames of the table in the model of the start. `known`: the joint fit and the errors
-    of its depths, of another fit that has the same; those that it lacks are added.
 
     Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
     without visible points; convergence; and the other attributes of `AffineNRSfM`.
     """
-    camera, wanted = settings.camera, n_components
+    wanted, first = n_components, settings
     # Calibrated cameras: the fit does not depend on the number of coefficients.
-    whole = settings.joint and camera != "affine"
-    whole = whole and settings.whole and settings.prior is None
-    if whole:
-        possible = most_components(len(table.sizes), table.n_points, camera)
+    if settings.all_directions:
+        possible = most_components(len(table.sizes), table.n_points, settings.camera)
         n_components = min(MOST_FIRST, possible)
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
@@ -145,15 +131,15 @@ def fit_table(
     given = None
     if settings.prior is not None:
         # Perspective images are right for the last fit, which has errors.
-        given, settings = prior_start(table, settings, checked=errors)
-    if start is not None:
-        given = _started(table, start, n_components, placed)
+        given, settings = prior_start(table, settings, checked=settings.errors)
+    if settings.start is not None:
+        given = _started(table, settings, n_components)
     if given is None:
         isa, factors = clone(isa), factorised.factors
         shapes, covariance, n_iter, converged = run_paper_pipeline(
             factors.leading(3 * wanted), wanted, isa, settings, progress
         )
-        if whole:  # the start has a fixed number of basis shapes
+        if settings.all_directions:  # the start has a fixed number of basis shapes
             rigid = factors.rigid_motion.reshape(-1, 2, 3)
             images = factorised.W.reshape(len(rigid), 2, -1)
             shapes = lifted_shapes(images, rigid, n_components)
@@ -161,88 +147,107 @@ def fit_table(
         isa, shapes = None, given.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
-        settings = settings._replace(on_step=progress.step)
-        args = factorised, shapes, settings, given
-        fit, tracks, alpha = _remembered(known, "joint", fit_jointly, *args)
-        (shapes, _, noise), starts = fit.state, spread_starts(alpha, 8)
-        settings = settings._replace(shape_prior=fit.prior)
-        gauge = FrameMap.identity(len(shapes) - 1)
-        model = PosteriorFrames(shapes, noise, starts, settings.loss, gauge, camera)
-        progress(JOINT_STAGE)
-        attributes = {
-            "camera_noise_ratio_": fit.camera_noise_ratio,
-            "objective_history_": fit.history,
-            "gradient_norm_": fit.gradient_norm,
-            "n_iter_": len(fit.history) - 1,
-        }
-        if free and fit.widths is not None:
-            wanted = min(fit.widths.n_relevant, MOST_FIRST)
-        grouped, widths = settings.refinement == "consensus", fit.widths
-        if grouped:
-            # A residual below the noise of the spectrum leaves nothing for groups.
-            n_numbers, square = tracks.totals
-            noise = factorised.noise_level(len(shapes) - 1) * square / n_numbers
-            if widths is not None:  # whose noise is that of the other coordinates
-                n_unknowns = widths.n_unknowns(len(table.sizes), camera)
-                noise *= n_numbers / (n_numbers - n_unknowns)
-            grouped = fit.misfit > noise
-        if (needed := errors and camera != "affine") and (
-            not grouped or (known and "certainty" in known)
-        ):
-            of = model, table.rows, table.weights, settings, widths, fit.rivals
-            certainty = _remembered(known, "certainty", depth_certainty, *of)
-            model, needed = replace(model, certainty=certainty), False
-        if grouped:
-            model, widths = consensus(model, table, settings, needed, fit), None
-            tracks = JointFrames.from_points(table.rows, table.complete)
-        if settings.refinement == "consensus":
-            progress(CONSENSUS_STAGE)
-        if errors and settings.loss == "linear" and table.weights is None:
-            some = spread(np.arange(len(table.sizes)), 100)
-            distance = left_out_distances(model, table.rows.take(some))
-            attributes["_left_out"] = distance, np.flatnonzero(table.shown)[some]
-        if (n_more := wanted + 1 - len(model.shapes)) > 0:
-            # Coefficients beyond the directions that a table supports are zero.
-            shapes = np.pad(model.shapes, ((0, n_more), (0, 0), (0, 0)))
-            starts = np.pad(model.starts, ((0, 0), (0, n_more)))
-            model = replace(model, shapes=shapes, starts=starts)
-            widths = None if widths is None else widths.padded(n_more)
-        fits = fitted_frames(model, tracks, table.rows)
-        del tracks  # as much memory as the table
-        fitted, frames, measures = _joint_frames(
-            table, model, fits, settings, wanted, widths, remove_pose
+        fitted, frames, converged, attributes = _joint_fit(
+            factorised, shapes, given, settings, wanted, progress
         )
-        if fit.prior is not None:
-            attributes["prior_std_"] = np.array([fit.prior.distance, 0.0])
-        if errors and camera != "affine":
-            attributes["depth_uncertainty_"] = fitted.frames.certainty.total
-        converged = fit.converged
         # Down-weighted outliers, for example, look like basis shapes at first.
-        supported = max(n_reliable(measures["reliability_"]), 1)
-        if free and not whole and supported < n_components:
+        supported = max(n_reliable(attributes["reliability_"]), 1)
+        falls = settings.free and not settings.all_directions
+        if falls and supported < n_components:
             progress("gauge and coefficients")
-            same = NoProgress(), start, free, errors, remove_pose, placed
-            return fit_table(table, supported, isa, settings, *same)
+            first = first._replace(known=None)
+            return fit_table(table, supported, isa, first, NoProgress())
     else:
-        fitted, frames, measures = _paper_frames(
+        fitted, frames, attributes = _paper_frames(
             table, factorised.factors, shapes, covariance, settings
         )
-        attributes = {"n_iter_": n_iter}
+        attributes["n_iter_"] = n_iter
     # The mirror image in depth
     probability = settings.mirror_certainty
     if settings.hidden_points and not table.complete and settings.prior is None:
         probability = fitted.mirror_certainty(table.rows, frames)
         if probability < 0.5:
             probability = 1.0 - probability
-            fitted, frames, measures = mirror_image(fitted, frames, measures)
-    attributes["mirror_certainty_"] = probability
+            fitted, frames, attributes = mirror_image(fitted, frames, attributes)
     # 6. Measures of the fit
-    attributes |= measures | _measures(table, factorised, fitted, frames, settings)
+    attributes |= _measures(table, factorised, fitted, frames, settings)
     progress("gauge and coefficients")
     rows = (of_all_rows(part.astype(table.dtype), table.shown) for part in frames)
     sizes = of_all_rows(table.sizes, table.shown)
-    attributes |= {"isa_": isa, "_frame_sizes": sizes}
+    attributes |= {"mirror_certainty_": probability, "isa_": isa, "_frame_sizes": sizes}
     return fitted, Decomposition(*rows), converged, attributes
+
+
+def _joint_fit(
+    factorised: FactorisedTable,
+    shapes: NDArray,
+    given: JointState | None,
+    settings: FitSettings,
+    n_components: int,
+    progress: FitProgress | NoProgress,
+) -> TableFit:
+    """Return the joint fit from shapes, or a given state, or the consensus of groups.
+
+    K coefficients are reported, or the relevant ones if they are free. Frames are those
+    that are shown, some attributes are lacking.
+    """
+    table, settings = factorised.scaled, settings._replace(on_step=progress.step)
+    args = factorised, shapes, given
+    fit, tracks, alpha = settings.remembered("joint", fit_jointly, *args)
+    settings = settings._replace(shape_prior=fit.prior)
+    progress(JOINT_STAGE)
+    (shapes, _, noise), starts, widths = fit.state, spread_starts(alpha, 8), fit.widths
+    kind = settings.loss, FrameMap.identity(len(shapes) - 1), settings.camera
+    model = FrameModel(shapes, noise, starts, *kind)
+    errors, calibrated = settings.errors, settings.camera != "affine"
+    if settings.free and widths is not None:
+        n_components = min(widths.n_relevant, MOST_FIRST)
+    grouped = settings.refinement == "consensus"
+    if grouped:
+        # A residual below the noise of the spectrum leaves nothing for groups.
+        n_numbers, square = tracks.totals
+        noise = factorised.noise_level(len(shapes) - 1) * square / n_numbers
+        if widths is not None:  # whose noise is that of the other coordinates
+            n_unknowns = widths.n_unknowns(len(table.sizes), settings.camera)
+            noise *= n_numbers / (n_numbers - n_unknowns)
+        grouped = fit.misfit > noise
+    if (needed := errors and calibrated) and (
+        not grouped or "certainty" in (settings.known or ())
+    ):
+        of = model, table.rows, table.weights, widths, fit.rivals
+        certainty = settings.remembered("certainty", depth_certainty, *of)
+        model, needed = replace(model, certainty=certainty), False
+    if grouped:
+        model, widths = consensus(model, table, settings, needed, fit), None
+        tracks = JointFrames.from_points(table.rows, table.complete)
+    if settings.refinement == "consensus":
+        progress(CONSENSUS_STAGE)
+    attributes: dict[str, Any] = {
+        "camera_noise_ratio_": fit.camera_noise_ratio,
+        "objective_history_": fit.history,
+        "gradient_norm_": fit.gradient_norm,
+        "n_iter_": len(fit.history) - 1,
+    }
+    if errors and settings.loss == "linear" and table.weights is None:
+        some = spread(np.arange(len(table.sizes)), 100)
+        distance = left_out_distances(model, table.rows.take(some))
+        attributes["_left_out"] = distance, np.flatnonzero(table.shown)[some]
+    if (n_more := n_components + 1 - len(model.shapes)) > 0:
+        # Coefficients beyond the directions that a table supports are zero.
+        shapes = np.pad(model.shapes, ((0, n_more), (0, 0), (0, 0)))
+        starts = np.pad(model.starts, ((0, 0), (0, n_more)))
+        model = replace(model, shapes=shapes, starts=starts)
+        widths = None if widths is None else widths.padded(n_more)
+    fits = fitted_frames(model, tracks, table.rows)
+    del tracks  # as much memory as the table
+    fitted, frames, measures = _joint_frames(
+        table, model, fits, settings, n_components, widths
+    )
+    if fit.prior is not None:
+        attributes["prior_std_"] = np.array([fit.prior.distance, 0.0])
+    if errors and calibrated:
+        attributes["depth_uncertainty_"] = fitted.frames.certainty.total
+    return fitted, frames, fit.converged, attributes | measures
 
 
 @one_blas_thread
@@ -306,29 +311,18 @@ def _factorised(
     return FactorisedTable(table, compressed, outliers, values, rest, W, parts, factors)
 
 
-def _remembered(
-    known: dict[str, Any] | None, name: str, function: Callable[..., Any], *args: Any
-) -> Any:
-    """Return a known result, or that of a function, which is known from now on."""
-    if known is None:
-        return function(*args)
-    if name not in known:
-        known[name] = function(*args)
-    return known[name]
-
-
 def _started(
-    table: ScaledTable, model: TableModel, n_components: int, placed: Any = None
+    table: ScaledTable, settings: FitSettings, n_components: int
 ) -> JointState:
     """Return a start of K basis shapes from a model, in units of a table.
 
     It has the cameras of frames that are placed, otherwise none. Basis shapes that the
     model lacks are directions of the residuals of at most 200 frames.
     """
+    model, placed = settings.start, settings.placed
     frames, (own, other) = model.frames, (model.unit, table.unit)
     # Frames have size one, unless all have one scale.
     unit = own / other if own and other else 1.0
-    assert isinstance(frames, PosteriorFrames)
     n_more = max(n_components + 1 - len(frames.shapes), 0)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance
     if n_more:
@@ -359,7 +353,7 @@ def _paper_frames(
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
 
     def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
-        frames = RigidFrames(mean_shape, basis, s.camera)
+        frames = FrameModel.rigid(mean_shape, basis, s.camera)
         K = len(basis)
         return TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
 
@@ -378,12 +372,11 @@ def _paper_frames(
 
 def _joint_frames(
     table: ScaledTable,
-    model: PosteriorFrames,
+    model: FrameModel,
     fits: FrameFits,
     s: FitSettings,
     n_components: int,
     widths: Widths | None,
-    remove_pose: bool,
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return model, frames and attributes of fits in the independent gauge.
 
@@ -404,7 +397,7 @@ def _joint_frames(
     unit = table.unit if s.camera == "orthographic" else None
     attributes: dict[str, Any] = {}
     if prior is None:
-        kind = s.independence, s.camera, unit, n_components, remove_pose
+        kind = s.independence, s.camera, unit, n_components, s.remove_pose
         mean_shape, basis, gauge = independent_gauge(model.shapes, motion, alpha, *kind)
     else:
         gauge = prior.gauge
@@ -493,9 +486,6 @@ def mirror_image(
     model: TableModel, frames: Decomposition, attributes: dict[str, Any]
 ) -> tuple[TableModel, Decomposition, dict[str, Any]]:
     """Return the mirror image in depth of a fit."""
-    K = model.n_components
-    model, signs = model.mirrored(), np.tile(MIRROR, K)
-    shapes = {"mean_shape_": model.mean_shape, "basis_": model.basis[:K]}
-    covariance = attributes.get("mode_covariance_", 0.0) * np.outer(signs, signs)
-    attributes = attributes | shapes | {"mode_covariance_": covariance}
-    return model, frames._replace(motion=frames.motion * MIRROR), attributes
+    attributes = attributes | model.mirrored_attributes(attributes)
+    frames = frames._replace(motion=frames.motion * MIRROR)
+    return attributes.pop("_model"), frames, attributes

@@ -16,9 +16,8 @@ from isa_nrsfm._frames.camera_models import (
 from isa_nrsfm._frames.models import (
     MIRROR,
     Decomposition,
+    FrameModel,
     LinearisedFrames,
-    PosteriorFrames,
-    RigidFrames,
 )
 from isa_nrsfm._frames.pinhole import Pinhole, turns_to, zoomed
 from isa_nrsfm._frames.search import FramePosterior
@@ -56,7 +55,7 @@ class TableModel(NamedTuple):
     `axes` is a camera of known focal length that has taken weak-perspective images.
     """
 
-    frames: RigidFrames | PosteriorFrames
+    frames: FrameModel
     mean_shape: NDArray
     basis: NDArray
     n_components: int
@@ -131,7 +130,6 @@ class TableModel(NamedTuple):
             return rows
         images = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
-        assert isinstance(self.frames, PosteriorFrames)
         weak = self._replace(frames=self.frames.without_starts, pinhole=None)
         moving = np.arange(len(rows))
         for _ in range(30 if pinhole.near else 0):
@@ -175,7 +173,7 @@ class TableModel(NamedTuple):
             length = np.square(sight).sum(axis=1)[:, None, None]
             across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
             found["rotations_"] = (across @ R * signs).astype(R.dtype)
-        found["mirror_certainty_"] = 1.0 - known["mirror_certainty_"]
+        found["mirror_certainty_"] = 1.0 - known.get("mirror_certainty_", np.nan)
         return found | {"_model": self.mirrored()}
 
     def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
@@ -222,7 +220,6 @@ class TableModel(NamedTuple):
     ) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
         rows = self.straightened(rows, weights)
-        assert isinstance(self.frames, PosteriorFrames)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
         whole = FramePosterior.unknown(len(rows), len(self.basis))
         unit = centred / sizes[:, None, None]
@@ -235,7 +232,6 @@ class TableModel(NamedTuple):
         Noise and errors of the shapes are expected, and distances that are tiny for the
         size of a frame. Few outliers have no effect.
         """
-        assert isinstance(self.frames, PosteriorFrames)
         constant, slope = self.frames.certainty.images
         ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
         expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)
@@ -247,7 +243,6 @@ class TableModel(NamedTuple):
     ) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
         rows = self.straightened(rows, weights)
-        assert isinstance(self.frames, PosteriorFrames)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
         fit = self.frames.linearised(centred, sizes, weights)
         fit = fit._replace(translation=fit.translation + translation)
@@ -305,7 +300,6 @@ class TableModel(NamedTuple):
 
         They are along the axes of the camera.
         """
-        assert isinstance(self.frames, PosteriorFrames)
         straight = self.straightened(rows, weights)
         weak = self._replace(pinhole=None)
         virtual = weak.decompose(straight, weights, False, dtype=np.float64)
@@ -371,12 +365,10 @@ class TableModel(NamedTuple):
         seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
         counts = counts * sizes[:, None] ** -2.0
-        # Complete frames are fitted without these points, others with NaN instead. With
-        # perspective the other points keep their depths.
+        # With perspective the other points keep their depths.
         frames, weak = self.frames, self._replace(pinhole=None)
         straight = self.straightened(rows, weights)
-        linear = self.pinhole is None and frames.loss == "linear"
-        complete = linear and weights is None and bool(seen.all())
+        linear = self.pinhole is None and frames.joint and frames.loss == "linear"
         tracks = np.ascontiguousarray(rows.transpose(0, 2, 1))
         mean_of = np.mean if seen.all() else np.nanmean  # which takes a copy
         signal = np.square(tracks - mean_of(tracks, 1, keepdims=True)).sum(axis=2)
@@ -388,22 +380,16 @@ class TableModel(NamedTuple):
             usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
             if not len(usable):
                 continue
-            mean, others = self.mean_shape[held], self.basis[:, held]
-            if complete and isinstance(frames, PosteriorFrames):
-                kept = frames.of_points(~held)  # their centroid is the origin
-                visible = np.compress(~held, rows[usable], axis=2)
-                fit = kept.fit(visible, sizes[usable], False, None)
-                mean = mean - self.mean_shape[~held].mean(axis=0)
-                others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
+            own = None if weights is None else weights[usable]
+            if linear:
+                unit = rows[usable] / sizes[usable, None, None]
+                posterior = frames.posterior_without(unit, held, own)
+                fit = frames.shown(posterior, sizes[usable])
             else:
-                own = None if weights is None else weights[usable]
-                if linear:
-                    fit = frames.fit(visible[usable], sizes[usable], False, own)
-                else:
-                    fit = weak.decompose(visible[usable], own, False)
-                    fit = self.in_table_cameras(rows[usable], *fit)
+                fit = weak.decompose(visible[usable], own, False)
+                fit = self.in_table_cameras(rows[usable], *fit)
             # Prediction of the held-out points, and its error
-            shapes = compose(mean, others, fit.alpha)
+            shapes = compose(self.mean_shape[held], self.basis[:, held], fit.alpha)
             predicted = self.images(shapes, fit.motion, fit.translation)
             places = np.ix_(usable, np.flatnonzero(held))
             error = np.square(tracks[places] - predicted).sum(axis=2)

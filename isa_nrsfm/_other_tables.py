@@ -12,7 +12,7 @@ from sklearn.base import clone
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import distances, full_rotations
-from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
@@ -76,7 +76,7 @@ def warn_if_foreign(
     The noise of a weighted fit is not comparable to unweighted residuals.
     """
     model, held = estimator._model, estimator._held
-    if not isinstance(model.frames, PosteriorFrames) or (held and held[2][0] is table):
+    if not model.frames.joint or (held and held[2][0] is table):
         return
     certainty, camera = model.frames.certainty, model.frames.camera
     if table.n_frames < FEWEST_COMPARED or (certainty.weighted and not weights):
@@ -160,8 +160,7 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
             f"prior must be a fitted AffineNRSfM; got {prior!r}. A search over several "
             "priors clones them: give sklearn.frozen.FrozenEstimator(prior)"
         )
-    calibrated = isinstance(model.frames, PosteriorFrames) and prior.camera_ != "affine"
-    if not calibrated:
+    if not model.frames.joint or prior.camera_ == "affine":
         raise ValueError(
             "prior must be fitted with calibrated cameras and the joint refinement; "
             f"got {named('camera', prior.camera_)}, "

@@ -24,13 +24,14 @@ from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fit import (
     PERSPECTIVE_STAGE,
+    TableFit,
     fit_table,
     mean_camera,
     mirror_image,
     supported_components,
 )
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.pinhole import Pinhole, common, pinhole_of
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
@@ -163,35 +164,40 @@ class PerspectiveTable(NamedTuple):
         pinhole: Pinhole | None,
         n_components: int | None,
         before: PerspectiveFit | None = None,
+        *,
         last: bool = False,
-        **options: Any,
+        progress: FitProgress | NoProgress | None = None,
+        **changes: Any,
     ) -> PerspectiveFit:
         """Return the fit of images that are corrected for the depths of another fit.
 
         It has the mirror image with those depths. None stands for as many basis shapes
         as are relevant. Fits before the last one are joint fits with principal axes and
-        a larger tolerance, from the other fit and its cameras. Options are those of
-        `fit_table`.
+        a larger tolerance, from the other fit and its cameras. `changes` are those of
+        the settings.
         """
-        isa, settings = self.isa, self.settings
+        isa, quiet = self.isa, NoProgress()
+        settings = self.settings._replace(start=None, known=None)
         if not last:
             settings = settings._replace(
                 independence=None,
                 tol=ROUGH * settings.tol,
                 whole=False,  # all directions of a shape would explain the perspective
                 refinement="joint",
+                remove_pose=False,
+                errors=False,
             )
             if before is not None:
-                options |= {"start": before.model, "placed": before.frames}
-        options.setdefault("free", n_components is None)
-        options.setdefault("progress", NoProgress())
+                settings = settings._replace(start=before.model, placed=before.frames)
+        settings = settings._replace(**{"free": n_components is None} | changes)
         if n_components is None:
             table = self.straight(pinhole, 1, before)
-            n_components = supported_components(table, isa, settings, NoProgress())
+            n_components = supported_components(table, isa, settings, quiet)
             if before is not None and n_components == before.n_components:
                 return before
         table = self.straight(pinhole, n_components, before)
-        fit = PerspectiveFit(*fit_table(table, n_components, isa, settings, **options))
+        args = table, n_components, isa, settings, progress or quiet
+        fit = PerspectiveFit(*fit_table(*args))
         fit = fit._replace(model=fit.model._replace(pinhole=pinhole))
         if before is not None:
             change = fit.change(before, self.source.slices)
@@ -319,26 +325,23 @@ def fit_perspective(
     table: PerspectiveTable,
     n_components: int | None,
     given: Any,
-    start: TableModel | None = None,
-    errors: bool = False,
-    remove_pose: bool = False,
-    weak: TableModel | None = None,
-) -> tuple[TableModel, Decomposition, bool, dict[str, Any]]:
+) -> TableFit:
     """Fit perspective images as `fit_table` fits weak-perspective ones.
 
     `n_components` and the given focal length are estimated if they are None; the table
     has the mean of several. A fit from the model of a similar table has that of it.
     If perspective is not found, its fit does not settle, or held-out points do not
-    prefer it, the fit is that of weak-perspective cameras, with a warning. `weak`: the
-    model of that fit, if it is known.
+    prefer it, the fit is that of weak-perspective cameras, with a warning. The model of
+    that fit may be known, as "weak".
     """
+    settings, errors = table.settings, table.settings.errors
     fits: dict[float, PerspectiveFit] = {}
-    deviation, why, prior = 0.0, "", table.settings.prior
+    deviation, why, prior = 0.0, "", settings.prior
     # Like all fits with calibrated cameras, it does not depend on the number reported.
-    number = None if table.settings.whole and prior is None else n_components
+    number = None if settings.all_directions else n_components
     with warnings.catch_warnings(action="ignore"):  # the last fit warns
-        if start is not None:
-            best = table.started(start, n_components)
+        if settings.start is not None:
+            best = table.started(settings.start, n_components)
         elif given is not None:
             f = common(given)
             virtual = table.pinhole(f, near=False)
@@ -362,29 +365,24 @@ def fit_perspective(
             best = table.fit(best.pinhole, None, best)
             best = table.settled(best.pinhole, best.n_components, best)[0]
     # The last fits, with warnings and errors of depths
-    options: dict[str, Any] = {
-        "last": True,
-        "errors": errors,
-        "remove_pose": remove_pose,
-    }
+    last = partial(table.fit, last=True)
     if not why:
         n_last = n_components or best.n_components
-        fit = table.fit(best.pinhole, n_last, best, **options)
+        fit = last(best.pinhole, n_last, best)
         if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
-            fit = table.fit(best.pinhole, n_last, fit, **options)
-    options["free"] = n_components is None
-    if not why and start is None:
+            fit = last(best.pinhole, n_last, fit)
+    plain = partial(last, None, n_components or 1, free=n_components is None)
+    if not why and settings.start is None:
         with warnings.catch_warnings(action="ignore"):
-            plain = options | {"errors": False}
-            weak = weak or table.fit(None, n_components or 1, **plain).model
+            weak = (settings.known or {}).get("weak") or plain(errors=False).model
         why = "" if table.preferred(fit.model, weak) else NOT_BETTER
     table.progress(PERSPECTIVE_STAGE)
     if why:
         warn_caller(f"{why}. {WEAK}")
-        return table.fit(None, n_components or 1, **options)[:4]
+        return plain()[:4]
     model, _, converged, attributes, *_ = fit
     f = best.pinhole.focal_length
-    if errors and isinstance(model.frames, PosteriorFrames):
+    if errors and model.frames.joint:
         certainty = model.frames.certainty
         error = focal_error(fits, 1.0 / f, deviation, table.source.slices)
         total = float(np.hypot(certainty.total, error))
@@ -444,6 +442,6 @@ def _straight(
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
     square = model.distances(rows, *model.in_table_cameras(rows, *fit)[:3]) ** 2
-    if isinstance(model.frames, PosteriorFrames) and model.frames.loss != "linear":
+    if model.frames.loss != "linear":
         square = robust_square(square, model.frames.noise_variance)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

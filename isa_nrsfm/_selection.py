@@ -53,8 +53,6 @@ NO_SHAPE = (
 class StartedNRSfM(AffineNRSfM):
     """A fit that starts from another one, without warnings and errors of depths."""
 
-    _whole = _errors = False  # held-out points compare numbers of basis shapes
-
     def __sklearn_clone__(self) -> Self:
         """Return a copy with the same start."""
         return copy.copy(self)
@@ -63,6 +61,8 @@ class StartedNRSfM(AffineNRSfM):
         self, X: Any, y: Any = None, *, point_weight: Any = None, groups: Any = None
     ) -> Self:
         """Fit a table, and remember whether the fit has not converged."""
+        # Held-out points compare numbers of basis shapes.
+        self._continued = {"whole": False, "errors": False} | (self._continued or {})
         with warnings.catch_warnings(record=True, action="always") as caught:
             self._fit(X, point_weight, NoProgress())
         self.unconverged = ConvergenceWarning in [each.category for each in caught]
@@ -310,7 +310,7 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
             since = time.perf_counter()
             if joint:
                 whole.set_params(n_components=k).fit(X)
-                whole._start = trial._start = whole._model
+                whole._continued = trial._continued = {"start": whole._model}
             seconds = joint * (time.perf_counter() - since)
             trial.set_params(n_components=k)
             part = cross_validate(trial, X, y, n_jobs=self.n_jobs, **validation)

@@ -1,13 +1,59 @@
-"""The parts of fits of frames, by their names."""
+"""The parts of fits of frames, by their names, and frames as dense algebra."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.testing import assert_allclose
+from numpy.typing import NDArray
 
-from isa_nrsfm._frames.models import frame_search
+from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.search import FrameSearch
 
 # What a fitted model has of its shapes, and of each frame.
 OF_SHAPES = ("mean_shape_", "basis_", "singular_values_", "mode_covariance_")
 OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
+
+
+class Regression(NamedTuple):
+    """A frame in a known camera, ``y ~ x_0 + X a``, as dense linear algebra.
+
+    Points and shapes (n, 3, n_seen) are centred, times the roots of their weights.
+    """
+
+    y: NDArray
+    first: NDArray
+    X: NDArray
+    shapes: NDArray
+
+    @classmethod
+    def of(cls, scene, i, M=None, shapes=None):
+        M, points = scene.motion[i] if M is None else M, scene.tracks[i]
+        w = np.isfinite(points[:, 0]) * 1.0
+        w *= 1.0 if scene.weights is None else scene.weights[i]
+        seen = w > 0
+        w, points = w[seen], points[seen] - np.average(points[seen], 0, w[seen])
+        shapes = (scene.shapes if shapes is None else shapes)[..., seen]
+        shapes = np.sqrt(w) * (shapes - np.average(shapes, 2, w)[..., None])
+        columns = (M @ shapes).reshape(len(shapes), -1)
+        y = (np.sqrt(w) * points.T).ravel()
+        return cls(y, columns[0], columns[1:].T, shapes)
+
+    def precision(self, noise):
+        return self.X.T @ self.X + noise * np.eye(self.X.shape[1])
+
+    def mean(self, noise):
+        """Return the posterior mean of the coefficients."""
+        right = self.X.T @ (self.y - self.first)
+        return np.linalg.solve(self.precision(noise), right)
+
+    def square(self, alpha, noise):
+        rest = self.y - self.first - self.X @ alpha
+        return rest @ rest + noise * alpha @ alpha
+
+    def value(self, noise):
+        """Return F: minus two log marginal likelihoods, up to a constant."""
+        _, determinant = np.linalg.slogdet(self.precision(noise) / noise)
+        return self.square(self.mean(noise), noise) / noise + determinant
 
 
 def camera_and_alpha(fits):
@@ -22,7 +68,7 @@ def numbers_of(fits):
 
 def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     """Return the fit of frames by a new search."""
-    return frame_search(camera, shapes).fit_rows(
+    return FrameSearch(shapes, CAMERAS[camera]).fit_rows(
         tracks.transpose(0, 2, 1), noise, **given
     )
 

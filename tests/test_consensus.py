@@ -12,17 +12,15 @@ from scipy.stats import spearmanr
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._joint.common_depths import (
-    _principal,
-    _turns,
-    aligning_rotations,
-    common_coordinates,
-)
 from isa_nrsfm._joint.consensus import (
     COVER,
     Group,
     Scene,
+    _principal,
+    _turns,
+    aligning_rotations,
     centred,
+    common_coordinates,
     group_fit,
     hidden_residuals,
     interpolation,

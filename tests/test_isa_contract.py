@@ -26,7 +26,7 @@ from sklearn.utils.estimator_checks import (
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, isa as strategies
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
-from isa_nrsfm.isa._base import derivatives, log_density
+from isa_nrsfm.isa._strategies import derivatives, log_density
 from isa_nrsfm.metrics import subspace_distance
 
 KINDS = [getattr(strategies, name) for name in strategies.__all__]

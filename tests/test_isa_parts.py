@@ -11,18 +11,18 @@ from scipy.optimize import linear_sum_assignment
 
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.isa import _shared_mixing
-from isa_nrsfm.isa._base import (
-    fixed_point_step,
-    iterate,
-    orthogonalise,
-    subspace_change,
-    whiten,
-)
 from isa_nrsfm.isa._shared_mixing import (
     LIGHT,
     TAILS,
     independent_coefficients,
     shared_mixing,
+)
+from isa_nrsfm.isa._strategies import (
+    fixed_point_step,
+    iterate,
+    orthogonalise,
+    subspace_change,
+    whiten,
 )
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scenes
+from frame_parts import Regression
 from numpy.testing import assert_allclose
 from scenes import likelihood_of
 
@@ -26,39 +27,18 @@ def random_scene(kind, n_components=3):
     return Scene(*scenes.random_scene(0, 11, 9, n_components, noise=0.2, kind=kind))
 
 
-def frame_by_frame(scene):
-    """
-    Yield for each frame its points and shapes, centred, missing points left out.
-
-    That is: the points (n, 2), the shapes (n_shapes, 3, n), the roots of the weights
-    (n,), the camera (2, 3), and which points are seen.
-    """
-    for i, frame in enumerate(scene.tracks):
-        w = np.ones(len(frame)) if scene.weights is None else scene.weights[i]
-        seen = w > 0
-        w = w[seen]
-        points = frame[seen] - np.average(frame[seen], axis=0, weights=w)
-        shapes = scene.shapes[:, :, seen]
-        middle = np.average(shapes, axis=2, weights=w)
-        yield points, shapes - middle[..., None], np.sqrt(w), scene.motion[i], seen
+def frames_of(scene):
+    """Return the frames by dense linear algebra."""
+    return [Regression.of(scene, i) for i in range(len(scene.tracks))]
 
 
-def coefficients(points, shapes, root, M, noise):
-    """Return mean and covariance of alpha, given a frame, by dense linear algebra."""
-    images = [(root * (M @ B)).ravel() for B in shapes]
-    y, X = (root * points.T).ravel() - images[0], np.array(images[1:]).T
-    precision = X.T @ X / noise + np.eye(X.shape[1])
-    return np.linalg.solve(precision, X.T @ y / noise), np.linalg.inv(precision)
-
-
-def second_moments(scene, noise, penalty):
-    """Yield E of each frame with what the penalty adds to it, and the mean of c."""
-    for points, shapes, root, M, _ in frame_by_frame(scene):
-        alpha, covariance = coefficients(points, shapes, root, M, noise)
-        c = np.concatenate([[1.0], alpha])
-        E = np.outer(c, c)
-        E[1:, 1:] += covariance + noise * np.diag(np.broadcast_to(penalty, len(alpha)))
-        yield E, c
+def second_moments(frame, noise, penalty):
+    """Return E of a frame with what the penalty adds to it."""
+    c = np.concatenate([[1.0], frame.mean(noise)])
+    E = np.outer(c, c)
+    E[1:, 1:] += noise * np.linalg.inv(frame.precision(noise))
+    E[1:, 1:] += noise * np.diag(np.broadcast_to(penalty, len(c) - 1))
+    return E
 
 
 @pytest.fixture(params=["complete", "weighted", "missing"])
@@ -75,30 +55,25 @@ class TestValue:
     def test_is_minus_two_log_of_the_normal_density_of_the_frames(self, scene):
         # All coordinates of a frame at once: N(M B_0, s2 + sum_k M B_k (M B_k)^T).
         expected = 0.0
-        for points, shapes, root, M, _ in frame_by_frame(scene):
-            images = np.array([(root * (M @ B)).ravel() for B in shapes])
-            y = (root * points.T).ravel() - images[0]
-            covariance = NOISE * np.eye(len(y)) + images[1:].T @ images[1:]
+        for frame in frames_of(scene):
+            y = frame.y - frame.first
+            covariance = NOISE * np.eye(len(y)) + frame.X @ frame.X.T
             expected += np.linalg.slogdet(covariance)[1]
             expected += y @ np.linalg.solve(covariance, y)
         assert scene.at().value == pytest.approx(expected, rel=1e-12)
 
     @PENALTIES
     def test_penalty_adds_the_energies_of_the_basis_shapes(self, scene, penalty):
-        frames = frame_by_frame(scene)
-        images = (root * (M @ shapes[1:]) for _, shapes, root, M, _ in frames)
-        energies = sum(np.sum(image**2, axis=(1, 2)) for image in images)
+        energies = sum(np.sum(frame.X**2, axis=0) for frame in frames_of(scene))
         added = scene.at(penalty).value - scene.at().value
         assert added == pytest.approx(np.sum(penalty * energies), rel=1e-12)
 
     def test_coefficients_and_residual(self, scene):
         passed = scene.at(PENALTY)
         residual = 0.0
-        for i, (points, shapes, root, M, _) in enumerate(frame_by_frame(scene)):
-            alpha, _ = coefficients(points, shapes, root, M, NOISE)
-            assert_allclose(passed.alpha[i], alpha, rtol=1e-10, atol=1e-12)
-            model = M @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
-            residual += np.sum((root * (points.T - model)) ** 2)
+        for frame, alpha in zip(frames_of(scene), passed.alpha, strict=True):
+            assert_allclose(alpha, frame.mean(NOISE), rtol=1e-10, atol=1e-12)
+            residual += frame.square(frame.mean(NOISE), 0.0)
         assert passed.residual == pytest.approx(residual, rel=1e-11)
 
     def test_is_precise_where_the_noise_is_tiny(self):
@@ -110,10 +85,9 @@ class TestValue:
         scene = scene._replace(tracks=tracks)
         noise = 1e-11
         expected = 0.0
-        for points, shapes, _, M, _ in frame_by_frame(scene):
-            images = np.array([(M @ B).ravel() for B in shapes])
-            y = points.T.ravel() - images[0]
-            stacked = np.vstack([images[1:].T, np.sqrt(noise) * np.eye(2)])
+        for frame in frames_of(scene):
+            y = frame.y - frame.first
+            stacked = np.vstack([frame.X, np.sqrt(noise) * np.eye(2)])
             Q, R = np.linalg.qr(stacked)
             z = np.concatenate([y, [0.0, 0.0]])
             expected += np.sum((z - Q @ (Q.T @ z)) ** 2) / noise
@@ -126,11 +100,10 @@ class TestValue:
         scene.shapes[2] = scene.shapes[1] + 1e-4 * scene.shapes[2]
         tracks = scenes.images(*scene[1:5])
         scene, left = scene._replace(tracks=tracks), 0.0
-        pairs = zip(frame_by_frame(scene), scene.at(noise=1e-14).alpha, strict=True)
-        for (points, shapes, root, M, _), alpha in pairs:
-            images = np.array([(root * (M @ B)).ravel() for B in shapes])
-            rest = (root * points.T).ravel() - images[0] - alpha @ images[1:]
-            left += np.sum((images[1:] @ rest - 1e-14 * alpha) ** 2)
+        alphas = scene.at(noise=1e-14).alpha
+        for frame, alpha in zip(frames_of(scene), alphas, strict=True):
+            rest = frame.y - frame.first - frame.X @ alpha
+            left += np.sum((frame.X.T @ rest - 1e-14 * alpha) ** 2)
         assert np.sqrt(left) < 2e-13
 
     def test_counts_of_the_table(self):
@@ -139,16 +112,13 @@ class TestValue:
         assert frames.n_frames == len(scene.tracks)
         n_seen, square = frames.totals
         assert n_seen == np.isfinite(scene.tracks).sum()
-        parts = ((root * points.T) for points, _, root, _, _ in frame_by_frame(scene))
-        energy = sum(np.sum(part**2) for part in parts)
+        energy = sum(frame.y @ frame.y for frame in frames_of(scene))
         assert square == pytest.approx(energy, rel=1e-13)
 
     def test_without_basis_shapes_it_is_the_likelihood_of_rigid_frames(self):
         scene = random_scene("complete")
         rigid = scene._replace(shapes=scene.shapes[:1])
-        frames = frame_by_frame(scene)
-        rest = (points.T - M @ shapes[0] for points, shapes, _, M, _ in frames)
-        energy = sum(np.sum(each**2) for each in rest)
+        energy = sum(np.sum((each.y - each.first) ** 2) for each in frames_of(scene))
         expected = scene.tracks.size * np.log(NOISE) + energy / NOISE
         assert rigid.at(PENALTY).value == pytest.approx(expected, rel=1e-12)
 
@@ -190,20 +160,19 @@ class TestCurvature:
         expected = np.zeros((n_points, 3 * n_shapes, 3 * n_shapes))
         weights = 1.0 if scene.weights is None else scene.weights
         weights = np.broadcast_to(weights, scene.tracks.shape[:2])
-        moments = second_moments(scene, NOISE, penalty)
-        for i, (E, _) in enumerate(moments):
-            M = scene.motion[i]
+        for i, (frame, M) in enumerate(
+            zip(frames_of(scene), scene.motion, strict=True)
+        ):
+            E = second_moments(frame, NOISE, penalty)
             expected += weights[i][:, None, None] * np.kron(E, M.T @ M)
         assert got.shape[0] == (1 if scene.weights is None else n_points)
         assert_allclose(np.broadcast_to(got, expected.shape), expected, rtol=1e-10)
 
     def test_of_the_cameras(self, scene, penalty):
         got = scene.at(penalty).motion_curvature
-        moments = second_moments(scene, NOISE, penalty)
-        pairs = zip(moments, frame_by_frame(scene), strict=True)
-        for i, ((E, _), (_, shapes, root, _, _)) in enumerate(pairs):
-            weighted = root * shapes
-            A = np.einsum("kl,kaj,lbj->ab", E, weighted, weighted)
+        for i, frame in enumerate(frames_of(scene)):
+            E = second_moments(frame, NOISE, penalty)
+            A = np.einsum("kl,kaj,lbj->ab", E, frame.shapes, frame.shapes)
             packed = A[np.triu_indices(3)]
             assert_allclose(got[:, i], packed, rtol=1e-10, atol=1e-12)
 

@@ -29,6 +29,7 @@ from isa_nrsfm._linalg.small_matrices import (
     inverse3,
     lengths,
     packed_products,
+    pair_indices,
     polar,
     unpack3,
     unpacked,
@@ -38,6 +39,8 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 # Largest rotation of a camera in one step, in radians, and largest change of the
 # logarithm of its scale.
 LARGEST_TURN = 1.0
+# Places of the entries of a packed symmetric 6x6 matrix
+_PLACES = unpacked(np.arange(21))
 
 
 class AffineCameras:
@@ -70,8 +73,19 @@ class AffineCameras:
         return np.broadcast_to(entries, (len(entries), *M.shape))
 
     def gradient(self, M: NDArray, G: NDArray) -> NDArray:
-        """Return dF/dparameters (p, n) from G = dF/dM (2, 3, n)."""
-        return G.reshape(6, -1)[: self.n_parameters]
+        """Return dF/dparameters (..., p, n) from G = dF/dM (..., 2, 3, n)."""
+        return G.reshape(*G.shape[:-3], 6, G.shape[-1])[..., : self.n_parameters, :]
+
+    def curvature(self, M: NDArray, A: NDArray) -> NDArray:
+        """Return ``tr(D_c A D_d^T)`` along the tangents, packed, as A (6, n) is."""
+        packed = np.zeros((21, A.shape[-1]))
+        for row in slice(3), slice(3, 6):
+            packed[_PLACES[row, row][ROWS, COLUMNS]] = A
+        return packed
+
+    def second(self, M: NDArray, G: NDArray, gradient: NDArray) -> NDArray:
+        """Return ``<G, D_cd>`` with the second derivatives D_cd: zero."""
+        return np.zeros(1)
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return inverse curvatures, for `product`, of curvatures (6, n) per row."""
@@ -123,8 +137,8 @@ class CalibratedCameras:
         return np.concatenate([turned, M[None]]) if self.scaled else turned
 
     def gradient(self, M: NDArray, G: NDArray) -> NDArray:
-        """Return the derivative by the tangents (p, n)."""
-        return np.einsum("crai,rai->ci", self.tangents(M), G)
+        """Return the derivative by the tangents (..., p, n)."""
+        return np.einsum("crai,...rai->...ci", self.tangents(M), G)
 
     def curvature(self, M: NDArray, A: NDArray) -> NDArray:
         """Return ``tr(D_c A D_d^T)``, along the tangents, packed, as A (6, n) is."""
@@ -132,6 +146,19 @@ class CalibratedCameras:
         DA = np.einsum("crai,abi->crbi", D, unpack3(A))
         shape = self.n_parameters, 6, M.shape[-1]
         return packed_products(DA.reshape(shape), D.reshape(shape))
+
+    def second(self, M: NDArray, G: NDArray, gradient: NDArray) -> NDArray:
+        """Return ``<G, D_cd>`` with the second derivatives D_cd, packed.
+
+        Of two rotations, row by row, ``D_cd = (e_c m_d + e_d m_c) / 2 - m d_cd``. With
+        the scale ``D_c4 = D_c``, ``D_44 = M``.
+        """
+        mixed = np.einsum("rai,rbi->abi", G, M)
+        second = np.empty((len(gradient), *gradient.shape))
+        second[:3, :3] = 0.5 * (mixed + mixed.swapaxes(0, 1))
+        second[:3, :3] -= np.einsum("aai->i", mixed) * np.eye(3)[:, :, None]
+        second[3:], second[:, 3:] = gradient, gradient[:, None]
+        return np.asarray(second[pair_indices(len(gradient))])
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return inverses (p, p, n); a scale without curvature does not move."""

@@ -1,15 +1,14 @@
 """Camera, position and coefficients of single frames for given shapes.
 
-The result of a frame does not depend on the others. `RigidFrames`, the paper's model,
-fits the camera to the mean shape alone, then the coefficients by least squares.
-`PosteriorFrames`, the joint refinement's model, finds the most probable camera and
-coefficients together.
+The result of a frame does not depend on the others. The joint refinement's model of a
+frame finds the most probable camera and coefficients together. The paper's model fits
+the camera to the mean shape alone, then the coefficients by least squares.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,13 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
+    compose,
     distances,
     full_rotations,
     rigid_cameras,
 )
-from isa_nrsfm._frames.newton import AffineSearch, CalibratedSearch
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
@@ -223,96 +223,56 @@ class LinearisedFrames(NamedTuple):
     slope: NDArray
 
 
-@dataclass(frozen=True, eq=False)
-class RigidFrames:
-    """The paper's model of a frame: rigid camera, coefficients by least squares.
+def rigid_fit(
+    rows: NDArray, shapes: NDArray, camera: str
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return motion, translation and alpha of rows (n, 2, J) that show the same points.
 
-    Shapes are centred, ``B_k B_l^T = 0`` (3x3) for different k and l, with the mean
-    shape as B_0. If no point is missing, each coefficient is then fitted by itself.
-    Calibrated cameras are the nearest to the cameras of the rigid fit.
+    The paper's fit: the camera of the mean shape alone, calibrated ones the nearest to
+    it. Then the coefficients by least squares, the solution of least norm.
     """
-
-    mean_shape: NDArray
-    basis: NDArray
-    camera: str = "affine"
-
-    loss: ClassVar[str] = "linear"
-    certainty: ClassVar[DepthCertainty] = NOT_ESTIMATED  # there is no noise variance
-
-    def mirrored(self) -> "RigidFrames":
-        """Return the model with shapes mirrored in depth."""
-        return RigidFrames(self.mean_shape * MIRROR, self.basis * MIRROR, self.camera)
-
-    def fit(
-        self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
-    ) -> Decomposition:
-        """Return the camera of the rigid fit and the coefficients of least squares.
-
-        If no point is missing, ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2``, or zero
-        if the camera does not show B_k. Otherwise the solution of least norm. Ignores
-        the other parameters.
-        """
-        shapes = (2, 3), (2,), (len(self.basis),), (len(self.basis),)
-        fit = Decomposition(*(np.full((len(rows), *size), np.nan) for size in shapes))
-        complete = np.asarray(seen_points(rows).all(axis=1))
-        parts = [(np.array([i]), self._together) for i in np.flatnonzero(~complete)]
-        for frames, fitted in [(complete, self._separately), *parts]:
-            part = fitted(rows[frames])
-            fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
-        return fit
-
-    def _separately(self, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return motion, translation and alpha of complete frames (n, 2, n_points)."""
-        translation = rows.mean(axis=2)
-        W = (rows - translation[..., None]).reshape(-1, rows.shape[2])
-        motion = CAMERAS[self.camera].nearest(rigid_cameras(W, self.mean_shape))
-        n_components, n_points, _ = self.basis.shape
-        stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
-        P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
-        along = np.einsum("irkc,irc->ik", P, motion)
-        # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q_k R_k. The Gram matrix of B_k would
-        # give only half the digits.
-        R = np.linalg.qr(self.basis, mode="r")
-        images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
-        energy = np.einsum("ikrd,ikrd->ik", images, images)
-        largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
-        visible = energy > 1e-28 * largest  # less is rounding errors
-        alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
-        return motion, translation, alpha
-
-    def _together(self, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the fit of one frame (1, 2, n_points), all coefficients at once."""
-        (seen,) = seen_points(rows)
-        points, mean_shape = rows[0][:, seen].T, self.mean_shape[seen]
-        centre, centroid = points.mean(axis=0), mean_shape.mean(axis=0)
-        motion = rigid_cameras((points - centre).T, mean_shape - centroid)
-        motion = CAMERAS[self.camera].nearest(motion)
-        # Least squares for the residuals of the mean shape
-        basis = self.basis[:, seen]
-        middles = basis.mean(axis=1)
-        images = (basis - middles[:, None]) @ motion[0].T
-        rest = points - centre - (mean_shape - centroid) @ motion[0].T
-        alpha = np.linalg.lstsq(images.reshape(len(basis), -1).T, rest.ravel())[0]
-        translation = centre - motion[0] @ (centroid + alpha @ middles)
-        return motion, translation, alpha
+    seen = seen_points(rows)[0]
+    shapes = shapes[:, :, seen]
+    middles, centre = shapes.mean(axis=2), rows[:, :, seen].mean(axis=2)
+    W, shapes = rows[:, :, seen] - centre[..., None], centred(shapes)
+    # Directions of all shapes in the place of points, as these may be many
+    axes = np.linalg.qr(shapes.reshape(-1, shapes.shape[2]).T)[0]
+    W, shapes = W @ axes, shapes @ axes
+    motion = rigid_cameras(W.reshape(-1, W.shape[2]), shapes[0].T)
+    motion = CAMERAS[camera].nearest(motion)
+    images = (motion[:, None] @ shapes[1:]).reshape(len(rows), len(shapes) - 1, -1)
+    rest = (W - motion @ shapes[0]).reshape(len(rows), -1, 1)
+    # Smaller images are rounding errors.
+    alpha = (np.linalg.pinv(images.mT, rcond=OF_PRODUCTS) @ rest)[..., 0]
+    middle = middles[0] + alpha @ middles[1:]
+    return motion, centre - (motion @ middle[..., None])[..., 0], alpha
 
 
-def frame_search(camera: str, shapes: NDArray) -> FrameSearch:
-    """Return the search of a camera model for centred shapes with alpha ~ N(0, I)."""
-    if camera == "affine":
-        return AffineSearch(shapes)
-    return CalibratedSearch(shapes, camera == "weak_perspective")
+def derivatives(
+    shapes: NDArray, motion: NDArray, alpha: NDArray, camera: str
+) -> NDArray:
+    """Return derivatives (n, K + p, r, J) of points by coefficients and cameras.
+
+    Shapes are (K + 1, 3, J). Cameras (n, r, 3) have two rows, for images, or three.
+    """
+    tangents = CAMERAS[camera].tangents(frames_last(motion))
+    shaped = compose(shapes[0], shapes[1:], alpha)
+    turned = np.moveaxis(tangents, 3, 0) @ shaped[:, None]
+    return np.concatenate([motion[:, None] @ shapes[1:], turned], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
-class PosteriorFrames:
-    """The joint refinement's model of a frame: its posterior, camera and coefficients.
+class FrameModel:
+    """The model of a frame: its posterior, camera and coefficients.
 
     shapes (K + 1, 3, J): centred, with coefficients that are drawn from N(0, I).
     noise_variance: that of a coordinate, for frames of size one. starts (n_starts, K):
     further coefficients to start from if the fit from zero is bad. gauge: maps cameras
     and coefficients to those of the public shapes. certainty: uncertainty of the fit of
     the shapes, with calibrated cameras.
+
+    Models of the paper's refinement have no noise variance, NaN: frames are fitted by
+    `rigid_fit`, in units of the table.
     """
 
     shapes: NDArray
@@ -323,13 +283,25 @@ class PosteriorFrames:
     camera: str = "affine"
     certainty: DepthCertainty = NOT_ESTIMATED
 
+    @classmethod
+    def rigid(cls, mean_shape: NDArray, basis: NDArray, camera: str) -> Self:
+        """Return the paper's model of a mean shape (J, 3) and a basis (K, J, 3)."""
+        shapes, K = np.concatenate([mean_shape[None], basis]).mT, len(basis)
+        gauge = FrameMap.identity(K)
+        return cls(shapes, np.nan, np.empty((0, K)), "linear", gauge, camera)
+
+    @property
+    def joint(self) -> bool:
+        """Whether it is the joint refinement's model, with a noise variance."""
+        return not np.isnan(self.noise_variance)
+
     @cached_property
     def _search(self) -> FrameSearch:
         """The search for frames, shared by all tables."""
-        return frame_search(self.camera, self.shapes)
+        return FrameSearch(self.shapes, CAMERAS[self.camera])
 
     @cached_property
-    def without_starts(self) -> "PosteriorFrames":
+    def without_starts(self) -> "FrameModel":
         """The model that fits each frame from zero only."""
         return replace(self, starts=self.starts[:0])
 
@@ -337,14 +309,10 @@ class PosteriorFrames:
         """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def mirrored(self) -> "PosteriorFrames":
+    def mirrored(self) -> "FrameModel":
         """Return the model whose public shapes are mirrored in depth."""
         space = MIRROR[:, None] * self.gauge.space
         return replace(self, gauge=self.gauge._replace(space=space))
-
-    def of_points(self, kept: NDArray) -> "PosteriorFrames":
-        """Return the model of frames that have only some of the points (n_points,)."""
-        return replace(self, shapes=centred(self.shapes[:, :, kept]))
 
     def fit(
         self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
@@ -353,8 +321,19 @@ class PosteriorFrames:
 
         With a robust loss the weights follow from the residuals of the fit.
         """
-        unit = rows / sizes[:, None, None]
-        return self.shown(self.posterior(unit, deviations, weights), sizes)
+        if self.joint:
+            unit = rows / sizes[:, None, None]
+            return self.shown(self.posterior(unit, deviations, weights), sizes)
+        K, complete = len(self.shapes) - 1, seen_points(rows).all(axis=1)
+        empty = (np.full((len(rows), *n), np.nan) for n in ((2, 3), (2,), (K,), (K,)))
+        fit = Decomposition(*empty)
+        # Complete frames together, others one by one
+        single = np.flatnonzero(~complete)[:, None]
+        for frames in (np.flatnonzero(complete), *single):
+            if len(frames):
+                part = rigid_fit(rows[frames], self.shapes, self.camera)
+                fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
+        return fit._replace(motion=fit.motion @ np.linalg.inv(self.gauge.space))
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""
@@ -390,11 +369,7 @@ class PosteriorFrames:
             deviation = np.sqrt(self.noise_variance)
             weights = frame_weights(self.loss, distance, deviation, robust_sizes(unit))
         motion = fit.motion * sizes[:, None, None]
-        shapes = self.shapes[0] + np.tensordot(fit.alpha, self.shapes[1:], 1)
-        tangents = CAMERAS[self.camera].tangents(frames_last(motion))
-        bent = np.einsum("ira,kaj->ikrj", motion, self.shapes[1:])
-        turned = np.einsum("prai,iaj->iprj", tangents, shapes)
-        T = np.concatenate([bent, turned], axis=1)
+        T = derivatives(self.shapes, motion, fit.alpha, self.camera)
         share = weights / np.maximum(weights.sum(axis=1), 1e-300)[:, None]
         slope = np.einsum("iprj,ij->ipr", T, share)
         T -= slope[..., None]
@@ -421,24 +396,24 @@ class PosteriorFrames:
         """
         unit = rows / sizes[:, None, None]
         fit = self.posterior(unit, covariances=False, weights=weights)
-        seen, free = seen_points(rows), CAMERAS[self.camera].scaled
-        weights = seen.astype(float) if weights is None else weights
-        covariances = np.full((*seen.shape, 3, 3), np.nan)
+        weights = 1.0 * seen_points(rows) if weights is None else weights
+        covariances = np.full((*weights.shape, 3, 3), np.nan)
         rotations, scales = full_rotations(fit.motion)
-        prior = np.diag([0.0] * (3 + free) + [1.0] * fit.alpha.shape[1])
-        for i in np.flatnonzero(np.isfinite(scales)):
-            w = weights[i, seen[i]]
-            middle = (self.shapes[:, :, seen[i]] @ w / w.sum())[..., None]
-            mean_shape, basis = np.split(self.shapes - middle, [1])
-            shape = mean_shape[0] + np.tensordot(fit.alpha[i], basis, 1)
-            turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
-            changes = np.stack([*turned, *([shape] if free else []), *basis])
-            changes = scales[i] * rotations[i] @ changes
-            T = (changes[:, :2, seen[i]] * np.sqrt(w)).reshape(len(changes), -1)
-            information = T @ T.T / self.noise_variance + prior
-            covariance = np.linalg.pinv(information, hermitian=True)
-            Z = changes.transpose(2, 1, 0)
-            covariances[i] = Z @ covariance @ Z.mT
+        motion = scales[:, None, None] * rotations
+        known = np.flatnonzero(np.isfinite(scales))
+        # Few frames at a time: their derivatives take much memory.
+        length = max(2**17 // self.shapes.size, 1)
+        for first in range(0, len(known), length):
+            frames = known[first : first + length]
+            w = weights[frames, None, None]
+            Z = derivatives(self.shapes, motion[frames], fit.alpha[frames], self.camera)
+            Z -= (Z * w).sum(axis=3, keepdims=True) / w.sum(axis=3, keepdims=True)
+            T = (Z[:, :, :2] * np.sqrt(w)).reshape(*Z.shape[:2], -1)
+            prior = np.arange(Z.shape[1]) < fit.alpha.shape[1]
+            information = T @ T.mT / self.noise_variance + np.diag(1.0 * prior)
+            covariance = np.linalg.pinv(information, hermitian=True)[:, None]
+            Z = Z.transpose(0, 3, 2, 1)
+            covariances[frames] = Z @ covariance @ Z.mT
         # Errors of the shapes, in the image and in depth, and of the middle of frames.
         weight = weights.sum(axis=1)
         image = self.certainty.images[1] * leverages(fit.alpha) + 1 / weight
@@ -476,24 +451,43 @@ class PosteriorFrames:
         median = lower_medians(distance, seen_points(rows))[:, 0]
         poor = np.flatnonzero(median > MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
         if len(poor):
-            fitted = partial(fitted, starts=self.starts)
-            fit.put(poor, self._reweighted(rows[poor], fitted))
+            fit.put(poor, self._reweighted(rows[poor], fitted, self.starts))
         return fit
 
-    def _reweighted(
-        self, rows: NDArray, fitted: Callable[..., FramePosterior]
+    def posterior_without(
+        self, rows: NDArray, hidden: NDArray, weights: NDArray | None = None
     ) -> FramePosterior:
-        """Return the fit of rows (n, 2, J) with a robust loss."""
+        """Return the fit of rows (n, 2, J) without some of the points (J,)."""
+        if weights is not None or not seen_points(rows).all():
+            visible = np.where(hidden, np.nan, rows)
+            return self.posterior(visible, False, weights)
+        shapes = self.shapes[:, :, ~hidden]
+        fit = replace(self, shapes=centred(shapes)).posterior(rows[..., ~hidden], False)
+        middles = shapes.mean(axis=2)
+        middle = middles[0] + fit.alpha @ middles[1:]
+        shift = (fit.motion @ middle[..., None])[..., 0]
+        return fit._replace(translation=fit.translation - shift)
+
+    def _reweighted(
+        self,
+        rows: NDArray,
+        fitted: Callable[..., FramePosterior],
+        starts: NDArray | None = None,
+    ) -> FramePosterior:
+        """Return the fit of rows (n, 2, J) with a robust loss.
+
+        Only the first pass starts again from `starts`: later ones go on from it.
+        """
         quick = partial(fitted, covariances=False)
         sizes, deviation = robust_sizes(rows), np.sqrt(self.noise_variance)
         # First without gross outliers
         weights = frame_weights("linear", lengths(rows), 1.0, sizes)
-        fit = quick(rows, weights=weights)
+        fit = quick(rows, weights=weights, starts=starts)
         # If too few points remain, use the distant ones.
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
         if len(lost):
             weights[lost] = 1.0
-            fit.put(lost, quick(rows[lost]))
+            fit.put(lost, quick(rows[lost], starts=starts))
         # Then iteratively reweighted, for the frames whose weights still change
         changing = np.flatnonzero(np.isfinite(fit.objective))
         for _ in range(50):

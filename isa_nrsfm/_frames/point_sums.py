@@ -156,23 +156,17 @@ def camera_gram(M: NDArray) -> NDArray:
     return np.einsum("rpi,rpi->pi", M[:, ROWS], M[:, COLUMNS])
 
 
-def affine_cameras(
-    products: FrameSums, c: NDArray
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return the affine cameras of least squares for coefficients c (n_shapes, n).
+def affine_cameras(products: FrameSums, c: NDArray) -> NDArray:
+    """Return affine cameras (2, 3, n) by least squares, coefficients c (n_shapes, n).
 
-    Returns ``T_k = B_k S^T + S B_k^T`` (n_shapes, 6, n), packed, the inverse of ``A = S
-    S^T`` (3, 3, n), the cameras ``M = Y A^-1`` (2, 3, n) and ``<M, Y>`` (n,).
+    They are ``M = Y A^-1`` with ``A = S S^T`` and ``Y = W S^T``.
     """
-    T = products.gram.products(c)
-    A = np.einsum("ki,kpi->pi", 0.5 * c, T)
+    A = np.einsum("ki,kpi->pi", 0.5 * c, products.gram.products(c))
     # A ridge, relative to the moments of all shapes, for finite cameras of flat ones
     moments = products.gram.pairs[diagonal_of(products.gram.pairs)][:, DIAGONAL]
     A[DIAGONAL] += 1e-13 * moments.sum(axis=0).mean(axis=0)
-    inverse = inverse3(A)
     Y = np.einsum("ki,kari->rai", c, products.cross)
-    M = np.einsum("rbi,bai->rai", Y, inverse)
-    return T, inverse, M, np.einsum("rai,rai->i", M, Y)
+    return np.einsum("rbi,bai->rai", Y, inverse3(A))
 
 
 def seen_changes(cross: NDArray, T: NDArray, M: NDArray) -> NDArray:

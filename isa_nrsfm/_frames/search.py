@@ -1,9 +1,26 @@
 """Most probable camera, position and coefficients of frames, for given shapes.
 
-Newton's method for many frames at once, the frame as the last index of all arrays.
-Steps are damped if the Hessian is not positive definite or a step has raised the
-objective of a frame. So the objective never rises. The search starts from zero
-coefficients. Badly fitted frames start again from others.
+Shapes and noise variance s2 are given. For each frame by itself, this minimises minus
+twice the log marginal likelihood of its camera, with the coefficients integrated out ::
+
+    F(M) = f(M) / s2 + log det(I + H / s2),  f(M) = min_a ||W - M S(a)||^2 + s2 |a|^2,
+
+over affine cameras, scaled rotations ``M(w, l) = exp(l) M exp(hat(w))`` or, where
+scales are known, rotations. With the posterior moments c and E of
+`coefficient_posterior` the gradient is, as in expectation maximisation, ``dF/dM = 2 G /
+s2``, ``G = M A - sum_k c_k P_k^T``, ``A = sum_kl E_kl B_k B_l^T``. Along the tangents
+D_c of a camera, ``s2 / 2`` times the Hessian is ::
+
+    tr(D_c A D_d^T) + <G, D_cd> - sum_kl <D_c, F_k> Q_kl <D_d, F_l>,
+
+with ``F_k = M (B_k S^T + S B_k^T) - P_k^T``, ``Q = (H + s2 I)^-1`` and the second
+derivative D_cd of the camera. This is exact except for the log determinant: its second
+derivative is replaced by the bound that A contains.
+
+Newton's method works on many frames at once, the frame as the last index of all arrays.
+Steps are damped by ``tr(D_c A D_d^T)`` if the Hessian is not positive definite or a
+step has raised the objective of a frame. So the objective never rises. The search
+starts from zero coefficients. Badly fitted frames start again from others.
 """
 
 from functools import partial
@@ -12,32 +29,52 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CameraModel
+from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, nearest_calibrated
 from isa_nrsfm._frames.point_sums import (
+    FLAT,
+    CoefficientPosterior,
     FrameSums,
     FrameTracks,
     ShapeProducts,
+    affine_cameras,
+    coefficient_posterior,
     determines_camera,
     frame_sums,
     frame_tracks,
+    seen_changes,
+    whitened,
+    with_one,
 )
 from isa_nrsfm._linalg.rounding import OF_STEPS
 from isa_nrsfm._linalg.small_matrices import (
     frames_first,
+    frames_last,
     invert_positive,
     of_frames,
+    packed_products,
     padded,
     solve_positive,
+    unpack3,
     unpacked,
 )
 from isa_nrsfm._tables.tracks import seen_points
 
-# Largest number of steps of a search.
-MAX_STEPS = 60
+# Largest numbers of steps of a search, and of one for rough cameras.
+MAX_STEPS, ROUGH_STEPS = 60, 3
 # The search of a frame ends at this damping: its steps no longer move it.
 LARGEST_DAMPING = 1e8
 # Objectives with a smaller relative difference are equal.
 EQUAL = 1e-10
+# Maps cameras, in the axes of the mean shape, to their depth reversals. Reflecting a
+# flat object at its plane does not change its images. The thinner an
+# object is, the less its images change (Necker reversal).
+REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
+# A search from a reversed camera that comes nearer than this share of its first
+# distance returns to where it came from: docs/benchmarks/README.md, "Thresholds".
+SAME_WELL = 0.1
+# The reversed camera is not tried if the objective rises by more than this multiple of
+# itself on the way there: docs/benchmarks/README.md, "Thresholds".
+LARGE_RISE = 20.0
 
 
 class FramePosterior(NamedTuple):
@@ -134,17 +171,21 @@ Minima = tuple[NDArray, NDArray, NDArray]
 class FrameSearch:
     """A search for cameras of one model that see given shapes, frame by frame.
 
-    Shapes (K + 1, 3, J), rows centred, are in the coordinates of the search, to which
-    `space` (3, 3) maps the original ones. In the first round each block takes at most
-    `first_steps` steps. Frames that have not converged are collected from all blocks
-    for a second round. Rough cameras take `rough_steps`.
+    Shapes (K + 1, 3, J) are centred, with coefficients that are drawn from N(0, I). The
+    search has its own coordinates, to which `space` (3, 3) maps the original ones: the
+    principal axes of the mean shape, the thinnest one last. With affine cameras the
+    shapes are white.
     """
 
-    first_steps = MAX_STEPS
-    rough_steps = 3
-
-    def __init__(self, shapes: NDArray, space: NDArray, model: CameraModel):
-        self.shared, self.space, self.model = ShapeProducts(shapes), space, model
+    def __init__(self, shapes: NDArray, model: CameraModel):
+        self.model = model
+        if model.calibrated:
+            axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
+            shapes, self.space = axes.T @ shapes, axes.T
+            shapes[0, size <= FLAT * size[0]] = 0.0
+        else:
+            shapes, self.space = whitened(np.ascontiguousarray(shapes))
+        self.shared = ShapeProducts(shapes)
 
     def fit_rows(
         self,
@@ -206,19 +247,14 @@ class FrameSearch:
         fit = partial(self._minima, frames, noise, covariances, rough)
         every = np.arange(n_frames)
         initial = np.zeros((n_frames, n_components)) if initial is None else initial
-        if rough:
-            return fit(every, initial, self.rough_steps)
-        # First round, block by block
-        fits = fit(every, initial, self.first_steps)
-        # Second round: the few frames that have not converged, from all blocks
-        slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
-        if len(slow):
-            fits.put(slow, fit(slow, fits.alpha[slow], MAX_STEPS))
+        fits = fit(every, initial, ROUGH_STEPS if rough else MAX_STEPS)
+        if rough or starts is None or not len(starts):
+            return fits
         # Further starts for badly fitted frames, all starts at once
         poor = np.flatnonzero(fits.objective > largest_objective(frames.weight, noise))
-        if starts is not None and len(starts) and len(poor):
-            number = np.repeat(np.arange(len(starts)), len(poor))
-            others = fit(np.tile(poor, len(starts)), starts[number], MAX_STEPS)
+        if len(poor):
+            initial = np.repeat(starts, len(poor), axis=0)
+            others = fit(np.tile(poor, len(starts)), initial, MAX_STEPS)
             # Of equal minima, keep the first.
             objective = others.objective.reshape(len(starts), -1)
             best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
@@ -281,29 +317,134 @@ class FrameSearch:
         noise = np.maximum(variance, 1e-13 * products.energy)
         return products, np.where(noise > 0, noise, 1.0)
 
+    def reversed_cameras(
+        self, problem: FrameProblem, motion: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """Return the better of cameras (n, 2, 3) and reversed ones, and their mask."""
+        M = frames_last(motion @ self.space.T)
+        # The cameras may not be at their minimum yet: compare minima with minima. With
+        # 3, 6 and 12 steps 22, 7 and 1 % of reversed frames of motion capture remain.
+        n_steps = 6
+        M, _ = self.descend(problem, self.evaluate(problem, M), n_steps)
+        # Shapes that are not fitted yet can explain a reversed frame well: try all.
+        value, every = _value(problem, _posterior(problem, M)), np.arange(len(motion))
+        M, better, _ = self._better_reversed(problem, M, value, every, n_steps)
+        motion = motion.copy()
+        motion[better] = frames_first(M[:, :, better]) @ self.space
+        return motion, better
+
+    def reversals(
+        self, problem: FrameProblem, motion: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the minima from reversed cameras (n, 2, 3) and alpha (n, K) there.
+
+        The third result (n,) is the rise of -2 log L from the given cameras.
+        """
+        M = frames_last(motion @ self.space.T)
+        value = _value(problem, _posterior(problem, M))
+        M, _ = self.descend(problem, self.evaluate(problem, M * REVERSED), 30)
+        posterior = _posterior(problem, M)
+        rise = (_value(problem, posterior) - value) / problem[1]
+        return frames_first(M) @ self.space, posterior.alpha.T, rise
+
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
-        """Return the start of the search for coefficients (K, n)."""
-        raise NotImplementedError
+        """Return cameras (2, 3, n) near the affine ones for alpha (K, n).
+
+        If calibrated, the better of the nearest and the `_completed` camera is taken.
+        """
+        M = affine_cameras(problem[0], with_one(alpha))
+        if not self.model.calibrated:
+            return M
+        starts = calibrated_starts(self.model, M)
+        values = [_value(problem, _posterior(problem, start)) for start in starts]
+        return np.where(values[1] < values[0], *starts[::-1])
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
-        """Return the objectives and their derivatives."""
-        raise NotImplementedError
+        """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
+        return self._derivatives(problem, position, _posterior(problem, position))[0]
+
+    def _derivatives(
+        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
+    ) -> tuple[State, NDArray]:
+        """Return the state at M (2, 3, n), and ``Q C`` (K, p, n), C = <D_c, F_k>."""
+        products, noise = problem
+        A = products.gram.moments(posterior.second_moments(noise))
+        G = np.einsum("rbi,bai->rai", M, unpack3(A))
+        G -= np.einsum("ki,kari->rai", posterior.c, products.cross)
+        gradient, definite = self.model.gradient(M, G), self.model.curvature(M, A)
+        # The coefficients follow: - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
+        coupling = self.model.gradient(M, _changes(products, M, posterior))
+        through = posterior.covaried(coupling)
+        hessian = definite + self.model.second(M, G, gradient)
+        hessian -= packed_products(through.swapaxes(0, 1), coupling.swapaxes(0, 1))
+        value = _value(problem, posterior)
+        return State(M, value, -gradient, definite, hessian), through
 
     def solution(
         self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
     ) -> tuple[NDArray, NDArray, NDArray]:
         """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,).
 
-        They are replaced by lower minima that are found in n_steps. `converged` is
-        updated.
+        Cameras are replaced by minima from reversed ones if these are lower.
         """
-        raise NotImplementedError
+        posterior = _posterior(problem, position)
+        if n_steps and self.model.calibrated:
+            value = _value(problem, posterior)
+            rise = _rise(problem, position, posterior)
+            tried = np.flatnonzero(~(rise > LARGE_RISE * value))
+            position, better, reached = self._better_reversed(
+                problem, position, value, tried, n_steps
+            )
+            converged[better] = reached[better]
+            if better.any():
+                posterior = _posterior(problem, position)
+        return position, posterior.alpha, posterior.objective
 
     def covariances(
         self, problem: FrameProblem, M: NDArray, alpha: NDArray
     ) -> tuple[NDArray, NDArray]:
-        """Return covariances of coefficients (K, K, n) and rotations (3, 3, n)."""
-        raise NotImplementedError
+        """Return the covariances of coefficients (K, K, n) and of rotations (3, 3, n).
+
+        They come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``. C is the
+        coupling, Y the Hessian by the camera with the coefficients eliminated.
+        """
+        noise, posterior = problem[1], _posterior(problem, M)
+        state, through = self._derivatives(problem, M, posterior)
+        inverse = state.inverse()
+        widened = np.einsum("kci,cdi->kdi", through, inverse)
+        covariance = np.einsum("kdi,ldi->kli", widened, through)
+        covariance -= unpacked(posterior.inverse[len(posterior.c) :])
+        covariance = 0.5 * (covariance + covariance.swapaxes(0, 1))
+        turns = noise * inverse[:3, :3] if self.model.calibrated else np.nan
+        return noise * covariance, np.broadcast_to(turns, (3, 3, len(noise)))
+
+    def _better_reversed(
+        self,
+        problem: FrameProblem,
+        M: NDArray,
+        value: NDArray,
+        tried: NDArray,
+        max_steps: int,
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
+
+        Cameras M have the objectives value (n,); the indices of those to reverse are
+        `tried`. Also returns masks (n,) of replaced cameras and of searches that
+        converged.
+        """
+        limit = value - 1e-10 * scale_of(problem)
+        cameras, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
+        tried = padded(tried)
+        if len(tried):
+            problem, M, limit = of_frames((problem, M, limit), tried)
+            start = self.evaluate(problem, M * REVERSED)
+            # The reversed camera and M differ in the third column.
+            radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
+            known = M, limit, radius
+            other, converged[tried] = self.descend(problem, start, max_steps, known)
+            better[tried] = lower = _value(problem, _posterior(problem, other)) < limit
+            cameras[..., tried] = np.where(lower, other, M)
+        return cameras, better, converged
 
     def descend(
         self,
@@ -370,6 +511,78 @@ class FrameSearch:
             still = ~positive & (damping[failing] < LARGEST_DAMPING)
             failing = padded(np.unique(failing[still]))
         return self.model.limited(step), damping
+
+
+def calibrated_starts(model: CameraModel, M: NDArray) -> list[NDArray]:
+    """Return the nearest and the `_completed` cameras of affine cameras M (2, 3, n)."""
+    rows, scales = nearest_calibrated(frames_first(M))
+    starts = (frames_last(rows), scales), _completed(M)
+    return [scale * rows if model.scaled else rows for rows, scale in starts]
+
+
+def _completed(M: NDArray) -> tuple[NDArray, NDArray]:
+    """Return orthonormal rows and scales from the first two columns of affine cameras.
+
+    The third column of cameras (2, 3, n) belongs to the thinnest axis. For thin objects
+    it is not determined. The first two, N, have singular values s_1 and s_2. In a
+    scaled rotation of scale s_1 the third, z, has ``z z^T = s_1^2 I - N N^T``, and
+    here the sign of the affine camera.
+    """
+    N, third = M[:, :2], M[:, 2]
+    (p, r), q = (N**2).sum(axis=1), (N[0] * N[1]).sum(axis=0)
+    half = 0.5 * (p - r)
+    height = np.hypot(half, q)
+    scale = np.sqrt(0.5 * (p + r) + height)
+    scale = np.where(scale > 0, scale, 1.0)
+    # The larger entry of z, and the other one from their product -q, without cancelling
+    large = np.sqrt(height + np.abs(half))
+    small = np.divide(-q, large, where=large > 0, out=np.zeros_like(q))
+    z = np.where(half > 0, (small, large), (large, small)) / scale
+    z = np.where((z * third).sum(axis=0) < 0, -z, z)
+    N = np.where(p + r > 0, N / scale, np.eye(2)[..., None])
+    return np.concatenate([N, z[:, None]], axis=1), scale
+
+
+def _rise(
+    problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
+) -> NDArray:
+    """Return the least rise (n,) of the objective on the way to the reversed camera.
+
+    A reversal turns the third column z of M (2, 3, n) over. On the way ``<z', z> = 0``.
+    The objective of affine cameras is there higher by at least ``|z|^2 / <e, Y^-1 e>``,
+    ``e = (0, 0, z) / |z|``, in the quadratic approximation with half the Hessian Y.
+    This neglects the gradient at M, and Y bounds the log determinant from above.
+    """
+    (products, noise), K, n = problem, len(posterior.alpha), M.shape[2]
+    F = _changes(products, M, posterior).reshape(K, 6, n)
+    A = products.gram.moments(posterior.second_moments(noise))
+    Y = CAMERAS["affine"].curvature(M, A)
+    Y -= packed_products(posterior.covaried(F).swapaxes(0, 1), F.swapaxes(0, 1))
+    z = (M * (REVERSED < 0)).reshape(6, n)
+    square = np.einsum("pi,pi->i", z, z)
+    e = z / np.sqrt(np.where(square > 0, square, 1.0))
+    steps, definite = solve_positive(Y, e)
+    definite &= square > 0
+    variance = np.where(definite, np.einsum("pi,pi->i", e, steps), 1.0)
+    return np.where(definite, square / variance, 0.0)
+
+
+def _changes(
+    products: FrameSums, M: NDArray, posterior: CoefficientPosterior
+) -> NDArray:
+    """Return ``F_k`` (K, 2, 3, n) for cameras M (2, 3, n)."""
+    return seen_changes(products.cross, products.gram.products(posterior.c), M)
+
+
+def _value(problem: FrameProblem, posterior: CoefficientPosterior) -> NDArray:
+    """Return ``s2 F`` (n,)."""
+    return posterior.objective + problem[1] * posterior.log_determinant
+
+
+def _posterior(problem: FrameProblem, M: NDArray) -> CoefficientPosterior:
+    """Return the posterior of the coefficients for cameras (2, 3, n)."""
+    products, noise = problem
+    return coefficient_posterior(products, M, noise)
 
 
 def _hopeless(

@@ -22,12 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
-    CameraModel,
-    residuals,
-)
-from isa_nrsfm._frames.models import LEAST_POINTS, PosteriorFrames
+from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, residuals
+from isa_nrsfm._frames.models import LEAST_POINTS, FrameModel, derivatives
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.prior import SETTLED_WIDTH, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
@@ -62,7 +58,7 @@ from isa_nrsfm._joint.whole import (
     whole_distribution,
 )
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
+from isa_nrsfm._linalg.small_matrices import centred, lengths
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
 from isa_nrsfm._tables.tracks import seen_points
@@ -84,8 +80,8 @@ LARGEST_SPREAD = 5.0
 def fit_jointly(
     table: FactorisedTable,
     paper_shapes: NDArray,
+    start: JointState | None,
     settings: FitSettings,
-    start: JointState | None = None,
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
@@ -99,7 +95,7 @@ def fit_jointly(
     every_point = table.scaled.complete and table.scaled.weights is None
     problems = _problems(table, paper_shapes, settings)
     first = next(problems)
-    whole = first.cameras.calibrated and settings.whole and settings.prior is None
+    whole = settings.all_directions
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is not None:
         start = start._replace(shapes=first.frames.coordinates(start.shapes))
@@ -539,7 +535,7 @@ def residual_deviations(
     the noise variance for each coefficient.
     """
     deviations = np.empty(weights.shape)
-    for part, A, weighed, inverse in own_unknowns(state, alpha, weights, cameras):
+    for part, A, weighed, inverse in own_unknowns(state, alpha, weights, cameras.name):
         Z = inverse @ A
         spread = np.einsum("ipx,ipx->ix", Z, weighed @ weighed.swapaxes(1, 2) @ Z)
         leverage = np.einsum("ipx,ipx->ix", weighed, Z)
@@ -549,7 +545,7 @@ def residual_deviations(
 
 
 def own_unknowns(
-    state: JointState, alpha: NDArray, weights: NDArray, cameras: CameraModel
+    state: JointState, alpha: NDArray, weights: NDArray, camera: str
 ) -> Iterator[tuple[slice, NDArray, NDArray, NDArray]]:
     """Yield A (n, p, 2 J), A W and ``(A^T W A + P)^-1`` of slices of frames.
 
@@ -557,26 +553,22 @@ def own_unknowns(
     """
     shapes, motion, noise = state
     (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
-    n_pose = 2 + cameras.n_parameters
     # Process frames in slices whose derivatives fit into 1 MB
-    length = max(2**17 // (2 * n_points * (n_pose + n_components)), 1)
+    length = max(2**17 // (2 * n_points * (8 + n_components)), 1)
     for first in range(0, n_frames, length):
         part = slice(first, first + length)
-        M, w = motion[part], weights[part, None, None]
-        frames = shapes[0] + np.tensordot(alpha[part], shapes[1:], 1)
-        moved = np.moveaxis(cameras.tangents(frames_last(M)), 3, 0) @ frames[:, None]
-        positions = np.zeros((len(M), 2, 2, n_points))
+        moved = derivatives(shapes, motion[part], alpha[part], camera)
+        positions = np.zeros((len(moved), 2, 2, n_points))
         positions[:, [0, 1], [0, 1]] = 1.0
-        A = np.concatenate([moved, positions, M[:, None] @ shapes[1:]], axis=1)
+        A = np.concatenate([moved, positions], axis=1)
         flat = A.reshape(*A.shape[:2], -1)
-        weighed = (A * w).reshape(flat.shape)
-        gram = weighed @ flat.swapaxes(1, 2)
-        coefficients = np.arange(n_pose, A.shape[1])
-        gram[:, coefficients, coefficients] += noise
+        weighed = (A * weights[part, None, None]).reshape(flat.shape)
+        gram = weighed @ flat.mT
+        gram[:, range(n_components), range(n_components)] += noise
         yield part, flat, weighed, np.linalg.inv(regular(gram))
 
 
-def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
+def left_out_distances(model: FrameModel, rows: NDArray) -> NDArray:
     """Return distances (n, J) of points from fits of the others of their frame.
 
     rows (n, 2, J): of size one. To first order, ``(I - H_jj)^-1 r_j`` with the residual
@@ -587,8 +579,8 @@ def left_out_distances(model: PosteriorFrames, rows: NDArray) -> NDArray:
     fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
     state = JointState(model.shapes, fit.motion, model.noise_variance)
     rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
-    distance, camera = np.full(w.shape, np.nan), CAMERAS[model.camera]
-    for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, camera):
+    distance = np.full(w.shape, np.nan)
+    for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, model.camera):
         Z, Y = (x.reshape(len(x), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
         left = (1.0 + OF_DIFFERENCES) * np.eye(2) - np.einsum("iprj,ipsj->ijrs", Y, Z)
         spread = np.linalg.inv(left)  # covariance of the errors over that of the noise

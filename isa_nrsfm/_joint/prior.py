@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import stacked_motion
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm._frames.models import FrameMap, FrameModel
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import centred
 
@@ -72,7 +72,7 @@ class ShapePrior(NamedTuple):
 
     @classmethod
     def of_model(
-        cls, frames: PosteriorFrames, scale: float, gauge: FrameMap, scaled: bool
+        cls, frames: FrameModel, scale: float, gauge: FrameMap, scaled: bool
     ) -> "ShapePrior":
         """Return the prior with a model's shapes times a scale, for a gauge."""
         certainty = frames.certainty

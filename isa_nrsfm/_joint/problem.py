@@ -19,9 +19,8 @@ from scipy.special import expit
 
 from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, line_of_sight
-from isa_nrsfm._frames.models import frame_search
-from isa_nrsfm._frames.newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
+from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
@@ -223,7 +222,7 @@ class JointProblem:
     def aligned(self, state: JointState, cameras: CameraModel) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes."""
         shapes, noise = self.frames.centred(state.shapes), state.noise
-        search = frame_search(cameras.name, shapes)
+        search = FrameSearch(shapes, cameras)
         motion = self.frames.blocks.joined(
             lambda block: search.fit(block, noise, covariances=False, rough=True).motion
         )
@@ -282,7 +281,7 @@ class JointProblem:
         The search for each frame is repeated from its camera reversed in depth. The
         result is used if its objective is lower.
         """
-        search = CalibratedSearch(state.shapes, cameras.scaled)
+        search = FrameSearch(state.shapes, cameras)
         motion, better = self._searched(search.reversed_cameras, search, state)
         return state._replace(motion=motion), int(better.sum())
 
@@ -292,14 +291,14 @@ class JointProblem:
         Relative to their mean square. Each frame is reversed with the probability ``1 /
         (1 + exp(r / 2))``, r the rise of -2 log L at the minimum from there.
         """
-        search = CalibratedSearch(state.shapes, self.cameras.scaled)
+        search = FrameSearch(state.shapes, self.cameras)
         motion, alpha, rise = self._searched(search.reversals, search, state)
         other = state._replace(motion=motion).depths(alpha)
         square = np.sum((other - depths) ** 2, axis=1)
         return float(expit(-rise / 2) @ square / max(np.sum(depths**2), 1e-300))
 
     def _searched(
-        self, method: Any, search: CalibratedSearch, state: JointState
+        self, method: Any, search: FrameSearch, state: JointState
     ) -> tuple[NDArray, ...]:
         """Return the results of a method of a search for all frames."""
 
@@ -307,7 +306,8 @@ class JointProblem:
             parts = []
             for frames, piece in block.pieces():
                 sums = frame_sums(piece, search.shared)
-                parts.append(method(sums, state.noise, motion[frames]))
+                problem = search.problem(sums, np.full(len(sums.weight), state.noise))
+                parts.append(method(problem, motion[frames]))
             return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
         parts = self.frames.blocks.map(of_block, state.motion)

@@ -69,6 +69,13 @@ class FitSettings(NamedTuple):
     silent_isa: whether a strategy that only starts the joint fit may end early.
     on_step: called before each step of the joint fit.
     whole: whether fits of calibrated cameras have all directions of a shape.
+    free: whether K is the number of directions that the table determines, or with
+    affine cameras falls until all directions of the coefficients are reliable.
+    errors: whether to estimate the errors of the depths.
+
+    Of a fit that continues another one, a `TableModel` of a similar table as its start:
+    placed: frames of the table in that model. known: results that both fits have, by
+    name; those that are lacking are added.
     """
 
     refinement: str | None = "joint"
@@ -91,6 +98,25 @@ class FitSettings(NamedTuple):
     on_step: Callable[[], None] | None = None
     whole: bool = True
     groups: NDArray | None = None
+    remove_pose: bool = False
+    free: bool = False
+    errors: bool = True
+    start: Any = None
+    placed: Any = None
+    known: dict[str, Any] | None = None
+
+    @property
+    def all_directions(self) -> bool:
+        """Whether the joint fit has all directions of a shape, whatever K is."""
+        calibrated = self.joint and self.camera != "affine"
+        return calibrated and self.whole and self.prior is None
+
+    def remembered(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
+        """Return a known result, or that of a function, which is known from now on."""
+        known = {} if self.known is None else self.known
+        if name not in known:
+            known[name] = function(*args, settings=self)
+        return known[name]
 
     @property
     def joint(self) -> bool:

@@ -12,14 +12,21 @@ neighbouring points the variance of an estimate t is ::
     (g - 1) / g sum_g (t_g - t)^2.
 
 These fits do not have the prior of the extents, which would hide uncertain depths.
+
+Random halves show how a fit would change on another table, without new fits. A sum over
+the groups of a table changes by ``sum_g h_g x_g`` for the groups with h_g = 1, counted
+twice, and without those with h_g = -1. The rows h of a Hadamard matrix are orthogonal:
+two of these halves differ as much as two independent tables of the full size (McCarthy,
+"Pseudo-replication: half samples", 1969, with balanced half samples).
 """
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import hadamard
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
@@ -29,17 +36,17 @@ from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     distances,
     full_rotations,
+    residuals,
     stacked_motion,
 )
 from isa_nrsfm._frames.models import (
     NOT_ESTIMATED,
     Decomposition,
     DepthCertainty,
-    PosteriorFrames,
-    frame_search,
+    FrameModel,
     leverages,
 )
-from isa_nrsfm._frames.search import FramePosterior
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem, JointState, Widths, refine_joint
@@ -47,8 +54,10 @@ from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import other_depths, steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
 from isa_nrsfm._linalg.small_matrices import centred
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
-from isa_nrsfm._tables.tracks import FEWEST_POINTS
+from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
+from isa_nrsfm._prepare.scaling import ScaledTable
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
+from isa_nrsfm._tables.tracks import FEWEST_POINTS, seen_points
 
 # With a robust loss, points with residuals above this threshold, in standard deviations
 # of a coordinate, are left out: docs/benchmarks/README.md, "Thresholds".
@@ -78,7 +87,7 @@ FrameFits = tuple[FrameBlocks, NDArray, NDArray, NDArray, float]
 
 
 def inlying_rows(
-    model: PosteriorFrames, rows: FrameBlocks, most: int, weights: NDArray | None = None
+    model: FrameModel, rows: FrameBlocks, most: int, weights: NDArray | None = None
 ) -> tuple[NDArray, FramePosterior, NDArray | None]:
     """Return about `most` frames (n, 2, J) of size one with a camera, and their fit.
 
@@ -97,7 +106,7 @@ def inlying_rows(
 
 
 def fitted_frames(
-    model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
+    model: FrameModel, frames: JointFrames, rows: FrameBlocks
 ) -> FrameFits:
     """Return the fits of all frames in blocks of FramePosterior, before the gauge.
 
@@ -105,7 +114,8 @@ def fitted_frames(
     sum of the squared residuals.
     """
     if model.loss == "linear":
-        search = frame_search(model.camera, frames.coordinates(model.shapes))
+        shapes, camera = frames.coordinates(model.shapes), CAMERAS[model.camera]
+        search = FrameSearch(shapes, camera)
         fitted = partial(search.fit, noise=model.noise_variance, starts=model.starts)
         posteriors = frames.blocks.derive(fitted)
     else:
@@ -142,7 +152,7 @@ def shape_information(
 
 
 def frame_certainty(
-    frames: PosteriorFrames,
+    frames: FrameModel,
     fits: FrameFits,
     n_seen: NDArray,
     weight: NDArray,
@@ -177,7 +187,7 @@ def shown_frames(
     sizes: NDArray,
     n_seen: NDArray,
     weight: NDArray,
-    frames: PosteriorFrames,
+    frames: FrameModel,
     uncertainty: NDArray,
 ) -> tuple[Decomposition, NDArray, float]:
     """Return fits in the gauge, and the effect of their noise on their coefficients.
@@ -252,12 +262,12 @@ def n_reliable(reliability: NDArray) -> int:
 
 
 def depth_certainty(
-    frames: PosteriorFrames,
+    frames: FrameModel,
     rows: FrameBlocks,
     weights: NDArray | None,
+    widths: Widths | None,
+    rivals: float,
     settings: FitSettings,
-    widths: Widths | None = None,
-    rivals: float = 0.0,
 ) -> DepthCertainty:
     """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
 
@@ -387,3 +397,80 @@ def neighbours(points: NDArray) -> NDArray:
     places = np.sort(np.arange(len(points)) % N_GROUPS)
     squares = cdist(points, points[centres][places], "sqeuclidean")
     return places[linear_sum_assignment(squares)[1]]
+
+
+# Groups are divided into 15 parts at random, which 15 halves have or have not.
+SIGNS = hadamard(16)[1:, 1:]
+# Change of converged shapes over that of one step of expectation maximisation:
+# docs/stability.md, "How it is estimated".
+PER_STEP = 4.0
+# Numbers of frames and points by which the gauges of halves are compared.
+HALF_FRAMES, HALF_POINTS = 5000, 500
+
+
+class HalfTables(NamedTuple):
+    """Shapes of halves of a table, and frames of it, before the gauge.
+
+    shapes (n_halves, n, 3, J). halves (n_halves, I): whether a half has a frame.
+    motion (I, 2, 3), alpha (I, n - 1). kind: further arguments of `independent_gauge`.
+    """
+
+    shapes: NDArray
+    halves: NDArray
+    motion: NDArray
+    alpha: NDArray
+    kind: tuple[Any, ...]
+
+
+def half_tables(
+    table: ScaledTable,
+    model: FrameModel,
+    motion: NDArray,
+    alpha: NDArray,
+    inverse: NDArray,
+    groups: NDArray | None,
+    kind: tuple[Any, ...],
+) -> HalfTables | None:
+    """Return the halves of a table; None if it has fewer than four groups.
+
+    inverse (3 n, 3 n): that of the information on a point. groups (n_rows,): numbers.
+    """
+    units = np.arange(len(alpha))
+    if groups is not None:
+        units = np.unique(groups[table.shown], return_inverse=True)[1]
+    if units.max() < 3:
+        return None
+    part = (np.random.RandomState(0).permutation(units.max() + 1) % len(SIGNS))[units]
+    shapes, n_shapes = model.shapes, len(model.shapes)
+
+    def scores(
+        rows: NDArray, part: NDArray, motion: NDArray, alpha: NDArray, *given: NDArray
+    ) -> NDArray:
+        """Return ``sum_i X_i^T r_i`` over the frames of each part."""
+        seen = seen_points(rows)
+        w = given[0] if given else seen.astype(float)
+        rest = residuals(rows, shapes, motion, alpha)
+        rest[~np.broadcast_to(seen[:, None], rest.shape)] = 0.0
+        mean = np.einsum("irj,ij->ir", rest, w) / w.sum(axis=1)[:, None]
+        if model.loss != "linear":
+            off = distances(rows, shapes, motion, mean, alpha)
+            deviation = np.sqrt(model.noise_variance)
+            w = seen * frame_weights(model.loss, off, deviation, robust_sizes(rows))
+        rest = (rest - mean[:, :, None]) * w[:, None]
+        X = stacked_motion(motion, alpha).reshape(*rest.shape[:2], -1)
+        chosen = [part == number for number in range(len(SIGNS))]
+        return np.stack(
+            [np.tensordot(X[i], rest[i], axes=((0, 1), (0, 1))) for i in chosen]
+        )
+
+    weights = () if table.weights is None else (table.weights,)
+    total = sum(table.rows.map(scores, part, motion, alpha, *weights))
+    steps = inverse @ np.tensordot(SIGNS, total, 1)
+    # Mixtures of the shapes themselves are left to the gauge.
+    flat, steps = shapes.reshape(n_shapes, -1), steps.reshape(len(SIGNS), n_shapes, -1)
+    steps = PER_STEP * (steps - steps @ np.linalg.pinv(flat) @ flat)
+    points = spread(np.arange(shapes.shape[2]), HALF_POINTS)
+    moved = (shapes + steps.reshape(-1, *shapes.shape))[..., points]
+    frames = spread(np.arange(len(alpha)), HALF_FRAMES)
+    halves = SIGNS[:, part[frames]] > 0
+    return HalfTables(centred(moved), halves, motion[frames], alpha[frames], kind)

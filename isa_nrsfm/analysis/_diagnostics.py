@@ -16,7 +16,7 @@ from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._compat.scikit_learn import CoefficientsMixin
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._fitted_model import removed_part
-from isa_nrsfm._joint.half_tables import HalfTables
+from isa_nrsfm._joint.uncertainty import HalfTables
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._parameters.naming import named

@@ -11,7 +11,7 @@ from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.camera_models import pose_effect, pose_part
 from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._gauge import independent_gauge
-from isa_nrsfm._joint.half_tables import HalfTables
+from isa_nrsfm._joint.uncertainty import HalfTables
 
 # Least correlation of what counts as the same coefficient, as for the congruence of
 # factors: Lorenzo-Seva, ten Berge, "Tucker's congruence coefficient as a meaningful

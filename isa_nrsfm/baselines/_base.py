@@ -27,8 +27,9 @@ from isa_nrsfm._compat.scikit_learn import (
     fit_context,
     with_numpy_defaults,
 )
-from isa_nrsfm._frames.camera_models import compose, project
-from isa_nrsfm._frames.models import Decomposition, frame_search
+from isa_nrsfm._frames.camera_models import CAMERAS, compose, project
+from isa_nrsfm._frames.models import Decomposition
+from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._gauge import canonical_rotation
 from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
@@ -272,7 +273,8 @@ class ShapeSequenceNRSfM(
             refuse_one_place(report, rows.shape[2])
             sizes = report.size
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
-        search = frame_search("orthographic", shapes.transpose(0, 2, 1).astype(float))
+        shapes = shapes.transpose(0, 2, 1).astype(float)
+        search = FrameSearch(shapes, CAMERAS["orthographic"])
         noise = self.noise_variance_ / self._unit**2
         fits = search.fit_rows(rows / sizes[:, None, None], noise, covariances=False)
         motion = (sizes / self._unit)[:, None, None] * fits.motion

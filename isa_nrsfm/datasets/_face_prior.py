@@ -9,7 +9,7 @@ from sklearn.utils import check_scalar
 
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.models import DepthCertainty, FrameMap, PosteriorFrames
+from isa_nrsfm._frames.models import DepthCertainty, FrameMap, FrameModel
 from isa_nrsfm._parameters.choices import FACE_PRIORS
 
 
@@ -108,7 +108,7 @@ def model_of_points(
     noise, camera = noise / share + left, "weak_perspective"
     shapes = np.ascontiguousarray(shapes[: K + 1].mT)
     gauge, starts = FrameMap.identity(K), np.zeros((0, K))
-    frames = PosteriorFrames(shapes, noise, starts, "linear", gauge, camera, certainty)
+    frames = FrameModel(shapes, noise, starts, "linear", gauge, camera, certainty)
     share, n_features = stored["energy_share"][:K], 2 * len(mean_shape)
     model = AffineNRSfM(K, camera="weak_perspective")
     model.__dict__ |= {

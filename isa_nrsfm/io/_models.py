@@ -30,8 +30,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import (
     DepthCertainty,
     FrameMap,
-    PosteriorFrames,
-    RigidFrames,
+    FrameModel,
 )
 from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._other_tables import fitted_prior
@@ -294,8 +293,9 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         if (pinhole := getattr(model, name)) is not None:
             f, (x, y), *kinds = pinhole
             entries[name] = np.array([f, x, y, *kinds], dtype=float)
-    if isinstance(frames, RigidFrames):
-        return {**entries, "mean_shape": frames.mean_shape, "basis": frames.basis}
+    if not frames.joint:
+        mean_shape, *basis = frames.shapes.mT
+        return {**entries, "mean_shape": mean_shape, "basis": np.array(basis)}
     return {
         **entries,
         "loss": frames.loss,
@@ -323,11 +323,12 @@ def _pinhole(entry: NDArray | None) -> Pinhole | None:
     return Pinhole(f, (x, y), bool(robust), bool(near))
 
 
-def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
+def _frame_model(entries: dict[str, Any]) -> FrameModel:
     """Return the model of a frame of `_frame_entries`."""
     if "loss" not in entries:
-        return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
-    return PosteriorFrames(
+        shapes = entries["mean_shape"], entries["basis"]
+        return FrameModel.rigid(*shapes, entries["camera"])
+    return FrameModel(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
         starts=entries["coefficient_starts"],

@@ -14,7 +14,7 @@ from scipy.special import gammaln
 from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
 from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._tables.blocks import spread
-from isa_nrsfm.isa._base import orthogonalise
+from isa_nrsfm.isa._strategies import orthogonalise
 
 # Candidate densities of each signal, by their *tail*: degrees of freedom of Student's
 # t, or LIGHT for one with lighter tails than a Gaussian, exp(-c ||y||^4).

@@ -1,4 +1,9 @@
-"""The most probable camera, position and coefficients of frames, by Newton's method."""
+"""The most probable camera, position and coefficients of frames, by Newton's method.
+
+One contract for all cameras, complete, missing and weighted points: derivatives are
+those of a dense objective, the fit is its minimum, covariances are inverse Hessians,
+and the fit of a frame does not depend on the others.
+"""
 
 from typing import NamedTuple
 
@@ -6,6 +11,8 @@ import numpy as np
 import pytest
 import scenes
 from frame_parts import (
+    Regression,
+    assert_calibrated,
     assert_same_fits,
     camera_and_alpha,
     fit_posterior,
@@ -13,41 +20,243 @@ from frame_parts import (
 )
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import images, random_rotation, random_scene, with_gaps
+from scenes import images, random_rotation, with_gaps
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.models import frame_search, spread_starts
-from isa_nrsfm._frames.newton import AffineSearch
-from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
-from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch, State, scale_of
-from isa_nrsfm._linalg.small_matrices import LANES, unpacked
+from isa_nrsfm._frames.models import spread_starts
+from isa_nrsfm._frames.point_sums import coefficient_posterior, frame_sums, frame_tracks
+from isa_nrsfm._frames.search import (
+    LARGE_RISE,
+    MAX_STEPS,
+    REVERSED,
+    FrameSearch,
+    State,
+    _rise,
+    calibrated_starts,
+    scale_of,
+)
+from isa_nrsfm._linalg.small_matrices import LANES, frames_first, frames_last, unpacked
 from isa_nrsfm._tables.blocks import block_slices
 
 AS_USERS = ["few_frames", "widths"]
 NOISE = 0.02
-CAMERA = pytest.mark.parametrize(
-    "camera", ["affine", "weak_perspective", "orthographic"]
-)
+CAMERA = pytest.mark.parametrize("camera", CAMERAS)
+CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 GAPS = pytest.mark.parametrize("gaps", [False, True])
+KINDS = pytest.mark.parametrize("kind", ["complete", "gaps", "weighted"])
 
 
-def scene_of(camera, gaps=False, noise=NOISE, n_frames=20):
-    """Return a scene of three basis shapes, maybe with missing points."""
+def scene_of(camera, kind="complete", noise=NOISE, n_frames=20, depth=1.0):
+    """Return a scene of three basis shapes, maybe with missing or weighted points."""
     options = {"noise": noise, "camera": camera, "deformation": 0.2}
-    scene = random_scene(0, n_frames, extent=(1.0, 0.8, 0.6), **options)
-    return scene._replace(tracks=with_gaps(scene.tracks)) if gaps else scene
+    options["extent"] = (1.0, 0.8, 0.6 * depth)
+    if kind == "weighted":
+        options["kind"] = "missing"
+    scene = scenes.random_scene(0, n_frames, **options)
+    return scene._replace(tracks=with_gaps(scene.tracks)) if kind == "gaps" else scene
 
 
 def fitted(scene, camera, noise=NOISE**2, **given):
+    given = {"weights": scene.weights} | given
     return fit_posterior(scene.tracks, scene.shapes, noise, camera, **given)
+
+
+def problem_of(scene, camera, noise):
+    """Return the search, its frames, and cameras in its coordinates."""
+    search = FrameSearch(scene.shapes, CAMERAS[camera])
+    weights, seen = scene.weights, np.isfinite(scene.tracks[..., 0])
+    if weights is None and not seen.all():
+        weights = 1.0 * seen
+    tracks = frame_tracks(scene.tracks.swapaxes(1, 2), weights)
+    sums = frame_sums(tracks, search.shared)
+    problem = search.problem(sums, np.full(len(scene.tracks), noise))
+    return search, problem, frames_last(scene.motion @ np.linalg.inv(search.space))
+
+
+def value(scene, i, M, noise=NOISE**2):
+    return Regression.of(scene, i, M).value(noise)
+
+
+def moved(camera, M, step):
+    """Return a camera (2, 3) after a step of its parameters."""
+    return CAMERAS[camera].moved(M[..., None], np.reshape(step, (-1, 1)))[..., 0]
+
+
+def hessian_of(f, n, h=1e-3):
+    """Return the Hessian (n, n) of a function of a step, by central differences."""
+    hessian, steps = np.empty((n, n)), h * np.eye(n)
+    for p, q in np.ndindex(n, n):
+        a, b = steps[p], steps[q]
+        hessian[p, q] = f(a + b) + f(-a - b) - f(a - b) - f(b - a)
+    return hessian / (4 * h * h)
+
+
+@KINDS
+@CAMERA
+class TestMinimum:
+    def test_objective_rises_in_every_direction(self, camera, kind):
+        scene = scene_of(camera, kind)
+        fits = fitted(scene, camera)
+        assert fits.converged.all()
+        if camera != "affine":
+            assert_calibrated(fits.motion, camera)
+        rng = np.random.default_rng(1)
+        for i, M in enumerate(fits.motion):
+            least = value(scene, i, M)
+            for _ in range(5):
+                step = 1e-4 * rng.normal(size=CAMERAS[camera].n_parameters)
+                ends = (moved(camera, M, sign * step) for sign in (1, -1))
+                rises = [value(scene, i, end) - least for end in ends]
+                assert min(rises) > 0
+                # Equal on both sides: the slope is zero, not only small.
+                assert_allclose(rises[0], rises[1], rtol=1e-2)
+
+    def test_coefficients_and_position(self, camera, kind):
+        scene = scene_of(camera, kind)
+        fits = fitted(scene, camera)
+        for i, M in enumerate(fits.motion):
+            frame = Regression.of(scene, i, M)
+            assert_allclose(fits.alpha[i], frame.mean(NOISE**2), rtol=1e-9, atol=1e-12)
+            square = frame.square(fits.alpha[i], NOISE**2)
+            assert fits.objective[i] == pytest.approx(square, rel=1e-9)
+        rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
+        if scene.weights is not None:
+            rest *= scene.weights[..., None]
+        assert_allclose(np.nansum(rest, axis=1), 0.0, atol=1e-11)
+
+    def test_covariances_are_those_of_camera_and_coefficients_together(
+        self, camera, kind
+    ):
+        deviation = 2e-3
+        scene = scene_of(camera, kind, noise=deviation, n_frames=4)
+        noise, n = deviation**2, CAMERAS[camera].n_parameters
+        fits = fitted(scene, camera, noise)
+        for i, M in enumerate(fits.motion):
+
+            def f(x, i=i, M=M):
+                frame = Regression.of(scene, i, moved(camera, M, x[:n]))
+                return frame.square(fits.alpha[i] + x[n:], noise)
+
+            # The posterior density is exp(-f / (2 s2)).
+            expected = np.linalg.inv(hessian_of(f, n + 3) / (2 * noise))
+            parts = [(fits.covariance[i], expected[n:, n:])]
+            if camera != "affine":
+                parts.append((fits.turn_covariance[i], expected[:3, :3]))
+            for got, part in parts:
+                assert_allclose(got, part, atol=2e-3 * np.abs(part).max())
+        assert np.isnan(fits.turn_covariance).all() == (camera == "affine")
+
+    @pytest.mark.parametrize("depth", slow_after(1, [0.1, 1.0]))
+    def test_is_no_higher_than_from_many_other_starts(self, camera, kind, depth):
+        scene = scene_of(camera, kind, noise=0.1, n_frames=2, depth=depth)
+        noise = 0.1**2
+        fits = fitted(scene, camera, noise)
+        rng = np.random.default_rng(1)
+        for i, M in enumerate(fits.motion):
+            scale = np.linalg.norm(M) / np.sqrt(2)
+            found, ends = value(scene, i, M, noise), []
+            for _ in range(6):
+                start = scale * Rotation.random(None, rng).as_matrix()[:2]
+                ends.append(self.minimum(scene, camera, i, start, noise))
+            assert found <= min(ends) + 1e-6
+            assert min(ends) == pytest.approx(found, abs=1e-4)
+
+    @staticmethod
+    def minimum(scene, camera, i, start, noise):
+        """Return the least objective of a frame that a search from a camera reaches."""
+
+        def f(step):
+            return value(scene, i, moved(camera, start, step), noise)
+
+        return minimize(f, np.zeros(CAMERAS[camera].n_parameters)).fun
+
+
+@CAMERA
+class TestDerivatives:
+    """Away from the minimum, where the gradient is not zero."""
+
+    H = 1e-5
+
+    @staticmethod
+    def disturbed(M, cameras, size=0.1):
+        rng = np.random.default_rng(1)
+        step = size * rng.normal(size=(cameras.n_parameters, M.shape[2]))
+        return cameras.moved(M, step)
+
+    def states(self, search, problem, M):
+        """Yield the states above and below along each tangent."""
+        n = search.model.n_parameters
+        for c in range(n):
+            step = np.zeros((n, M.shape[2]))
+            step[c] = self.H
+            yield tuple(
+                search.evaluate(problem, search.model.moved(M, sign * step))
+                for sign in (1, -1)
+            )
+
+    @KINDS
+    def test_value_by_dense_algebra(self, camera, kind):
+        scene = scene_of(camera, kind)
+        search, problem, M = problem_of(scene, camera, NOISE**2)
+        got = search.evaluate(problem, M).value
+        expected = [value(scene, i, each) for i, each in enumerate(scene.motion)]
+        assert_allclose(got, NOISE**2 * np.array(expected), rtol=1e-9)
+
+    @KINDS
+    @pytest.mark.parametrize("noise", [1e-4, 10.0])
+    def test_slope_by_differences(self, camera, kind, noise):
+        search, problem, M = problem_of(scene_of(camera, kind), camera, noise)
+        M = self.disturbed(M, CAMERAS[camera])
+        slope = search.evaluate(problem, M).slope
+        for c, (above, below) in enumerate(self.states(search, problem, M)):
+            expected = -(above.value - below.value) / (4 * self.H)
+            assert_allclose(slope[c], expected, rtol=1e-6, atol=1e-5)
+
+    def numerical_hessian(self, search, problem, M):
+        """Return half the Hessian of s2 F (p, p, n), by differences of the slope."""
+        rows = [
+            (below.slope - above.slope) / (2 * self.H)
+            for above, below in self.states(search, problem, M)
+        ]
+        # Differences of the slope along tangents that turn along: what is not
+        # symmetric is the commutator of two rotations.
+        hessian = np.array(rows)
+        return 0.5 * (hessian + hessian.swapaxes(0, 1))
+
+    @KINDS
+    def test_hessian_is_exact_but_for_the_determinant(self, camera, kind):
+        # What is left falls like the noise.
+        scene = scene_of(camera, kind)
+        errors = []
+        for noise in (1e-2, 1e-3, 1e-4):
+            search, problem, M = problem_of(scene, camera, noise)
+            M = self.disturbed(M, CAMERAS[camera], 0.03)
+            got = unpacked(search.evaluate(problem, M).hessian)
+            expected = self.numerical_hessian(search, problem, M)
+            size = np.abs(expected).max(axis=(0, 1))
+            errors.append((np.abs(got - expected).max(axis=(0, 1)) / size).max())
+        assert errors[0] < 0.1
+        assert errors[1] < 0.15 * errors[0]
+        assert errors[2] < 0.15 * errors[1]
+
+    @pytest.mark.parametrize("noise", [1e-3, 0.1, 10.0])
+    def test_hessian_of_the_determinant_is_a_bound(self, camera, noise):
+        search, problem, M = problem_of(scene_of(camera), camera, noise)
+        M = self.disturbed(M, CAMERAS[camera])
+        got = unpacked(search.evaluate(problem, M).hessian)
+        excess = got - self.numerical_hessian(search, problem, M)
+        assert (np.linalg.eigvalsh(frames_first(excess))[:, 0] > -1e-5).all()
+        assert np.abs(excess).max() > 1e-5
 
 
 @GAPS
 @CAMERA
 class TestExact:
     def test_truth_is_found(self, camera, gaps):
-        scene = scene_of(camera, gaps, noise=0.0)
+        scene = scene_of(camera, "gaps" if gaps else "complete", noise=0.0)
         fits = fitted(scene, camera, 0.0)
         for got, true in zip(
             camera_and_alpha(fits), camera_and_alpha(scene), strict=True
@@ -56,19 +265,11 @@ class TestExact:
         assert fits.converged.all()
         assert_allclose(fits.objective, 0, atol=1e-9)
 
-    def test_position_is_that_of_least_squares(self, camera, gaps):
-        scene = scene_of(camera, gaps)
-        rest = scene.tracks - images(
-            scene.shapes, *camera_and_alpha(fitted(scene, camera))
-        )
-        assert_allclose(np.nanmean(rest, axis=1), 0.0, atol=1e-12)
-
     def test_prepared_and_rough_frames(self, camera, gaps):
-        scene = scene_of(camera, gaps)
-        frames = frame_tracks(
-            scene.tracks.transpose(0, 2, 1), np.isfinite(scene.tracks[..., 0]) * 1.0
-        )
-        search = frame_search(camera, scene.shapes)
+        scene = scene_of(camera, "gaps" if gaps else "complete")
+        weights = np.isfinite(scene.tracks[..., 0]) * 1.0
+        frames = frame_tracks(scene.tracks.swapaxes(1, 2), weights)
+        search = FrameSearch(scene.shapes, CAMERAS[camera])
         expected = fitted(scene, camera)
         assert_same_fits(search.fit(frames, NOISE**2), expected, 1e-8)
         rough = search.fit(frames, NOISE**2, rough=True)
@@ -113,7 +314,7 @@ class TestInvariance:
     @pytest.mark.parametrize("unit", [1e-100, 1e100])
     def test_units(self, camera, gaps, unit):
         # Of single images, or of the whole table and the shapes
-        scene = scene_of(camera, gaps)
+        scene = scene_of(camera, "gaps" if gaps else "complete")
         units, shapes = unit ** np.random.default_rng(1).random(20), scene.shapes
         if camera == "orthographic":
             units, shapes = np.full(20, unit), unit * shapes
@@ -129,7 +330,7 @@ class TestInvariance:
 
 
 # What is done to shapes (4, 3, n_points), in place
-KINDS = {
+SHAPES = {
     "flat mean shape": lambda B: B[0, 2].fill(0),
     "flat": lambda B: B[:, 2].fill(0),
     "on a line": lambda B: B[:, 1:].fill(0),
@@ -152,12 +353,12 @@ KINDS = {
 
 @CAMERA
 class TestDegenerate:
-    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("kind", SHAPES)
     @pytest.mark.parametrize("variance", slow_after(1, [0.0, NOISE**2]))
     def test_stays_finite_and_no_worse_than_rigid(self, camera, kind, variance):
         scene = scene_of(camera)
         shapes = scene.shapes.copy()
-        KINDS[kind](shapes)
+        SHAPES[kind](shapes)
         shapes = random_rotation(5) @ shapes
         scene.tracks[10:] = with_gaps(scene.tracks[10:])
         starts = np.ones((2, 3))
@@ -240,89 +441,14 @@ def test_no_block_of_several_has_one_frame(n, length):
     assert lengths[:-1] == [length] * (len(slices) - 1)
 
 
-def noisy_scene(seed, noise=NOISE, n_frames=30):
-    """Return tracks, shapes (n_components + 1, 3, n_points) and what made them."""
-    scene = scenes.random_scene(seed, n_frames, noise=noise)
-    return scene.tracks, scene.shapes, camera_and_alpha(scene)
-
-
-def cost(tracks, shapes, variance, fits):
-    """Return f of each frame by its definition."""
-    difference = tracks - images(shapes, fits.motion, fits.translation, fits.alpha)
-    squares = np.nansum(difference**2, axis=(1, 2))
-    return squares + variance * np.sum(fits.alpha**2, axis=1)
-
-
-def energy_of(tracks):
-    """Return the largest energy of a frame; rounding errors are relative to it."""
-    centred = tracks - np.nanmean(tracks, axis=1, keepdims=True)
-    return np.nansum(centred**2, axis=(1, 2)).max()
-
-
-def problem_of(tracks, shapes, variance, weights=None):
-    """Return the search for shapes, and the frames as it takes them."""
-    search = AffineSearch(shapes)
-    products = frame_sums(
-        frame_tracks(tracks.transpose(0, 2, 1), weights), search.shared
-    )
-    return search, search.problem(products, np.full(len(tracks), variance))
-
-
-class TestOptimum:
-    @pytest.mark.parametrize("gaps", [False, True])
-    def test_objective_by_definition_rises_in_every_direction(self, gaps):
-        tracks, shapes, _ = noisy_scene(0)
-        if gaps:
-            tracks = with_gaps(tracks)
-        rng = np.random.default_rng(1)
-        fits = fit_posterior(tracks, shapes, NOISE**2)
-        least = cost(tracks, shapes, NOISE**2, fits)
-        assert_allclose(fits.objective, least, atol=1e-12 * energy_of(tracks))
-        for _ in range(20):
-            change = [rng.normal(size=each.shape) for each in camera_and_alpha(fits)]
-            rises = []
-            for size in (-1e-4, 1e-4):
-                moved = [
-                    x + size * d
-                    for x, d in zip(camera_and_alpha(fits), change, strict=True)
-                ]
-                moved = fits._replace(
-                    motion=moved[0], translation=moved[1], alpha=moved[2]
-                )
-                rises.append(cost(tracks, shapes, NOISE**2, moved) - least)
-            # Equal on both sides: the slope is zero, not only small.
-            assert (np.array(rises) > 0).all()
-            assert_allclose(rises[0], rises[1], rtol=1e-2)
-
-    def test_derivatives_by_differences(self):
-        tracks, shapes, _ = noisy_scene(0, n_frames=5)
-        weights = np.random.default_rng(1).uniform(0, 2, tracks.shape[:2])
-        for w in (None, weights):
-            search, problem = problem_of(tracks, shapes, NOISE, w)
-            alpha = np.random.default_rng(2).normal(size=(3, 5))
-            state = search.evaluate(problem, alpha)
-            h = 1e-5
-            for k in range(3):
-                e = h * np.eye(3)[:, [k]]
-                above = search.evaluate(problem, alpha + e)
-                below = search.evaluate(problem, alpha - e)
-                slope = (below.value - above.value) / (4 * h)
-                assert_allclose(state.slope[k], slope, rtol=1e-6, atol=1e-7)
-                bend = (below.slope - above.slope) / (2 * h)
-                assert_allclose(
-                    unpacked(state.hessian)[:, k], bend, rtol=1e-6, atol=1e-6
-                )
-
-
 class TestSpecial:
     def test_flat_shapes_have_cameras_that_are_zero_across(self):
-        tracks, shapes, _ = noisy_scene(0)
-        shapes[:, 2] = 0
+        scene = scenes.random_scene(0, noise=NOISE)
+        scene.shapes[:, 2] = 0
         R = random_rotation(0)
-        fits = fit_posterior(tracks, R @ shapes, NOISE**2)
-        assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
-        fits = fit_posterior(tracks, (R @ shapes)[:1], NOISE**2)
-        assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
+        for n in (4, 1):
+            fits = fit_posterior(scene.tracks, (R @ scene.shapes)[:n], NOISE**2)
+            assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -364,11 +490,12 @@ class TestStarts:
 
     def test_every_search_ends_in_a_minimum(self, mocap):
         tracks, shapes, _, variance = mocap
-        search, problem = problem_of(tracks, shapes, variance)
+        scene = scenes.Scene(tracks, shapes, np.zeros((len(tracks), 2, 3)), None, None)
+        search, problem, _ = problem_of(scene, "affine", variance)
         rng = np.random.default_rng(0)
         for size in (0.0, 1.0, 3.0):
-            start = size * rng.normal(size=(len(shapes) - 1, len(tracks)))
-            before = search.evaluate(problem, start)
+            alpha = size * rng.normal(size=(len(shapes) - 1, len(tracks)))
+            before = search.evaluate(problem, search.start(problem, alpha))
             found, there = search.descend(problem, before, MAX_STEPS)
             state = search.evaluate(problem, found)
             assert (state.value <= before.value + 1e-12 * scale_of(problem)).all()
@@ -378,7 +505,7 @@ class TestStarts:
             assert np.abs(step[:, there]).max() < 1e-7
 
     def test_frames_that_the_noise_explains_keep_theirs(self):
-        tracks, shapes, _ = noisy_scene(0)
+        tracks, shapes, *_ = scenes.random_scene(0, noise=NOISE)
         starts = np.random.default_rng(1).normal(size=(5, 3))
         tracks[3] += 0.5 * np.random.default_rng(2).normal(size=(20, 2))
         # By the chi-squared distribution of their objectives
@@ -404,6 +531,111 @@ class TestSpreadStarts:
         assert spread_starts(np.zeros((5, 2)), 4).shape == (0, 2)
         assert spread_starts(np.zeros((0, 2)), 4).shape == (0, 2)
         assert spread_starts(np.zeros((5, 0)), 4).shape == (0, 0)
+
+
+@CALIBRATED
+class TestReversal:
+    """Of a nearly flat object, whose reversed images are nearly the same."""
+
+    def scene(self, camera, deviation=0.01):
+        return scene_of(camera, noise=deviation, depth=0.1, n_frames=40)
+
+    def reversed(self, scene):
+        """Return cameras reflected at the plane of the mean shape."""
+        axes = np.linalg.svd(scene.shapes[0], full_matrices=False)[0]
+        return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
+
+    def search(self, scene, camera, noise, motion):
+        search, problem, _ = problem_of(scene, camera, noise)
+        return search.reversed_cameras(problem, motion)
+
+    def test_cameras_that_start_reversed_are_turned_back(self, camera):
+        scene = self.scene(camera)
+        found, better = self.search(scene, camera, 1e-4, self.reversed(scene))
+        expected = fitted(scene, camera, 1e-4).motion
+        assert better.mean() > 0.9
+        # A few steps lead there, not all of them to the minimum.
+        away = np.abs(found - expected).max(axis=(1, 2))[better]
+        assert away.max() < 0.2
+        assert np.median(away) < 1e-4
+        assert_calibrated(found, camera)
+
+    def test_reversals_are_tried_over_a_large_rise(self, camera):
+        # In a joint fit cameras can be in high minima, where the bound does not hold.
+        scene = scenes.random_scene(
+            n_frames=1500,
+            noise=0.01,
+            camera=camera,
+            deformation=0.4,
+            extent=(1.0, 0.8, 0.3),
+        )
+        search, problem, M = problem_of(scene, camera, 1e-4)
+        M = M * REVERSED
+        _, better = self.search(scene, camera, 1e-4, frames_first(M) @ search.space)
+        M, _ = search.descend(problem, search.evaluate(problem, M), 6)
+        posterior = coefficient_posterior(problem[0], M, problem[1])
+        value = search.evaluate(problem, M).value
+        steep = _rise(problem, M, posterior) > LARGE_RISE * value
+        assert (better & steep).sum() >= 3
+
+    def test_cameras_at_the_minimum_stay(self, camera):
+        scene = self.scene(camera)
+        expected = fitted(scene, camera, 1e-4).motion
+        found, better = self.search(scene, camera, 1e-4, expected)
+        assert not better.any()
+        assert_array_equal(found, expected)
+
+    def test_fit_takes_the_better_of_the_two(self, camera):
+        # The depth of the object is that of the noise: the start can be reversed.
+        scene = self.scene(camera, deviation=0.05)
+        noise = 0.05**2
+        fits = fitted(scene, camera, noise)
+        turned = scene._replace(motion=fits.motion)
+        for i, start in enumerate(self.reversed(turned)[:10]):
+            end = TestMinimum.minimum(scene, camera, i, start, noise)
+            assert value(scene, i, fits.motion[i], noise) <= end + 1e-6
+
+    def test_rise_on_the_way_is_that_of_the_quadratic_approximation(self, camera):
+        scene = scene_of(camera, noise=0.0, n_frames=3)
+        search, problem, M = problem_of(scene, camera, 1e-9)
+        posterior = coefficient_posterior(problem[0], M, problem[1])
+        for i, rise in enumerate(_rise(problem, M, posterior)):
+
+            def f(change, i=i):
+                changed = M[..., i] + change.reshape(2, 3)
+                frame = Regression.of(scene, i, changed, search.shared.shapes)
+                return frame.square(frame.mean(1e-9), 1e-9)
+
+            Y, z = hessian_of(f, 6) / 2, (M[..., i] * [0, 0, 1]).ravel()
+            assert_allclose(rise, (z @ z) ** 2 / (z @ np.linalg.solve(Y, z)), rtol=1e-3)
+
+    def test_solid_objects_are_not_reversed(self, camera, monkeypatch):
+        scene = scene_of(camera)
+        search, problem, M = problem_of(scene, camera, NOISE**2)
+        monkeypatch.setattr(search, "evaluate", None)  # no search from reversed cameras
+        converged = np.ones(len(scene.tracks), dtype=bool)
+        assert_array_equal(search.solution(problem, M, converged, 10)[0], M)
+
+
+def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):
+    """Also of equal singular values, of one, of none, and of axes in the columns."""
+    M = rng.standard_normal((2, 3, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
+    M[:, :2, :4] = 0.0
+    M[:, :2, 0] = np.eye(2)
+    M[0, 0, 1] = M[1, 1, 2] = M[0, 1, 3] = 2.0
+    M[:, :2, 4] = 0.0
+    affine = M.copy()
+    completed = calibrated_starts(CAMERAS["weak_perspective"], M)[1]
+    assert_array_equal(M, affine)
+    size = np.linalg.norm(M[:, :2], axis=(0, 1), ord=2)
+    size[4] = 1.0
+    products = (
+        np.einsum("rci,sci->irs", completed, completed) / size[:, None, None] ** 2
+    )
+    assert_allclose(products, np.broadcast_to(np.eye(2), products.shape), atol=1e-12)
+    some = np.arange(40) != 4
+    assert_allclose(completed[:, :2, some] / size[some], M[:, :2, some] / size[some])
+    assert (np.einsum("ri,ri->i", completed[:, 2], M[:, 2]) >= 0).all()
 
 
 class Frames(NamedTuple):
