@@ -26,7 +26,8 @@ from isa_nrsfm._joint.settings import LIMITS
 matplotlib.use("Agg")
 gc.disable()  # while tests are collected, which stay
 # Joint fits have one start, and few steps for the errors of their depths.
-AffineNRSfM._limits = LIMITS._replace(few_frames=0, widths=(), error_steps=3)
+QUICK = {"few_frames": 0, "widths": (), "error_steps": 3, "restarts": False}
+AffineNRSfM._limits = LIMITS._replace(**QUICK)
 
 # The same examples each time
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
