@@ -33,14 +33,14 @@ from isa_nrsfm._joint.consensus import (
     share_of_first,
     weighted,
 )
-from isa_nrsfm._joint.settings import LIMITS, FitSettings
+from isa_nrsfm._joint.settings import FitSettings, Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
-AS_USERS = ["few_frames", "widths", "error_steps"]
+AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
-Quick = limited(LIMITS._replace(few_frames=0, widths=(), error_steps=3))
+Quick = limited(Limits(few_frames=0, widths=(), error_steps=3, restarts=False))
 
 
 def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):

@@ -37,6 +37,7 @@ from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 from isa_nrsfm.skeletons import find_skeleton, get_skeleton
 
+AS_USERS = ["restarts"]
 # For errors of depths
 Thorough = limited(LIMITS._replace(few_frames=0, widths=()))
 N_POINTS = 16
