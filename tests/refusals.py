@@ -1,17 +1,24 @@
 """Calls that are refused, or that warn; `refusals.txt` is a table of refused calls.
 
 A section of the table has the name of a test file, and for each call two lines: the
-call, in the names of that file, and an expression for the message of its ValueError.
+call, in the names of that file, and an expression for the message of its ValueError,
+or of another error or a warning that is named before it, as in "OSError: is a pipe".
 `written(name, content)` writes a file into `folder`. `tmp_path` stays empty. Commands
-are `told_of_fit` and `usage`.
+are `told`, `told_of_fit` and `usage`; `pd` and `isa_nrsfm` are imported.
 """
 
+import builtins
 from pathlib import Path
 
+import pandas as pd
 import pytest
-from fit_runs import told_of_fit, usage
+from fit_runs import told, told_of_fit, usage
+
+import isa_nrsfm
 
 TABLE = Path(__file__).with_suffix(".txt")
+GIVEN = {"isa_nrsfm": isa_nrsfm, "pd": pd}
+GIVEN |= {"told": told, "told_of_fit": told_of_fit, "usage": usage}
 
 
 def refused(message, call, /, *args, error=ValueError, **kwargs):
@@ -44,8 +51,15 @@ def refusals_of(section, names):
             return folder / name
 
         given = {"tmp_path": tmp_path, "folder": folder, "written": written}
-        given |= {"told_of_fit": told_of_fit, "usage": usage}
-        refused(message, eval, call, names | given)
+        given |= GIVEN
+        kind, _, rest = message.partition(": ")
+        error = getattr(builtins, kind, None)
+        if kind.endswith("Warning"):
+            warned(rest, eval, call, names | given, category=error)
+        elif kind.endswith("Error"):
+            refused(rest, eval, call, names | given, error=error)
+        else:
+            refused(message, eval, call, names | given)
         assert not any(tmp_path.iterdir())
 
     return test

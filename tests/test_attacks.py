@@ -84,11 +84,6 @@ def test_threads_see_the_old_or_the_new_fit():
     assert all(np.array_equal(each, seen[0]) for each in seen)
 
 
-@pytest.mark.parametrize("model", [AffineNRSfM(1), AffineNRSfMCV(), FastISA()])
-def test_no_jobs_are_refused(model):
-    refused("'n_jobs' parameter of .* Got 0", model.set_params(n_jobs=0).fit, X)
-
-
 @pytest.mark.parametrize(
     ("part", "change"),
     [

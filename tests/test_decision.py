@@ -7,10 +7,10 @@ import warnings
 import numpy as np
 import pytest
 from layers import slow_after
-from refusals import refused
+from refusals import refusals_of
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AutoNRSfM
 from isa_nrsfm._decision import FIRST, first_settings
@@ -242,7 +242,4 @@ def test_pages_are_shown_in_notebooks(tmp_path):
     assert len(repr(page)) < 50
 
 
-def test_strategies_without_components_are_refused():
-    X = make_nonrigid_tracks(30, 16, **GIVEN).data
-    model = AffineNRSfM(1, isa=StandardScaler(), refinement=None)
-    refused("isa must give components_ of shape", model.fit, X)
+test_refusals = refusals_of("decision", globals())

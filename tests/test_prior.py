@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from layers import slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scenes import likelihood_of, random_scene, with_gaps
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
@@ -452,28 +453,8 @@ def test_squeezed_images_are_named():
 # --- refusals -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("of_prior", "params", "message"),
-    [
-        (None, {}, "prior must be a fitted AffineNRSfM"),
-        ({"camera": "affine"}, {}, "fitted with calibrated cameras"),
-        ({"refinement": None}, {}, "fitted with calibrated cameras and the joint"),
-        ({}, {"camera": "orthographic"}, "was fitted with camera='weak_perspective'"),
-        ({}, {"camera": "affine"}, "prior needs calibrated cameras"),
-        ({}, {"refinement": "consensus"}, "prior needs calibrated cameras"),
-        ({}, {"n_components": 3}, "must be that of the prior, 2, or 'auto'"),
-    ],
-)
-def test_refused(turned, frontal, of_prior, params, message):
-    prior = AffineNRSfM()
-    if of_prior is not None:
-        prior = fitted(turned.X, **of_prior) if of_prior else turned.model
-    refused(message, fitted, frontal.X, prior, **params)
-
-
 def test_other_points_are_refused(turned, frontal):
     X = frontal.X
-    refused("the prior has 16 points, the table 15", fitted, X[:, 2:], turned.model)
     order = np.random.default_rng(0).permutation(N_POINTS)
     other = X.reshape(len(X), -1, 2)[:, order].reshape(X.shape)
     refused("the same points in the same order", fitted, other, turned.model)
@@ -580,3 +561,11 @@ def test_weights_of_points_and_other_tables():
     assert not model.diagnostics(X, point_weight=weights).outlier_share
     other = np.roll(X, 2, axis=1)
     warned("as far from", model.transform, other, point_weight=weights)
+
+
+@made_once
+def prior_of(**params):
+    return fitted(study(0, 40, 30).X, **params)
+
+
+test_refusals = refusals_of("prior", globals())

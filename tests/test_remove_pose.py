@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from refusals import refused
+from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
@@ -122,11 +122,6 @@ def test_a_prior_keeps_its_origin(plain):
     assert_allclose(left.mean(axis=0), mean, atol=1e-9)
 
 
-def test_needs_calibrated_cameras(table):
-    fit = AffineNRSfM(2, remove_pose=True).fit
-    refused("remove_pose needs calibrated cameras, .*camera='weak", fit, table)
-
-
 def test_diagnostics_say_what_was_removed_and_what_is_left(model, plain):
     before, after = plain.diagnostics(), model.diagnostics()
     assert before.pose_share.max() > 0.3
@@ -148,3 +143,6 @@ def test_pose_share_of_unrelated_coefficients_is_not_above_zero(n_frames, rng):
     share = pose_share(turns[:, :2], rng.normal(size=(n_frames, 200)))
     assert share.mean() < 0
     assert np.mean(share > 0.3) < 0.01
+
+
+test_refusals = refusals_of("remove_pose", globals())

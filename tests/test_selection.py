@@ -9,10 +9,9 @@ import sklearn
 from layers import may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import (
     GridSearchCV,
-    KFold,
     LeaveOneGroupOut,
     cross_val_score,
 )
@@ -109,12 +108,6 @@ def test_methods_are_those_of_the_best_estimator(fitted):
     assert_array_equal(fitted.get_feature_names_out(), ["alpha_1", "alpha_2"])
 
 
-def test_nothing_is_there_before_the_fit():
-    search = AffineNRSfMCV()
-    assert not hasattr(search, "n_features_in_")
-    refused(None, search.transform, X, error=NotFittedError)
-
-
 @pytest.mark.slow
 def test_neither_order_nor_workers_change_the_result():
     fitted = AffineNRSfMCV((1, 2, 3), estimator=inner(), cv=3).fit(X)
@@ -205,16 +198,6 @@ def test_fewest_basis_shapes_are_fitted():
 def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
     monkeypatch.delattr("isa_nrsfm._selection.cross_validate")
     refused("n_components=500", AffineNRSfMCV((1, 500)).fit, X)
-
-
-def test_the_limit_of_the_parts_is_named():
-    few = X[:14]  # nine frames are fitted in a part, enough for three basis shapes
-    message = r"9 frames, enough for n_components=3 at most"
-    refused(message, AffineNRSfMCV((3, 5)).fit, few)
-    hidden = X.copy()
-    hidden[6:, :2] = np.nan  # five of the six rows that show it are held out
-    with pytest.raises(ValueError, match=r"split 0 of cv fits .* needs every point"):
-        AffineNRSfMCV((1, 2), cv=KFold(12)).fit(hidden)
 
 
 @may_not_converge

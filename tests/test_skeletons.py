@@ -263,18 +263,6 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
         refused(message, read_skeleton, config, ["a", "b"])
 
 
-def test_bad_questions():
-    refused(r"skeletons are ibug-68, .*; got 'cat'", get_skeleton, "cat")
-    refused("names must hold 3 names; got 2", find_skeleton, 3, ["a", "b"])
-    refused("shape must hold 3 points", find_skeleton, 3, shape=np.zeros((4, 2)))
-    hand, pose = get_skeleton("hand-21"), canonical_pose
-    refused("not the names of the points of 'hand-21'", hand.reordered, ["thumb"])
-    refused("has 21 points, the shape 20", pose, np.eye(20, 3), scheme="hand-21")
-    pairs = skeleton_of_names([("a", "b")], ["a", "b"], name="ab", source="me")
-    refused("does not define which way is up", pose, np.eye(2, 3), scheme=pairs)
-    refused(r"skeletons are .*; got \[\[0, 1\]\]", pose, np.eye(2, 3), scheme=[[0, 1]])
-
-
 WITH_CONTOUR = {
     **{"ibug-68": "ibug-51", "xm2vts-68": "xm2vts-53", "muct-76": "muct-61"},
     "wflw-98": "wflw-65",
