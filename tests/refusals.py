@@ -1,8 +1,9 @@
-"""Calls that are refused, or that warn; `refusals.txt` is a table of refused calls.
+"""Calls that are refused, that warn, or with their results: the table `refusals.txt`.
 
 A section of the table has the name of a test file, and for each call two lines: the
 call, in the names of that file, and an expression for the message of its ValueError,
 or of another error or a warning that is named before it, as in "OSError: is a pipe".
+Calls that are not refused have their result after "== ".
 `written(name, content)` writes a file into `folder`. `tmp_path` stays empty. Commands
 are `told`, `told_of_fit` and `usage`; `pd` and `isa_nrsfm` are imported.
 """
@@ -13,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from fit_runs import told, told_of_fit, usage
+from numpy.testing import assert_equal
 
 import isa_nrsfm
 
@@ -52,14 +54,17 @@ def refusals_of(section, names):
 
         given = {"tmp_path": tmp_path, "folder": folder, "written": written}
         given |= GIVEN
+        if message.startswith("== "):
+            assert_equal(eval(call, names | given), eval(message[3:], names | given))
+            return
         kind, _, rest = message.partition(": ")
-        error = getattr(builtins, kind, None)
-        if kind.endswith("Warning"):
-            warned(rest, eval, call, names | given, category=error)
-        elif kind.endswith("Error"):
-            refused(rest, eval, call, names | given, error=error)
-        else:
+        error = vars(builtins).get(kind)
+        if error is None:
             refused(message, eval, call, names | given)
+        elif issubclass(error, Warning):
+            warned(rest, eval, call, names | given, category=error)
+        else:
+            refused(rest, eval, call, names | given, error=error)
         assert not any(tmp_path.iterdir())
 
     return test

@@ -155,46 +155,6 @@ def test_generated_shapes_are_recognised_in_their_own_order_only(name, maker, rn
         assert find_skeleton(n_points, shape=other) is None
 
 
-@pytest.mark.parametrize(
-    ("n_points", "options"),
-    [
-        (17, {}),
-        (68, {}),
-        (42, {}),
-        (17, {"shape": make_body_tracks(100, random_state=0).mean_shape}),
-        # Readers of other layouts, other names, numbers that leave some out.
-        (21, {"reader": "openface"}),
-        (17, {"reader": "mediapipe"}),
-        (21, {"names": [f"marker {j} of mine" for j in range(21)]}),
-        (17, {"names": [f"joint_{chr(97 + j)}" for j in range(17)]}),
-        (21, {"names": [str(j) for j in (*range(20), 21)]}),
-    ],
-)
-def test_where_no_or_two_layouts_fit_none_is_taken(n_points, options):
-    assert find_skeleton(n_points, **options) is None
-
-
-@pytest.mark.parametrize(
-    ("n_points", "reader", "name"),
-    [
-        (68, "openface", "ibug-68"),
-        (68, "pyfeat", "ibug-68"),
-        (478, "pyfeat", "mediapipe-face-478"),
-        (51, "pts", "ibug-51"),
-        (98, "wflw", "wflw-98"),
-        (17, "coco", "coco-17"),
-        (133, "coco", "coco-wholebody-133"),
-        (33, "mediapipe", "mediapipe-pose-33"),
-        (21, "mediapipe", "hand-21"),
-        (21, "table", "hand-21"),
-    ],
-)
-def test_the_reader_tells_the_layout(n_points, reader, name):
-    assert find_skeleton(n_points, None, reader).name == name
-    numbers = [f"point{j}" for j in range(n_points)]
-    assert find_skeleton(n_points, numbers, reader).name == name
-
-
 OPENPOSE = """Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip
 RKnee RAnkle LHip LKnee LAnkle REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe
 RSmallToe RHeel""".split()
