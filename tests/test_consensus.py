@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
@@ -582,12 +583,6 @@ class TestEstimator:
             errors.append(np.mean(off[:, others] ** 2))
         assert errors[1] < errors[0]
 
-    def test_affine_cameras_are_refused(self):
-        """Depths of groups with affine cameras have no common unit."""
-        message = "needs calibrated cameras.*camera='weak_perspective'"
-        with pytest.raises(ValueError, match=message):
-            consensus_fit(camera="affine")
-
     def test_saved_models(self, body, tmp_path):
         """A model that is read again gives the same results."""
         save_model(body, tmp_path / "model.npz")
@@ -652,3 +647,6 @@ def test_tables_whose_noise_is_at_the_floor_have_groups(load_data):
         )
     )
     assert merged < 0.8 * joint
+
+
+test_refusals = refusals_of("consensus", globals())

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scipy.io import netcdf_file
 
 from isa_nrsfm import AffineNRSfM
@@ -155,10 +155,11 @@ def test_depths_that_are_not_determined(face, tmp_path):
     assert np.isfinite([points.position[..., :2], points.position_std[..., :2]]).all()
 
 
-def test_what_has_no_deviations_is_refused(face, tmp_path):
-    model, X, _ = face
-    affine = AffineNRSfM(1, random_state=0).fit(X.dropna())
-    refused("needs a model with calibrated cameras", frame_points, affine, X)
-    refused("path must end in .nc or .h5", write_points, model, tmp_path / "a.txt", X)
-    refused("above zero", write_points, model, tmp_path / "a.nc", X, fps=0)
-    assert not list(tmp_path.iterdir())
+TABLE = make_face_tracks(40, n_components=1, random_state=0, noise=0.01).data
+
+
+def plain_model(**params):
+    return AffineNRSfM(1, random_state=0, **params).fit(TABLE)
+
+
+test_refusals = refusals_of("points_in_space", globals())
