@@ -18,10 +18,10 @@ import pandas as pd
 import pytest
 from estimator_contract import widen
 from hypothesis import settings
+from layers import LIMITS
 from sklearn.utils import estimator_checks
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._joint.settings import LIMITS
 
 matplotlib.use("Agg")
 gc.disable()  # while tests are collected, which stay

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from layers import with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint.common_depths import (
     _principal,
@@ -34,14 +34,14 @@ from isa_nrsfm._joint.consensus import (
     share_of_first,
     weighted,
 )
-from isa_nrsfm._joint.settings import FitSettings, Limits
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
-Quick = limited(Limits(few_frames=0, widths=(), error_steps=3, restarts=False))
+Quick = with_limits(few_frames=0, widths=(), error_steps=3, restarts=False)
 
 
 def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):

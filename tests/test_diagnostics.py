@@ -280,6 +280,13 @@ class TestPoseShare:
         model = AffineNRSfM(2, camera=camera, random_state=0).fit(inner)
         assert np.abs(model.diagnostics().pose_share).max() < 0.1
 
+    @pytest.mark.parametrize("n_frames", [20, 40, 100])
+    def test_of_unrelated_coefficients_is_not_above_zero(self, n_frames, rng):
+        turns = Rotation.from_rotvec(0.4 * rng.normal(size=(n_frames, 3))).as_matrix()
+        share = pose_share(turns[:, :2], rng.normal(size=(n_frames, 200)))
+        assert share.mean() < 0
+        assert np.mean(share > 0.3) < 0.01
+
 
 class TestOutliers:
     def test_are_found_beside_badly_explained_points_and_frames(self, rng):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
@@ -22,14 +22,12 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, AutoNRSfM
-from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._joint.fit import widened
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem
-from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._other_tables import prior_start
 from isa_nrsfm._parameters.choices import FACE_PRIORS
 from isa_nrsfm._prepare.scaling import scaled_table
@@ -40,7 +38,7 @@ from isa_nrsfm.skeletons import find_skeleton, get_skeleton
 
 AS_USERS = ["restarts"]
 # For errors of depths
-Thorough = limited(LIMITS._replace(few_frames=0, widths=()))
+Thorough = with_limits(few_frames=0, widths=())
 N_POINTS = 16
 PERSPECTIVE = {"camera": "perspective", "principal_point": (0, 0)}
 

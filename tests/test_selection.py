@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import sklearn
-from layers import may_not_converge
+from layers import may_not_converge, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
 from sklearn.exceptions import ConvergenceWarning
@@ -19,14 +19,12 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm._selection import results_of, selected
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0).data
 PERSON = np.arange(len(X)) % 6
-OneStartNRSfM = limited(Limits(few_frames=0, widths=()))
+OneStartNRSfM = with_limits(few_frames=0, widths=(), restarts=False)
 
 
 def inner(**parameters):

@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from frame_parts import OF_FRAMES, OF_SHAPES, assert_same_model
-from layers import slow_after
+from layers import slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -26,9 +24,9 @@ FEW_POINTS = np.repeat([1.0, 2.0, 4.0, np.nan], [2, 2, 2, 34])
 CHUNKS = (35, 75, 0, 40)
 # Small tables are worked on as large ones are.
 # Their starts and ends are none of their own: one start and few steps are quick.
-ALL = Limits(few_frames=0, widths=())
-SAMPLED = ALL._replace(small_table=1000, sample=50, model_frames=100)
-KRYLOV = ALL._replace(dense=300)
+ALL = {"few_frames": 0, "widths": (), "restarts": False}
+SAMPLED = ALL | {"small_table": 1000, "sample": 50, "model_frames": 100}
+KRYLOV = ALL | {"dense": 300}
 
 
 @made_once
@@ -47,13 +45,13 @@ def table(missing=0.0, n_points=20, n_frames=150, outliers=False, planar=False):
 
 
 def estimator(limits=ALL, tol=1.0, **params):
-    return limited(limits)(K, random_state=0, tol=tol, **params)
+    return with_limits(**limits)(K, random_state=0, tol=tol, **params)
 
 
 @made_once
-def in_memory(limits=ALL, params=(), given=()):
+def in_memory(limits=(), params=(), given=()):
     """Return the fit of a table in memory."""
-    return estimator(limits, **dict(params)).fit(table(**dict(given)))
+    return estimator(dict(limits) or ALL, **dict(params)).fit(table(**dict(given)))
 
 
 def stored(X, path, kind="memmap", n_files=3):
@@ -104,7 +102,7 @@ SLOW_FITS = [
     slow_after(len(FITS), FITS + SLOW_FITS),
 )
 def test_fit_is_that_in_memory(tmp_path, kind, memory, limits, params, given):
-    expected = in_memory(limits, tuple(params.items()), tuple(given.items()))
+    expected = in_memory(*(tuple(each.items()) for each in (limits, params, given)))
     X = stored(table(**given), tmp_path, kind)
     got = estimator(limits, working_memory=memory, **params).fit(X)
     assert_same_model(got, expected)
