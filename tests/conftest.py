@@ -165,24 +165,11 @@ def fits(succeeds, tmp_path):
 
 
 @pytest.fixture
-def begins(run, tmp_path, monkeypatch):
+def begins():
     """Return a function that reads a table up to its fit: what is told until then."""
+    from fit_runs import begun
 
-    def stop(*_, **__):
-        raise ValueError("here the fit begins")
-
-    def told(table, *options):
-        quick = ["--refinement", "none", "-k", 1, "--no-figures"]
-        with monkeypatch.context() as patch:
-            patch.setattr(AffineNRSfM, "fit", stop)
-            folder = tmp_path / "no results"
-            code, out, err = run("fit", table, "-o", folder, *quick, *options)
-        assert (code, out) == (1, ""), err
-        before, last = err[:-1].rpartition("\n")[::2]
-        assert last == "isa-nrsfm: error: here the fit begins"
-        return before
-
-    return told
+    return begun
 
 
 @pytest.fixture

@@ -3,24 +3,37 @@
 A section of the table has the name of a test file, and for each call two lines: the
 call, in the names of that file, and an expression for the message of its ValueError,
 or of another error or a warning that is named before it, as in "OSError: is a pipe".
-Calls that are not refused have their result after "== ".
+Calls that are not refused have their result after "== ", or what their text matches
+after "~ ", and does not after "!~ ".
 `written(name, content)` writes a file into `folder`. `tmp_path` stays empty. Commands
-are `told`, `told_of_fit` and `usage`; `pd` and `isa_nrsfm` are imported.
+are `begun`, `told`, `told_of_fit` and `usage`; `pd` and `isa_nrsfm` are imported.
 """
 
 import builtins
+import re
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from fit_runs import told, told_of_fit, usage
+from fit_runs import begun, told, told_of_fit, usage
 from numpy.testing import assert_equal
 
 import isa_nrsfm
 
 TABLE = Path(__file__).with_suffix(".txt")
 GIVEN = {"isa_nrsfm": isa_nrsfm, "pd": pd}
-GIVEN |= {"told": told, "told_of_fit": told_of_fit, "usage": usage}
+GIVEN |= {"begun": begun, "told": told, "told_of_fit": told_of_fit, "usage": usage}
+
+# Of results: their equality, and whether a text matches an expression
+CHECKS = {
+    "==": lambda found, rest, scope: assert_equal(found, eval(rest, scope)),
+    "~": lambda found, rest, _: assert_regex(rest, found, True),
+    "!~": lambda found, rest, _: assert_regex(rest, found, False),
+}
+
+
+def assert_regex(pattern, text, expected):
+    assert bool(re.search(pattern, text)) == expected, text
 
 
 def refused(message, call, /, *args, error=ValueError, **kwargs):
@@ -54,8 +67,9 @@ def refusals_of(section, names):
 
         given = {"tmp_path": tmp_path, "folder": folder, "written": written}
         given |= GIVEN
-        if message.startswith("== "):
-            assert_equal(eval(call, names | given), eval(message[3:], names | given))
+        sign, _, rest = message.partition(" ")
+        if sign in CHECKS:
+            CHECKS[sign](eval(call, names | given), rest, names | given)
             return
         kind, _, rest = message.partition(": ")
         error = vars(builtins).get(kind)

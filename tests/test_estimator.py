@@ -205,21 +205,6 @@ def test_every_attribute_is_documented(model):
     assert documented - fitted == set()
 
 
-@pytest.mark.parametrize(
-    ("name", "own"),
-    [
-        ("components_", "basis_"),
-        ("explained_variance_ratio_", "energy_share_"),
-        ("mean_", "mean_shape_"),
-    ],
-)
-def test_names_of_scikit_learn_lead_to_those_of_the_model(name, own, model):
-    with pytest.raises(AttributeError, match=f"{name} has the name {own}"):
-        getattr(model, name)
-    assert hasattr(model, own)
-    assert not hasattr(model, name)
-
-
 def test_inputs_of_other_types_are_fitted_in_double_precision():
     table = np.round(TABLE).astype(np.int32)
     model = estimator(refinement="alternating").fit(table)

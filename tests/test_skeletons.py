@@ -160,21 +160,6 @@ RKnee RAnkle LHip LKnee LAnkle REye LEye REar LEar LBigToe LSmallToe LHeel RBigT
 RSmallToe RHeel""".split()
 
 
-@pytest.mark.parametrize(
-    ("names", "name"),
-    [
-        (OPENPOSE, "body-25"),
-        (get_skeleton("coco-17").point_names, "coco-17"),
-        ([n.upper() for n in get_skeleton("h36m-17").point_names], "h36m-17"),
-        (get_skeleton("coco-wholebody-133").point_names, "coco-wholebody-133"),
-    ],
-)
-def test_names_tell_the_layout(names, name):
-    assert find_skeleton(len(names), names).name == name
-    # Whatever else is said.
-    assert find_skeleton(len(names), names, "mediapipe").name == name
-
-
 def test_names_in_another_order_are_the_layout_in_that_order():
     coco = get_skeleton("coco-17")
     order = np.random.default_rng(0).permutation(17)
