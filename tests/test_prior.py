@@ -79,11 +79,17 @@ def error(model, S, X):
     return mean_shape_error_3d(S, model.reconstruct(X), convention="frame")
 
 
+@made_once
+def prior_of(**params):
+    """Return a fit of a table that determines its shapes."""
+    return fitted(study(0, 40, 30).X, **params)
+
+
 @pytest.fixture(scope="module")
 def turned():
     """A table that determines its shapes, and its fit."""
     table = study(0, 40, 30)
-    table.model = fitted(table.X)
+    table.model = prior_of()
     return table
 
 
@@ -559,11 +565,6 @@ def test_weights_of_points_and_other_tables():
     assert not model.diagnostics(X, point_weight=weights).outlier_share
     other = np.roll(X, 2, axis=1)
     warned("as far from", model.transform, other, point_weight=weights)
-
-
-@made_once
-def prior_of(**params):
-    return fitted(study(0, 40, 30).X, **params)
 
 
 test_refusals = refusals_of("prior", globals())
