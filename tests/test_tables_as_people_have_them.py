@@ -15,7 +15,7 @@ from fit_runs import JOINT, QUICK
 from landmark_files import BODYPARTS, TRACKS
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli._times import image_numbers
@@ -130,32 +130,15 @@ FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 LEGS = ("coxa", "femur", "tibia", "tarsus", "claw")
 
 
-@pytest.mark.parametrize(
-    ("name", "first", "second"),
-    [
-        ("{}_{}", ("thumb", "index", "ring"), range(4)),
-        ("{}_{}", ("left", "right"), BODYPARTS),
-        ("{}_{}", ("lefthand", "righthand"), range(21)),
-        ("{}{}", ("LeftHand", "RightHand"), range(21)),
-        ("{1}_{0}", ("gauche", "droite"), range(17)),
-        ("{}{}", ("vänster", "höger"), range(17)),
-        ("hand{}_{}", "LR", range(21)),
-        ("{}_{}", FINGERS, "123"),
-        ("{}_{}", ("finger1", "finger2", "finger3"), range(7)),
-        ("L{}{}", "123", ("Coxa", "Femur", "Tibia", "Tarsus")),
-        ("{}_{}", ("L1", "L2", "L3", "R1", "R2", "R3"), LEGS),
-        ("{}_{}", (f"leg{i}" for i in range(1, 7)), range(8)),
-        ("row{}_{}", range(8), range(8)),
-    ],
-)
-def test_parts_of_one_body_are_no_individuals(name, first, second):
+def reads_all_parts(name, first, second):
+    """Return whether all points of one body are read, if need be as advised."""
     parts = [name.format(a, b) for a, b in product([*first], [*second])]
     parts += [part.replace("L", "R") for part in parts if name[0] == "L"]
     table, options = table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts), {}
     if name[:3] != "{1}" and isinstance(second, range) and len(second) > 6:
         told = str(refused("more than one set", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
-    assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
+    return landmark_table(table, **options).points.shape == (2, 2 * len(parts))
 
 
 def test_individuals_of_few_points_are_not_fitted():
@@ -217,28 +200,9 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
     assert "exactly" not in warnings_of(fit, tracks.reshape(N, -1))[0]
 
 
-@pytest.mark.parametrize(
-    ("names", "numbers"),
-    [
-        ("labeled-data/v/img0010.png labeled-data/v/img0030.png", [10, 30]),
-        ("v1_7_x2.png v1_9_x2.png v1_30_x2.png", [7, 9, 30]),
-        ("a/1.png a/5.png b/1.png b/5.png", [1, 5, 1, 5]),
-        ("e3a1.png 77b0.png 0c9d.png", [0, 1, 2]),  # no numbers of frames
-        ("anna.png bob.png anna.png", [0, 1, 0]),
-        ("2023-05-01_12-00-30.png 2023-05-01_12-00-31.png", [0, 1]),
-        ("20230501120030.png 20230501120130.png 20230501120230.png", [0, 1, 2]),
-        ("v/20230501_120030.png v/20230501_120031.png", [0, 1]),
-        ("2023-05-01_0001.png 2023-05-01_0130.png", [1, 130]),
-        ("20230501_01.png 20230501_02.png 20230502_01.png 20230502_02.png", [1, 2] * 2),
-        ("12h00m30s.png 12h00m50s.png 12h01m10s.png", [0, 1, 2]),
-        ("frame_0.04.png frame_0.96.png frame_1.04.png", [0, 1, 2]),
-        ("1682935230040.jpg 1682935230080.jpg", [0, 1]),
-        ("cam1.012.png cam1.015.png cam2.012.png cam2.015.png", [12, 15] * 2),
-        ("000000000139.jpg 000000000785.jpg", [139, 785]),
-    ],
-)
-def test_numbers_in_names_are_those_of_frames(names, numbers):
-    assert list(image_numbers(pd.DataFrame({"image": names.split()}))) == numbers
+def numbers_in(names):
+    """Return the numbers of frames in names of images."""
+    return list(image_numbers(pd.DataFrame({"image": names.split()})))
 
 
 def test_times_in_names_of_images_are_told(tmp_path, begins):
@@ -544,3 +508,6 @@ def test_points_w_and_h_are_no_sizes_of_boxes(name):
         told = str(refused("give columns, such as", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
     assert_array_equal(landmark_table(table, **options).points, table)
+
+
+test_refusals = refusals_of("tables_as_people_have_them", globals())
