@@ -32,8 +32,15 @@ from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
 from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
 from isa_nrsfm._frames.pinhole import focal_shares, pinhole_of, zoomed_table
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._other_tables import checked_prior, fitted_prior, warn_if_foreign
+from isa_nrsfm._other_tables import (
+    checked_prior,
+    fitted_prior,
+    of_fits,
+    warn_if_foreign,
+)
 from isa_nrsfm._parameters import choices
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.checks import (
     check_camera,
@@ -44,7 +51,7 @@ from isa_nrsfm._prepare.checks import (
     validated_table,
 )
 from isa_nrsfm._prepare.coordinates import warn_of_rows
-from isa_nrsfm._prepare.scaling import check_weightable, scaled_table, weighted_rows
+from isa_nrsfm._prepare.scaling import scaled_table, weighted_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
     CHECKS,
@@ -56,7 +63,7 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
-from isa_nrsfm.analysis._after_fit import warn_after_fit
+from isa_nrsfm.analysis._advice import warn_after_fit
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
 from isa_nrsfm.analysis._smoothing import SmoothedCoefficients, smooth
@@ -392,6 +399,7 @@ default="affine"
     _limits: ClassVar[Limits] = LIMITS  # others: `limited`
     # Settings of a fit that continues another one: whole, errors, start, known
     _continued: dict[str, Any] | None = None
+    _held: tuple[Any, Any, Any] | None = None  # a fitted table, weights, both opened
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
@@ -623,24 +631,19 @@ default="affine"
         self, X: Any, point_weight: Any = None
     ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
         """Return the checked table of a fit, its weights and settings; set names."""
-        joint = self.refinement in choices.JOINT_REFINEMENTS
+        joint = self.refinement in JOINT_REFINEMENTS
+        params = self.get_params(deep=False)
+        check_requirements(params | {"point_weight": point_weight})
         if not joint:
-            got = f"needs refinement='joint'; got refinement={self.refinement!r}"
-            only_joint: dict[str, list[Any]] = {
-                "n_components": ["auto"],
-                "loss": [*choices.LOSSES[1:]],
-                "independence": ["coefficients"],
-            }
-            for name, values in only_joint.items():
-                if getattr(self, name) in values:
-                    raise ValueError(f"{name}={getattr(self, name)!r} {got}")
             if is_on_dask(X) or isinstance(X, StoredTable):
-                raise ValueError(f"a table that is not in memory {got}")
+                raise ValueError(
+                    "a table that is not in memory needs refinement='joint'; got "
+                    f"refinement={self.refinement!r}"
+                )
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
         check_camera(self)
         source, weights = self._opened(X, point_weight, reset=True)
-        params = self.get_params(deep=False)
         params |= checked_prior(self, source.empty.shape[2])
         if self.tol is None:
             params["tol"] = JOINT_TOL if joint else PAPER_TOL
@@ -711,13 +714,12 @@ default="affine"
         ndarray of shape (n_frames, n_components)
             Coefficients; `alpha_` for the fitted table. NaN for rows of too few points.
         """
-        table, weights = self._opened(X, point_weight)
 
-        def coefficients(rows: NDArray, weights: NDArray | None = None) -> NDArray:
-            fit = self._model.reported(rows, weights, deviations=False)
-            return fit.alpha - removed_part(self, fit.motion)
+        def coefficients(fit: Decomposition, *_: NDArray) -> NDArray:
+            alpha = leading(fit, self._model.n_components).alpha
+            return alpha - removed_part(self, fit.motion)
 
-        return table.collect(coefficients, *weights)
+        return of_fits(self, coefficients, X, point_weight)
 
     def decompose(self, X: Any, *, point_weight: Any = None) -> Decomposition:
         """
@@ -736,8 +738,11 @@ default="affine"
             Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
             alpha_std (n_frames, n_components), also with `remove_pose` of the shapes.
         """
-        table, weights = self._opened(X, point_weight)
-        return table.collect(self._model.reported, *weights)
+
+        def reported(fit: Decomposition, *_: NDArray) -> Decomposition:
+            return leading(fit, self._model.n_components)
+
+        return of_fits(self, reported, X, point_weight, deviations=True)
 
     def smooth(
         self,
@@ -952,21 +957,17 @@ default="affine"
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled, model = metric is not None and camera == "orthographic", self._model
 
-        def shapes_of(fit: Decomposition) -> NDArray:
+        def shapes_of(fit: Decomposition, *_: NDArray) -> NDArray:
             shapes = model.shapes(fit, metric, scaled)
             return model.turned(shapes, fit) if turned else shapes
 
         if decomposed:
             return shapes_of(X)
+        if not return_std:
+            return of_fits(self, shapes_of, X, point_weight)
         table, weights = self._opened(X, point_weight)
-        if return_std:
-            uncertain = partial(model.uncertain_shapes, turned=turned)
-            return table.collect(uncertain, *weights)
-
-        def shapes(rows: NDArray, weights: NDArray | None = None) -> NDArray:
-            return shapes_of(model.decompose(rows, weights, deviations=False))
-
-        return table.collect(shapes, *weights)
+        uncertain = partial(model.uncertain_shapes, turned=turned)
+        return table.collect(uncertain, *weights)
 
     def shapes(self, alpha: Any) -> NDArray:
         """
@@ -1037,9 +1038,8 @@ default="affine"
             Points of the fitted shapes in the fitted cameras. NaN for rows with too
             few visible points.
         """
-        table, weights = self._opened(X, point_weight)
-        reproject = partial(self._model.reproject, weighted=bool(weights))
-        return table.collect(reproject, *self._focal_shares(table), *weights)
+        check_is_fitted(self)
+        return of_fits(self, self._model.reproject, X, point_weight)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1152,15 +1152,15 @@ default="affine"
         table must match the fit: parameters that are set after it have no effect.
         `judged`: warn if it does not fit the model.
         """
-        layout, loss = self.layout, str(self.loss)
-        joint = self.refinement in choices.JOINT_REFINEMENTS
+        layout = self.layout
         if not reset:
+            if self._held and self._held[0] is X and self._held[1] is point_weight:
+                return self._held[2]
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
-            joint, loss = frames.joint, frames.loss
-        if point_weight is not None:
-            grouped = reset and self.refinement == "consensus"
-            check_weightable(X, joint, loss, grouped)
+            known = "joint" if frames.joint else None
+            given = {"point_weight": point_weight, "refinement": known}
+            check_requirements(given | {"loss": frames.loss})
         if is_read_later(X):
             check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
@@ -1176,8 +1176,8 @@ default="affine"
         weights: tuple[NDArray, ...] = ()
         if point_weight is not None:
             table, weights = weighted_rows(table, point_weight)
-        if judged and joint and not (reset or is_on_dask(X)):
-            warn_if_foreign(self, table, *weights)
+        if judged and not (reset or is_on_dask(X)):
+            warn_if_foreign(self, table, None, *weights)
         return table, weights
 
 

@@ -18,7 +18,6 @@ from isa_nrsfm._frames.models import (
     Decomposition,
     FrameModel,
     LinearisedFrames,
-    leading,
 )
 from isa_nrsfm._frames.pinhole import Pinhole, turns_to, zoomed
 from isa_nrsfm._frames.search import FramePosterior
@@ -80,10 +79,6 @@ class TableModel(NamedTuple):
         fit = self.in_virtual_cameras(rows, weights, deviations)
         fit = self.in_table_cameras(rows, *fit)
         return Decomposition(*(part.astype(dtype) for part in fit))
-
-    def reported(self, *args: Any, **options: Any) -> Decomposition:
-        """Return `decompose` with the coefficients that are reported."""
-        return leading(self.decompose(*args, **options), self.n_components)
 
     def in_virtual_cameras(
         self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
@@ -317,19 +312,10 @@ class TableModel(NamedTuple):
         variances = np.diagonal(turns @ covariances @ turns.mT, axis1=2, axis2=3)
         return fit, of_all_rows(variances, usable)
 
-    def reproject(
-        self, rows: NDArray, *by_frame: NDArray, weighted: bool = False
-    ) -> NDArray:
-        """Return images of the fitted shapes, as a table.
-
-        With shares (n, 1) by frame they are zoomed back. If `weighted`, weights (n, J)
-        of points follow.
-        """
-        weights = by_frame[-1] if weighted else None
-        shares = by_frame[: len(by_frame) - weighted]
-        motion, translation, alpha, _ = self.decompose(rows, weights, deviations=False)
-        shapes = compose(self.mean_shape, self.basis, alpha)
-        images = self.images(shapes, motion, translation)
+    def reproject(self, fit: Decomposition, *shares: NDArray) -> NDArray:
+        """Return images of fitted frames as a table, zoomed back by shares (n, 1)."""
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        images = self.images(shapes, fit.motion, fit.translation)
         known = self.pinhole or self.axes
         if known is not None and shares:
             centre = known.centre[:, 0]

@@ -1,6 +1,7 @@
 """A fitted model and other tables: as their prior, and whether they fit it."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,13 +12,16 @@ from sklearn.base import clone
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import distances, full_rotations
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
 from isa_nrsfm._joint.settings import FitSettings
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._prepare.checks import FEWEST_COMPARED
 from isa_nrsfm._prepare.robust import median_noise
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._tables.sources import is_read_later
 from isa_nrsfm._tables.tracks import tracks_to_table
 
 # Distance of points from the shapes of a prior, in sizes of frames, beyond its noise,
@@ -27,18 +31,62 @@ from isa_nrsfm._tables.tracks import tracks_to_table
 OTHER_POINTS, LARGEST_MISFIT, OF_AFFINE = 0.15, 1.8, 5.0
 
 
-def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> None:
+def of_fits(
+    estimator: Any,
+    result: Callable[..., Any],
+    X: Any,
+    point_weight: Any = None,
+    *,
+    deviations: bool = False,
+) -> Any:
+    """Return a result of the fits of a table's rows, and of their focal shares.
+
+    Warn if the table does not fit the model. Fits of tables that are read later are not
+    kept.
+    """
+    later = is_read_later(X)
+    table, weights = estimator._opened(X, point_weight, judged=later)
+    shares, n = estimator._focal_shares(table), len(weights)
+
+    def fits(rows: NDArray, *weights: NDArray) -> Decomposition:
+        return estimator._model.decompose(rows, *weights, deviations=deviations)
+
+    def results(rows: NDArray, *by_frame: NDArray) -> Any:
+        return result(fits(rows, *by_frame[:n]), *by_frame[n:])
+
+    if later:
+        return table.collect(results, *weights, *shares)
+    fit = table.collect(fits, *weights)
+    warn_if_foreign(estimator, table, fit, *weights)
+    return result(fit, *shares)
+
+
+def hold_open(estimator: Any, X: Any, point_weight: Any = None) -> None:
+    """Open a fitted table once for all methods that it is given to."""
+    opened = estimator._opened(X, point_weight, judged=False)
+    estimator._held = X, point_weight, opened
+
+
+def warn_if_foreign(
+    estimator: Any, table: FrameBlocks, fit: Decomposition | None, *weights: NDArray
+) -> None:
     """Warn if frames lie farther from the shapes of a model than its noise explains.
 
+    Without fits of all frames, some are fitted.
     The noise of a weighted fit is not comparable to unweighted residuals.
     """
-    model = estimator._model
+    model, held = estimator._model, estimator._held
+    if not model.frames.joint or (held and held[2][0] is table):
+        return
     certainty, camera = model.frames.certainty, model.frames.camera
     if table.n_frames < FEWEST_COMPARED or (certainty.weighted and not weights):
         return
     some = spread(np.arange(table.n_frames), 100)
     rows, own = table.take(some), [w[some] for w in weights]
-    fit = model.decompose(rows, own[0] if own else None, False, np.float64)
+    if fit is None:
+        fit = model.decompose(rows, *own, deviations=False, dtype=np.float64)
+    else:
+        fit = Decomposition(*(part[some] for part in fit))
     distance = model.distances(rows, *fit[:3], *own)
     misfit = model.misfit(distance)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
@@ -54,7 +102,7 @@ def warn_if_foreign(estimator: Any, table: FrameBlocks, *weights: NDArray) -> No
                 way = (
                     "Adapt the model to X: AutoNRSfM(model, prior=model).fit(X). Held-"
                     "out points of some rows then have an inverse SNR of "
-                    f"{after:.2g}, now {before:.2g} (command line: fit TABLE --prior "
+                    f"{after:.2g}, now {before:.2g} (isa-nrsfm fit TABLE --prior "
                     "model.npz)"
                 )
         warn_caller(
@@ -106,12 +154,6 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
     if estimator.prior is None:
         return {}
     prior, n_components = fitted_prior(estimator.prior), estimator.n_components
-    if estimator.refinement != "joint" or estimator.camera == "affine":
-        raise ValueError(
-            "prior needs calibrated cameras and refinement='joint'; got camera="
-            f"{estimator.camera!r}, refinement={estimator.refinement!r}. Set camera="
-            "'weak_perspective' and refinement='joint'"
-        )
     model = getattr(prior, "_model", None)
     if not isinstance(model, TableModel):
         raise ValueError(
@@ -121,8 +163,9 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
     if not model.frames.joint or prior.camera_ == "affine":
         raise ValueError(
             "prior must be fitted with calibrated cameras and the joint refinement; "
-            f"got camera={prior.camera_!r}, refinement={prior.refinement!r}. Fit it "
-            "with camera='weak_perspective'"
+            f"got {named('camera', prior.camera_)}, "
+            f"{named('refinement', prior.refinement)}. Fit it with "
+            f"{named('camera', 'weak_perspective')}"
         )
     if not model.frames.certainty.determined:
         raise ValueError(
@@ -132,8 +175,8 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
         )
     if (prior.camera_ == "orthographic") != (estimator.camera == "orthographic"):
         raise ValueError(
-            f"the prior was fitted with camera={prior.camera_!r}; got camera="
-            f"{estimator.camera!r}. Set the same camera"
+            f"the prior was fitted with {named('camera', prior.camera_)}; got "
+            f"{named('camera', estimator.camera)}. Set the same camera"
         )
     if len(model.mean_shape) != n_points:
         raise ValueError(
@@ -142,8 +185,8 @@ def checked_prior(estimator: Any, n_points: int) -> dict[str, Any]:
         )
     if n_components not in ("auto", K := model.n_components):
         raise ValueError(
-            f"n_components must be that of the prior, {K}, or 'auto', which takes it; "
-            f"got {n_components}"
+            f"{named('n_components')} must be that of the prior, {K}, or auto, which "
+            f"takes it; got {n_components}"
         )
     return {"prior": model, "mirror_certainty": prior.mirror_certainty_}
 

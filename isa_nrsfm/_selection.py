@@ -38,6 +38,7 @@ from isa_nrsfm._compat.scikit_learn import (
 from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._joint.settings import JOINT_TOL
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.sources import refuse_stored
 
@@ -322,9 +323,9 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
                 print(f"[{type(self).__name__}] {text}, {seconds:.1f} s", flush=True)
         if which := [str(candidates[i]) for i in np.flatnonzero(n_unconverged)]:
             warn_caller(
-                "not all fits converged while n_components was chosen: "
-                f"{sum(n_unconverged)} with n_components of {', '.join(which)} did "
-                "not. Increase max_iter or tol",
+                f"not all fits converged while {named('n_components')} was chosen: "
+                f"{sum(n_unconverged)} with {named('n_components')} of "
+                f"{', '.join(which)} did not. Increase max_iter or tol",
                 ConvergenceWarning,
             )
         self.cv_results_ = results_of(candidates, parts)
@@ -438,7 +439,7 @@ def check_rows(
             fewer = (k for k in range(n_components)[:0:-1] if not refused(rows, k))
             raise ValueError(
                 f"split {number} of cv fits {len(train)} frames, enough for "
-                f"n_components={next(fewer, 0)} at most: {error}"
+                f"{named('n_components', next(fewer, 0))} at most: {error}"
             ) from error
 
 
@@ -471,8 +472,9 @@ def selected(scores: NDArray, select: str) -> int:
     mean = scores.mean(axis=1)
     if np.isnan(mean).all():
         raise ValueError(
-            "n_components cannot be chosen by held-out points: too few points are "
-            "visible. Give n_components, or take frames with more visible points"
+            f"{named('n_components')} cannot be chosen by held-out points: too few "
+            f"points are visible. Give {named('n_components')}, or take frames with "
+            "more visible points"
         )
     best = int(np.nanargmax(mean))
     if select == "best":
@@ -499,4 +501,4 @@ def line(n_components: int, scores: NDArray, held_out: bool) -> str:
     text = f"score {mean:.4g}, standard error {error:.2g}"
     if held_out:
         text = f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
-    return f"n_components={n_components}: {text}"
+    return f"{named('n_components', n_components)}: {text}"

@@ -18,15 +18,16 @@ import pandas as pd
 import pytest
 from estimator_contract import widen
 from hypothesis import settings
+from layers import LIMITS
 from sklearn.utils import estimator_checks
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._joint.settings import LIMITS
 
 matplotlib.use("Agg")
 gc.disable()  # while tests are collected, which stay
 # Joint fits have one start, and few steps for the errors of their depths.
-AffineNRSfM._limits = LIMITS._replace(few_frames=0, widths=(), error_steps=3)
+QUICK = {"few_frames": 0, "widths": (), "error_steps": 3, "restarts": False}
+AffineNRSfM._limits = LIMITS._replace(**QUICK)
 
 # The same examples each time
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
@@ -164,24 +165,11 @@ def fits(succeeds, tmp_path):
 
 
 @pytest.fixture
-def begins(run, tmp_path, monkeypatch):
+def begins():
     """Return a function that reads a table up to its fit: what is told until then."""
+    from fit_runs import begun
 
-    def stop(*_, **__):
-        raise ValueError("here the fit begins")
-
-    def told(table, *options):
-        quick = ["--refinement", "none", "-k", 1, "--no-figures"]
-        with monkeypatch.context() as patch:
-            patch.setattr(AffineNRSfM, "fit", stop)
-            folder = tmp_path / "no results"
-            code, out, err = run("fit", table, "-o", folder, *quick, *options)
-        assert (code, out) == (1, ""), err
-        before, last = err[:-1].rpartition("\n")[::2]
-        assert last == "isa-nrsfm: error: here the fit begins"
-        return before
-
-    return told
+    return begun
 
 
 @pytest.fixture

@@ -6,10 +6,12 @@ import json
 import re
 from contextlib import redirect_stderr, redirect_stdout
 from html import unescape
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model
@@ -87,6 +89,25 @@ def told_of_fit(table, options):
         told("fit", table, "-o", table.parent / "results", *options.split())
     finally:
         assert not (table.parent / "results").exists()
+
+
+def begun(table, *options):
+    """Read a table up to its fit; return what is told until then."""
+    out, err = io.StringIO(), io.StringIO()
+    argv = ["fit", table, "-o", Path(table).parent / "no results", "-k", 1, *options]
+    argv += ["--refinement", "none", "--no-figures"]
+
+    def stop(*_, **__):
+        raise ValueError("here the fit begins")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(AffineNRSfM, "fit", stop)
+        with redirect_stdout(out), redirect_stderr(err):
+            code = main([str(word) for word in argv])
+    before, last = err.getvalue()[:-1].rpartition("\n")[::2]
+    assert (code, out.getvalue()) == (1, ""), err.getvalue()
+    assert last == "isa-nrsfm: error: here the fit begins"
+    return before
 
 
 def usage(words):

@@ -1,6 +1,9 @@
-"""Parameters of tests of which some are slow, and a mark of tests."""
+"""Parameters of tests of which some are slow, marks, and limits of estimators."""
 
 import pytest
+
+from isa_nrsfm._estimator import limited
+from isa_nrsfm._joint.settings import LIMITS
 
 # The run of FastICA or FastISA that is kept may go round in a cycle; it says so.
 may_not_converge = pytest.mark.filterwarnings(
@@ -20,3 +23,8 @@ def slow_after(n_quick, values):
     sets = [value if isinstance(value, tuple) else (value,) for value in values]
     marks = [[]] * n_quick + [pytest.mark.slow] * len(sets)
     return [pytest.param(*each, marks=m) for each, m in zip(sets, marks, strict=False)]
+
+
+def with_limits(**limits):
+    """Return a class of estimators with other limits than those of users."""
+    return limited(LIMITS._replace(**limits))

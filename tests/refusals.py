@@ -1,17 +1,39 @@
-"""Calls that are refused, or that warn; `refusals.txt` is a table of refused calls.
+"""Calls that are refused, that warn, or with their results: the table `refusals.txt`.
 
 A section of the table has the name of a test file, and for each call two lines: the
-call, in the names of that file, and an expression for the message of its ValueError.
+call, in the names of that file, and an expression for the message of its ValueError,
+or of another error or a warning that is named before it, as in "OSError: is a pipe".
+Calls that are not refused have their result after "== ", or what their text matches
+after "~ ", and does not after "!~ ".
 `written(name, content)` writes a file into `folder`. `tmp_path` stays empty. Commands
-are `told_of_fit` and `usage`.
+are `begun`, `told`, `told_of_fit` and `usage`; `pd` and `isa_nrsfm` are imported.
 """
 
+import builtins
+import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
-from fit_runs import told_of_fit, usage
+from fit_runs import begun, told, told_of_fit, usage
+from numpy.testing import assert_equal
+
+import isa_nrsfm
 
 TABLE = Path(__file__).with_suffix(".txt")
+GIVEN = {"isa_nrsfm": isa_nrsfm, "pd": pd}
+GIVEN |= {"begun": begun, "told": told, "told_of_fit": told_of_fit, "usage": usage}
+
+# Of results: their equality, and whether a text matches an expression
+CHECKS = {
+    "==": lambda found, rest, scope: assert_equal(found, eval(rest, scope)),
+    "~": lambda found, rest, _: assert_regex(rest, found, True),
+    "!~": lambda found, rest, _: assert_regex(rest, found, False),
+}
+
+
+def assert_regex(pattern, text, expected):
+    assert bool(re.search(pattern, text)) == expected, text
 
 
 def refused(message, call, /, *args, error=ValueError, **kwargs):
@@ -44,8 +66,19 @@ def refusals_of(section, names):
             return folder / name
 
         given = {"tmp_path": tmp_path, "folder": folder, "written": written}
-        given |= {"told_of_fit": told_of_fit, "usage": usage}
-        refused(message, eval, call, names | given)
+        given |= GIVEN
+        sign, _, rest = message.partition(" ")
+        if sign in CHECKS:
+            CHECKS[sign](eval(call, names | given), rest, names | given)
+            return
+        kind, _, rest = message.partition(": ")
+        error = vars(builtins).get(kind)
+        if error is None:
+            refused(message, eval, call, names | given)
+        elif issubclass(error, Warning):
+            warned(rest, eval, call, names | given, category=error)
+        else:
+            refused(rest, eval, call, names | given, error=error)
         assert not any(tmp_path.iterdir())
 
     return test

@@ -5,7 +5,7 @@ import pytest
 import sklearn
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refusals_of, refused, warned
+from refusals import refusals_of, warned
 from scipy.signal import lfilter
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
@@ -304,10 +304,6 @@ class TestAssociation:
         assert "rank correlation" in str(untested)
         assert "no p-values: one group; 120 frames" in str(untested)
 
-    def test_refuses_a_table_without_coefficients(self):
-        alpha = np.full((4, 2), np.nan)
-        refused("no frame has coefficients", association, alpha, [0, 0, 1, 1])
-
 
 class TestPredictability:
     def test_accuracy_of_classes(self):
@@ -347,13 +343,6 @@ class TestPredictability:
         y = np.where(np.arange(40) < 3, 5, y)
         assert len(predictability(alpha, y, random_state=0)) == 3
 
-    @pytest.mark.parametrize(
-        ("y", "groups"),
-        [(np.r_[2, np.arange(119) % 2], None), (np.arange(120) % 2, np.zeros(120))],
-    )
-    def test_refuses_what_has_no_two_folds(self, y, groups):
-        refused("two folds need", predictability, related()[0], y, groups)
-
 
 class TestWithinGroups:
     alpha = rng_of(0).normal(size=(30, 2))
@@ -391,11 +380,6 @@ class TestWithinGroups:
         expected = WithinGroups().fit_transform(self.alpha, groups=self.people)
         assert_allclose(got, expected)
 
-    def test_groups_without_neutral_frames_are_refused(self):
-        groups = {"groups": self.people, "neutral": self.people == "a"}
-        message = r"neutral frame: 2 of 3 \(first: b, c.*mark one"
-        refused(message, WithinGroups().fit, self.alpha, **groups)
-
     def test_single_frames_are_told(self):
         message, step = "a single frame: 1 of", WithinGroups()
         warned(message, step.fit_transform, self.alpha[:3], groups=["a", "a", "b"])
@@ -415,11 +399,6 @@ class TestBetweenShare:
         assert found.n_groups == 400
         assert found.n_frames == len(person)
 
-    @pytest.mark.parametrize("groups", [np.zeros(6), np.arange(6)])
-    def test_refusals(self, groups):
-        message = "need two groups, and one with two"
-        refused(message, between_share, np.ones((6, 2)), groups)
-
 
 class TestAlignedFrames:
     def test_position_size_and_turn_are_taken_away(self, rng):
@@ -432,9 +411,6 @@ class TestAlignedFrames:
         points = got.view(complex)
         assert_allclose(points.mean(axis=1), 0, atol=1e-12)
         assert_allclose(np.mean(np.abs(points) ** 2, axis=1), 1)
-
-    def test_refuses_half_a_point(self):
-        refused("two columns per point; got 3", AlignedFrames().fit, np.ones((4, 3)))
 
 
 test_refusals = refusals_of("analysis", globals())

@@ -84,32 +84,6 @@ def test_threads_see_the_old_or_the_new_fit():
     assert all(np.array_equal(each, seen[0]) for each in seen)
 
 
-@pytest.mark.parametrize("model", [AffineNRSfM(1), AffineNRSfMCV(), FastISA()])
-def test_no_jobs_are_refused(model):
-    refused("'n_jobs' parameter of .* Got 0", model.set_params(n_jobs=0).fit, X)
-
-
-@pytest.mark.parametrize(
-    ("part", "change"),
-    [
-        ("images", {"file_name": "other.jpg"}),
-        ("images", {"width": 1}),
-        ("images", {"video": "b"}),
-        ("categories", {"name": "other"}),
-        ("categories", {"keypoints": files.BODYPARTS, "skeleton": []}),
-        ("images", None),
-    ],
-)
-def test_files_of_coco_that_were_joined(part, change, tmp_path):
-    content = files.coco_annotations(TRACKS)
-    content[part].append(content[part][0] | (change or {}))
-    path = files.write_json(tmp_path / "a.json", content)
-    if change is None:  # the same entry twice
-        assert len(read_landmarks(path).points) == len(TRACKS)
-    else:
-        refused(f"two of the {part} have the id", read_landmarks, path)
-
-
 TABLE = pd.DataFrame(np.random.default_rng(0).normal(300, 50, (30, 16)), columns=XY)
 
 
@@ -161,29 +135,6 @@ for _ in range(9):
     NESTED = (NESTED,) * 10
 
 
-@pytest.mark.parametrize(
-    "labels",
-    [
-        [("s", b, c) for b in ("a", NESTED) for c in ("x", "y", "likelihood")],
-        [("s", "a", NESTED)],
-        {("s", "a", "x"): 1},
-        [("s", "a", b"x" * 9)],
-        [["s", ["a"], "x"]],
-        [None],
-        [frozenset("ax")],
-    ],
-)
-def test_labels_of_h5_files_are_texts(labels, tmp_path):
-    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
-    path = files.write_deeplabcut(tmp_path / "a.h5", FRAME)
-    for protocol in (0, 2, 5):
-        with h5py.File(path, "a") as file:
-            pickled = np.void(pickle.dumps(labels, protocol))
-            file["df_with_missing/table"].attrs["values_block_0_kind"] = pickled
-        message = "its labels should be texts|not (iterable|a sequence)|no columns"
-        refused(message, read_landmarks, path)
-
-
 def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
     text = "\x1b]0;a\x07\x1b[2J\x9b2J\x08\x7f\u202egpj.exe\u2028"
     frame = pd.DataFrame(np.round(X[:16] * 100 + 300, 2))
@@ -204,14 +155,6 @@ def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
 
 
 YOLO = "0 .5 .5 .2 .2" + " .5" * 10
-
-
-def test_sizes_of_images_have_a_limit(tmp_path, capsys):
-    path = files.write_mesh(tmp_path / "a.csv", files.MESH)
-    refused("image_size must be", read_landmarks, path, image_size=(10**21, 10**21))
-    with pytest.raises(SystemExit):
-        main(["fit", str(path), "--image-size", f"{'1' * 22}x1080"])
-    assert "expected WIDTHxHEIGHT" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -252,6 +195,23 @@ def test_folders_of_several_kinds(tmp_path):
         read_landmarks,
         files.write_trc(tmp_path / "b.trc", TRACKS, np.arange(12.0)[:, None, None]),
     )
+
+
+def joined(folder, part, change):
+    """Write annotations of which one entry is there twice, with other content."""
+    content = files.coco_annotations(TRACKS)
+    content[part].append(content[part][0] | change)
+    return files.write_json(folder / "a.json", content)
+
+
+def labelled(folder, labels, protocol):
+    """Write a table of DeepLabCut with other labels of its columns."""
+    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
+    path = files.write_deeplabcut(folder / "a.h5", FRAME)
+    with h5py.File(path, "a") as file:
+        pickled = np.void(pickle.dumps(labels, protocol))
+        file["df_with_missing/table"].attrs["values_block_0_kind"] = pickled
+    return path
 
 
 test_refusals = refusals_of("attacks", globals())

@@ -2,7 +2,8 @@
 
 import json
 import runpy
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stderr, suppress
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pandas as pd
 import pytest
 from isolated import measured_square
 from layers import may_not_converge, slow_after
-from refusals import refused
+from refusals import refusals_of
 from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
@@ -236,15 +237,11 @@ def test_absent_sets_are_skipped_by_name(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.glob("*.md"))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["speed"], "no section speed here; there are reprojection, truth"),
-        (["truth", "--sets", "muct_68"], "no set muct_68 here; there are shark"),
-        (["recovery", "--methods", "pca"], "no method pca here; there are isa1"),
-        (["--repeats", "0"], "--repeats and --jobs must be 1 or more"),
-    ],
-)
-def test_command_refuses_what_it_does_not_know(arguments, message, capsys):
-    refused(None, command.main, arguments, error=SystemExit)
-    assert message in capsys.readouterr().err
+def chosen(words):
+    """Raise the message of wrong usage."""
+    with redirect_stderr(StringIO()) as err, suppress(SystemExit):
+        command.main(words.split())
+    raise ValueError(err.getvalue())
+
+
+test_refusals = refusals_of("benchmarks", globals())

@@ -525,15 +525,6 @@ def test_nearest_principal_axes(rng):
     assert not pose.mirrored
 
 
-def test_refused_shapes(face):
-    message = "'ibug-68' has 68 points, the shape 60"
-    refused(message, canonical_pose, face[:60], scheme="ibug-68")
-    refused(r"\(n_points, 3\).*got the shape \(68, 2\)", canonical_pose, face[:, :2])
-    holes = face.copy()
-    holes[3] = np.nan
-    refused("with 3 entries that are not", canonical_pose, holes)
-
-
 NOSE, CROWN = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
 
 

@@ -19,7 +19,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm import AffineNRSfM, FastISA, __version__
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model
@@ -440,19 +441,10 @@ def test_rows_that_cannot_be_fitted_are_empty(fits, transforms, faces, tmp_path)
     assert_allclose(*numbers, atol=1e-7)
 
 
-def test_standard_deviations_are_written(
-    transforms, fits, fails, table, fitted, tmp_path
-):
+def test_standard_deviations_are_written(transforms, table, fitted):
     written, *_ = transforms(fitted.path, table, "--std")
     assert list(written)[-2:] == ["alpha_1_std", "alpha_2_std"]
     assert_allclose(written.iloc[:, -2:], fitted.model.alpha_std_, rtol=1e-6)
-    for wrong in ("--std", "--n-components=auto"):
-        message = fails("fit", table, "-o", tmp_path / "no", *UNREFINED, wrong)
-        assert "needs --refinement joint or consensus; got --refinement none" in message
-    assert not (tmp_path / "no").exists()
-    path = fits(table, *UNREFINED).path
-    message = fails("transform", path, table, "-o", tmp_path / "a.csv", "--std")
-    assert "was fitted with refinement=None" in message
 
 
 def test_origin_is_not_a_missing_point(begins, faces, tmp_path):
@@ -574,58 +566,6 @@ def test_named_index_of_a_parquet_file_is_a_column(fits, faces, tmp_path):
         assert list(found.alpha)[:3] == ["row", "name", "code"]
 
 
-def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_path):
-    folder = ["-o", tmp_path / "results", "--no-figures"]
-    (tmp_path / "folder.csv").mkdir()
-    (tmp_path / "ragged.csv").write_text("x0,y0\n1\n")
-    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    faces.assign(x_3="?").to_csv(tmp_path / "text.csv", index=False)
-    for name, expected in (
-        ("absent.csv", "absent.csv: No such file"),
-        ("folder.csv", "folder.csv is of no known format: a folder with"),
-        ("ragged.csv", "line 2"),
-        ("other.csv", "no landmark columns"),
-        ("text.csv", "'x_3' should hold"),
-    ):
-        assert expected in fails("fit", tmp_path / name, *folder)
-    for options, expected in (
-        (["--columns", "u#,v#"], "no column matches 'u#'"),
-        (["--skip-rows", "nam=i"], "no column 'nam'; its columns are name, x_0, y_0"),
-        (["--skip-rows", "name=^i"], "fitted: 60 left out (name matches '^i')"),
-        (
-            ["-k", "40", "--camera", "affine"],
-            "--n-components 40 needs at least 124 points, the table has 68; with 68 "
-            "points the largest possible --n-components is 21 with affine cameras, and "
-            "129 with calibrated ones (--camera weak_perspective)",
-        ),
-        (["--skip-rows", "code=[1-9].$|[4-9]$"], "at least 5 frames"),
-        (["--skip-rows", "code=[1-9].$", "-k", "1-3"], "of cv fits 6 frames, enough"),
-    ):
-        assert expected in fails("fit", table, *folder, *options)
-    absent, output = tmp_path / "absent.npz", ["-o", tmp_path / "alpha.csv"]
-    assert f"{absent}: No such file" in fails("transform", absent, table, *output)
-    assert "cannot be read as a model" in fails("transform", table, table, *output)
-    message = fails("transform", fitted.path, table, "-o", tmp_path / "a.xls")
-    assert "a.xls: a table is a .csv, .tsv, .txt or .parquet file" in message
-
-
-def test_bad_outputs_are_refused(fails, table, fitted, faces, tmp_path):
-    for name in (table, tmp_path / "alpha.csv", tmp_path / "model.NPZ"):
-        message = fails("fit", table, "-o", name, *QUICK)
-        assert f"--output {name}: expected a folder" in message
-        assert message.endswith("the table of coefficients is alpha.csv in it")
-    assert not any(tmp_path.iterdir())
-    message = fails("fit", table, "-o", table / "results", *QUICK)
-    assert "Not a directory" in message
-    transform = ["transform", fitted.path]
-    assert "no" in fails(*transform, table, "-o", tmp_path / "no/a.csv")
-    copy = tmp_path / "alpha.csv"
-    faces.to_csv(copy, index=False)
-    for argv in (("fit", copy, "-o", tmp_path, *QUICK), (*transform, copy, "-o", copy)):
-        assert "would be overwritten by the results" in fails(*argv)
-    pd.testing.assert_frame_equal(pd.read_csv(copy, dtype={"code": str}), faces)
-
-
 def test_a_figure_that_fails_costs_no_results(
     fits, fitted, table, tmp_path, monkeypatch
 ):
@@ -698,8 +638,9 @@ def test_warnings_are_shown_once_with_options(fits, table, monkeypatch):
     fit = AffineNRSfM.fit
 
     def warn_and_fit(self, X, y=None, groups=None):
-        given = "got camera='affine';\n  n_components=2 of a/camera=1.csv, layout='x'"
-        given += ". Use refinement=None"
+        given = f"got {named('camera', 'affine')};\n  {named('n_components')} of "
+        given += f"a/camera=1.csv, {named('layout', 'x')}. Use "
+        given += named("refinement", None, "joint")
         for _ in range(2):
             warnings.warn(given, UserWarning, stacklevel=1)
         warnings.warn("for developers", DeprecationWarning, stacklevel=1)
@@ -707,8 +648,8 @@ def test_warnings_are_shown_once_with_options(fits, table, monkeypatch):
 
     monkeypatch.setattr(AffineNRSfM, "fit", warn_and_fit)
     found = fits(table, *UNREFINED)
-    text = "got --camera affine; --n-components 2 of a/camera=1.csv, layout='x'"
-    text += ". Use --refinement none"
+    text = "got --camera affine; --n-components of a/camera=1.csv, layout='x'"
+    text += ". Use --refinement none or joint"
     assert found.err == f"isa-nrsfm: warning: {text}\n"
     assert found.report["warnings"] == [text]
 
@@ -757,6 +698,32 @@ def test_reader_that_goes_away_is_no_error(fitted, table, tmp_path, monkeypatch,
         argv = ["transform", fitted.path, table, "-o", tmp_path / "a.csv"]
         assert main([str(word) for word in argv]) == 141
     assert capfd.readouterr() == ("", "")
+
+
+def faces_in(folder, name="faces.csv", **columns):
+    """Write a table of faces with some other columns, and return its path."""
+    named_faces().assign(**columns).to_csv(folder / name, index=False)
+    return folder / name
+
+
+@cache
+def simple_model():
+    model = AffineNRSfM(2, refinement=None, random_state=0, isa=FastISA(n_init=1))
+    return model.fit(named_faces()[LANDMARKS])
+
+
+def model_in(folder):
+    save_model(simple_model(), folder / MODEL)
+    return folder / MODEL
+
+
+def kept(call, path, *argv):
+    """Raise the message of a command, which leaves a file as it is."""
+    before = path.read_bytes()
+    try:
+        call(*argv)
+    finally:
+        assert path.read_bytes() == before
 
 
 test_refusals = refusals_of("cli", globals())

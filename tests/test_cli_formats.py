@@ -204,22 +204,6 @@ def write_shares(folder, change=lambda shares: shares):
     return path
 
 
-@pytest.mark.parametrize(
-    ("change", "is_named"),
-    [
-        (lambda shares: shares - np.quantile(shares, 0.04), True),
-        (lambda shares: shares - np.quantile(shares, 0.2, axis=(0, 1)), False),
-        (lambda shares: shares * [1, 2] + [0, 0.1], True),
-        (lambda shares: shares * [1920, 1080], False),
-    ],
-    ids="border corner cut_off pixels".split(),
-)
-def test_shares_of_an_image_are_named(begins, tmp_path, change, is_named):
-    err = begins(write_shares(tmp_path, change))
-    assert (SHARES in err) == is_named
-    assert ("--format mediapipe --image-size" in err) == is_named
-
-
 def test_most_points_are_inside_of_the_image(begins, fails, tmp_path):
     def change(shares):
         shares[3, 5] = [0.5, 1.25]

@@ -8,6 +8,7 @@ import pytest
 from exported_files import Read, content_of
 from fit_runs import JOINT, Results
 from layers import slow_after
+from refusals import refusals_of
 
 from isa_nrsfm import datasets
 from isa_nrsfm.cli import main
@@ -151,19 +152,6 @@ def test_where_y_is_zero_is_said(fits, transforms, succeeds, tmp_path):
     assert not np.allclose(fit.cameras["yaw"], yaw["upper"], atol=1)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--skeleton", "hand-21"], "--skeleton hand-21 has 21 points, the table 17"),
-        (["--edges", "absent.csv"], "absent.csv: No such file"),
-        (["--skeleton", "absent.yaml"], "absent.yaml: No such file"),
-    ],
-)
-def test_what_does_not_fit_is_refused_at_once(fails, table, tmp_path, options, message):
-    assert message in fails("fit", table, "-o", tmp_path / "out", *options)
-    assert not (tmp_path / "out").exists()
-
-
 def test_edges_are_numbers_of_named_points(run, fails, bodies, tmp_path):
     names = [f"j{j:02d}.{axis}" for j in range(17) for axis in "xy"]
     table = write(bodies, tmp_path / "named.csv", names)
@@ -215,16 +203,8 @@ def test_points_are_named(fits, faces, tmp_path, points, kept):
     assert edges_of(tmp_path / "viewer.html")[0] == {*map(tuple, expected)}
 
 
-@pytest.mark.parametrize(
-    ("given", "points", "message"),
-    [
-        ("table", "inner", "17 points are in no known layout: name the points"),
-        ("table", "3-17", "there are no points '3-17'; the 17 points are 0, 1"),
-        ("faces", "nose", "there are no points 'nose'"),
-        ("faces", "9-3", "there are no points '9-3'"),
-        ("faces", "0-3", "needs at least 7 points, the table has 4"),
-    ],
-)
-def test_points_that_are_none(fails, request, given, tmp_path, points, message):
-    options = ["-o", tmp_path / "o", "--points", points, *QUICK]
-    assert message in fails("fit", request.getfixturevalue(given), *options)
+def written_bodies(folder):
+    return write(datasets.make_body_tracks(20, random_state=0), folder / "bodies.csv")
+
+
+test_refusals = refusals_of("cli_skeletons", globals())

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from layers import with_limits
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint.consensus import (
     COVER,
@@ -31,14 +32,14 @@ from isa_nrsfm._joint.consensus import (
     share_of_first,
     weighted,
 )
-from isa_nrsfm._joint.settings import LIMITS, FitSettings
+from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
-AS_USERS = ["few_frames", "widths", "error_steps"]
+AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
-Quick = limited(LIMITS._replace(few_frames=0, widths=(), error_steps=3))
+Quick = with_limits(few_frames=0, widths=(), error_steps=3, restarts=False)
 
 
 def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):
@@ -580,12 +581,6 @@ class TestEstimator:
             errors.append(np.mean(off[:, others] ** 2))
         assert errors[1] < errors[0]
 
-    def test_affine_cameras_are_refused(self):
-        """Depths of groups with affine cameras have no common unit."""
-        message = "needs calibrated cameras.*camera='weak_perspective'"
-        with pytest.raises(ValueError, match=message):
-            consensus_fit(camera="affine")
-
     def test_saved_models(self, body, tmp_path):
         """A model that is read again gives the same results."""
         save_model(body, tmp_path / "model.npz")
@@ -650,3 +645,6 @@ def test_tables_whose_noise_is_at_the_floor_have_groups(load_data):
         )
     )
     assert merged < 0.8 * joint
+
+
+test_refusals = refusals_of("consensus", globals())

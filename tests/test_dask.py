@@ -7,12 +7,11 @@ import joblib
 import numpy as np
 import pytest
 from frame_parts import assert_same_model
+from layers import with_limits
 from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import FastISA
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm._tables.blocks import DaskBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -44,7 +43,7 @@ def cluster():
 
 
 # The first steps are taken on few frames, as of large tables.
-SampledNRSfM = limited(Limits()._replace(small_table=1000, sample=40))
+SampledNRSfM = with_limits(small_table=1000, sample=40, restarts=False)
 
 
 @pytest.mark.cluster

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refusals_of, refused
 
 from isa_nrsfm.datasets import (
     make_body_tracks,
@@ -108,42 +108,6 @@ class TestEveryMaker:
         # The stretch leaves the area, and so the scale.
         areas = [values[c].prod(axis=1) for c in ("affine", "weak_perspective")]
         assert_allclose(*areas)
-
-
-COMMON = {
-    "n_frames": (1, 10.5, True),
-    "noise": (-0.1, np.nan, False),
-    "missing": (1.0, -0.1),
-    "camera": ("fisheye",),
-    "layout": ("columns",),
-    "random_state": ("seed",),
-}
-
-
-@pytest.mark.parametrize(
-    ("make", "parameter", "value"),
-    [
-        *(
-            (make, name, value)
-            for make in MAKERS.values()
-            for name, values in COMMON.items()
-            for value in values
-        ),
-        (make_nonrigid_tracks, "n_points", 3),
-        (make_nonrigid_tracks, "amplitude", -1.0),
-        (make_nonrigid_tracks, "shapes", "sparse"),
-        (make_nonrigid_tracks, "coefficients", "uniform"),
-        (make_nonrigid_tracks, "n_components", -1),
-        (make_nonrigid_tracks, "camera", "perspective"),
-        (make_face_tracks, "n_components", 9),
-        (make_face_tracks, "focal_length", 0.0),
-        (make_face_tracks, "distance", -1.0),
-        (make_hand_tracks, "n_people", 0),
-        (make_body_tracks, "scheme", "body-25"),
-    ],
-)
-def test_bad_parameters_are_refused(make, parameter, value):
-    refused(f"The '{parameter}' parameter", make, **{parameter: value})
 
 
 @linear
@@ -410,3 +374,6 @@ class TestPeople:
         raised = y["right_wrist"] < y["nose"]
         assert raised.any()
         assert set(bodies.labels[raised].tolist()) <= {"reach"}
+
+
+test_refusals = refusals_of("datasets", globals())

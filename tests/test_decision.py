@@ -6,16 +6,14 @@ import warnings
 
 import numpy as np
 import pytest
-from layers import slow_after
-from refusals import refused
+from layers import slow_after, with_limits
+from refusals import refusals_of
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AutoNRSfM
 from isa_nrsfm._decision import FIRST, first_settings
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._prepare.coordinates import still_points
 from isa_nrsfm.analysis._advice import COMPARE
 from isa_nrsfm.analysis._frame_columns import runs_between_gaps
@@ -132,7 +130,7 @@ def test_one_scale_is_found():
 
 def test_one_scale_is_found_from_a_sample():
     X = make_nonrigid_tracks(150, 16, noise=0.02, camera="orthographic", **GIVEN).data
-    sampled = limited(LIMITS._replace(sample=60, small_table=1000))
+    sampled = with_limits(sample=60, small_table=1000)
     auto = AutoNRSfM(sampled(random_state=0), loss="linear").fit(X)
     assert auto.best_estimator_.camera == "orthographic"
     assert auto.best_estimator_._continued is None
@@ -242,7 +240,4 @@ def test_pages_are_shown_in_notebooks(tmp_path):
     assert len(repr(page)) < 50
 
 
-def test_strategies_without_components_are_refused():
-    X = make_nonrigid_tracks(30, 16, **GIVEN).data
-    model = AffineNRSfM(1, isa=StandardScaler(), refinement=None)
-    refused("isa must give components_ of shape", model.fit, X)
+test_refusals = refusals_of("decision", globals())

@@ -1,6 +1,7 @@
 from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 from layers import slow_after
 from made_once import made_once
@@ -334,6 +335,14 @@ class TestSmooth:
         # Rows that nobody saw are filled in, and less certain.
         assert np.isfinite(expected.alpha).all()
         assert (expected.alpha_std[63] > expected.alpha_std[30]).all()
+
+    def test_times_with_a_zone(self, waving):
+        model, table = waving
+        hours = pd.date_range("2024-03-30", periods=60, freq="h", tz="Europe/Berlin")
+        expected = model.smooth(table[:60], time=3600.0 * np.arange(60), **FEW_STEPS)
+        for times in (list(hours.to_pydatetime()), pd.Series(hours), hours):
+            found = model.smooth(table[:60], time=times, **FEW_STEPS)
+            assert_allclose(found.alpha, expected.alpha, atol=1e-12)
 
     def test_uneven_times_are_rounded_but_stay_apart(self, waving):
         model, table = waving

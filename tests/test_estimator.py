@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refusals_of, refused
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, FastISA, PooledFastICA
@@ -203,21 +203,6 @@ def test_every_attribute_is_documented(model):
     assert fitted <= documented
     documented = {name for name in documented if name.endswith("_")}
     assert documented - fitted == set()
-
-
-@pytest.mark.parametrize(
-    ("name", "own"),
-    [
-        ("components_", "basis_"),
-        ("explained_variance_ratio_", "energy_share_"),
-        ("mean_", "mean_shape_"),
-    ],
-)
-def test_names_of_scikit_learn_lead_to_those_of_the_model(name, own, model):
-    with pytest.raises(AttributeError, match=f"{name} has the name {own}"):
-        getattr(model, name)
-    assert hasattr(model, own)
-    assert not hasattr(model, name)
 
 
 def test_inputs_of_other_types_are_fitted_in_double_precision():
@@ -552,29 +537,6 @@ def with_value(value):
     return table
 
 
-def test_calibrated_cameras_need_seven_points():
-    model = AffineNRSfM(1, camera="weak_perspective")
-    refused(
-        "n_components=1 needs at least 7 points, the table", model.fit, TABLE[:, :12]
-    )
-    model.set_params(n_components=8)
-    message = "needs at least 8 points, the table has 7; .* largest .* is 7"
-    refused(message, model.fit, TABLE[:, :14])
-
-
-@pytest.mark.parametrize("method", ["transform", "decompose", "reproject", "score"])
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        (with_value(np.inf), "X contains infinity"),
-        (TABLE[:, :-2], "X has 134 features, but AffineNRSfM is expecting 136"),
-        (TABLE[:0], r"0 sample\(s\)"),
-    ],
-)
-def test_bad_new_tables_are_refused(model, method, table, message):
-    refused(message, getattr(model, method), table)
-
-
 @pytest.mark.parametrize("library", ["pandas", "polars"])
 def test_columns_that_are_no_points_are_refused(library):
     table = pd.DataFrame(TABLE, columns=FACES.feature_names)
@@ -604,24 +566,6 @@ def test_too_few_basis_shapes_are_better_than_none(variant):
 
 
 # --- parameters ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "option",
-    [
-        {"loss": "huber"},
-        {"loss": "cauchy"},
-        {"independence": "coefficients"},
-        {"n_components": "auto"},
-    ],
-)
-@pytest.mark.parametrize("refinement", ["alternating", None])
-def test_options_that_need_the_joint_refinement(refinement, option):
-    ((name, value),) = option.items()
-    message = rf"{name}={value!r} needs refinement='joint'; got refinement="
-    model = AffineNRSfM(refinement=refinement, **option)
-    refused(message, model.fit, TABLE)
-    refused(None, model.transform, TABLE, error=NotFittedError)
 
 
 @pytest.mark.parametrize(

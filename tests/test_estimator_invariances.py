@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from layers import may_not_converge, slow_after, start_may_not_converge
+from layers import may_not_converge, slow_after, start_may_not_converge, with_limits
 from numpy.testing import assert_allclose
 from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 # The warning about the layout has tests of its own.
@@ -32,7 +30,7 @@ SHAPE_TOLERANCE = 1e-6
 
 
 # Many starts are those of test_default_strategies_are_invariant.
-OneStart = limited(LIMITS._replace(few_frames=0, widths=()))
+OneStart = with_limits(few_frames=0, widths=(), restarts=False)
 
 
 def estimator(params, scale_frames=True):

@@ -9,7 +9,7 @@ import pytest
 from frame_parts import OF_FRAMES
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
-from refusals import refused, warned
+from refusals import refusals_of, warned
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
@@ -220,40 +220,15 @@ def without(frames, points):
     return tracks.reshape(len(tracks), -1)
 
 
-ALL_FRAMES, ALL_POINTS = np.arange(60), np.arange(30)
-BAD = {
-    "a point nowhere": (
-        without(ALL_FRAMES, [7]),
-        r"every point in at least 5 frames; .* 1 of 30 points \(first: point 7, in 0 ",
-    ),
-    "points in too few frames": (
-        without(ALL_FRAMES[4:], [11, 12]),
-        r"at least 5 frames; .* 2 of 30 points \(first: point 11, in 4 of 60 frames",
-    ),
-    "a frame with too few points": (
-        without([5], ALL_POINTS[3:]),
-        r"fewer than 4 points are visible in 1 of 60 frames \(first: row 5, with 3\)",
-    ),
-    "nothing": (without(ALL_FRAMES, ALL_POINTS), "no point is visible: all 60 rows"),
-}
-
-
-@pytest.mark.parametrize("refinement", REFINEMENTS)
-@pytest.mark.parametrize("name", BAD)
-def test_tables_that_show_too_little_are_refused(name, refinement):
-    table, message = BAD[name]
-    refused(message, estimator(refinement=refinement).fit, table)
-
-
-@pytest.mark.parametrize(
-    ("spoilt", "message"),
-    [(np.nan, "row 5, with 3"), (0.1, r"equal in 1 of 60 frames .* row 5\)")],
-)
-def test_rows_are_counted_from_the_first_one_where_some_show_nothing(spoilt, message):
+def spoilt(points, value):
+    """Return a table with two empty rows, and points of a later row with one value."""
     tracks = COMPLETE.tracks.copy()
     tracks[[1, 2]] = np.nan
-    tracks[5, 3 if np.isnan(spoilt) else 0 :] = spoilt
-    refused(message, estimator().fit, tracks.reshape(60, -1))
+    tracks[5, points] = value
+    return tracks.reshape(60, -1)
+
+
+ALL_FRAMES, ALL_POINTS = np.arange(60), np.arange(30)
 
 
 def test_rows_that_show_nothing_are_no_frames():
@@ -263,12 +238,6 @@ def test_rows_that_show_nothing_are_no_frames():
         pytest.warns(UserWarning, match="54 of 60"),
     ):
         estimator().fit(without(ALL_FRAMES[6:], ALL_POINTS))
-
-
-def test_missing_points_of_dataframes_are_named():
-    pandas = pytest.importorskip("pandas")
-    table = pandas.DataFrame(without(ALL_FRAMES, [7]), columns=COMPLETE.feature_names)
-    refused(r"point 7 \(x_7, y_7\), in 0 of 60", estimator().fit, table)
 
 
 # --- methods ------------------------------------------------------------------------
@@ -462,3 +431,6 @@ def test_warnings_point_to_the_line_of_the_user(n_jobs, piped):
         with pytest.warns(UserWarning, match="only one of") as caught:
             method(X)
         assert {each.filename for each in caught} == {__file__}
+
+
+test_refusals = refusals_of("estimator_missing", globals())

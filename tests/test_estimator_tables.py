@@ -4,14 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
-from layers import may_not_converge, slow_after
+from layers import may_not_converge, slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
@@ -21,7 +19,7 @@ REAL_TABLES = (
     "shark_torresani"
 ).split()
 FAST = FastISA(n_init=2)
-AllStarts, OneStart = limited(LIMITS), limited(LIMITS._replace(few_frames=0, widths=()))
+AllStarts, OneStart = with_limits(), with_limits(few_frames=0, widths=())
 FACES = make_face_tracks(60, n_components=2, random_state=0).tracks
 
 

@@ -1,14 +1,14 @@
 """The command export, and what a fit writes for other programs."""
 
-import re
-
 import numpy as np
 import pandas as pd
 import pytest
 from export_models import face_model, faces
 from exported_files import Read, content_of
-from fit_runs import MODEL
+from fit_runs import MODEL, told
+from made_once import made_once
 from numpy.testing import assert_array_equal, assert_equal
+from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli import main
@@ -31,9 +31,7 @@ def folder(tmp_path_factory):
     """Return a folder with a model, and one with names of points."""
     folder = tmp_path_factory.mktemp("export")
     save_model(face_model(), folder / MODEL)
-    named = AffineNRSfM(2, random_state=0)
-    named.fit(pd.DataFrame(faces().data[:50], columns=NAMES))
-    save_model(named, folder / NAMED)
+    save_model(named_model(), folder / NAMED)
     return folder
 
 
@@ -98,46 +96,6 @@ def test_edges_are_pairs_of_names_or_numbers_of_points(export, tmp_path):
     assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        *(
-            (text, r"edges\.csv, line \d: expected the names of two points")
-            for text in ("00,99", "00", "00,01\n00,01,02")
-        ),
-        ("\n", "has no edges; use --edges none to draw only points"),
-        ("00,01\n", "cannot be read as a list of edges: its text is not in UTF-8"),
-    ],
-)
-def test_other_edges_are_refused(export, tmp_path, text, message):
-    path = tmp_path / "edges.csv"
-    path.write_text(text, encoding="utf-16" if "UTF" in message else "utf-8")
-    assert re.search(message, export("a.glb", "--edges", path)[2])
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("a.foo", [], "expected a file with one of the suffixes .html, .htm, .glb"),
-        ("a.mat", ["--n-modes", "2"], "--n-modes is an option of pdm; "),
-        ("a.txt", ["--edges", "none"], "--edges is an option of viewer and glb; "),
-        ("a.glb", ["--names", "jaw"], "names must hold 2 names"),
-        ("a.txt", ["--n-modes", "999"], "n_modes must be at most"),
-    ],
-)
-def test_what_does_not_fit_is_refused(export, name, options, message):
-    _, _, error = export(name, *options)
-    assert message in error
-
-
-@pytest.mark.parametrize("n_modes", ["0", "-1", "1.5", "many", "inf"])
-def test_numbers_of_modes_are_checked(export, n_modes, capsys):
-    with pytest.raises(SystemExit) as stop:
-        export("a.txt", "--n-modes", n_modes)
-    assert stop.value.code == 2
-    assert "expected a whole number or a share" in capsys.readouterr().err
-
-
 def test_inputs_are_not_overwritten(folder, capsys):
     model = folder / "model.txt"
     model.write_bytes((folder / MODEL).read_bytes())
@@ -162,3 +120,21 @@ def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys, rng):
     content = content_of(results / "viewer.html")
     assert content["about"].startswith("Affine shapes")
     assert content["rotations"] == ""
+
+
+@made_once
+def named_model():
+    table = pd.DataFrame(faces().data[:50], columns=NAMES)
+    return AffineNRSfM(2, random_state=0).fit(table)
+
+
+def exported(folder, name, *options):
+    """Raise the message of an export, and write nothing."""
+    save_model(named_model(), folder / MODEL)
+    try:
+        told("export", folder / MODEL, "-o", folder / name, *options)
+    finally:
+        assert not (folder / name).exists()
+
+
+test_refusals = refusals_of("export_cli", globals())

@@ -26,7 +26,6 @@ from refusals import refusals_of, refused, warned
 from scipy.io import loadmat
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._compat.stored_arrays import read_arrays
@@ -199,10 +198,6 @@ def test_names_are_cell_arrays_in_matlab(tmp_path):
     names = loadmat(path)["component_names"]
     assert names.dtype == object
     assert names.shape == (N_COMPONENTS, 1)
-
-
-def test_models_that_are_not_fitted_have_no_frames():
-    refused(None, frame_poses, AffineNRSfM(), error=NotFittedError)
 
 
 # --- pages ---------------------------------------------------------------------------

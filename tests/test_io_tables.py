@@ -64,28 +64,6 @@ def test_quotation_marks_are_understood(write):
     assert len(table) == 8
 
 
-def test_wrong_encodings_and_formats_are_refused(write, tmp_path):
-    for encoding in ("latin-1", "utf-16"):
-        path = write("näme,x0\n1,2\n", encoding=encoding)
-        refused("as a table: its text is not in UTF-8", read_table, path)
-    path = write("x0,y0\n1,2\n", name="table.parquet")
-    refused("as a table: .*magic bytes", read_table, path)
-    message = r"is a \.csv, \.tsv, \.txt or \.parquet.*got '.xlsx'"
-    refused(message, read_table, tmp_path / "table.xlsx")
-    refused("got ''", write_table, pd.DataFrame({"a": [1]}), tmp_path / "table")
-    empty = tmp_path / "empty.parquet"
-    write_table(pd.DataFrame({"x0": []}), empty)
-    refused("has no rows", read_table, empty)
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_files_that_do_not_open_raise_os_errors(tmp_path, suffix):
-    refused(None, read_table, tmp_path / f"absent{suffix}", error=FileNotFoundError)
-    folder = tmp_path / f"folder{suffix}"
-    folder.mkdir()
-    refused(None, read_table, folder, error=IsADirectoryError)
-
-
 def test_landmarks_and_other_columns_are_separated(frame):
     shuffled = frame[["y3", "id", *(name for name in NAMES if name != "y3")]]
     table = landmark_table(shuffled)
@@ -126,21 +104,13 @@ def test_numbers_of_all_kinds_become_floats(frame):
     assert (points.dtypes == np.float64).all()
 
 
-def test_row_in_the_message_is_the_row_of_the_whole_table(frame):
-    frame = frame.astype(object)
-    frame.loc[3, "y4"] = "?"
-    refused(r"'y4' .* in row 3 \(counted from 0\)", landmark_table, frame.iloc[2:])
-
-
-def test_other_input_is_refused(frame):
-    refused("DataFrame is needed; got ndarray", landmark_table, frame[NAMES].to_numpy())
-    refused("no landmark columns", landmark_table, frame[["id"]])
-    doubled = pd.concat([frame, frame[["id"]]], axis=1)
-    refused("more than one column is called 'id'", landmark_table, doubled)
-
-
 def landmarks_in(path):
     return landmark_table(read_table(path), columns="x#,y#")
+
+
+def made(folder):
+    folder.mkdir()
+    return folder
 
 
 test_refusals = refusals_of("io_tables", globals())

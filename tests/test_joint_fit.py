@@ -7,19 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from layers import may_not_converge, slow_after
+from layers import may_not_converge, slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scenes import random_scene, with_gaps
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._joint import problem as problem_module
 from isa_nrsfm._joint.fit import residual_deviations
 from isa_nrsfm._joint.problem import FactorisedTable, JointState
-from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
@@ -38,11 +37,10 @@ KINDS = pytest.mark.parametrize(
     ("camera", "gaps"), slow_after(1, [*product(SEEN_BY, [True, False])])
 )
 # Errors of depths are tested in test_frame_fit.py.
-QUICK = Limits(error_steps=3)
-QuickNRSfM = limited(QUICK)
+QuickNRSfM = with_limits(error_steps=3)
 # The first steps are made on few frames, as of large tables.
-ONE_START = QUICK._replace(few_frames=0, widths=())
-SampledNRSfM = limited(ONE_START._replace(small_table=1000, sample=40))
+ONE_START = {"error_steps": 3, "few_frames": 0, "widths": (), "restarts": False}
+SampledNRSfM = with_limits(**ONE_START, small_table=1000, sample=40)
 
 
 def noisy(tracks, deviation, seed=0, unit=False):
@@ -115,6 +113,37 @@ class TestStarts:
         model = fitted(tracks, max_iter=5)
         assert model.basis_.shape == (2, 250, 3)
         assert np.isfinite(model.basis_).all()
+
+
+def flying_bird(n_frames=50):
+    """Return tracks and shapes of a body with two wings that beat while it rolls."""
+    rng = np.random.default_rng(0)
+    body = rng.normal(size=(6, 3)) * (0.15, 0.15, 0.8)
+    across, along = rng.uniform(0.3, 1.5, 7), rng.uniform(-0.4, 0.4, 7)
+    wing = np.stack([across, np.zeros(7), along], axis=1)
+    beat = 30 * np.sin(0.7 * np.arange(n_frames) + rng.uniform(0, 6))
+    up, down = (
+        Rotation.from_euler("z", sign * beat[:, None], degrees=True).as_matrix().mT
+        for sign in (1, -1)
+    )
+    sides = [np.tile(body, (n_frames, 1, 1)), wing @ up, wing * (-1, 1, 1) @ down]
+    shapes = np.concatenate(sides, axis=1)
+    shapes -= shapes.mean(axis=1, keepdims=True)
+    angles = rng.uniform(-1, 1, (n_frames, 3)) * (30, 25, 25)
+    R = Rotation.from_euler("zyx", angles, degrees=True).as_matrix()
+    images = shapes @ R[:, :2].mT
+    return images + 0.005 * rng.normal(size=images.shape), shapes
+
+
+def test_further_starts_tell_beating_wings_from_a_bird_that_rolls():
+    tracks, shapes = flying_bird()
+    errors = [
+        euclidean_error(
+            fitted(tracks, kind=kind, camera="orthographic"), tracks, shapes
+        )
+        for kind in (with_limits(error_steps=3, few_frames=0, widths=()), AffineNRSfM)
+    ]
+    assert errors[0] < 0.5 * errors[1]
 
 
 @pytest.mark.parametrize(("n_components", "n_points"), [(1, 20), (2, 20), (1, 7)])

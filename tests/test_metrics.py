@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refusals_of, refused
+from refusals import refusals_of
 from scenes import random_rotation
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
@@ -342,9 +342,6 @@ class TestDegenerateShapes:
         expected = distance / truth.std(axis=1).mean()
         assert mean_shape_error_3d(truth, shapes) == pytest.approx(expected)
         assert 1.3 < expected < 1.8
-
-    def test_other_conventions(self, pair):
-        refused("one of .* 'mpjpe'", mean_shape_error_3d, *pair, convention="mpjpe")
 
 
 def test_of_a_published_estimate(load_data):

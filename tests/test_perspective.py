@@ -5,20 +5,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import slow_after, with_limits
 from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._estimator import limited
 from isa_nrsfm._frames.pinhole import Pinhole
-from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm._perspective import WEAK
 from isa_nrsfm.export import frame_points, frame_poses
 from isa_nrsfm.io import load_model, save_model
 
 F, CENTRE = 1000.0, (640.0, 360.0)
-AllStarts = limited(LIMITS._replace(error_steps=3))
+AllStarts = with_limits(error_steps=3)
 
 
 def scene(

@@ -5,14 +5,12 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
-from layers import slow_after
+from layers import slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scipy.io import netcdf_file
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import LIMITS
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.export import frame_points, write_points
 
@@ -43,7 +41,7 @@ def test_deviations_are_those_of_the_errors(name, missing):
     camera = "perspective" if name == "near" else "weak_perspective"
     for seed in (0, 1) if name == "clouds" else (0,):
         table = MAKE[name](missing=missing, random_state=seed)
-        model = limited(LIMITS)(3, camera=camera, random_state=0)
+        model = with_limits()(3, camera=camera, random_state=0)
         if name == "near":
             model.set_params(principal_point=(640, 360))
         points = frame_points(model.fit(table.data), table.data)
@@ -155,10 +153,11 @@ def test_depths_that_are_not_determined(face, tmp_path):
     assert np.isfinite([points.position[..., :2], points.position_std[..., :2]]).all()
 
 
-def test_what_has_no_deviations_is_refused(face, tmp_path):
-    model, X, _ = face
-    affine = AffineNRSfM(1, random_state=0).fit(X.dropna())
-    refused("needs a model with calibrated cameras", frame_points, affine, X)
-    refused("path must end in .nc or .h5", write_points, model, tmp_path / "a.txt", X)
-    refused("above zero", write_points, model, tmp_path / "a.nc", X, fps=0)
-    assert not list(tmp_path.iterdir())
+TABLE = make_face_tracks(40, n_components=1, random_state=0, noise=0.01).data
+
+
+def plain_model(**params):
+    return AffineNRSfM(1, random_state=0, **params).fit(TABLE)
+
+
+test_refusals = refusals_of("points_in_space", globals())

@@ -9,9 +9,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import slow_after
+from layers import slow_after, with_limits
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from scenes import likelihood_of, random_scene, with_gaps
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
@@ -21,15 +22,14 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, AutoNRSfM
-from isa_nrsfm._estimator import limited
+from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._joint.fit import widened
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointProblem
-from isa_nrsfm._joint.settings import LIMITS
-from isa_nrsfm._other_tables import prior_start
+from isa_nrsfm._other_tables import hold_open, prior_start
 from isa_nrsfm._parameters.choices import FACE_PRIORS
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm.datasets import load_face_prior
@@ -37,8 +37,9 @@ from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 from isa_nrsfm.skeletons import find_skeleton, get_skeleton
 
+AS_USERS = ["restarts"]
 # For errors of depths
-Thorough = limited(LIMITS._replace(few_frames=0, widths=()))
+Thorough = with_limits(few_frames=0, widths=())
 N_POINTS = 16
 PERSPECTIVE = {"camera": "perspective", "principal_point": (0, 0)}
 
@@ -79,11 +80,17 @@ def error(model, S, X):
     return mean_shape_error_3d(S, model.reconstruct(X), convention="frame")
 
 
+@made_once
+def prior_of(**params):
+    """Return a fit of a table that determines its shapes."""
+    return fitted(study(0, 40, 30).X, **params)
+
+
 @pytest.fixture(scope="module")
 def turned():
     """A table that determines its shapes, and its fit."""
     table = study(0, 40, 30)
-    table.model = fitted(table.X)
+    table.model = prior_of()
     return table
 
 
@@ -451,28 +458,8 @@ def test_squeezed_images_are_named():
 # --- refusals -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("of_prior", "params", "message"),
-    [
-        (None, {}, "prior must be a fitted AffineNRSfM"),
-        ({"camera": "affine"}, {}, "fitted with calibrated cameras"),
-        ({"refinement": None}, {}, "fitted with calibrated cameras and the joint"),
-        ({}, {"camera": "orthographic"}, "was fitted with camera='weak_perspective'"),
-        ({}, {"camera": "affine"}, "prior needs calibrated cameras"),
-        ({}, {"refinement": "consensus"}, "prior needs calibrated cameras"),
-        ({}, {"n_components": 3}, "must be that of the prior, 2, or 'auto'"),
-    ],
-)
-def test_refused(turned, frontal, of_prior, params, message):
-    prior = AffineNRSfM()
-    if of_prior is not None:
-        prior = fitted(turned.X, **of_prior) if of_prior else turned.model
-    refused(message, fitted, frontal.X, prior, **params)
-
-
 def test_other_points_are_refused(turned, frontal):
     X = frontal.X
-    refused("the prior has 16 points, the table 15", fitted, X[:, 2:], turned.model)
     order = np.random.default_rng(0).permutation(N_POINTS)
     other = X.reshape(len(X), -1, 2)[:, order].reshape(X.shape)
     refused("the same points in the same order", fitted, other, turned.model)
@@ -561,6 +548,30 @@ def test_foreign_tables_are_warned_of_once(turned, params, other):
         assert eval(code, names).best_estimator_.prior_std_[0] > 0.01
 
 
+def test_rows_of_a_table_are_fitted_once(turned, monkeypatch):
+    decompose, numbers = TableModel.decompose, []
+
+    def counted(self, rows, *args, **params):
+        numbers.append(len(rows))
+        return decompose(self, rows, *args, **params)
+
+    monkeypatch.setattr(TableModel, "decompose", counted)
+    model, X = turned.model, np.roll(turned.X, 2, axis=1)
+    warned("as far from", model.transform, X)
+    assert sum(numbers) == len(X)
+
+
+def test_a_table_that_is_held_is_opened_once(turned):
+    model, X = copy.copy(turned.model), turned.X.copy()
+    expected, other = model.reproject(X), np.roll(X, 2, axis=1)
+    hold_open(model, X)
+    opened = model._opened(X)
+    assert model._opened(X) is opened
+    assert_array_equal(model.reproject(X), expected)
+    warned("as far from", model.reproject, other)
+    assert model._opened(X, np.ones((len(X), N_POINTS))) is not opened
+
+
 def test_weights_of_points_and_other_tables():
     rng, table = np.random.default_rng(0), study(0, 30, 30, noise=0)
     weights = np.exp(3 * rng.normal(size=(30, N_POINTS)))
@@ -579,3 +590,6 @@ def test_weights_of_points_and_other_tables():
     assert not model.diagnostics(X, point_weight=weights).outlier_share
     other = np.roll(X, 2, axis=1)
     warned("as far from", model.transform, other, point_weight=weights)
+
+
+test_refusals = refusals_of("prior", globals())

@@ -1,7 +1,6 @@
 """What is promised of files, outputs and tables that others bring or forge."""
 
 import bz2
-import datetime
 import os
 import signal
 import subprocess
@@ -9,7 +8,6 @@ import sys
 import threading
 import time
 import zipfile
-from zoneinfo import ZoneInfo
 
 import numpy as np
 import pandas as pd
@@ -19,7 +17,6 @@ from layers import slow_after
 from refusals import refused, warned
 
 from isa_nrsfm import AffineNRSfM, association
-from isa_nrsfm.analysis._frame_columns import checked_times
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, open_table, read_landmarks, read_table
 
@@ -181,10 +178,3 @@ def test_copies_of_a_frame_count_once_in_any_group(noise, rng):
     alpha = alpha[copies] + noise * rng.normal(size=(360, 2))
     found = association(alpha, y[copies], rng.integers(0, 3, 360), random_state=0)
     assert 60 <= found.n_frames <= 62
-
-
-def test_times_with_a_zone():
-    zone = ZoneInfo("Europe/Berlin")
-    hours = [datetime.datetime(2024, 3, 31, h, tzinfo=zone) for h in (0, 1, 3, 4)]
-    for times in (hours, pd.Series(hours), pd.DatetimeIndex(hours)):
-        assert checked_times(times, 4).tolist() == [0.0, 3600.0, 7200.0, 10800.0]

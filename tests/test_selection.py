@@ -6,13 +6,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import sklearn
-from layers import may_not_converge
+from layers import may_not_converge, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import (
     GridSearchCV,
-    KFold,
     LeaveOneGroupOut,
     cross_val_score,
 )
@@ -20,14 +19,12 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm._selection import results_of, selected
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0).data
 PERSON = np.arange(len(X)) % 6
-OneStartNRSfM = limited(Limits(few_frames=0, widths=()))
+OneStartNRSfM = with_limits(few_frames=0, widths=(), restarts=False)
 
 
 def inner(**parameters):
@@ -107,12 +104,6 @@ def test_methods_are_those_of_the_best_estimator(fitted):
     assert fitted.score(rows) == best.score(rows)
     assert fitted.n_features_in_ == X.shape[1]
     assert_array_equal(fitted.get_feature_names_out(), ["alpha_1", "alpha_2"])
-
-
-def test_nothing_is_there_before_the_fit():
-    search = AffineNRSfMCV()
-    assert not hasattr(search, "n_features_in_")
-    refused(None, search.transform, X, error=NotFittedError)
 
 
 @pytest.mark.slow
@@ -205,16 +196,6 @@ def test_fewest_basis_shapes_are_fitted():
 def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
     monkeypatch.delattr("isa_nrsfm._selection.cross_validate")
     refused("n_components=500", AffineNRSfMCV((1, 500)).fit, X)
-
-
-def test_the_limit_of_the_parts_is_named():
-    few = X[:14]  # nine frames are fitted in a part, enough for three basis shapes
-    message = r"9 frames, enough for n_components=3 at most"
-    refused(message, AffineNRSfMCV((3, 5)).fit, few)
-    hidden = X.copy()
-    hidden[6:, :2] = np.nan  # five of the six rows that show it are held out
-    with pytest.raises(ValueError, match=r"split 0 of cv fits .* needs every point"):
-        AffineNRSfMCV((1, 2), cv=KFold(12)).fit(hidden)
 
 
 @may_not_converge

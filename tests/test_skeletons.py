@@ -155,64 +155,9 @@ def test_generated_shapes_are_recognised_in_their_own_order_only(name, maker, rn
         assert find_skeleton(n_points, shape=other) is None
 
 
-@pytest.mark.parametrize(
-    ("n_points", "options"),
-    [
-        (17, {}),
-        (68, {}),
-        (42, {}),
-        (17, {"shape": make_body_tracks(100, random_state=0).mean_shape}),
-        # Readers of other layouts, other names, numbers that leave some out.
-        (21, {"reader": "openface"}),
-        (17, {"reader": "mediapipe"}),
-        (21, {"names": [f"marker {j} of mine" for j in range(21)]}),
-        (17, {"names": [f"joint_{chr(97 + j)}" for j in range(17)]}),
-        (21, {"names": [str(j) for j in (*range(20), 21)]}),
-    ],
-)
-def test_where_no_or_two_layouts_fit_none_is_taken(n_points, options):
-    assert find_skeleton(n_points, **options) is None
-
-
-@pytest.mark.parametrize(
-    ("n_points", "reader", "name"),
-    [
-        (68, "openface", "ibug-68"),
-        (68, "pyfeat", "ibug-68"),
-        (478, "pyfeat", "mediapipe-face-478"),
-        (51, "pts", "ibug-51"),
-        (98, "wflw", "wflw-98"),
-        (17, "coco", "coco-17"),
-        (133, "coco", "coco-wholebody-133"),
-        (33, "mediapipe", "mediapipe-pose-33"),
-        (21, "mediapipe", "hand-21"),
-        (21, "table", "hand-21"),
-    ],
-)
-def test_the_reader_tells_the_layout(n_points, reader, name):
-    assert find_skeleton(n_points, None, reader).name == name
-    numbers = [f"point{j}" for j in range(n_points)]
-    assert find_skeleton(n_points, numbers, reader).name == name
-
-
 OPENPOSE = """Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip
 RKnee RAnkle LHip LKnee LAnkle REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe
 RSmallToe RHeel""".split()
-
-
-@pytest.mark.parametrize(
-    ("names", "name"),
-    [
-        (OPENPOSE, "body-25"),
-        (get_skeleton("coco-17").point_names, "coco-17"),
-        ([n.upper() for n in get_skeleton("h36m-17").point_names], "h36m-17"),
-        (get_skeleton("coco-wholebody-133").point_names, "coco-wholebody-133"),
-    ],
-)
-def test_names_tell_the_layout(names, name):
-    assert find_skeleton(len(names), names).name == name
-    # Whatever else is said.
-    assert find_skeleton(len(names), names, "mediapipe").name == name
 
 
 def test_names_in_another_order_are_the_layout_in_that_order():
@@ -261,18 +206,6 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
         config.write_bytes(damaged)
         message = r"config.yaml cannot be read as a configuration"
         refused(message, read_skeleton, config, ["a", "b"])
-
-
-def test_bad_questions():
-    refused(r"skeletons are ibug-68, .*; got 'cat'", get_skeleton, "cat")
-    refused("names must hold 3 names; got 2", find_skeleton, 3, ["a", "b"])
-    refused("shape must hold 3 points", find_skeleton, 3, shape=np.zeros((4, 2)))
-    hand, pose = get_skeleton("hand-21"), canonical_pose
-    refused("not the names of the points of 'hand-21'", hand.reordered, ["thumb"])
-    refused("has 21 points, the shape 20", pose, np.eye(20, 3), scheme="hand-21")
-    pairs = skeleton_of_names([("a", "b")], ["a", "b"], name="ab", source="me")
-    refused("does not define which way is up", pose, np.eye(2, 3), scheme=pairs)
-    refused(r"skeletons are .*; got \[\[0, 1\]\]", pose, np.eye(2, 3), scheme=[[0, 1]])
 
 
 WITH_CONTOUR = {

@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from frame_parts import OF_FRAMES, OF_SHAPES, assert_same_model
-from layers import slow_after
+from layers import slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 
-from isa_nrsfm._estimator import limited
-from isa_nrsfm._joint.settings import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -26,9 +24,9 @@ FEW_POINTS = np.repeat([1.0, 2.0, 4.0, np.nan], [2, 2, 2, 34])
 CHUNKS = (35, 75, 0, 40)
 # Small tables are worked on as large ones are.
 # Their starts and ends are none of their own: one start and few steps are quick.
-ALL = Limits(few_frames=0, widths=())
-SAMPLED = ALL._replace(small_table=1000, sample=50, model_frames=100)
-KRYLOV = ALL._replace(dense=300)
+ALL = {"few_frames": 0, "widths": (), "restarts": False}
+SAMPLED = ALL | {"small_table": 1000, "sample": 50, "model_frames": 100}
+KRYLOV = ALL | {"dense": 300}
 
 
 @made_once
@@ -47,13 +45,13 @@ def table(missing=0.0, n_points=20, n_frames=150, outliers=False, planar=False):
 
 
 def estimator(limits=ALL, tol=1.0, **params):
-    return limited(limits)(K, random_state=0, tol=tol, **params)
+    return with_limits(**limits)(K, random_state=0, tol=tol, **params)
 
 
 @made_once
-def in_memory(limits=ALL, params=(), given=()):
+def in_memory(limits=(), params=(), given=()):
     """Return the fit of a table in memory."""
-    return estimator(limits, **dict(params)).fit(table(**dict(given)))
+    return estimator(dict(limits) or ALL, **dict(params)).fit(table(**dict(given)))
 
 
 def stored(X, path, kind="memmap", n_files=3):
@@ -104,7 +102,7 @@ SLOW_FITS = [
     slow_after(len(FITS), FITS + SLOW_FITS),
 )
 def test_fit_is_that_in_memory(tmp_path, kind, memory, limits, params, given):
-    expected = in_memory(limits, tuple(params.items()), tuple(given.items()))
+    expected = in_memory(*(tuple(each.items()) for each in (limits, params, given)))
     X = stored(table(**given), tmp_path, kind)
     got = estimator(limits, working_memory=memory, **params).fit(X)
     assert_same_model(got, expected)
@@ -223,22 +221,6 @@ def test_chunks_of_unknown_length():
     assert_same_model(model, estimator().fit(X[np.arange(150) % 7 != 0]))
 
 
-@pytest.mark.parametrize(
-    ("place", "value", "message"),
-    [
-        ((120, 3), np.inf, "Input X contains infinity"),
-        (120, FEW_POINTS, r"fewer than 4 .* in 1 of 150 frames \(first: row 120"),
-        (120, 1.0, r"equal in 1 of 150 frames \(first: row 120\)"),
-    ],
-    ids=["infinite value", "few points", "equal points"],
-)
-@pytest.mark.parametrize("kind", ["memmap", "dask"])
-def test_rows_are_checked(tmp_path, kind, place, value, message):
-    X = table().copy()
-    X[place] = value
-    refused(message, estimator(working_memory=0.05).fit, stored(X, tmp_path, kind))
-
-
 def test_half_points_are_warned_of_once(tmp_path):
     X = table().copy()
     X[[40, 120], 3] = np.nan
@@ -248,21 +230,6 @@ def test_half_points_are_warned_of_once(tmp_path):
     assert len(w) == 1
     message = "some points have only one of their two"
     warned(message, model.transform, stored(X, tmp_path))
-
-
-@pytest.mark.parametrize("kind", ["memmap", "dask"])
-def test_other_shapes_are_refused(tmp_path, kind):
-    blocks = stored(table(), tmp_path, kind)
-    refused("Expected 2D array, got 1D", estimator().fit, blocks[:, 0])
-    refused("an even number; got n_features=39", estimator().fit, blocks[:, :-1])
-    refused("expecting 40 features", in_memory().transform, blocks[:, :-2])
-
-
-@pytest.mark.parametrize("kind", ["npy", "dask"])
-def test_the_refinement_of_the_paper_needs_memory(tmp_path, kind):
-    model = estimator(refinement="alternating")
-    blocks = stored(table(), tmp_path, kind)
-    refused("not in memory needs refinement='joint'", model.fit, blocks)
 
 
 def test_memory_maps_are_taken_as_arrays_where_that_is_needed(tmp_path):
@@ -290,17 +257,19 @@ class TestOpenTable:
         blocks = stored(table().astype(np.float32), tmp_path, "parquet")
         assert blocks.dtype == blocks[:3].dtype == np.float32
 
-    def test_files_that_are_no_table(self, tmp_path):
-        (tmp_path / ".hidden").write_text("")
-        message = r"has no .npy or .parquet files"
-        refused(message, open_table, tmp_path, error=FileNotFoundError)
-        np.save(tmp_path / "a.npy", np.zeros((3, 4, 2)))
-        refused(r"table of real numbers.*\(3, 4, 2\)", open_table, tmp_path)
-        np.save(tmp_path / "a.npy", table())
-        np.save(tmp_path / "b.npy", table()[:, :30])
-        refused(r"same columns: a.npy has 40, b.npy 30", open_table, tmp_path)
-        (tmp_path / "b.npy").rename(tmp_path / "b.csv")
-        refused(r"one kind.*got a.npy, b.csv", open_table, tmp_path)
-        file = tmp_path / "a.parquet"
-        pq.write_table(pa.table({"x0": [1.0], "name": ["b"]}), file)
-        refused("column 'name' is of type string", open_table, file)
+
+def spoilt(place, value):
+    """Return a table with a value at a place."""
+    X = table().copy()
+    X[place] = value
+    return X
+
+
+def arrays(folder, **tables):
+    """Write arrays into a folder, and return it."""
+    for name, values in tables.items():
+        np.save(folder / f"{name}.npy", values)
+    return folder
+
+
+test_refusals = refusals_of("stored_tables", globals())

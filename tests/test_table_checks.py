@@ -7,11 +7,10 @@ import pandas as pd
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 from sklearn.exceptions import ConvergenceWarning
 
-from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
-from isa_nrsfm.baselines import PseudoInverseNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
@@ -62,14 +61,6 @@ class TestPoints:
         message += r"\d+ numbers of the shapes, which have \d+\."
         refused(message, fit, table_of(tracks), K)
 
-    def test_groups_of_points_that_are_never_seen_together(self, rng):
-        tracks = rng.normal(size=(100, 20, 2))
-        tracks[:50, 12:] = np.nan
-        tracks[50:, :12] = np.nan
-        message = r"2 groups that no frame shows together, .* \(first: point 12 is "
-        message += r"never visible with point 0 and its group\)"
-        refused(message, fit, table_of(tracks))
-
     def test_frames_of_points_on_a_line(self, rng):
         tracks = FACES.copy()
         tracks[::2] = rng.normal(size=(20, 30, 1)) * rng.normal(size=(20, 1, 2))
@@ -114,24 +105,6 @@ class TestNames:
             names = np.array(pairs).T if layout == "planar" else np.array(pairs)
             X = pd.DataFrame(table_of(FACES, layout), columns=names.ravel())
             assert fit(X, layout=layout).n_features_in_ == 60
-
-    @pytest.mark.parametrize(
-        ("layout", "names", "order"),
-        [
-            ("planar", ["x0", "y0", "x1", "y1", "x2", "y2"], "interleaved"),
-            ("interleaved", ["x0", "x1", "x2", "y0", "y1", "y2"], "planar"),
-            (
-                "interleaved",
-                ["y0", "x0", "y1", "x1", "y2", "x2"],
-                "neither interleaved nor planar; .*landmark_table.*",
-            ),
-        ],
-    )
-    def test_contradicting_names(self, layout, names, order):
-        message = rf"layout='{layout}' contradicts the column names "
-        message += rf"\({', '.join(names[:4])}, ...\), whose order is {order}$"
-        X = pd.DataFrame(FACES[:, :3, 0].repeat(2, 1), columns=names)
-        refused(message, fit, X, layout=layout)
 
 
 class TestOtherLayout:
@@ -207,13 +180,6 @@ def test_masked_whole_numbers_and_single_precision(model):
     assert model.transform(single).dtype == np.float32
 
 
-def test_masks_are_refused_where_nothing_may_be_missing(model):
-    masked = np.ma.masked_array(X, HIDDEN)
-    refused("takes no missing points", PseudoInverseNRSfM(1).fit, masked)
-    with pytest.raises(ValueError, match="contains NaN"):
-        PooledFastICA().fit(np.ma.masked_array(X[:, :9], HIDDEN[:, :9]))
-
-
 def test_masked_coefficients_have_no_images(model):
     alpha = np.ma.masked_array(model.alpha_, model.alpha_ > 0)
     images = model.inverse_transform(alpha)
@@ -248,22 +214,6 @@ def test_sizes_within_the_range_change_no_coefficient(params, size):
     assert_allclose(scaled.inverse_snr_, usual.inverse_snr_, rtol=1e-6)
 
 
-@pytest.mark.parametrize("size", [1e160, 1e-300])
-def test_coordinates_outside_the_range_are_refused(model, size, tmp_path):
-    match = "between 1e-150 and 2e\\+153 .* another unit"
-    refused(match, estimator().fit, size * X)
-    refused(match, PseudoInverseNRSfM(1).fit, size * X)
-    refused(r"in row 2\. Give", model.transform, np.concatenate([X[:2], size * X]))
-    np.save(tmp_path / "X.npy", size * X)
-    refused(match, estimator().fit, np.load(tmp_path / "X.npy", mmap_mode="r"))
-
-
-@pytest.mark.parametrize("name", ["n_components", "max_iter", "tol"])
-def test_flags_are_no_numbers(name):
-    params = {"n_components": 1, name: True}
-    refused(rf"'{name}' parameter .* Got True instead", AffineNRSfM(**params).fit, X)
-
-
 def test_rotations_and_scales_of_single_precision():
     table = (1e25 * X).astype(np.float32)
     model = estimator(camera="weak_perspective").fit(table)
@@ -271,3 +221,23 @@ def test_rotations_and_scales_of_single_precision():
     expected = np.broadcast_to(np.eye(2), (30, 2, 2))
     assert_allclose(rows @ rows.swapaxes(1, 2), expected, atol=1e-5)
     assert_allclose(model.scales_[:, None, None] * rows, model.motion_, rtol=1e-5)
+
+
+def named(layout, names):
+    """Return a table with these names of columns."""
+    return pd.DataFrame(table_of(FACES[:, :3], layout), columns=names.split())
+
+
+def mapped(folder, table):
+    np.save(folder / "X.npy", table)
+    return np.load(folder / "X.npy", mmap_mode="r")
+
+
+def in_two_parts():
+    """Return tracks of two groups of points that are never seen together."""
+    tracks = np.random.default_rng(0).normal(size=(100, 20, 2))
+    tracks[:50, 12:] = tracks[50:, :12] = np.nan
+    return tracks
+
+
+test_refusals = refusals_of("table_checks", globals())

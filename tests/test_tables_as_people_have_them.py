@@ -15,7 +15,7 @@ from fit_runs import JOINT, QUICK
 from landmark_files import BODYPARTS, TRACKS
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused, warned
+from refusals import refusals_of, refused, warned
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli._times import image_numbers
@@ -106,7 +106,7 @@ def warnings_of(call, *args, **kwargs):
         ("{who}{part} {axis}", "12"),
     ],
 )
-def test_individuals_in_a_row_are_a_question(tmp_path, begins, name, who):
+def test_individuals_in_a_row_are_a_question(tmp_path, begins, fails, name, who):
     own = [name.replace("{who}", each) for each in who]
     tables = [table_of(each, POINTS + 300 * i) for i, each in enumerate(own)]
     scores = [f"{each.format(part=p, axis='p')}" for each in own for p in BODYPARTS]
@@ -119,7 +119,8 @@ def test_individuals_in_a_row_are_a_question(tmp_path, begins, name, who):
     for i in (0, 1):
         assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
     assert (rows.confidence == 1).all(axis=None)
-    options = re.findall(r"command line: (--\w+ .*?)\)", told)
+    told = fails("fit", path, *QUICK, "1", "-o", tmp_path / "b")
+    options = re.findall(r"use (--\w+ .*?)(?:\. |$)", told)
     assert len(options) == 2
     for option in options:
         begins(path, *shlex.split(option))
@@ -129,32 +130,15 @@ FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 LEGS = ("coxa", "femur", "tibia", "tarsus", "claw")
 
 
-@pytest.mark.parametrize(
-    ("name", "first", "second"),
-    [
-        ("{}_{}", ("thumb", "index", "ring"), range(4)),
-        ("{}_{}", ("left", "right"), BODYPARTS),
-        ("{}_{}", ("lefthand", "righthand"), range(21)),
-        ("{}{}", ("LeftHand", "RightHand"), range(21)),
-        ("{1}_{0}", ("gauche", "droite"), range(17)),
-        ("{}{}", ("vänster", "höger"), range(17)),
-        ("hand{}_{}", "LR", range(21)),
-        ("{}_{}", FINGERS, "123"),
-        ("{}_{}", ("finger1", "finger2", "finger3"), range(7)),
-        ("L{}{}", "123", ("Coxa", "Femur", "Tibia", "Tarsus")),
-        ("{}_{}", ("L1", "L2", "L3", "R1", "R2", "R3"), LEGS),
-        ("{}_{}", (f"leg{i}" for i in range(1, 7)), range(8)),
-        ("row{}_{}", range(8), range(8)),
-    ],
-)
-def test_parts_of_one_body_are_no_individuals(name, first, second):
+def reads_all_parts(name, first, second):
+    """Return whether all points of one body are read, if need be as advised."""
     parts = [name.format(a, b) for a, b in product([*first], [*second])]
     parts += [part.replace("L", "R") for part in parts if name[0] == "L"]
     table, options = table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts), {}
     if name[:3] != "{1}" and isinstance(second, range) and len(second) > 6:
         told = str(refused("more than one set", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
-    assert landmark_table(table, **options).points.shape == (2, 2 * len(parts))
+    return landmark_table(table, **options).points.shape == (2, 2 * len(parts))
 
 
 def test_individuals_of_few_points_are_not_fitted():
@@ -216,28 +200,9 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
     assert "exactly" not in warnings_of(fit, tracks.reshape(N, -1))[0]
 
 
-@pytest.mark.parametrize(
-    ("names", "numbers"),
-    [
-        ("labeled-data/v/img0010.png labeled-data/v/img0030.png", [10, 30]),
-        ("v1_7_x2.png v1_9_x2.png v1_30_x2.png", [7, 9, 30]),
-        ("a/1.png a/5.png b/1.png b/5.png", [1, 5, 1, 5]),
-        ("e3a1.png 77b0.png 0c9d.png", [0, 1, 2]),  # no numbers of frames
-        ("anna.png bob.png anna.png", [0, 1, 0]),
-        ("2023-05-01_12-00-30.png 2023-05-01_12-00-31.png", [0, 1]),
-        ("20230501120030.png 20230501120130.png 20230501120230.png", [0, 1, 2]),
-        ("v/20230501_120030.png v/20230501_120031.png", [0, 1]),
-        ("2023-05-01_0001.png 2023-05-01_0130.png", [1, 130]),
-        ("20230501_01.png 20230501_02.png 20230502_01.png 20230502_02.png", [1, 2] * 2),
-        ("12h00m30s.png 12h00m50s.png 12h01m10s.png", [0, 1, 2]),
-        ("frame_0.04.png frame_0.96.png frame_1.04.png", [0, 1, 2]),
-        ("1682935230040.jpg 1682935230080.jpg", [0, 1]),
-        ("cam1.012.png cam1.015.png cam2.012.png cam2.015.png", [12, 15] * 2),
-        ("000000000139.jpg 000000000785.jpg", [139, 785]),
-    ],
-)
-def test_numbers_in_names_are_those_of_frames(names, numbers):
-    assert list(image_numbers(pd.DataFrame({"image": names.split()}))) == numbers
+def numbers_in(names):
+    """Return the numbers of frames in names of images."""
+    return list(image_numbers(pd.DataFrame({"image": names.split()})))
 
 
 def test_times_in_names_of_images_are_told(tmp_path, begins):
@@ -273,9 +238,7 @@ def test_parts_of_whole_bodies(tmp_path, lists, part):
     found = read_landmarks(path, part=part).points
     assert_array_equal(found, BODIES[:, first:end].reshape(4, -1))
     if len(lists) > 1:
-        told = (
-            "those in foot_kpts, face_kpts, .* choose with part, one of body, .*--part"
-        )
+        told = "those in foot_kpts, face_kpts, .* choose with part, one of body, "
         assert len(warned(told, read_landmarks, path).point_names) == 17
     refused("'nose' is none of body, ", read_landmarks, path, part="nose")
 
@@ -297,7 +260,7 @@ def test_parts_are_chosen_as_messages_say(tmp_path, begins, fails):
     both = {"pose": files.SCORED[0], "face": files.SCORED[1]}
     files.write_openpose(folder, [[files.openpose_person(**both)]] * 9)
     told = fails("fit", folder, *QUICK, "1", "-o", tmp_path / "b")
-    part, option = re.search(r"of (\w+), .*command line: (--part)\)", told).groups()
+    part, option = re.search(r"of (\w+), .* with (--part)", told).groups()
     begins(folder, option, part)
 
 
@@ -485,12 +448,12 @@ SIZE = "--camera affine --image-size 640x480"
 @pytest.mark.parametrize(
     ("table", "options", "told", "advised"),
     [
-        (SETS, "", r"command line: (.*?)\), such as (.*)", "{} {}"),
+        (SETS, "", r"Choose with (.*?), such as (.*)", "{} {}"),
         (VIDEOS, "--fps 25", "apart with (.*?),", "--fps 25 {} who"),
         (VIDEOS, "--fps 25", "others out with (.*)", "--fps 25 {} who=bob"),
         (PLAIN, "--time day", r"\((.*?)\) or", "--time day {}"),
         (PLAIN, "--time day", r" or .* \((.*?)\)", "--time day {}"),
-        (PLAIN, "--label age", r"command line: --label COLUMN(.*)\)", "--label age{}"),
+        (PLAIN, "--label age", r"use --label COLUMN(.*)", "--label age{}"),
         (PLAIN, "--group team", "rows out with (.*)", "--group team {} team=^$"),
         (PLAIN, "--distance neck,hip", "such as (--unit .*)", "--distance neck,hip {}"),
         (PLAIN, "--unit neck,hip", "needs (.*?),", "--unit neck,hip {} neck,hip"),
@@ -533,7 +496,7 @@ def test_corners_of_boxes_are_no_points(box, name):
     table = table_of(name, TRACKS).assign(**dict.fromkeys(box.split(), 5.0))
     options = {}
     if "_" not in name:
-        told = str(refused("--columns", landmark_table, table))
+        told = str(refused("give columns, such as", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
     assert_array_equal(landmark_table(table, **options).points, FLAT)
 
@@ -542,6 +505,9 @@ def test_corners_of_boxes_are_no_points(box, name):
 def test_points_w_and_h_are_no_sizes_of_boxes(name):
     table, options = table_of(name, files.scene(2, 26), ascii_lowercase), {}
     if not {*"_."} & {*name}:
-        told = str(refused("--columns", landmark_table, table))
+        told = str(refused("give columns, such as", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
     assert_array_equal(landmark_table(table, **options).points, table)
+
+
+test_refusals = refusals_of("tables_as_people_have_them", globals())

@@ -67,30 +67,15 @@ def seconds(times):
 DAY = 86400.0
 
 
-@pytest.mark.parametrize(
-    ("cells", "steps"),
-    [
-        (["02/11/2024", "02/12/2024", "02/13/2024"], [0, DAY, 2 * DAY]),
-        (["1.2.2024 9:05", "13.2.2024 9:05"], [0, 12 * DAY]),
-        (["2/1/24 9:05 AM", "2/13/24 9:05 PM"], [0, 12.5 * DAY]),
-        (["01/01/2024", "02/02/2024"], [0, 32 * DAY]),  # both orders agree
-        (["2024-02-01", "2024-02-02T12:00:00.5"], [0, 1.5 * DAY + 0.5]),
-        (["01-Feb-24", "02-Feb-24"], [0, DAY]),
-        (["2024-02-01T12:00:00Z", "2024-02-01T12:00:01.5Z"], [0, 1.5]),
-        (["2024-03-31T01:59:59+01:00", "2024-03-31T03:00:00+02:00"], [0, 1]),
-        (["0:58.5", "0:59.0", "1:00"], [0, 0.5, 1.5]),
-        (["59:59", "1:00:00"], [0, 1]),
-        (["23:59", "24:01"], [0, 2]),
-        (["0:00:58", "0:01:00"], [0, 2]),
-        (["58", "60.5"], [0, 2.5]),
-    ],
-)
-def test_times_are_read_in_the_one_way_that_reads_all(asked, cells, steps):
-    # The time of a column is that of its rows: short ones are repeated by groups.
+def times_in(folder, cells):
+    """Return the times of some cells, in seconds.
+
+    The time of a column is that of its rows: short ones are repeated by groups.
+    """
     n_groups = -(-N // len(cells))
     columns = {"t": cells * n_groups, "g": np.repeat(range(n_groups), len(cells))}
-    found = asked(columns, "--time", "t", "--group", "g").times
-    np.testing.assert_allclose(seconds(found)[: len(cells)], steps, atol=1e-6)
+    found = asked_in(folder, columns, "--time", "t", "--group", "g").times
+    return [*np.round(seconds(found)[: len(cells)], 6)]
 
 
 def test_times_of_several_ways_of_writing_are_refused(asked):
@@ -136,25 +121,12 @@ ROWS = np.arange(N)
 FACES = {"face": np.where(ROWS % 2, "right", "left")}
 
 
-@pytest.mark.parametrize(
-    ("columns", "options", "numbers"),
-    [
-        ({}, [], ROWS),
-        (FACES | {"frame": ROWS // 2 + 1}, ["--group", "face"], ROWS // 2),
-        (FACES | {"image_id": ROWS // 2 * 7}, ["--group", "face"], ROWS // 2),
-        (FACES | {"frame": ROWS // 2}, ["--skip-rows", "face=right"], ROWS[: N // 2]),
-        (FACES | {"image": ROWS // 2}, ["--skip-rows", "face=right"], ROWS[: N // 2]),
-        ({" Frame": ROWS * 5}, [], ROWS * 5),
-        ({"frame": [f"i{i}.png" for i in ROWS]}, [], ROWS),
-        ({"video": ROWS // 12, "frame": ROWS % 12}, ["--group", "video"], ROWS % 12),
-        ({"video": ROWS // 12}, ["--group", "video"], ROWS),
-        ({"file": ["a.mp4"] * N}, [], ROWS),
-        ({"code": ROWS % 8}, ["--skip-rows", "code=7"], ROWS[ROWS % 8 < 7]),
-    ],
-)
-def test_fps_counts_images(asked, columns, options, numbers):
-    found = asked(pd.DataFrame(columns, index=ROWS), "--fps", 25, *options).times
-    np.testing.assert_allclose(seconds(found), numbers / 25, atol=1e-12)
+def images_of(folder, columns, options):
+    """Return the numbers of images that --fps counts."""
+    columns = pd.DataFrame(columns, index=ROWS)
+    return np.round(
+        25 * seconds(asked_in(folder, columns, "--fps", 25, *options).times), 9
+    )
 
 
 LONG_NAMES = "123456789012345678901", "123456789012345678902"
@@ -276,7 +248,6 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
     hidden[:, :8] = False  # these are seen in all rows
     tracks[hidden] = code
     n_rows, n_points = hidden.any(axis=1).sum(), hidden.sum()
-    option = f"--missing-value={code:g}"
     points, (warning,) = tracks_read(tracks)
     if not code:  # far from all other points, which are not
         told = f"{n_points:,} points at (0, 0), in {n_rows} rows, are missing: "
@@ -287,17 +258,16 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
     assert re.match(rf"{shown} \({n_points} in all\)", warning)
-    assert warning.endswith(f"(command line: {option.replace('=', ' ')})")
-    call = re.search(r"with (isa_nrsfm\S+\(.*?\))", warning)[1]
+    number = re.search(r"with missing=(\S+)", warning)[1]
     table = pd.DataFrame(tracks.reshape(200, -1), columns=POINTS)
-    found = eval(call, {"isa_nrsfm": isa_nrsfm, "table": table}).points.to_numpy()
+    found = isa_nrsfm.io.landmark_table(table, missing=code).points.to_numpy()
     np.testing.assert_array_equal(np.isnan(found[:, ::2]), hidden)
     warned(
         re.escape(warning.partition(" If")[0]),
         AffineNRSfM(1, refinement=None).fit,
         table,
     )
-    points, texts = tracks_read(tracks, option)
+    points, texts = tracks_read(tracks, f"--missing-value={number}")
     assert texts == []
     expected = np.where(hidden[..., None], np.nan, tracks)
     np.testing.assert_array_equal(points.reshape(tracks.shape), expected)
@@ -497,56 +467,25 @@ def test_the_way_from_several_levels_of_names_is_right():
     np.testing.assert_array_equal(landmark_table(table).points, WIDE)
 
 
-@pytest.mark.parametrize(
-    ("name", "pattern"),
-    [
-        ("{a}[{j}]", "x[#],y[#]"),
-        ("LM{j}{a}", "LM#x,LM#y"),
-        ("lm_{j}_{a}_px", "lm_#_x_px,lm_#_y_px"),
-        ("eye{letter}:{a}", "*x,*y"),
-        ("{a}@{letter}", "x*,y*"),
-        ("('{letter}', '{a}')", "*x'),*y')"),
-    ],
-)
-def test_names_of_another_form_are_told_their_pattern(name, pattern):
+def pattern_told(name):
+    """Return the pattern that an error tells, which is right."""
     points = enumerate("abcdefghijkl")
     names = [name.format(a=a, j=j, letter=letter) for j, letter in points for a in "xy"]
     table = WIDE.set_axis(names, axis=1)
-    told = str(refused("--columns", landmark_table, table))
-    assert told.endswith(f"such as {pattern!r}")
+    told = str(refused("give columns, such as", landmark_table, table))
+    pattern = told.rpartition("such as ")[2].strip('"' if told[-1] == '"' else "'")
     found = landmark_table(table, columns=pattern).points
     np.testing.assert_array_equal(found, WIDE)
+    return pattern
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        TEXT.replace("\n", "\r\n"),
-        "\ufeff" + TEXT,
-        WIDE.to_csv(),  # an index without a name
-        TEXT.replace("\n", ",,\n"),
-        TEXT + "\n\n",
-        TEXT.replace(",", ", "),
-        WIDE.to_csv(index=False, quoting=1),
-        "# " + TEXT,  # as numpy.savetxt writes a header
-        WIDE[sorted(WIDE)].to_csv(index=False),
-        WIDE.map("{:.6e}".format).to_csv(index=False),
-    ],
-)
-def test_tables_of_many_programs_are_read(tmp_path, text):
-    (tmp_path / "a.csv").write_text(text, newline="")
-    np.testing.assert_array_equal(read_landmarks(tmp_path / "a.csv").points, WIDE)
+HOLED = WIDE.copy()
+HOLED.iloc[1, 4:6] = np.nan
 
 
-@pytest.mark.parametrize(
-    "word", ["NaN", "NAN", "Na", "#N/A", "<NA>", "-nan", "-nan(ind)", "None", '""']
-)
-def test_words_for_missing_points_are_missing(tmp_path, word):
-    table = WIDE.copy()
-    table.iloc[1, 4:6] = np.nan
-    text = table.to_csv(index=False, na_rep="@").replace("@", word)
-    (tmp_path / "a.csv").write_text(text)
-    np.testing.assert_array_equal(read_landmarks(tmp_path / "a.csv").points, table)
+def with_word(word):
+    """Return the text of a table with a word for missing numbers."""
+    return HOLED.to_csv(index=False, na_rep="@").replace("@", word)
 
 
 def skeletons(text):

@@ -200,6 +200,7 @@ def _likeliest_fit(
     n = n_directions(problem, paper_shapes.shape[2], few=True)
     most = min(len(paper_shapes) - 1, n)
     few, *more = dict.fromkeys(min(k, most) for k in FIRST_COMPONENTS)
+    more = more if problem.settings.limits.restarts else []
     rough, cameras = {"tol": problem.settings.tol}, problem.cameras
     fits = [_first_fit(problem, table, paper_shapes[: few + 1], **rough)[0]]
     for k in more:
@@ -235,7 +236,8 @@ def steadiest(
     before = evidence(problem, first)
     fit, widths = whole_distribution(problem, first)
     fit = fit._replace(widths=widths)
-    if not np.isfinite(before):  # nothing turns
+    restarts = problem.settings.limits.restarts
+    if not restarts or not np.isfinite(before):  # nothing turns
         return fit
     found, latest = [(evidence(problem, fit) - LEAST_GAIN, before, fit)], fit
 

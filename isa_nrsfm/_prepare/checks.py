@@ -11,7 +11,7 @@ from sklearn.utils.validation import validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import CHECKS, checked_range, unmasked
@@ -147,31 +147,32 @@ def check_size(
     """Refuse a table that is too small for the number of basis shapes."""
     largest = largest_n_components(n_points, camera)
     if n_components > largest:
-        possible = "at least 7 points are needed for n_components=1"
+        possible = f"at least 7 points are needed for {named('n_components', 1)}"
         if largest > 0:
             possible = (
-                f"with {n_points} points the largest possible n_components is {largest}"
+                f"with {n_points} points the largest possible {named('n_components')} "
+                f"is {largest}"
             )
         if largest > 0 and camera == "affine":
             most = largest_n_components(n_points, "weak_perspective")
             possible += (
                 f" with affine cameras, and {most} with calibrated ones "
-                '(camera="weak_perspective")'
+                f"({named('camera', 'weak_perspective')})"
             )
         of_affine = camera in (None, "affine")
         needed = 3 * n_components + 4 if of_affine else max(n_components // 2 + 4, 7)
         raise ValueError(
-            f"n_components={n_components} needs at least {needed} points, the table "
-            f"has {n_points}; {possible}"
+            f"{named('n_components', n_components)} needs at least {needed} points, "
+            f"the table has {n_points}; {possible}"
         )
     smallest = smallest_n_frames(n_components, n_points)
     if n_frames < smallest:
         possible = ""
         if most := most_components(n_frames, n_points, camera):
-            possible = f"; the largest possible n_components is {most}"
+            possible = f"; the largest possible {named('n_components')} is {most}"
         raise ValueError(
-            f"n_components={n_components} needs at least {smallest} frames (rows), "
-            f"the table has n_samples={n_frames}{possible}"
+            f"{named('n_components', n_components)} needs at least {smallest} frames "
+            f"(rows), the table has n_samples={n_frames}{possible}"
         )
 
 
@@ -199,8 +200,8 @@ def check_points(
     if few.any():
         point = int(few.argmax())
         raise ValueError(
-            f"n_components={n_components} needs every point in at least {minimum} "
-            f"frames; fewer show {few.sum()} of {n_points} points (first: "
+            f"{named('n_components', n_components)} needs every point in at least "
+            f"{minimum} frames; fewer show {few.sum()} of {n_points} points (first: "
             f"{describe_point(point, layout, names)}, in {n_frames[point]} of "
             f"{counts.sum()} frames). Leave out these points, or take fewer basis "
             "shapes"
@@ -209,9 +210,9 @@ def check_points(
     unknowns = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
     if equations < unknowns:
         raise ValueError(
-            f"too few points are visible for n_components={n_components}: they "
-            f"determine {equations} numbers of the shapes, which have {unknowns}. Take "
-            "fewer basis shapes, or leave out points that are rarely visible"
+            f"too few points are visible for {named('n_components', n_components)}: "
+            f"they determine {equations} numbers of the shapes, which have {unknowns}. "
+            "Take fewer basis shapes, or leave out points that are rarely visible"
         )
     # Points seen together take the least number of their frames, until none changes.
     before, group = np.array(-1), np.arange(n_points)
@@ -339,35 +340,14 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
 
 
 def check_camera(model: Any) -> None:
-    """Refuse parameters of an estimator that its camera lacks, or does not have."""
-    camera, refinement, centre = model.camera, model.refinement, model.principal_point
-    if refinement == "consensus" and camera == "affine":
+    """Refuse a focal length without an axis, or perspective cameras without one."""
+    camera, centre, f = model.camera, model.principal_point, model.focal_length
+    if camera != "perspective" and (f is None) != (centre is None):
         raise ValueError(
-            "refinement='consensus' needs calibrated cameras, because depths of "
-            "groups of points with affine cameras have no common unit. Set "
-            "camera='weak_perspective' or camera='orthographic'"
+            "focal_length and principal_point belong together: give both or none; got "
+            f"focal_length={f!r}, principal_point={centre!r}"
         )
-    if model.remove_pose and camera == "affine":
-        raise ValueError(
-            "remove_pose needs calibrated cameras, which have a yaw. Set "
-            "camera='weak_perspective' or camera='orthographic', or remove_pose=False"
-        )
-    f = model.focal_length
-    lens = (f is not None) + (centre is not None)
-    if lens and (camera == "affine" or (camera != "perspective" and lens == 1)):
-        raise ValueError(
-            "focal_length and principal_point are for calibrated cameras, which have "
-            "axes, and belong together. Give both or none, and none with "
-            f"camera='affine'; got camera={camera!r}, focal_length={f!r}, "
-            f"principal_point={centre!r}"
-        )
-    if camera == "perspective" and refinement not in JOINT_REFINEMENTS:
-        raise ValueError(
-            "camera='perspective' needs refinement='joint' or 'consensus', whose fits "
-            "repeat until the depths of the points agree with their images; got "
-            f"refinement={refinement!r}"
-        )
-    if not lens and camera != "perspective":
+    if centre is None and camera != "perspective":
         return
     numbers = np.asarray(centre, dtype=float)
     if numbers.shape != (2,) or not np.isfinite(numbers).all():
@@ -387,9 +367,9 @@ def undetermined(camera: str) -> Iterator[None]:
         yield
     except np.linalg.LinAlgError as error:
         raise ValueError(
-            f"the table does not determine shapes with camera={camera!r}: its frames "
-            "differ too little, or their points are on few lines. Add frames that show "
-            "the object from other sides, or set camera='affine'"
+            f"the table does not determine shapes with {named('camera', camera)}: its "
+            "frames differ too little, or their points are on few lines. Add frames "
+            f"that show the object from other sides, or set {named('camera', 'affine')}"
         ) from error
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -182,11 +183,7 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
             continue
         number, way = f"{xy[0]:.15g}", "before coordinates are shifted or scaled"
         if equal:
-            option = f"--missing-value {number}" if place else "--zeros-missing"
-            way = (
-                f"with isa_nrsfm.io.landmark_table(table, missing={number}) (command "
-                f"line: {option})"
-            )
+            way = f"as readers of tables do with {named('missing', float(number))}"
         warn_caller(
             f"in {n_rows} of {len(there)} {rows} points are at exactly ({number}, "
             f"{xy[1]:.15g}) ({there.sum()} in all). If these points are missing, make "
@@ -205,9 +202,8 @@ def warn_of_shares(tracks: NDArray, format: str = "table") -> bool:
     inside = np.mean((finite >= 0) & (finite <= 1))
     reader = "mediapipe" if format == "table" else format
     way = (
-        f": isa_nrsfm.io.read_landmarks with format={reader!r} and "
-        f"image_size=(WIDTH, HEIGHT) does it (command line: --format {reader} "
-        "--image-size WIDTHxHEIGHT)"
+        f": read the file with {named('format', reader)} and "
+        f"{named('image_size', (1280, 720))}, the width and height of the images"
     )
     if reader not in ("mediapipe", "yolo"):
         way = (

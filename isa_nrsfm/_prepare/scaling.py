@@ -9,10 +9,11 @@ from sklearn.utils import check_array
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._prepare.checks import check_arrangement, check_points, check_size
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import is_read_later, unmasked
+from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import (
     FrameReport,
     centred_frames,
@@ -169,37 +170,6 @@ def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:
     return kept - np.nanmean(kept, axis=2, keepdims=True)
 
 
-def check_weightable(X: Any, joint: bool, loss: str, grouped: bool) -> None:
-    """Raise if weights of points are not supported by a fit, or for a table.
-
-    `grouped`: groups of points are to be fitted, for a consensus.
-    """
-    if grouped:
-        raise ValueError(
-            "point_weight is not supported by the fit with refinement='consensus', "
-            "whose groups of points are fitted without weights. Set "
-            "refinement='joint', or give no point_weight"
-        )
-    if not joint:
-        raise ValueError(
-            "point_weight needs a fit with refinement='joint', because the refinement "
-            "of the paper has no weights. Set refinement='joint', or set points of low "
-            "weight to NaN"
-        )
-    if loss != "linear":
-        raise ValueError(
-            "point_weight needs loss='linear', because robust losses find weights of "
-            f"their own; got loss={loss!r}. Set loss='linear', or set points of low "
-            "weight to NaN"
-        )
-    if is_read_later(X):
-        raise ValueError(
-            "point_weight needs a table in memory, because weights are not read block "
-            f"by block; got a {type(X).__name__}. Give a NumPy array or a dataframe, "
-            "or no point_weight"
-        )
-
-
 def weighted_rows(
     rows: FrameBlocks, point_weight: Any
 ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
@@ -207,6 +177,11 @@ def weighted_rows(
 
     Weights of missing points are zero. There are none if all visible ones are one.
     """
+    if not rows.cached:
+        raise ValueError(
+            f"{named('point_weight')} needs a table in memory, because weights are not "
+            "read block by block. Give a NumPy array or a dataframe, or no weights"
+        )
     weights = check_array(
         unmasked(point_weight),
         dtype=np.float64,
@@ -252,7 +227,7 @@ def check_weights(weights: NDArray, n_components: int, camera: str | None) -> No
     if 2.0 * mean < n_unknowns:
         raise ValueError(
             f"the weights of a frame add up to {mean:.3g} observations on average, "
-            f"fewer than the {n_unknowns / 2:g} that its camera and n_components="
-            f"{n_components} coefficients need. Multiply point_weight by a number, so "
-            "that points with the least noise have weights of about one"
+            f"fewer than the {n_unknowns / 2:g} that its camera and {n_components} "
+            f"coefficients need. Multiply {named('point_weight')} by a number, so that "
+            "points with the least noise have weights of about one"
         )

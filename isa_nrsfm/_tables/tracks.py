@@ -151,31 +151,28 @@ def centred_frames(rows: NDArray) -> tuple[NDArray, FrameReport]:
     # Coordinates are equal up to four units in the last place of the largest one.
     eps = 4 * np.finfo(rows.dtype).eps
     seen = seen_points(rows)
-    n_seen, complete = seen.sum(axis=1), bool(seen.all())
-    # Points are complex numbers x + iy: each sum is one loop over both coordinates.
-    points = np.empty(seen.shape, dtype=complex)
-    points.real, points.imag = rows[:, 0], rows[:, 1]
-    if not complete:
-        points[~seen] = 0.0
-    total = points.sum(axis=1).view(np.float64).reshape(-1, 2)
+    n_seen, hidden = seen.sum(axis=1), None if seen.all() else ~seen[:, None]
+    centred = np.array(rows, dtype=float, order="C")
+    if hidden is not None:
+        np.copyto(centred, 0.0, where=hidden)
     translation = np.full((len(rows), 2), np.nan)
-    np.divide(total, n_seen[:, None], where=n_seen[:, None] > 0, out=translation)
-    points -= translation.view(complex)
-    if not complete:
-        points[~seen] = 0.0
-    flat = points.view(np.float64)
-    square = np.einsum("ij,ij->i", flat, flat)
-    centred = np.stack([points.real, points.imag], axis=1)
-    place = np.linalg.norm(translation, axis=1)
+    total, shown = centred.sum(axis=2), n_seen[:, None] > 0
+    np.divide(total, n_seen[:, None], where=shown, out=translation)
+    centred -= translation[:, :, None]
+    if hidden is not None:
+        np.copyto(centred, 0.0, where=hidden)
+    x, y = centred.swapaxes(0, 1)
+    xx, yy = np.vecdot(x, x), np.vecdot(y, y)
+    square, place = xx + yy, np.linalg.norm(translation, axis=1)
     in_one_place = (n_seen > 0) & (square <= n_seen * (eps * place) ** 2)
     on_line = np.zeros(len(rows), dtype=bool)
-    if not complete:
+    if hidden is not None:
         # Twice the square of the distances from the principal axis, roughly
-        off = square - np.abs(np.einsum("ij,ij->i", points, points))
+        off = square - np.hypot(xx - yy, 2.0 * np.vecdot(x, y))
         near = off <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
         some = near & ~seen.all(axis=1)
         on_line[some] = _collinear(centred[some], place[some], n_seen[some], eps)
-        np.copyto(centred, np.nan, where=~seen[:, None])
+        np.copyto(centred, np.nan, where=hidden)
     size = np.sqrt(square / (2 * np.maximum(n_seen, 1)))
     return centred, FrameReport(translation, size, n_seen, in_one_place, on_line)
 

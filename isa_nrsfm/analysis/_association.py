@@ -23,22 +23,7 @@ from sklearn.utils import check_array, check_random_state, check_scalar
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import aligned
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
-from isa_nrsfm.analysis._frame_columns import (
-    STATISTICS,
-    checked_column,
-    checked_times,
-    group_numbers,
-    kind_of,
-    refuse_infinite,
-    runs_between_gaps,
-)
-from isa_nrsfm.analysis._permutations import (
-    FrameOrder,
-    independent_length,
-    indicators,
-    permuted_energies,
-    unexplained,
-)
+from isa_nrsfm.analysis import _frame_columns, _permutations
 
 
 class Association(NamedTuple):
@@ -80,7 +65,7 @@ class Association(NamedTuple):
 
     def __repr__(self) -> str:
         """Return the results as a table and what they are."""
-        name, meaning = STATISTICS[self.kind]
+        name, meaning = _frame_columns.STATISTICS[self.kind]
         values = {name: self.statistic}
         if self.corrected is not None:
             values["corrected"] = self.corrected
@@ -208,13 +193,13 @@ def association(
     check_scalar(n_permutations, "n_permutations", Integral, min_val=1)
     given = alpha
     alpha, labels, _, order = _known_frames(alpha, y, groups, time)
-    kind = kind_of(labels, kind)
+    kind = _frame_columns.kind_of(labels, kind)
     columns, classes = _label_columns(labels, kind), kind == "classes"
     standard = _unit_columns(alpha if classes else rankdata(alpha, axis=0))
     covariances = columns.T @ standard
     statistic = np.sum(covariances**2, axis=0) if classes else covariances[0]
     rng = check_random_state(random_state)
-    energies, permuted, untested = permuted_energies(
+    energies, permuted, untested = _permutations.permuted_energies(
         alpha, standard, columns, order, n_permutations, rng
     )
     p_value = _step_down_p_values(energies)
@@ -271,7 +256,7 @@ def predictability(
     """
     check_scalar(n_folds, "n_folds", Integral, min_val=2)
     features, labels, numbers, order = _known_frames(features, y, groups, time)
-    kind = kind_of(labels, kind)
+    kind = _frame_columns.kind_of(labels, kind)
     if groups is None:
         numbers = _dependent_frames(features, labels, kind, order, n_folds)
     most, model = len(labels), RidgeCV(np.logspace(-3, 3, 13))
@@ -296,7 +281,7 @@ def predictability(
 
 def _known_frames(
     features: Any, y: Any, groups: Any, time: Any
-) -> tuple[NDArray, NDArray, NDArray | None, FrameOrder]:
+) -> tuple[NDArray, NDArray, NDArray | None, _permutations.FrameOrder]:
     """Return features, labels, groups and order of different frames without NaN."""
     features = check_array(
         features, dtype=np.float64, ensure_all_finite="allow-nan", input_name="alpha"
@@ -304,16 +289,16 @@ def _known_frames(
     finite = np.flatnonzero(np.isfinite(features).all(axis=1))
     if not len(finite):
         raise ValueError("no frame has coefficients: all rows of alpha have NaN")
-    labels = checked_column("y", y, len(features))
-    refuse_infinite("y", labels, np.arange(len(features)))
-    seconds = checked_times(time, len(features))
+    labels = _frame_columns.checked_column("y", y, len(features))
+    _frame_columns.refuse_infinite("y", labels, np.arange(len(features)))
+    seconds = _frame_columns.checked_times(time, len(features))
     if groups is None and time is not None:  # gaps are no jumps of a clip
-        groups = runs_between_gaps(seconds)
-    numbers = group_numbers(groups, len(features))
+        groups = _frame_columns.runs_between_gaps(seconds)
+    numbers = _frame_columns.group_numbers(groups, len(features))
     classes = np.unique(labels, return_inverse=True)[1][finite]
     rows = np.column_stack([_rounded(features[finite]), classes])
     finite = finite[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
-    order = FrameOrder(numbers[finite], seconds[finite])
+    order = _permutations.FrameOrder(numbers[finite], seconds[finite])
     return features[finite], labels[finite], numbers[finite], order
 
 
@@ -361,7 +346,7 @@ def _label_columns(labels: NDArray, kind: str) -> csr_array:
     """
     if kind == "number":
         return csr_array(_unit_columns(rankdata(labels)[:, None]))
-    columns = indicators(np.unique(labels, return_inverse=True)[1])
+    columns = _permutations.indicators(np.unique(labels, return_inverse=True)[1])
     return csr_array(columns / np.sqrt(columns.sum(axis=0)))
 
 
@@ -373,12 +358,18 @@ def _unit_columns(values: NDArray) -> NDArray:
 
 
 def _dependent_frames(
-    features: NDArray, labels: NDArray, kind: str, order: FrameOrder, n_folds: int
+    features: NDArray,
+    labels: NDArray,
+    kind: str,
+    order: _permutations.FrameOrder,
+    n_folds: int,
 ) -> NDArray | None:
     """Return the block of each frame (n_frames,), None for independent frames."""
     columns = _label_columns(labels, kind)[order.rows]
-    residuals = unexplained(_unit_columns(features)[order.rows], columns, order)
-    length = independent_length(residuals)
+    residuals = _permutations.unexplained(
+        _unit_columns(features)[order.rows], columns, order
+    )
+    length = _permutations.independent_length(residuals)
     if length == 1:
         return None
     blocks = np.empty(len(labels), dtype=int)

@@ -19,20 +19,10 @@ from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._joint.uncertainty import HalfTables
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm.analysis._advice import (
-    DEPTH,
-    FIT,
-    GROSS,
-    MOST_GROSS,
-    SAME_UNIT,
-    advice,
-    camera_meaning,
-    facts_of,
-    gross_residuals,
-    layout_of,
-    verdict,
-)
+from isa_nrsfm.analysis import _advice
+from isa_nrsfm.analysis._advice import camera_meaning
 from isa_nrsfm.analysis._stability import stability, stability_words
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
@@ -248,11 +238,11 @@ def diagnose(
         camera_meaning(ratio),
         share,
         np.divide(removed, variance, where=variance > 0, out=np.zeros_like(variance)),
-        *gross_residuals(distance),
+        *_advice.gross_residuals(distance),
     )
-    names, layout = names_of_points(estimator), layout_of(estimator)
+    names, layout = names_of_points(estimator), _advice.layout_of(estimator)
     error = np.nan if table is None else model.held_out_error(table, *weights)
-    facts = facts_of(
+    facts = _advice.facts_of(
         estimator,
         held_out_error=error,
         deviation=found.weak_deviations[-1],
@@ -262,10 +252,10 @@ def diagnose(
         pose=_of_pose(found, mean_shape, basis, layout, estimator),
     )
     return found._replace(
-        messages=advice(facts),
+        messages=_advice.advice(facts),
         held_out_error=error,
-        fit=verdict(error, *FIT),
-        depth=verdict(found.depth_uncertainty, *DEPTH),
+        fit=_advice.verdict(error, *_advice.FIT),
+        depth=_advice.verdict(found.depth_uncertainty, *_advice.DEPTH),
     )
 
 
@@ -294,7 +284,7 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
 
 def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     """Describe the outliers; empty if they are few enough to ignore."""
-    if not found.outlier_energy > MOST_GROSS:
+    if not found.outlier_energy > _advice.MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
     points, counts = np.unique(found.outliers[:, 1], return_counts=True)
@@ -302,7 +292,7 @@ def outlier_text(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     return (
         f"the table has outliers: {len(found.outliers)} points "
         f"({100 * found.outlier_share:.2g} %) in {len(frames)} frames are more than "
-        f"{GROSS:g} standard deviations from the model, in the rows "
+        f"{_advice.GROSS:g} standard deviations from the model, in the rows "
         f"{first_items((rows[i] for i in frames), 5)}, most often the points "
         f"{first_items((names[j] for j in most), 5)}"
     )
@@ -340,13 +330,15 @@ def _of_pose(
     shape = basis[np.nanargmax(found.pose_share)]
     deformation = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
     if 2 * np.sum(deformation**2) < np.sum(shape**2):
-        return f"{text}: they stretch the whole shape. Make sure that {SAME_UNIT}"
+        return (
+            f"{text}: they stretch the whole shape. Make sure that {_advice.SAME_UNIT}"
+        )
     if model.remove_pose:
         return (
-            f"{text}, beyond what remove_pose has removed. Compare coefficients of "
-            "similar views only"
+            f"{text}, beyond what {named('remove_pose')} has removed. Compare "
+            "coefficients of similar views only"
         )
-    way = "use --remove-pose (in Python remove_pose=True)"
+    way = f"use {named('remove_pose', True)}"
     if model.camera_ == "affine":
         way = "use isa_nrsfm.AutoNRSfM(AffineNRSfM(remove_pose=True)).fit(X)"
     if layout is None or not layout.contour or model.prior is not None:

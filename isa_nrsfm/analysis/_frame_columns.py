@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from sklearn.utils import check_array, column_or_1d
 from sklearn.utils.multiclass import type_of_target
 
+from isa_nrsfm._parameters.naming import named
+
 Kind = Literal["classes", "number"]
 # Names and meanings of the statistics of labels, by their kind.
 STATISTICS = {
@@ -64,8 +66,7 @@ def kind_of(y: NDArray, kind: str) -> Kind:
     if n_values == len(y):
         raise ValueError(
             f"the {len(y)} labels are all different, so that no class has two frames; "
-            "for a measured quantity use kind='number' (command line: --label "
-            "COLUMN:number)"
+            f"for a measured quantity use {named('kind', 'number')}"
         )
     return "classes"
 

@@ -22,7 +22,13 @@ axes and the sign of the depth remain unknown: the mirror image, ``z -> -z``, ha
 same images.
 """
 
-from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+from isa_nrsfm.calibration._canonical_pose import (
+    CanonicalPose,
+    ViewAngles,
+    angle_deviations,
+    canonical_pose,
+    view_angles,
+)
 from isa_nrsfm.calibration._deformation_metric import (
     DeformationMetric,
     EuclideanFrames,
@@ -38,7 +44,6 @@ from isa_nrsfm.calibration._orthonormal_cameras import (
     OrthonormalCameras,
     orthonormal_cameras,
 )
-from isa_nrsfm.calibration._view_angles import ViewAngles, angle_deviations, view_angles
 
 __all__ = [
     "CanonicalPose",

@@ -12,14 +12,7 @@ from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS
 from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS, CalibratedCamera
 from isa_nrsfm._tables.tracks import of_all_rows
-from isa_nrsfm.calibration._metric import (
-    MetricFit,
-    mean_gram,
-    metric_quadric,
-    refine_metric,
-    safe_start,
-    unit_cameras,
-)
+from isa_nrsfm.calibration import _metric
 
 # Above this condition number the cameras hardly determine the metric. It is that of
 # rotations by about five degrees: docs/benchmarks/README.md, "Thresholds".
@@ -213,9 +206,11 @@ def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]
     return cameras, np.asarray(usable)
 
 
-def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> MetricFit:
+def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> _metric.MetricFit:
     """Return the best metric of usable cameras (n_frames, 2, 3), from two starts."""
-    gram = mean_gram(unit_cameras(cameras)) if len(cameras) else np.zeros((3, 3))
+    gram = np.zeros((3, 3))
+    if len(cameras):
+        gram = _metric.mean_gram(_metric.unit_cameras(cameras))
     eigenvalues = np.linalg.eigvalsh(gram)
     n_seen = np.count_nonzero(eigenvalues > OF_RANKS * eigenvalues[-1])
     if n_seen < 3:
@@ -224,10 +219,10 @@ def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> MetricFit:
             f"space; the {len(cameras)} usable cameras see {n_seen}"
         )
     alpha, metrics = np.zeros((len(cameras), 0)), [np.linalg.inv(gram)]
-    if (G := metric_quadric(cameras)) is not None:
+    if (G := _metric.metric_quadric(cameras)) is not None:
         metrics.append(G)
-    starts = [safe_start(cameras, G, camera)[None] for G in metrics]
-    fits = [refine_metric(cameras, alpha, start, camera) for start in starts]
+    starts = [_metric.safe_start(cameras, G, camera)[None] for G in metrics]
+    fits = [_metric.refine_metric(cameras, alpha, start, camera) for start in starts]
     return min(fits, key=itemgetter(1))
 
 

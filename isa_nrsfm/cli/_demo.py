@@ -10,7 +10,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm.cli._fit import fit_table
 from isa_nrsfm.cli._options import PROGRAM, build_parser
 from isa_nrsfm.cli._reading import drawing_options
-from isa_nrsfm.cli._sections import fit_title, text_of
+from isa_nrsfm.cli._report import fit_title, text_of
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import affine_shape_error
 

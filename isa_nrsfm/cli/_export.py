@@ -6,19 +6,10 @@ from typing import Any
 
 from isa_nrsfm import export
 from isa_nrsfm.cli import _reading
-from isa_nrsfm.cli._options import NONE, SUFFIXES, flag_of
-from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, refuse_replacing
-from isa_nrsfm.cli._sections import text_of
+from isa_nrsfm.cli._options import EXPORTS, NONE, flag_of
+from isa_nrsfm.cli._outputs import check_outputs, read_model
+from isa_nrsfm.cli._report import text_of
 from isa_nrsfm.skeletons._column_names import names_of_points
-
-# The options of each content.
-_POSE = ("camera", "origin", "mirrored")
-_OPTIONS = {
-    "viewer": ("edges", "skeleton", "names", *_POSE),
-    "glb": ("edges", "skeleton", "names", *_POSE),
-    "pdm": ("n_modes", *_POSE),
-    "shapes": (),
-}
 
 
 def run(args: Namespace, warned: list[str]) -> str:
@@ -27,10 +18,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     content = _content(output)
     options = _given(args, content)
     estimator = read_model(args)
-    refuse_overwriting([args.model, *_reading.drawing_files(args)], [output])
-    if not args.force:
-        refuse_replacing([output])
-    if "edges" in _OPTIONS[content]:
+    check_outputs(args, [args.model], [output])
+    if "edges" in EXPORTS[content]["options"]:
         options |= _reading.drawing(args, names_of_points(estimator), None)
     if args.mirrored:
         estimator = estimator.mirrored()
@@ -50,7 +39,7 @@ def run(args: Namespace, warned: list[str]) -> str:
 
 def _content(output: Path) -> str:
     """Return the content to write, by the suffix."""
-    contents = {each: name for name, suffixes in SUFFIXES.items() for each in suffixes}
+    contents = {s: name for name, each in EXPORTS.items() for s in each["suffixes"]}
     if output.suffix.lower() not in contents:
         raise ValueError(
             "--output: expected a file with one of the suffixes "
@@ -62,10 +51,10 @@ def _content(output: Path) -> str:
 def _given(args: Namespace, content: str) -> dict[str, Any]:
     """Return the options that are given; raise if the content does not have them."""
     given = {}
-    for name in [name for options in _OPTIONS.values() for name in options]:
+    for name in [name for each in EXPORTS.values() for name in each["options"]]:
         if getattr(args, name) in (None, False):
             continue
-        having = [kind for kind, options in _OPTIONS.items() if name in options]
+        having = [kind for kind, each in EXPORTS.items() if name in each["options"]]
         if content not in having:
             raise ValueError(
                 f"{flag_of(name)} is an option of {' and '.join(having)}; "

@@ -19,29 +19,22 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
+from isa_nrsfm._other_tables import hold_open
 from isa_nrsfm._parameters.choices import (
     CALIBRATED_CAMERAS,
     FACE_PRIORS as LAYOUTS,
     JOINT_REFINEMENTS,
 )
+from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
-from isa_nrsfm.cli import _outputs
+from isa_nrsfm.cli import _outputs, _reading, _report
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, FACE_PRIORS, NONE, flag_of
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.cli._reading import (
-    Frames,
-    drawing,
-    drawing_files,
-    face_layout,
-    read_frames,
-)
-from isa_nrsfm.cli._report import model_report, table_report
-from isa_nrsfm.cli._sections import fit_title, summary, text_of, write_report
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
@@ -65,7 +58,7 @@ _PARAMETERS = (
 def run(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
     report, _ = fit_table(args, warned)
-    return text_of(fit_title(report), report["summary"])
+    return _report.text_of(_report.fit_title(report), report["summary"])
 
 
 def fit_table(
@@ -81,9 +74,9 @@ def fit_table(
     if prior not in (None, NONE, *FACE_PRIORS):
         args.prior = load_model(prior)
     folder = Path(args.output)
-    frames = _moving_points(args, read_frames(args, table=table), table)
+    frames = _moving_points(args, _reading.read_frames(args, table=table), table)
     if prior in FACE_PRIORS:
-        layout = face_layout(args, frames)
+        layout = _reading.face_layout(args, frames)
         if layout is None:
             raise ValueError(
                 f"--prior {prior} has no points of this table, whose layout is "
@@ -92,8 +85,8 @@ def fit_table(
             )
         K = None if args.n_components in (None, (AUTO,)) else args.n_components[0]
         args.prior = load_face_prior(K, layout=layout)
-    frames.points.attrs[TOLD] = True
     X = frames.X
+    X.attrs[TOLD] = True
     if X.empty:
         out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
@@ -108,23 +101,20 @@ def fit_table(
             "normalised coordinates)"
         )
     figures = {} if args.no_figures else figures_of(frames)
-    drawn = drawing(args, frames.columns.points, frames.skeleton)
-    results, inputs = dict.fromkeys(_outputs.RESULTS, ""), drawing_files(args)
+    drawn = _reading.drawing(args, frames.columns.points, frames.skeleton)
+    results = dict.fromkeys(_outputs.RESULTS, "")
+    inputs = [prior] * (prior not in (None, NONE, *FACE_PRIORS))
     if table is None:
         inputs.append(args.table)
     else:
         results[Path(args.table).name] = ""
-    if prior not in (None, NONE, *FACE_PRIORS):
-        inputs.append(prior)
     with whole_files.folder_for_writing(folder):
-        files = [*results, *figures, _outputs.REPORT]
-        _outputs.refuse_overwriting(inputs, [folder / name for name in files])
-        for name in files:
-            whole_files.check_replaceable(folder / name)
-        if not args.force:
-            earlier = _outputs.entry_of_report(folder, "sha256")
-            own_files = {*earlier, _outputs.REPORT} if earlier else ()
-            _outputs.refuse_replacing([folder / name for name in files], own_files)
+        targets = [folder / name for name in (*results, *figures, _outputs.REPORT)]
+        earlier = _outputs.entry_of_report(folder, "sha256")
+        own_files = {*earlier, _outputs.REPORT} if earlier else ()
+        _outputs.check_outputs(args, inputs, targets, own_files)
+        for target in targets:
+            whole_files.check_replaceable(target)
         old = _outputs.entry_of_report(folder, "files")
         removed = {*figures, *(name for name in old if name.endswith(".png"))}
         used = {args.group, args.time, frames.images.name}
@@ -135,16 +125,13 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
-        together = whole_files.files_together(folder, removed=removed)
-        with together as new, parallel_config(n_jobs=2):  # threads for blocks of frames
+        with whole_files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
             _outputs.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
-            viewer_data = {
-                "labels": first_classes(frames.labels),
-                "times": frames.times,
-            }
+            labels = first_classes(frames.labels)
+            viewer_data = {"labels": labels, "times": frames.times}
             if args.std and estimator.camera_ != "affine":
                 viewer_data["depth_std"] = estimator.reconstruct(
                     X, return_std=True, **frames.weighting
@@ -161,16 +148,16 @@ def fit_table(
                 "command": "fit",
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-                "table": table_report(args, frames) | {"other_columns": unused},
+                "table": _report.table_report(args, frames) | {"other_columns": unused},
                 **choice,
-                "model": model_report(fit, diagnostics),
+                "model": _report.model_report(fit, diagnostics),
                 "tried": [{**each._asdict(), "text": repr(each)} for each in trials],
                 **answers,
                 "warnings": warned,
                 "versions": {"isa_nrsfm": __version__, "python": python_version()},
             }
-            report |= {"files": results, "summary": summary(report, folder)}
-            report = write_report(new, report)
+            report |= {"files": results, "summary": _report.summary(report, folder)}
+            report = _report.write_report(new, report)
         if not figures:
             return report, estimator
         # A figure that fails, or takes long, costs no results: they are in place.
@@ -182,11 +169,13 @@ def fit_table(
                 )
             captions = write_figures(new, figures, fit)
             report |= {"files": results | captions}
-            report = write_report(new, report)
+            report = _report.write_report(new, report)
     return report, estimator
 
 
-def _moving_points(args: Namespace, frames: Frames, table: Any) -> Frames:
+def _moving_points(
+    args: Namespace, frames: _reading.Frames, table: Any
+) -> _reading.Frames:
     """Leave out points that stand still, unless the options name the points."""
     tracks = frames.X.to_numpy().reshape(len(frames.X), len(frames.columns.points), 2)
     still = still_points(tracks) if args.points is None else ()
@@ -198,7 +187,7 @@ def _moving_points(args: Namespace, frames: Frames, table: Any) -> Frames:
         f"{len(names)} points stand still while the others move through the image, and "
         f"are left out: {first_items(names, 12)}. --points fits those that it names"
     )
-    return read_frames(args, table=table)
+    return _reading.read_frames(args, table=table)
 
 
 def _check_options(args: Namespace) -> None:
@@ -211,20 +200,15 @@ def _check_options(args: Namespace) -> None:
         )
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
-    for name in ("focal_length", "principal_point"):
-        unused = args.focal_length is None and args.camera in CALIBRATED_CAMERAS
-        if getattr(args, name) is not None and (unused or args.camera == "affine"):
-            raise ValueError(
-                f"{flag_of(name)} has no effect on --camera {args.camera}"
-                f"{' without --focal-length' * unused}"
-            )
-    joint = {"--std": args.std, "--n-components auto": args.n_components == (AUTO,)}
-    for option, is_given in joint.items():
-        if is_given and args.refinement not in (None, *JOINT_REFINEMENTS):
-            raise ValueError(
-                f"{option} needs --refinement joint or consensus; got --refinement "
-                f"{args.refinement}"
-            )
+    given = {name: each for name, each in vars(args).items() if each is not None}
+    given = {name: None if each == NONE else each for name, each in given.items()}
+    auto = {"n_components": AUTO} if args.n_components == (AUTO,) else {}
+    check_requirements(given | auto | {"point_weight": args.weights})
+    lens = args.focal_length is not None or args.camera not in CALIBRATED_CAMERAS
+    if args.principal_point is not None and not lens:
+        raise ValueError(
+            f"--principal-point needs --focal-length with --camera {args.camera}"
+        )
     one = {
         "weights": "numbers are compared without weights",
         "prior": "a fit has those of the prior",
@@ -239,7 +223,7 @@ def _check_options(args: Namespace) -> None:
 
 
 def _fitted(
-    args: Namespace, frames: Frames
+    args: Namespace, frames: _reading.Frames
 ) -> tuple[AffineNRSfM, list[Trial], dict[str, Any], Diagnostics | None]:
     """Return the model that held-out points prefer, and what was tried.
 
@@ -287,12 +271,14 @@ def _fitted(
     estimator, trials = decided(
         *(estimator, X, free),
         principal_point=frames.principal_point,
-        face_layout=face_layout(args, frames),
+        face_layout=_reading.face_layout(args, frames),
         show=show_stage,
         groups=groups,
         **frames.weighting,
     )
     estimator.set_params(verbose=0)
+    with parallel_config(n_jobs=2):  # threads for blocks of frames
+        hold_open(estimator, X, **frames.weighting)
     diagnostics = None
     if estimator.refinement in JOINT_REFINEMENTS:
         diagnostics = estimator.diagnostics(X, **frames.weighting)

@@ -3,21 +3,19 @@
 import contextlib
 import importlib
 import os
-import re
+import shlex
 import sys
 import time
 import warnings
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TextIO
+from typing import Any, TextIO
 
 from isa_nrsfm._compat.texts import printable
+from isa_nrsfm._parameters.naming import WRITTEN, in_python
 from isa_nrsfm.cli._options import NONE, PROGRAM, build_parser, flag_of
 from isa_nrsfm.cli._progress import show_stage, shown_progress
-
-# Parameters that messages name, as options of the same names.
-_PARAMETERS = ("n_components", "camera", "refinement", "independence", "loss")
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -25,8 +23,9 @@ def run(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     started = Namespace(arguments=arguments, since=time.perf_counter())
     args = build_parser().parse_args(arguments, started)
+    before = WRITTEN.set(partial(_as_option, args))
     try:
-        with _warnings_as_lines(args) as warned, shown_progress(args.since):
+        with _warnings_as_lines() as warned, shown_progress(args.since):
             show_stage(args.command)
             # Each command is a module, which is only loaded now: help does not wait.
             command = importlib.import_module(f"isa_nrsfm.cli._{args.command}")
@@ -38,18 +37,20 @@ def run(argv: Sequence[str] | None = None) -> int:
         _silence(sys.stdout)
         return 141
     except (ValueError, OSError, ImportError) as error:
-        _say(f"error: {_message(error, args)}")
+        _say(f"error: {_message(error)}")
         return 1
+    finally:
+        WRITTEN.reset(before)
     return 0
 
 
 @contextlib.contextmanager
-def _warnings_as_lines(args: Namespace) -> Iterator[list[str]]:
+def _warnings_as_lines() -> Iterator[list[str]]:
     """Show each warning once, as a line; yield the list of those shown."""
     warned: list[str] = []
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        text = _with_options(str(message), args)
+        text = " ".join(str(message).split())
         if text not in warned:
             warned.append(text)
             _say(f"warning: {text}")
@@ -61,24 +62,25 @@ def _warnings_as_lines(args: Namespace) -> Iterator[list[str]]:
         yield warned
 
 
-def _message(error: Exception, args: Namespace) -> str:
+def _message(error: Exception) -> str:
     """Return the message of an error, in one line."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return _with_options(str(error), args) or type(error).__name__
+    return " ".join(str(error).split()) or type(error).__name__
 
 
-def _with_options(text: str, args: Namespace) -> str:
-    """Join the lines of a message, and name options instead of parameters of Python."""
-    text = " ".join(text.split())
-    for name in filter(partial(hasattr, args), _PARAMETERS):
-        text = text.replace(f"{name}=None", f"{name}={NONE}")
-        value = r"=(?P<quote>['\"]?)(?P<value>[\w.-]*\w)(?P=quote)"
-        option = rf"{flag_of(name)} \g<value>"
-        text = re.sub(rf"(?<![\w/\\-]){name}{value}", option, text)
-    if hasattr(args, "n_components"):
-        text = re.sub(r"(?<![\w'\"-])n_components\b", "--n-components", text)
-    return text
+def _as_option(args: Namespace, name: str, *values: Any) -> str:
+    """Return a parameter of Python as an option of the command, if it is one."""
+    if name == "kind":
+        return f"--label COLUMN:{values[0]}"
+    option = {"point_weight": "weights", "missing": "missing_value"}.get(name, name)
+    if getattr(args, option, args) is args:
+        return in_python(name, *values)
+    sizes = ("x".join(map(str, v)) if isinstance(v, tuple) else v for v in values)
+    values = tuple(f"{v:.15g}" if isinstance(v, float) else v for v in sizes)
+    values = values if values != (True,) else ()
+    texts = [shlex.quote(NONE if v is None else str(v)) for v in values]
+    return f"{flag_of(option)} {' or '.join(texts)}".strip()
 
 
 def _say(text: str) -> None:

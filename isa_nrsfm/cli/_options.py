@@ -26,13 +26,6 @@ NONE = "none"
 CONFIGURATIONS = (".yaml", ".yml")
 # The prior of the package, and another name of it.
 FACE_PRIOR, FACE_PRIORS = "face", ("face", "face-68")
-# What export writes, and the suffixes of the files.
-SUFFIXES = {
-    "viewer": (".html", ".htm"),
-    "glb": (".glb",),
-    "pdm": (".txt",),
-    "shapes": (".npz", ".mat"),
-}
 
 
 def _reader(
@@ -168,15 +161,13 @@ _LISTS = {
 }
 _WORDS = {name: ", ".join(values) for name, values in _LISTS.items()}
 HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
+# What export writes: suffixes of the files, and options.
+EXPORTS = _DATA["exports"]
 # The values of options that have few.
-CHOICES: dict[str, Sequence[str]] = {
+CHOICES: dict[str, Sequence[str]] = _DATA["choices"] | {
     "format": ("auto", *FORMATS),
-    "weights": ("confidence",),
     "part": tuple(dict.fromkeys((*choices.OPENPOSE_PARTS, *choices.WHOLE_PARTS))),
-    "origin": ("auto", "upper", "lower"),
     "camera": choices.CAMERA_NAMES,
-    "export.camera": ("weak_perspective", NONE),
-    "isa": ("pooled", "fast"),
     "block_recovery": choices.BLOCK_RECOVERIES,
     "refinement": (*choices.REFINEMENTS, NONE),
     "independence": (*choices.INDEPENDENCE, NONE),
@@ -184,11 +175,7 @@ CHOICES: dict[str, Sequence[str]] = {
 }
 # Options whose first choice is their value by default, which the help states.
 FIRST = ("isa", "block_recovery", "independence")
-DEFAULTS = {
-    **{name: CHOICES[name][0] for name in ("format", *FIRST)},
-    **{"length": 1.0, "random_state": 0},
-    "demo.output": "isa-nrsfm-demo",
-}
+DEFAULTS = _DATA["defaults"] | {n: CHOICES[n][0] for n in ("format", *FIRST)}
 REPEATED = ("skip_rows", "missing_value", "label", "distance")
 
 

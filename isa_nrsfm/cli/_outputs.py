@@ -18,7 +18,7 @@ from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._fitted_model import frames_of
-from isa_nrsfm.cli._reading import Frames
+from isa_nrsfm.cli._reading import Frames, drawing_files
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
 from isa_nrsfm.skeletons._column_names import names_of_points
@@ -51,20 +51,21 @@ class Fit(NamedTuple):
     inverse_snr: NDArray
 
 
-def refuse_overwriting(sources: Iterable[str], targets: Iterable[Path]) -> None:
-    """Raise if an output file would replace an input file."""
+def check_outputs(
+    args: Namespace, inputs: Iterable[str], targets: Iterable[Path], own: Any = ()
+) -> None:
+    """Raise if files of inputs would be replaced, or others but for own ones by name.
+
+    With --force only inputs are kept.
+    """
     existing = [target for target in targets if target.exists()]
-    for source in sources:
+    for source in (*inputs, *drawing_files(args)):
         if any(target.samefile(source) for target in existing):
             raise ValueError(
                 f"{source} would be overwritten by the results: choose another --output"
             )
-
-
-def refuse_replacing(targets: Iterable[Path], own: Iterable[str] = ()) -> None:
-    """Raise if files would be replaced, but for those of the command by their names."""
-    others = [str(path) for path in targets if path.is_file() and path.name not in own]
-    if others:
+    others = [str(path) for path in existing if path.is_file() and path.name not in own]
+    if others and not args.force:
         raise ValueError(
             f"existing files would be replaced: {', '.join(others)}. Choose another "
             "--output, or replace them with --force"

@@ -59,10 +59,11 @@ class Frames(NamedTuple):
     """The rows of a table as frames.
 
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
-    are not skipped, by the number of the row in the table. ``usable`` marks the rows
-    that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
-    request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
-    numbers of the images that all rows show, under the name of their column, if any.
+    are not skipped, by the number of the row in the table. ``X`` has the landmarks of
+    ``usable`` rows, which can be fitted. ``left_out`` has reason, rows, and whether
+    they were skipped on request, ``not_used`` the sizes of unused sets of coordinates.
+    ``images`` are the numbers of the images that all rows show, under the name of their
+    column, if any.
     ``weighting`` has the weights of the points of X as an argument of `fit`, if asked
     for. Labels, groups and times of the usable rows come from `asked_columns`. Labels
     are NaN where they are not known. Those of classes are categories.
@@ -70,6 +71,7 @@ class Frames(NamedTuple):
     """
 
     points: "pd.DataFrame"
+    X: "pd.DataFrame"
     other: "pd.DataFrame"
     usable: NDArray
     columns: LandmarkColumns
@@ -83,11 +85,6 @@ class Frames(NamedTuple):
     times: NDArray | None = None
     time_unit: str = "seconds"
     principal_point: tuple[float, float] | None = None
-
-    @property
-    def X(self) -> "pd.DataFrame":
-        """The landmarks of the usable rows."""
-        return self.points if self.usable.all() else self.points[self.usable]
 
 
 def read_frames(
@@ -182,8 +179,10 @@ def read_frames(
         if columns.z:
             sets[f"{columns.z[0].strip()}, ... (third coordinate)"] = len(columns.z)
         not_used = sets | not_used
+    points = pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped)
     return Frames(
-        points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
+        points=points,
+        X=points if report.usable.all() else points[report.usable],
         other=other.loc[kept],
         usable=report.usable,
         columns=columns,

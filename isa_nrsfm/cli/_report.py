@@ -1,19 +1,36 @@
-"""The report of a run as data, rendered as text, JSON and HTML."""
+"""The report of a run: as data, and how these become text, JSON and a page.
 
+A section of the page has paragraphs (texts) and tables (`Cells`).
+"""
+
+import base64
+import json
+import math
+import shlex
+import textwrap
 from argparse import Namespace
+from collections.abc import Sequence
+from importlib.resources import files
+from itertools import compress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.texts import as_utf8, escape, first_items, percent
+from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._advice import FIT, camera_meaning, verdict
 from isa_nrsfm.analysis._diagnostics import Diagnostics
-from isa_nrsfm.cli._outputs import Fit
+from isa_nrsfm.analysis._frame_columns import STATISTICS
+from isa_nrsfm.cli._options import PROGRAM
+from isa_nrsfm.cli._outputs import PAGE, REPORT, Fit, digests_of
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.io import FORMATS
+from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Rows and points that are listed, and classes whose means are shown, at most.
@@ -127,3 +144,441 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         "parameters": estimator.get_params(deep=True),
         "alpha": coefficients.to_dict("records"),
     }
+
+
+# Coefficients in the summary, at most; its texts in lines, without a break in paths.
+MOST_SHOWN = 5
+WRAPPED = textwrap.TextWrapper(80, break_on_hyphens=False, break_long_words=False)
+
+
+class Cells(NamedTuple):
+    """A table: titles of the columns if they have any, and rows."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    @property
+    def numbers(self) -> list[bool]:
+        """Which columns have numbers, and are aligned to the right."""
+        return [
+            any(column) and all(cell[:1] in "+-0123456789" for cell in column)
+            for column in zip(*self.rows, strict=True)
+        ]
+
+
+Section = Sequence[str | Cells]
+
+
+def fit_title(report: dict[str, Any]) -> str:
+    """Return the title of the report of a fit."""
+    table, n = report["table"], len(report["model"]["alpha"])
+    layout = f" ({name})" if (name := report["model"]["skeleton"]) else ""
+    rows = f"{table['n_frames']} frames of {table['n_points']} points{layout}"
+    return f"{n} movement{'s' * (n != 1)} in {rows}"
+
+
+def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
+    """Return what a fit has found in a few rows: a name, a mark, and a text.
+
+    The terminal and the page begin with it, and `report.json` has it.
+    """
+    model, table = report["model"], report["table"]
+    rows = [quality_row(model), ["depth", model["depth"].upper(), _depth(model)]]
+    for row in model["alpha"][:MOST_SHOWN]:
+        text = f"from row {row['row_of_min']} to row {row['row_of_max']}"
+        if share := _pose_share(row):
+            text = f"pose explains {share}; {text}"
+        rows.append([row["name"], f"{100 * row['energy_share']:.0f} %", text])
+    if more := len(model["alpha"][MOST_SHOWN:]):
+        rows.append(["", "", f"{more} more in {PAGE}"])
+    rows += [["label", "", _answer(label)] for label in report.get("labels", ())]
+    if "between" in report.get("groups", ()):
+        groups = report["groups"]
+        largest = int(np.argmax(groups["between"]))
+        name, share = model["alpha"][largest]["name"], groups["between"][largest]
+        text = f"{100 * share:.0f} % of the variance of {name} is between groups"
+        rows.append(["group", "", f"{groups['column']}: {text}"])
+    if "time" in report:
+        rows.append(["time", "", str(_time(report["time"])[0])])
+    tried = [each["text"] for each in report["tried"] if each["seconds"]]
+    others = [each for each in report["tried"] if not each["seconds"]]
+    if "choice" in report:
+        tried.insert(0, _choice(report["choice"]))
+    listed = "; ".join(f"{each['setting']} ({each['result']})" for each in others)
+    tried += [f"not tried: {listed}"] * bool(others)
+    rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
+    rows.append(left_out_row(table))
+    if names := table.get("other_columns"):
+        listed = first_items(map(str, names), 6)
+        rows.append(["next", "", f"--label, --group or --time COLUMN: {listed}"])
+    return [*rows, ["open", "", f"{Path(folder, PAGE)}  viewer.html  alpha.csv"]]
+
+
+def _pose_share(row: dict[str, Any]) -> str:
+    """Return the share of a coefficient that the pose explains, if it is known."""
+    share = row["pose_share"]
+    return f"{100 * max(share, 0):.0f} %" if pd.notna(share) else ""
+
+
+def _depth(model: dict[str, Any]) -> str:
+    """Return how well the depth is known, and which of the mirror images it is."""
+    error, mirror = model["depth_uncertainty"], model["mirror_certainty"]
+    if not model["depth"]:
+        return "affine cameras leave it open, and angles and proportions with it"
+    if not model["depth_determined"]:
+        return f"not determined (off by {100 * error:.0f} %): no angles and proportions"
+    text = f"known to {100 * error:.2g} %"
+    if not mirror or not math.isfinite(mirror):
+        return f"{text}; its mirror image is as likely"
+    certainty = min(math.floor(1000 * mirror) / 10, 99.9)
+    return f"{text}; the right one of two mirror images with {certainty:g} %"
+
+
+def _answer(label: dict[str, Any]) -> str:
+    """Return whether a label goes with coefficients."""
+    if label["untested"]:
+        return f"{label['column']} was not tested: {label['untested']}."
+    names = names_of_components(None, len(label["values"]))
+    related = np.asarray(names)[np.less(label["p_values"], 0.05)]
+    coefficients = ", ".join(related) or "no coefficient"
+    return f"{label['column']} goes with {coefficients} (p < 0.05)."
+
+
+def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
+    """Return the sections of the page of a fit, answers first, without figures."""
+    labels = map(_label, report.get("labels", ()))
+    versions = (f"{name} {each}" for name, each in report["versions"].items())
+    return {
+        "Labels": [part for parts in labels for part in parts],
+        "Groups": _groups(report["groups"]) if "groups" in report else (),
+        "Time": _time(report["time"]) if "time" in report else (),
+        "Alpha": _alpha(report["model"]),
+        "Fit": _fit(report),
+        "Table": table_section(report["table"]),
+        "Command": [shlex.join([PROGRAM, *report["arguments"]])],
+        "Versions": [", ".join(versions)],
+    }
+
+
+def table_section(table: dict[str, Any]) -> Section:
+    """Return the rows and columns of a table that are used, and the others."""
+    format, out = table["format"], left_out_row(table)[2]
+    listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
+    unused = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
+    others = {"coordinates not used": unused, "other columns": table["other_columns"]}
+    return [
+        table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
+        f"{table['n_points']} points in the columns {listed}",
+        f"{table['n_frames']} of {table['n_rows']} rows; left out: {out}",
+        *(
+            f"{what}: {first_items(map(str, names), MOST_LISTED)}"
+            for what, names in others.items()
+            if names
+        ),
+    ]
+
+
+def quality_row(quality: dict[str, Any]) -> list[str]:
+    """Return how well points are explained, as a row of a summary."""
+    off = f"points are off by {quality['rms_point_error']:.3g} in the unit of the table"
+    text = f"{percent(quality['held_out_error'])} of left-out points unexplained"
+    return ["fit", quality["fit"].upper(), f"{off}; {text}"]
+
+
+def left_out_row(table: dict[str, Any]) -> list[str]:
+    """Return the rows that are left out, and missing points, as a row of a summary."""
+    reasons = table["rows_left_out"]
+    out = [f"{each['n_rows']} rows: {each['reason']}" for each in reasons]
+    numbers = [f"({n:.15g}, {n:.15g})" for n in table["missing_values"]]
+    out += [f"points at {place} count as missing" for place in numbers]
+    if n_missing := table["n_missing_points"]:
+        share = n_missing / (table["n_frames"] * table["n_points"])
+        rows = f"in {table['n_frames_with_missing_points']} of the others"
+        out.append(f"{n_missing} points ({percent(share)}) are missing {rows}")
+    return ["left out", "", "; ".join(out) or "no row"]
+
+
+def text_of(title: str, rows: Sequence[Sequence[str]]) -> str:
+    """Return a summary as text: rows of a name, a mark, and a text that is wrapped."""
+    lines = [title] * bool(title)
+    for name, mark, text in rows:
+        first, *rest = WRAPPED.wrap(text) or [""]
+        lines.append(f"{name:9}{mark:6}{first}" if mark else f"{name:9}{first}")
+        lines += [f"{'':{15 if mark else 9}}{line}" for line in rest]
+    return "\n".join(lines)
+
+
+def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """Write the report of a fit as a page and as JSON; return it with digests."""
+    _write_page(folder, report)
+    digests = report.get("sha256", {}) | digests_of(folder, report["files"])
+    report = report | {"sha256": digests}
+    text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
+    write_whole(folder / REPORT, f"{text}\n".encode())
+    return report
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can hold it, NaN as null."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {as_utf8(str(key)): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if value is None or isinstance(value, int):
+        return value
+    return as_utf8(value if isinstance(value, str) else repr(value))
+
+
+def _write_page(folder: Path, report: dict[str, Any]) -> None:
+    """Write the report of a fit as a page, with the figures of the folder in it."""
+    title = escape(fit_title(report))
+    about = escape(f"{report['table']['path']}, {report['finished']}")
+    parts = [f"<h1>{title}</h1>", f'<p class="quiet">{about}</p>']
+    parts += _markup("", [Cells([], report["summary"])])
+    for warning in report["warnings"]:
+        parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
+    parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
+    figures = {n: text for n, text in report["files"].items() if n.endswith(".png")}
+    for section, content in fit_sections(report).items():
+        parts += _markup(section, content)
+        for name in figures if section == "Alpha" else ():  # after the answers
+            image = base64.b64encode((folder / name).read_bytes()).decode()
+            caption = escape(figures[name])
+            parts.append(
+                f'<figure><img src="data:image/png;base64,{image}" alt="{caption}">'
+                f"<figcaption>{caption}</figcaption></figure>"
+            )
+    page = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
+    page = page.replace("{{title}}", title).replace("{{content}}", "\n".join(parts))
+    write_whole(folder / PAGE, page.encode(errors="replace"))
+
+
+def _markup(name: str, parts: Section) -> list[str]:
+    """Return the HTML of a section, of an empty one nothing."""
+    found = [f"<h2>{name}</h2>"] if parts and name else []
+    for part in parts:
+        if isinstance(part, str):
+            found.append(f"<p>{escape(part)}</p>")
+            continue
+        found.append('<div class="wide"><table>')
+        for row in [part.head, *part.rows][not part.head :]:
+            tag = "th" if row is part.head else "td"
+            cells = (
+                f"<{tag}{' class=number' * is_number}>{escape(cell)}</{tag}>"
+                for cell, is_number in zip(row, part.numbers, strict=False)
+            )
+            found.append(f"<tr>{''.join(cells)}</tr>")
+        found.append("</table></div>")
+    return found
+
+
+def _fit(report: dict[str, Any]) -> Section:
+    """Return the numbers of the fit and its cameras, with what they mean."""
+    model, table = report["model"], report["table"]
+    square, mirror = model["noise_variance"], model["mirror_certainty"]
+    worst, determined = model["largest_error"], model["depth_determined"]
+    weighted = " Points count by their weights." * model["held_out_error_weighted"]
+    parts = [
+        f"held-out error {percent(model['held_out_error'])}: energy of the errors of "
+        "points that are predicted from the other points of their frame, relative to "
+        f"that of the centred points.{weighted}"
+        + " It is that of the median point, as outliers have less weight."
+        * (model["parameters"]["loss"] != "linear"),
+        f"largest error of a frame: {worst['rms']:.3g}, of row {worst['row']}",
+    ]
+    if square is not None:
+        noise = f"{math.sqrt(square):.3g} in the units of the table"
+        if model["frames_scaled"]:
+            noise = f"{percent(math.sqrt(square))} of the frame's size"
+        parts.append(f"noise in the fit {noise} (standard deviation of a coordinate)")
+    if "prior" in report:
+        name, (width, _) = report["prior"]["name"], report["prior"]["std"]
+        parts.append(
+            f"prior {name}: the mean shape differs by {100 * width:.2g} % of the size "
+            "of the object from that of the prior (standard deviation of a coordinate)."
+            " Coefficients are those of the prior, so that studies with the same prior "
+            "can be compared."
+        )
+    if model["skeleton"] is None and not model["lines_known"]:
+        parts.append(
+            f"{table['n_points']} points of no known layout: give lines of figures and "
+            "viewer with --edges FILE or --skeleton LAYOUT. If they are upside down, "
+            "use --origin lower."
+        )
+    if determined and mirror and math.isfinite(mirror):
+        which = "missing points are farther away"
+        if model["mirror_decided_by_perspective"]:
+            which = "perspective fits"
+        elif model["parameters"]["prior"] is not None:
+            which = "the prior is alike"
+        parts.append(f"mirror image in depth: the one for which {which}")
+    parts += _perspective(model, report.get("position_unit"))
+    if determined and not np.isnan(model["camera_noise_ratio"]):
+        parts.append(_sentence(model["camera_meaning"]))
+    return parts
+
+
+def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str]:
+    """Return focal length and unit of positions of perspective cameras."""
+    focal = model["focal_length"]
+    if focal is None:
+        return []
+    if not math.isfinite(focal):
+        return ["no perspective: the focal length is too long to estimate it"]
+    (x, y), origin, length = model["principal_point"], "given", "units of the shapes"
+    if model["parameters"]["focal_length"] is None:
+        origin = f"estimated, standard deviation {model['focal_length_std']:.2g}"
+    if unit is not None:
+        a, b = unit["points"]
+        length = f"points {a} and {b} of the mean shape are {unit['length']:g} apart"
+    focal = f"focal length {focal:.4g} ({origin}), principal point ({x:g}, {y:g})"
+    return [focal, f"positions in cameras.csv: {length}"]
+
+
+def _alpha(model: dict[str, Any]) -> Section:
+    """Return the distribution of the coefficients, and what the pose predicts."""
+    head = ["", "energy", "min", "row", "max", "row", "pose", "again"]
+    rows = [
+        [
+            row["name"],
+            f"{100 * row['energy_share']:.1f} %",
+            f"{row['min']:z.2f}",
+            f"{row['row_of_min']}",
+            f"{row['max']:z.2f}",
+            f"{row['row_of_max']}",
+            _pose_share(row),
+            row["stability_word"] or "",
+        ]
+        for row in model["alpha"]
+    ]
+    columns = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
+    head, *rows = [[*compress(line, columns)] for line in (head, *rows)]
+    notes = [
+        "energy: share of the deformation in the images (sum of squares)",
+        "pose: variance that yaw, pitch and roll predict, cross-validated",
+        "again: whether a fit of other people has the coefficient, with a correlation "
+        "of at least .85",
+    ]
+    parts: list[str | Cells] = [Cells(head, rows), *compress(notes, columns[5:])]
+    if model["parameters"]["remove_pose"]:
+        largest = max(model["alpha"], key=lambda row: row["pose_removed"] or 0.0)
+        share = f"{100 * (largest['pose_removed'] or 0.0):.0f} % of {largest['name']}"
+        parts.append(
+            f"--remove-pose: what yaw predicts was removed, up to {share}. It assumes "
+            "that the objects move alike in all views"
+        )
+    return parts
+
+
+def _choice(choice: dict[str, Any]) -> str:
+    """Return the held-out error of each number of basis shapes, in percent."""
+    names = ("n_components", "held_out_error", "held_out_error_standard_error")
+    each = zip(*(choice[name] for name in names), strict=True)
+    listed = (f"{k} ({100 * error:.3g} +- {100 * s:.2g} %)" for k, error, s in each)
+    return f"K = {first_items(listed, 12)}: {choice['chosen']} is used"
+
+
+def _label(label: dict[str, Any]) -> Section:
+    """Return how coefficients depend on a label."""
+    title = f"{label['column']}: {label['n_frames']} frames"
+    if "classes" in label:
+        title += f" of {len(label['classes'])} classes"
+    copies = "copies of other frames count once with them"
+    counts = {"n_copies": copies, "n_without_label": "without a label left out"}
+    title += "".join(f"; {label[n]} {what}" for n, what in counts.items() if label[n])
+    names = names_of_components(None, len(label["values"]))
+    statistic, meaning = STATISTICS[label["kind"]]
+    columns = {"": names, statistic: [f"{value:z.2f}" for value in label["values"]]}
+    columns["p"] = ["" if label["untested"] else f"{p:.3f}" for p in label["p_values"]]
+    if label["corrected"] is not None:
+        columns["corrected"] = [f"{value:z.2f}" for value in label["corrected"]]
+        meaning += "; corrected: without the errors of the coefficients"
+    test, means = "no p-values", "class_means" in label and not label["untested"]
+    if not label["untested"]:
+        test = f"corrected p-values: permutations of {label['permuted']}"
+    return [
+        _answer(label),
+        title,
+        Cells([*columns], [*zip(*columns.values(), strict=True)]),
+        f"{statistic}: {meaning}; {test}",
+        *(_class_means(label, names) if means else ()),
+        _score(label),
+    ]
+
+
+def _score(label: dict[str, Any]) -> str:
+    """Return how well coefficients predict a label, compared with PCA."""
+    if "not_cross_validated" in label:
+        return f"not cross-validated: {label['not_cross_validated']}"
+    classes, names = label["score"] == "accuracy", ("", "_standard_error")
+
+    def shown(name: str) -> str:
+        score, error = ((1, 100)[classes] * label[name + each] for each in names)
+        return f"{score:.{2 - classes}f} +- {error:.{2 - classes}f}{' %' * classes}"
+
+    others = [
+        f"{shown(name)} ({label[f'{name}_n_features']} components)"
+        for name in ("cross_validated_pca", "cross_validated_pca_of_rank")
+    ]
+    if classes:
+        others.append(f"largest class {100 * label['largest_class']:.1f} %")
+    return (
+        f"cross-validated {('R^2', 'accuracy')[classes]} {shown('cross_validated')} "
+        f"(standard error); PCA of the aligned frames {', '.join(others)}"
+    )
+
+
+def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
+    """Return the means of the classes of significant coefficients, largest first."""
+    lines = ["mean of each class if p < 0.05, in standard deviations:"]
+    means = pd.DataFrame(label["class_means"], names)
+    note = " (all in report.json)" * (len(means.columns) > MOST_CLASSES)
+    for name, row in means[np.less(label["p_values"], 0.05)].iterrows():
+        largest = row.sort_values(key=lambda mean: -mean.abs(), kind="stable")
+        listed = (f"{each} {mean:+z.1f}" for each, mean in largest.items())
+        lines.append(f"{name}: {first_items(listed, MOST_CLASSES)}{note}.")
+    return lines if len(lines) > 1 else []
+
+
+def _groups(groups: dict[str, Any]) -> Section:
+    """Return how much coefficients differ between groups."""
+    column = groups["column"]
+    if "not_divided" in groups:
+        return [f"{column}: {groups['not_divided']}"]
+    names = names_of_components(None, len(groups["between"]))
+    shares = zip(names, groups["between"], groups["within"], strict=True)
+    rows = [[name, f"{100 * a:.1f} %", f"{100 * b:.1f} %"] for name, a, b in shares]
+    title = f"{column}: variance between and within {groups['n_groups']} groups"
+    return [title, Cells(["", "between", "within"], rows)]
+
+
+def _time(time: dict[str, Any]) -> Section:
+    """Return the result of smoothing in time."""
+    scales = np.asarray(time["time_scales"], dtype=float)
+    name = time["column"]
+    if (frames := time.get("frames")) is not None:
+        name = f"frames {frames[0]:g} to {frames[1]:g} by {name or 'row'}"
+    if not len(scales):
+        return [f"{name}: no dynamics found, coefficients are not smoothed"]
+    fading = scales[np.isfinite(scales)]
+    listed = first_items(f"{each:.3g}" for each in fading)
+    found = [f"time constants of the deformation: {listed} {time['unit']}"] * (
+        len(fading) > 0
+    )
+    if lasting := len(scales) - len(fading):
+        found.append(f"changes last in {lasting} of {len(scales)} directions")
+    return [
+        f"{name}: {'; '.join(found)}",
+        f"smoothed coefficients differ by {time['changed_by']:.2f} (root mean square)",
+    ]
+
+
+def _sentence(text: str) -> str:
+    """Return a text as a sentence; names of files stay as they are."""
+    if text.partition(" ")[0].isalpha():
+        text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."

@@ -9,16 +9,11 @@ import numpy as np
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._fitted_model import removed_part
-from isa_nrsfm.cli import _reading
-from isa_nrsfm.cli._outputs import (
-    read_model,
-    refuse_overwriting,
-    refuse_replacing,
-    write_alpha,
-)
-from isa_nrsfm.cli._report import quality_report, table_report
-from isa_nrsfm.cli._sections import left_out_row, quality_row, text_of
+from isa_nrsfm._parameters.naming import check_requirements
+from isa_nrsfm.cli import _reading, _report
+from isa_nrsfm.cli._outputs import check_outputs, read_model, write_alpha
 from isa_nrsfm.io._tables import table_suffix
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -28,19 +23,14 @@ def run(args: Namespace, warned: list[str]) -> str:
     output = Path(args.output)
     table_suffix(output)
     estimator = read_model(args)
-    if args.std and not hasattr(estimator, "noise_variance_"):
-        raise ValueError(
-            f"--std: {args.model} was fitted with refinement={estimator.refinement!r}, "
-            "which gives no standard deviations"
-        )
+    with errors_of(args.model):
+        check_requirements({"std": args.std, "refinement": estimator.refinement})
     if args.viewer is None and _reading.drawing_options(args):
         raise ValueError("--edges, --skeleton and --origin need --viewer")
     frames = _reading.read_frames(args, estimator)
     drawn = _reading.drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]
-    refuse_overwriting([args.table, args.model, *_reading.drawing_files(args)], outputs)
-    if not args.force:
-        refuse_replacing(outputs)
+    check_outputs(args, [args.table, args.model], outputs)
     X, n_components = _reading.as_fitted(estimator, frames.X), len(estimator.basis_)
     alpha = std = np.empty((0, n_components))
     quality = ["fit", "", "no frame was fitted"]
@@ -49,7 +39,9 @@ def run(args: Namespace, warned: list[str]) -> str:
         explained = estimator.inverse_transform(alpha, motion, translation)
         square = np.nanmean((explained - np.asarray(X)) ** 2)
         error = -estimator.score(X, **frames.weighting)
-        quality = quality_row(quality_report(error, square, bool(frames.weighting)))
+        quality = _report.quality_row(
+            _report.quality_report(error, square, bool(frames.weighting))
+        )
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting
@@ -62,10 +54,10 @@ def run(args: Namespace, warned: list[str]) -> str:
     rows = [
         ["model", "", args.model],
         quality,
-        left_out_row(table_report(args, frames)),
+        _report.left_out_row(_report.table_report(args, frames)),
         ["output", "", f"{files}  {len(frames.points)} rows"],
     ]
-    return text_of(f"{n_components} coefficients of {len(X)} frames", rows)
+    return _report.text_of(f"{n_components} coefficients of {len(X)} frames", rows)
 
 
 def _write_viewer(path: Path, estimator: Any, **options: Any) -> None:

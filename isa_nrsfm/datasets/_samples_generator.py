@@ -7,6 +7,7 @@ on the left of the image (the subject's right) and the middle are written down, 
 indices of the iBUG-68 scheme; the other half is the mirror image.
 """
 
+import tomllib
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 from numbers import Integral, Real
@@ -545,18 +546,9 @@ OF_PEOPLE = PARAMETERS | {"n_people": [Interval(Integral, 1, None, closed="left"
 # Standard deviation of the logarithms of a person's size and of single bones
 SIZES, BONES = 0.06, 0.05
 ACTIONS = ("walk", "reach", "squat")
-# Millimetres: lengths of bones; half widths; points of the head from the neck, in a
-# body that faces the camera: x to its left, y down, z away from the camera.
-LENGTHS = {
-    **{"trunk": 480.0, "neck": 90.0, "upper_arm": 290.0, "forearm": 260.0},
-    **{"thigh": 430.0, "shank": 420.0, "hips": 95.0, "shoulders": 185.0},
-}
-HEAD = {
-    "nose": (0.0, -70.0, -105.0),
-    "left_eye": (32.0, -105.0, -85.0),
-    "left_ear": (75.0, -90.0, 0.0),
-    "head": (0.0, -200.0, -15.0),
-}
+FIGURES: dict[str, Any] = tomllib.loads(
+    (files("isa_nrsfm.datasets") / "figures.toml").read_text(encoding="utf-8")
+)
 STEPS_A_SECOND, MOVES_A_SECOND = 0.9, 0.5
 
 
@@ -732,7 +724,7 @@ def _joints(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDAr
     size = np.exp(SIZES * rng.standard_normal())
     length = {
         bone: size * value * np.exp(BONES * rng.standard_normal())
-        for bone, value in LENGTHS.items()
+        for bone, value in FIGURES["lengths"].items()
     }
     x = np.array([1.0, 0.0, 0.0])
     pelvis = np.zeros((len(time), 3))
@@ -743,7 +735,7 @@ def _joints(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDAr
     # The head leans with the trunk, half as much.
     ahead = _direction(np.pi / 2 - angle["lean"] / 2)
     down = _direction(-angle["lean"] / 2)
-    for name, (left, low, back) in HEAD.items():
+    for name, (left, low, back) in FIGURES["head"].items():
         place = neck + size * (low * down - back * ahead)
         joints[name.replace("left", "right")] = place - size * left * x
         joints[name] = place + size * left * x
@@ -768,24 +760,6 @@ def _direction(forwards: NDArray, sideways: NDArray | float = 0.0) -> NDArray:
     along, across = np.cos(sideways), np.sin(sideways) + 0 * forwards
     parts = across, along * np.cos(forwards), -along * np.sin(forwards)
     return np.stack(parts, axis=1)
-
-
-POSES = ("open", "fist", "point")
-# How far each finger is bent in a pose, from the thumb to the little finger.
-BENDS = np.array([[0.0, 0, 0, 0, 0], [1.0, 1, 1, 1, 1], [0.8, 0, 1, 1, 1]])
-# Degrees of the joints of a bent finger, from the palm on; of the thumb.
-FLEXION, THUMB_FLEXION = (75.0, 95.0, 55.0), (15.0, 35.0, 55.0)
-# Millimetres. A right hand whose palm is seen: x to the right, y down, z away.
-# (first joint, direction of the stretched finger, lengths of its three bones)
-THUMB = ((24.0, -22.0, -8.0), (0.72, -0.62, -0.3), (38.0, 32.0, 26.0))
-FINGERS = (
-    ((24.0, -88.0, 2.0), (0.14, -1.0, 0.0), (44.0, 26.0, 22.0)),
-    ((2.0, -92.0, 4.0), (0.02, -1.0, 0.0), (48.0, 30.0, 23.0)),
-    ((-18.0, -86.0, 2.0), (-0.1, -1.0, 0.0), (45.0, 28.0, 23.0)),
-    ((-35.0, -75.0, -3.0), (-0.22, -1.0, 0.0), (35.0, 21.0, 20.0)),
-)
-# Where bent fingers and the bent thumb go.
-INTO_THE_PALM, ACROSS_THE_PALM = (0.0, 0.0, -1.0), (-0.75, -0.3, -0.6)
 
 
 @checked_parameters(OF_PEOPLE)
@@ -913,7 +887,8 @@ default="weak_perspective"
     (['fist', 'open', 'point'], [0, 1])
     """
     rng = check_random_state(random_state)
-    shapes, path, truths = perform(n_frames, n_people, POSES, _hand, rng)
+    poses = tuple(FIGURES["poses"])
+    shapes, path, truths = perform(n_frames, n_people, poses, _hand, rng)
     scales, focal = lens_of(camera, focal_length, distance, (1.0, 3.0), 500.0)
     angles, motion, translation = film(path, (60.0, 35.0, 35.0), scales, camera, rng)
     table = observe(shapes, motion, translation, rng, noise, missing, layout, focal)
@@ -924,22 +899,19 @@ default="weak_perspective"
 def _hand(time: NDArray, weights: NDArray, rng: RandomState) -> NDArray[np.float64]:
     """Return the shapes (n, 21, 3) of a new person's hand."""
     # Fingers are held off their poses.
-    bends = weights @ BENDS + 0.12 * wander(time, 5, rng)
+    bends = weights @ [*FIGURES["poses"].values()] + 0.12 * wander(time, 5, rng)
     size = np.exp(SIZES * rng.standard_normal())
     shape = np.zeros((len(time), 21, 3))
-    fingers = (
-        (*THUMB, THUMB_FLEXION, ACROSS_THE_PALM),
-        *((*finger, FLEXION, INTO_THE_PALM) for finger in FINGERS),
-    )
+    fingers = np.array(FIGURES["hand"]["fingers"])
     for f, (joint, direction, bones, flexion, bent) in enumerate(fingers):
-        along = np.array(direction) / np.linalg.norm(direction)
-        across = np.array(bent) - (bent @ along) * along
+        along = direction / np.linalg.norm(direction)
+        across = bent - (bent @ along) * along
         across /= np.linalg.norm(across)
-        lengths = np.array(bones) * np.exp(BONES * rng.standard_normal(3))
+        lengths = bones * np.exp(BONES * rng.standard_normal(3))
         angles = np.cumsum(np.deg2rad(flexion)) * bends[:, [f]]
         steps = np.cos(angles)[..., None] * along + np.sin(angles)[..., None] * across
         chain = np.cumsum(lengths[:, None] * steps, axis=1)
-        first = np.array(joint) * np.exp(BONES * rng.standard_normal())
+        first = joint * np.exp(BONES * rng.standard_normal())
         shape[:, 1 + 4 * f] = first
         shape[:, 2 + 4 * f : 5 + 4 * f] = first + chain
     return size * shape

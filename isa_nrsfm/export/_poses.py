@@ -12,13 +12,8 @@ from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
+from isa_nrsfm.export import _upright
 from isa_nrsfm.export._names import frames_of_table, point_places
-from isa_nrsfm.export._upright import (
-    Camera,
-    UprightSpace,
-    upright_frames,
-    upright_space,
-)
 from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -64,7 +59,7 @@ def frame_poses(
     X: Any = None,
     *,
     point_weight: Any = None,
-    camera: Camera = "weak_perspective",
+    camera: _upright.Camera = "weak_perspective",
     edges: Any = "auto",
     origin: Origin = "auto",
 ) -> FramePoses:
@@ -125,7 +120,7 @@ def frame_poses(
 def pose_function(
     model: Any,
     *,
-    camera: Camera = "weak_perspective",
+    camera: _upright.Camera = "weak_perspective",
     edges: Any = "auto",
     origin: Origin = "auto",
 ) -> Callable[..., FramePoses]:
@@ -173,17 +168,17 @@ def pose_function(
     """
     if camera is None:
         raise ValueError("angles need calibrated cameras; got camera=None")
-    space = upright_space(model, camera, origin, edges)
+    space = _upright.upright_space(model, camera, origin, edges)
     return partial(_poses, space, model)
 
 
 def _poses(
-    space: UprightSpace, model: Any, X: Any, point_weight: Any = None
+    space: _upright.UprightSpace, model: Any, X: Any, point_weight: Any = None
 ) -> FramePoses:
     """Return the poses of frames in an upright space."""
     motion, alpha = frames_of_table(model, X, point_weight)
     shaped = alpha[:0] if space.metric is None else alpha  # no shapes are needed
-    _, rotations, scales = upright_frames(space, model, motion, shaped)
+    _, rotations, scales = _upright.upright_frames(space, model, motion, shaped)
     # The fitted table must determine the depth.
     determined = frames_of(model).certainty.determined
     if space.metric is not None:
@@ -207,7 +202,7 @@ def point_distances(
     *,
     unit: tuple[Any, Any] | None = None,
     length: float = 1.0,
-    camera: Camera = "weak_perspective",
+    camera: _upright.Camera = "weak_perspective",
 ) -> NDArray:
     """
     Return Euclidean distances of points in the shape of each frame.
@@ -257,7 +252,7 @@ def point_distances(
         raise ValueError("distances need calibrated cameras; got camera=None")
     if not 0 < length < np.inf:
         raise ValueError(f"length must be a positive number; got {length}")
-    space = upright_space(model, camera, "auto")
+    space = _upright.upright_space(model, camera, "auto")
     names = names_of_points(model)
     first, second = np.array([point_numbers(pair, names) for pair in pairs]).T
     if unit is None:
@@ -267,7 +262,7 @@ def point_distances(
             )
         unit = EYES
     a, b = point_numbers(unit, names)
-    shapes = upright_frames(space, model, *frames_of_table(model, X)).shapes
+    shapes = _upright.upright_frames(space, model, *frames_of_table(model, X)).shapes
     mean = np.nanmean(shapes, axis=0)
     size = np.linalg.norm(mean[a] - mean[b])
     if not size > 0:

@@ -16,8 +16,8 @@ from isa_nrsfm._compat.stored_arrays import write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._linalg.small_matrices import procrustes
+from isa_nrsfm.export import _upright
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
-from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
 from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -199,7 +199,7 @@ def point_distribution_model(
     model: Any,
     *,
     n_modes: float | None = None,
-    camera: Camera = "weak_perspective",
+    camera: _upright.Camera = "weak_perspective",
     origin: Origin = "auto",
 ) -> PointDistributionModel:
     """
@@ -266,8 +266,8 @@ def point_distribution_model(
     >>> pdm.mean.shape, pdm.modes.shape, pdm.eigenvalues.shape
     ((68, 3), (1, 68, 3), (1,))
     """
-    space = upright_space(model, camera, origin)
-    shapes = upright_frames(space, model, *frames_of_table(model, None)).shapes
+    space = _upright.upright_space(model, camera, origin)
+    shapes = _upright.upright_frames(space, model, *frames_of_table(model, None)).shapes
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
     if space.camera is not None:
         shapes = _aligned(shapes)

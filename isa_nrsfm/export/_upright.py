@@ -24,15 +24,7 @@ from isa_nrsfm.calibration import (
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm.plotting._views import (
-    UPSIDE_DOWN,
-    Origin,
-    euclidean_axes,
-    lines_of_model,
-    upright_turn,
-    viewing_rotation,
-    viewing_transform,
-)
+from isa_nrsfm.plotting import _views
 from isa_nrsfm.skeletons import Skeleton
 
 Camera = Literal["weak_perspective"] | None
@@ -55,7 +47,7 @@ class UprightSpace(NamedTuple):
 
 
 def upright_space(
-    model: Any, camera: Camera, origin: Origin, edges: Any = "auto"
+    model: Any, camera: Camera, origin: _views.Origin, edges: Any = "auto"
 ) -> UprightSpace:
     """Find the upright space of a fitted model, or raise.
 
@@ -75,24 +67,24 @@ def upright_space(
         warn_caller(depth_advice(facts_of(model)))
     to_metric = np.eye(3)
     if fitted != "affine":
-        transform = euclidean_axes(model)
+        transform = _views.euclidean_axes(model)
     elif camera is None:
-        transform = viewing_transform(model.motion_, model.reference_motion_)
+        transform = _views.viewing_transform(model.motion_, model.reference_motion_)
     else:
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
-        transform = viewing_rotation(
+        transform = _views.viewing_rotation(
             model.motion_ @ metric.Q,
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )
     shape = model.mean_shape_ @ (transform @ to_metric).T
     image_axes = np.eye(3)
-    layout, lines, origin = lines_of_model(model, edges, origin, shape)
+    layout, lines, origin = _views.lines_of_model(model, edges, origin, shape)
     if origin == "lower":
         image_axes[1, 1] = -1
-        transform, shape = UPSIDE_DOWN @ transform, shape @ UPSIDE_DOWN
-    transform = upright_turn(shape, layout, "upper") @ transform
+        transform, shape = _views.UPSIDE_DOWN @ transform, shape @ _views.UPSIDE_DOWN
+    transform = _views.upright_turn(shape, layout, "upper") @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
     return UprightSpace(calibration, metric, transform, image_axes, lines)
@@ -140,4 +132,4 @@ def viewed_shapes(space: UprightSpace, model: Any) -> NDArray[np.float64]:
         fit = np.linalg.pinv(gram, hermitian=True) @ product
         shapes = fit.reshape(shapes.shape)
     shapes[0] -= shapes[0].mean(axis=0)
-    return shapes @ UPSIDE_DOWN
+    return shapes @ _views.UPSIDE_DOWN

@@ -21,13 +21,8 @@ from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
+from isa_nrsfm.export import _upright
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
-from isa_nrsfm.export._upright import (
-    Camera,
-    upright_frames,
-    upright_space,
-    viewed_shapes,
-)
 from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
 from isa_nrsfm.plotting._views import UPSIDE_DOWN, Edges, Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
@@ -48,19 +43,6 @@ MIRRORED = " The mirror image in depth fits the images as well."
 FLOATS, INTEGERS = 5126, 5125
 VERTICES, INDICES = 34962, 34963
 POINTS, LINES, TRIANGLES = 0, 1, 4
-# Matt materials, seen from both sides.
-MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.8}
-MATERIALS = [
-    {
-        "name": name,
-        "doubleSided": True,
-        "pbrMetallicRoughness": {"baseColorFactor": [*colour, 1.0]} | MATT,
-    }
-    for name, colour in (
-        ("points and edges", (0.05, 0.12, 0.25)),
-        ("surface", (0.80, 0.66, 0.55)),
-    )
-]
 
 
 class ViewerPage(str):
@@ -90,7 +72,7 @@ def write_viewer(
     n_frames: int = 1000,
     edges: Edges = "auto",
     names: Sequence[str] | None = None,
-    camera: Camera = "weak_perspective",
+    camera: _upright.Camera = "weak_perspective",
     origin: Origin = "auto",
 ) -> ViewerPage:
     """
@@ -179,7 +161,7 @@ def write_viewer(
         raise ValueError(
             f"n_frames must be a whole number of at least 0; got {n_frames!r}"
         )
-    space = upright_space(model, camera, origin, edges)
+    space = _upright.upright_space(model, camera, origin, edges)
     components = names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
@@ -196,12 +178,12 @@ def write_viewer(
     rows, motion, alpha = rows[finite], motion[finite], alpha[finite]
     seconds = np.empty(0) if times is None else _seconds(times, n_rows)[rows]
 
-    shapes = viewed_shapes(space, model)
+    shapes = _upright.viewed_shapes(space, model)
     lines = space.lines
     size = np.linalg.norm(shapes[0], axis=1).max()
     rotations = np.empty((0, 3, 3))
     if space.camera is not None and len(motion):
-        rotations = upright_frames(space, model, motion, alpha).rotations
+        rotations = _upright.upright_frames(space, model, motion, alpha).rotations
         rotations = UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
     labelled = hasattr(X, "iloc")  # pandas: rows have names
     kind = space.camera if frames_of(model).certainty.determined else "unknown"
@@ -260,12 +242,14 @@ def _deviations(values: Any, n_rows: int, model: Any) -> NDArray:
     return np.broadcast_to(found, shape)
 
 
+def _resource(name: str) -> str:
+    """Return the text of a file beside this module."""
+    return (files("isa_nrsfm.export") / name).read_text(encoding="utf-8")
+
+
 def _page(content: dict[str, Any]) -> str:
     """Return the page with a content."""
-    page, script = (
-        (files("isa_nrsfm.export") / name).read_text(encoding="utf-8")
-        for name in ("viewer.html", "viewer.js")
-    )
+    page, script = map(_resource, ("viewer.html", "viewer.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     # Escape data that would end its HTML element.
     data = json.dumps(content, separators=(",", ":"), allow_nan=False)
@@ -318,7 +302,7 @@ def write_glb(
     *,
     edges: Edges = "auto",
     names: Sequence[str] | None = None,
-    camera: Camera = "weak_perspective",
+    camera: _upright.Camera = "weak_perspective",
     origin: Origin = "auto",
 ) -> None:
     """
@@ -378,9 +362,9 @@ def write_glb(
     frames; those of calibrated cameras are the model's.
     """
     suffix_of(path, [".glb"])
-    space = upright_space(model, camera, origin, edges)
+    space = _upright.upright_space(model, camera, origin, edges)
     targets = names_of_components(names, len(model.basis_))
-    shapes = viewed_shapes(space, model)
+    shapes = _upright.viewed_shapes(space, model)
     factor = 1 / np.ptp(shapes[0], axis=0).max()
     shapes = factor * shapes
     lines, surface = space.lines, None
@@ -410,15 +394,10 @@ def write_glb(
         "samplers": [sampler | {"output": file.add(weights.ravel())}],
         "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
     }
-    document = {
-        "asset": {"version": "2.0", "generator": f"isa_nrsfm {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "shape", "mesh": 0}],
-        "meshes": [mesh],
-        "materials": MATERIALS,
-        "animations": [animation],
-    }
+    # One node, and matt materials that are seen from both sides
+    document = json.loads(_resource("scene.gltf"))
+    document["asset"]["generator"] = f"isa_nrsfm {__version__}"
+    document |= {"meshes": [mesh], "animations": [animation]}
     write_whole(path, file.with_document(document))
 
 

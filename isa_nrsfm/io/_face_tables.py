@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._prepare.coordinates import are_shares
 from isa_nrsfm.io._keypoints import entries_as_rows, json_kind, read_json
 from isa_nrsfm.io._landmark_columns import (
@@ -155,8 +156,8 @@ def read_mediapipe_json(
         raise ValueError("it has no lists of objects with x and y")
     if len(chosen) != 1:
         raise ValueError(
-            f"it has {first_items(names)}: choose one with part, such as 'pose' "
-            "(command line: --part)"
+            f"it has {first_items(names)}: choose one with {named('part')}, such as "
+            "'pose'"
         )
     every = [p for _, found in entries for each in found.values() for p in each]
     seen = any(point.get("visibility") for points in every for point in points)
@@ -210,8 +211,8 @@ def _in_pixels(
         if image_size is None and sizes is None:
             raise ValueError(
                 "its coordinates are fractions of the image's width and height: give "
-                "image_size=(width, height) in pixels (command line: --image-size "
-                "1920x1080), or columns image_width and image_height"
+                f"{named('image_size', (1920, 1080))} in pixels, or columns "
+                "image_width and image_height"
             )
         _check_inside(tracks)
         scale = sizes

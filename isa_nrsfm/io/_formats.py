@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items
+from isa_nrsfm._parameters.naming import named
 
 if TYPE_CHECKING:
     from isa_nrsfm.io._landmarks import Landmarks
@@ -263,7 +264,7 @@ def find_format(path: str | os.PathLike[str]) -> str:
     if len(matching) > 1:
         raise ValueError(
             f"{path} matches more than one format: {', '.join(matching)}. Choose with "
-            "format (command line: --format)"
+            f"{named('format')}"
         )
     if matching:
         return matching[0]

@@ -14,6 +14,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items, frame_numbers
 from isa_nrsfm._parameters.choices import OPENPOSE_PARTS, WHOLE_PARTS
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
 from isa_nrsfm.io._tables import first_lines
 
@@ -226,10 +227,10 @@ def _chosen_categories(
 
     Where no category has names of keypoints, all are read.
     """
-    named = [entry for entry in categories if entry.get("keypoints")] or categories
-    names = [str(entry.get("name")) for entry in named]
+    used = [entry for entry in categories if entry.get("keypoints")] or categories
+    names = [str(entry.get("name")) for entry in used]
     points: list[str] = []
-    for entry in named:
+    for entry in used:
         found = entry.get("keypoints") or []
         if not isinstance(found, list) or not all(isinstance(p, str) for p in found):
             raise ValueError("the keypoints of a category must be a list of names")
@@ -239,7 +240,7 @@ def _chosen_categories(
                 "the others from the categories of the file"
             )
         points = found
-    return _by_id(named, "categories"), points or None
+    return _by_id(used, "categories"), points or None
 
 
 def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]]:
@@ -269,8 +270,7 @@ def _keypoints(
         part = "body"
         warn_caller(
             f"the points of bodies are read, and those in {', '.join(further)} are "
-            f"left out: choose with part, one of {', '.join(WHOLE_PARTS)} (command "
-            "line: --part)"
+            f"left out: choose with {named('part')}, one of {', '.join(WHOLE_PARTS)}"
         )
     n_lists = len(_LISTS) if further and part != "body" else 1
     n_points = len(names) if names and n_lists == 1 else 0
@@ -366,9 +366,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     if not parts:
         raise ValueError("it has no visible points in pose_keypoints_2d, ...")
     if len(parts) > 1 and part is None:
-        raise ValueError(
-            f"it has points of {listed}: choose one with part (command line: --part)"
-        )
+        raise ValueError(f"it has points of {listed}: choose one with {named('part')}")
     part = part or listed
     if part not in parts:
         raise ValueError(f"it has no points of {part}, but of {listed}")
@@ -412,8 +410,8 @@ def _each_file(
 def _openpose_files(path: Path) -> list[Path]:
     """Return the files of OpenPose in a folder, by their names or entries."""
     files = json_files(path) if path.is_dir() else []
-    named = [file for file in files if file.stem.lower().endswith("_keypoints")]
-    return named or json_files(path, "openpose")
+    by_name = [file for file in files if file.stem.lower().endswith("_keypoints")]
+    return by_name or json_files(path, "openpose")
 
 
 def _people_in(file: Path) -> list[dict[str, Any]]:

@@ -4,7 +4,6 @@ In patterns ``#`` is a number and ``*`` is any text.
 """
 
 import re
-import shlex
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from fnmatch import fnmatchcase
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm.skeletons._column_names import (
     individuals_in,
     parse_coordinate,
@@ -111,9 +111,8 @@ def find_landmark_columns(
         raise ValueError(
             "no landmark columns such as x0, y0, x1, y1 or nose_x, nose_y were found"
             f"{small}; {_first_columns(names)}. If there is a row for each point, give "
-            "row_per_point (command line: --row-per-point), such as 'frame,point'. If "
-            "they have other names, give columns (command line: --columns), such as "
-            f"{_likely_pattern(names)!r}"
+            f"{named('row_per_point')}, such as 'frame,point'. If they have other "
+            f"names, give {named('columns')}, such as {_likely_pattern(names)!r}"
         )
     if len(candidates) > 1:
         raise ValueError(_several_found(names, candidates))
@@ -129,8 +128,7 @@ def find_landmark_columns(
     if of_set:
         warn_caller(
             f"the columns {first_items(sorted(of_set))} are no points by their names, "
-            "and are left out. If they are, give columns (command line: --columns), "
-            f"such as {pattern!r}"
+            f"and are left out. If they are, give {named('columns', pattern)}"
         )
     return _select(names, patterns)
 
@@ -187,7 +185,7 @@ def _ask_which(
     every = [",".join([_all_sets(_chosen(names, w)), *w, *others]) for w in ways]
     raise ValueError(
         f"the points are probably there more than once, such as {which}, in another "
-        "unit or filtered. Choose with columns (command line: --columns): "
+        f"unit or filtered. Choose with {named('columns')}: "
         f"{', '.join(map(repr, every))}; or {_all_sets(names)!r} if all are points of "
         "one body"
     )
@@ -312,16 +310,14 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
     way = (
-        f"For a row for each, use individuals={listed!r} (command line: "
-        f"--individuals {shlex.quote(listed)})"
+        f"For a row for each, use {named('individuals', listed)}"
         if n_points >= MIN_POINTS
         else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
     )
     raise ValueError(
         f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
         f"of several individuals in one row, or in views of several cameras. {way}. If "
-        f"all are points of one body, use columns={whole!r} (command line: --columns "
-        f"{shlex.quote(whole)})"
+        f"all are points of one body, use {named('columns', whole)}"
     )
 
 
@@ -445,8 +441,7 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
         listed.append(f"{pattern!r} ({count}: {x[0].strip()} to {x[-1].strip()})")
     return (
         "the table has more than one set of landmark columns: "
-        f"{'; '.join(listed)}. Choose with columns (command line: --columns), "
-        f"such as {example!r}"
+        f"{'; '.join(listed)}. Choose with {named('columns')}, such as {example!r}"
     )
 
 

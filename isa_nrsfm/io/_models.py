@@ -10,6 +10,7 @@ name}`` for an array.
 import hashlib
 import json
 import os
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -39,28 +40,10 @@ from isa_nrsfm._tables.tracks import LAYOUTS
 
 FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
 HEADER = "header"
-ENTRIES = (
-    *("format", "format_version", "package_version", "arrays", "digest"),
-    *("parameters", "attributes", "set_output", "frames"),
-)
-NEEDED = (
-    *("mean_shape_", "basis_", "inverse_snr_", "rank_floor_", "n_iter_"),
-    *("energy_share_", "mode_covariance_", "singular_values_", "n_features_in_"),
-    *("reference_motion_", "reference_translation_", "mirror_certainty_"),
-)
+_FILE = Path(__file__).with_name("model_file.toml")
+PARTS: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 Arrays = dict[str, NDArray]
 OUTPUTS = ["default", "pandas", "polars"]
-# Numbers that results depend on, and those of them that are not negative. Others can be
-# NaN or infinite, such as results of rows without points.
-FINITE = (
-    *("mean_shape_", "basis_", "mean_shape", "basis", "shapes", "mixing", "space"),
-    *("coefficient_starts", "reference_motion_", "reference_translation_"),
-    *("n_iter_", "energy_share_", "mode_covariance_", "singular_values_"),
-    "pose_effect_",
-)
-POSITIVE = ("noise_variance", "noise_variance_", "unit", "depth_variances", "leverage")
-# Attributes that the model of a frame implies.
-IMPLIED = ("n_components_", "camera_", "frames_scaled_")
 
 
 class NamedStrategy(BaseEstimator):
@@ -200,7 +183,7 @@ def _read(path: Path) -> tuple[dict[str, Any], Arrays]:
             f"it was written by a newer isa_nrsfm (format {version}); this one reads "
             f"format {FORMAT_VERSION}"
         )
-    check_names(header, ENTRIES, "entries")
+    check_names(header, PARTS["entries"], "entries")
     check_names(arrays, header["arrays"], "arrays")
     if _digest(header, arrays) != header["digest"]:
         raise ValueError("its digest is wrong: it is damaged or was changed")
@@ -253,46 +236,22 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
 
 def _check_shapes(values: dict[str, Any]) -> None:
     """Raise if numbers of a model do not have the right shapes, or are missing."""
-    if missing := [name for name in NEEDED if values.get(name) is None]:
+    if missing := [name for name in PARTS["needed"] if values.get(name) is None]:
         raise ValueError(f"it lacks attributes: {', '.join(missing)}")
     K, P = (*np.shape(values["basis_"]), 0, 0)[:2]
     D = K + len(values["further_basis"])
     N = (*np.shape(values.get("sizes", ())), 0)[0]
-    single = "noise_variance unit n_features_in_ n_iter_ inverse_snr_ leverage".split()
-    single += "noise_variance_ rank_floor_ camera_noise_ratio_ gradient_norm_".split()
-    single += "depth_uncertainty_ focal_length_std_ mirror_certainty_".split()
-    single += "certainty deformation residual".split()
-    shapes: tuple[tuple[tuple[int | None, ...], list[str]], ...] = (
-        ((K, P, 3), ["basis_", "basis"]),
-        ((P, 3), ["mean_shape_", "mean_shape"]),
-        ((D + 1, 3, P), ["shapes"]),
-        ((D - K, P, 3), ["further_basis"]),
-        ((K,), ["energy_share_", "reliability_", "stability_"]),
-        ((None, D), ["coefficient_starts"]),
-        ((D + 1, D + 1), ["mixing"]),
-        ((3 * K, 3 * K), ["mode_covariance_"]),
-        ((None,), ["singular_values_"]),
-        ((P,), ["depth_variances"]),
-        ((2 * P,), ["feature_names_in_"]),
-        ((2, 3), ["reference_motion_"]),
-        ((2,), ["reference_translation_", "prior_std_"]),
-        ((2,), ["image_errors"]),
-        ((5,), ["pinhole", "axes"]),
-        ((3, 3), ["space", "turns"]),
-        ((None,), ["objective_history_", "focal_length_"]),
-        ((3, K), ["pose_effect_"]),
-        ((K, K), ["stable_sets_"]),
-        ((N, 2, 3), ["motion_"]),
-        ((N, 2), ["translation_"]),
-        ((N, K), ["alpha_", "alpha_std_"]),
-        ((N, 3, 3), ["rotations_"]),
-        ((N, 3), ["positions_"]),
-        ((N,), ["scales_", "sizes"]),
-        ((), single),
-    )
-    for shape, name in ((shape, name) for shape, names in shapes for name in names):
+    sizes = {"K": K, "P": P, "D": D, "N": N, "D+1": D + 1, "D-K": D - K}
+    sizes |= {"2P": 2 * P, "3K": 3 * K, "*": None}
+    shapes = {
+        name: tuple(sizes[n] if n in sizes else int(n) for n in shape.split())
+        for shape, names in PARTS["shapes"].items()
+        for name in names
+    }
+    finite, positive = {*PARTS["finite"], *PARTS["positive"]}, PARTS["positive"]
+    for name, shape in shapes.items():
         if (value := values.get(name)) is None:
-            if name in FINITE and name in values:
+            if name in {*values}.intersection(PARTS["finite"]):
                 raise ValueError(f"{name} is missing")
             continue
         found, kinds = np.shape(value), "f" if shape else "iuf"
@@ -305,9 +264,9 @@ def _check_shapes(values: dict[str, Any]) -> None:
             raise ValueError(f"{name} should be of shape {shape}; it has {found}")
         if numbers.dtype.kind == "f" and numbers.dtype.itemsize not in (4, 8):
             raise ValueError(f"{name} is of type {numbers.dtype}")
-        if name in (*FINITE, *POSITIVE) and not np.isfinite(numbers).all():
+        if name in finite and not np.isfinite(numbers).all():
             raise ValueError(f"{name} is not finite")
-        if name in POSITIVE and (numbers < 0).any():
+        if name in positive and (numbers < 0).any():
             raise ValueError(f"{name} is negative")
     if not K or values["n_features_in_"] != 2 * P:
         raise ValueError(f"it has {K} basis shapes of {P} points")
@@ -494,11 +453,9 @@ def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
 
 def fitted_attributes(held: Any) -> dict[str, Any]:
     """Return the attributes of an object whose names end with one underscore."""
-    return {
-        name: value
-        for name, value in getattr(held, "__dict__", {}).items()
-        if name.endswith("_") and not name.startswith("_") and name not in IMPLIED
-    }
+    known = getattr(held, "__dict__", {})
+    names = {name for name in known if name.endswith("_") and name[0] != "_"}
+    return {name: known[name] for name in known if name in names - {*PARTS["implied"]}}
 
 
 def check_names(found: Iterable[str], expected: Iterable[str], kind: str) -> None:

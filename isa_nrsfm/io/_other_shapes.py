@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
+from isa_nrsfm._parameters.naming import named
 from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
     MIN_POINTS,
@@ -182,8 +183,8 @@ def _points_apart(
     plain = [each for each in pairs if "".join(each[:2]).lower() == "xy"]
     if given is not None and not pairs:
         raise ValueError(
-            "with row_per_point, columns named x and y are needed, or their names in "
-            "columns (command line: --columns), such as 'u,v'"
+            f"with {named('row_per_point')}, columns named x and y are needed, or "
+            f"their names in {named('columns')}, such as 'u,v'"
         )
     if not 0 < len(pairs) < MIN_POINTS:
         return None
@@ -200,7 +201,7 @@ def _points_apart(
         listed = " or ".join(repr(f"{x},{y}") for x, y, _ in pairs)
         raise ValueError(
             "the table has a row for each point, and several pairs of coordinates. "
-            f"Choose with columns (command line: --columns), {listed}"
+            f"Choose with {named('columns')}, {listed}"
         )
     frame, by_frame, by_point = found
     row = np.zeros(len(frame), int)
@@ -216,7 +217,7 @@ def _points_apart(
     if (twice := pd.DataFrame({"row": row, "point": point}).duplicated()).any():
         raise ValueError(
             f"a frame has several rows for the point {texts[twice].iloc[0]!r}: name "
-            "all columns that tell frames apart in row_per_point (--row-per-point)"
+            f"all columns that tell frames apart in {named('row_per_point')}"
         )
     wide = frame.set_index([row, point])[[*values.values()]].unstack()
     wide = wide.set_axis([n for a in values for n in _names(labels, [a])], axis=1)
@@ -231,8 +232,7 @@ def _points_apart(
         warn_caller(
             f"the table has a row for each point: {', '.join(by_frame) or 'nothing'} "
             f"tells {len(first)} frames apart, {', '.join(by_point)} {len(labels)} "
-            f"points (row_per_point={option!r}; command line: --row-per-point "
-            f"{option}){told * bool(unassigned)}"
+            f"points ({named('row_per_point', option)}){told * bool(unassigned)}"
         )
     kept = frame[of_frame].iloc[first].reset_index(drop=True)
     points = _names(labels, "xy") if len(by_point) < 2 else None
@@ -278,10 +278,10 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
     def count(names: list[str]) -> int:
         return len(codes[names].drop_duplicates()) if names else 1
 
-    named = [name for name in keys if _POINT.search(name)]
+    of_points = [name for name in keys if _POINT.search(name)]
     image = next(filter(_IMAGE.fullmatch, keys), None)
     others = [n for n in keys[::-1] if not (is_frame[n] or no_point[n])]
-    for point in dict.fromkeys([*named, *others]):
+    for point in dict.fromkeys([*of_points, *others]):
         by_frame, by_point = [name for name in keys if name != point], [point]
         if count(keys) < len(frame):
             break
@@ -310,10 +310,10 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
             return frame, by_frame, by_point
     # What no column tells apart is counted, if there is the same number of each.
     by = [name for name in keys if sizes[name] <= len(frame) / 2]
-    counted = "point" if not named else "individual" if len(by) > 1 else "frame"
+    counted = "point" if not of_points else "individual" if len(by) > 1 else "frame"
     alike = codes.groupby(by).size() if by else pd.Series([1])
-    minimum = 2 if named else MIN_POINTS if image in by else np.inf
+    minimum = 2 if of_points else MIN_POINTS if image in by else np.inf
     if alike.nunique() > 1 or alike.iloc[0] < minimum:
         return None
-    by = [name for name in by if name not in named[:1]]
-    return _keys_as_given(frame, [*by, counted, *named[:1]])
+    by = [name for name in by if name not in of_points[:1]]
+    return _keys_as_given(frame, [*by, counted, *of_points[:1]])

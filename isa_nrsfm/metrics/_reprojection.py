@@ -14,7 +14,7 @@ from isa_nrsfm._tables.tracks import (
     table_to_tracks,
     without_half_points,
 )
-from isa_nrsfm.metrics._checks import check_same_shape
+from isa_nrsfm.metrics._shapes import check_same_shape
 
 
 def inverse_snr(

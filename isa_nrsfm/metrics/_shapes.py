@@ -10,10 +10,29 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import linear_sum_assignment, minimize
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm.metrics._checks import as_finite, check_same_shape
+from isa_nrsfm._tables.sources import unmasked
+
+
+def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
+    """Return an array of floats; refuse NaN and infinity."""
+    values = np.asarray(unmasked(array), dtype=np.float64)
+    if not np.isfinite(values).all():
+        n_bad = int(np.sum(~np.isfinite(values)))
+        raise ValueError(f"{name} must be finite; {n_bad} entries are NaN or infinite")
+    return values
+
+
+def check_same_shape(name_a: str, a: NDArray, name_b: str, b: NDArray) -> None:
+    """Refuse arrays of different shapes."""
+    if a.shape != b.shape:
+        raise ValueError(
+            f"{name_a} and {name_b} must be of the same shape; got {a.shape} and "
+            f"{b.shape}"
+        )
+
 
 # Places of matched true and estimated basis shapes, and absolute cosines of the pairs.
 Matched = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]
@@ -250,47 +269,22 @@ def best_affinity(truth: NDArray, shapes: NDArray) -> NDArray[np.float64]:
 def _climb(
     start: NDArray, cross: NDArray, scatter: NDArray
 ) -> tuple[float, NDArray[np.float64]]:
-    """Maximise ``sum <a, cross_i>^2 / <a, scatter_i a>`` over unit vectors a."""
+    """Maximise ``sum <a, cross_i>^2 / <a, scatter_i a>`` from a start.
+
+    What is left of each pair is minimised, which rounds less: return minus that, and a.
+    """
+    fits = np.linalg.pinv(scatter, hermitian=True) @ cross.reshape(len(cross), -1, 3)
+
+    def left(a: NDArray) -> tuple[float, NDArray]:
+        half = (scatter @ a.reshape(-1, 3)).reshape(cross.shape)  # half the slope of q
+        t = quotient(cross @ a, half @ a)  # the best factor of each pair
+        rest = fits - t[:, None, None] * a.reshape(-1, 3)
+        return float(np.vdot(rest, scatter @ rest)), 2 * (t**2 @ half - t @ cross)
+
+    options = {"gtol": 1e-13, "ftol": 0.0, "maxiter": 1000}
     a = start / np.linalg.norm(start)
-    value, gradient, hessian = _squared_cosines(a, cross, scatter)
-    for _ in range(100):
-        # The function does not change along a: exclude this direction.
-        tangent = np.eye(len(a)) - np.outer(a, a)
-        values, axes = np.linalg.eigh(tangent @ hessian @ tangent - np.outer(a, a))
-        # Ascend even if the curvature has the wrong sign. Bound its size from below.
-        curvature = np.maximum(np.abs(values), 1e-8 * np.abs(values).max())
-        step = axes @ ((axes.T @ gradient) / curvature)
-        gain = float(gradient @ step)
-        if gain <= 1e-28 * len(cross):
-            break
-        # If the gain is smaller than the rounding of the value, accept any step.
-        needed = 0.1 * gain if gain > 1e-10 * len(cross) else -np.inf
-        for fraction in 0.5 ** np.arange(30):
-            moved = a + fraction * step
-            moved /= np.linalg.norm(moved)
-            new = _squared_cosines(moved, cross, scatter)
-            if new[0] >= value + fraction * needed:
-                break
-        else:
-            break
-        a, (value, gradient, hessian) = moved, new
-    return value, a
-
-
-def _squared_cosines(
-    a: NDArray, cross: NDArray, scatter: NDArray
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Return the sum that `_climb` maximises, its gradient and its Hessian matrix."""
-    half = (scatter @ a.reshape(-1, 3)).reshape(cross.shape)  # half the slope of q
-    r, q = cross @ a, half @ a
-    t = quotient(r, q)  # the best factor of each pair
-    u, w = quotient(t, q), quotient(np.ones_like(q), q)
-    gradient = 2 * (t @ cross - t**2 @ half)
-    mixed = (cross * u[:, None]).T @ half
-    hessian = 2 * (cross * w[:, None]).T @ cross - 4 * (mixed + mixed.T)
-    hessian += 8 * (half * (t * u)[:, None]).T @ half
-    hessian -= 2 * np.kron(np.tensordot(t**2, scatter, 1), np.eye(3))
-    return float(r @ t), gradient, hessian
+    found = minimize(left, a, jac=True, method="L-BFGS-B", options=options)
+    return -float(found.fun), found.x
 
 
 def quotient(numerator: NDArray, denominator: NDArray) -> NDArray[np.float64]:

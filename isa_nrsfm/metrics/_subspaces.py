@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from isa_nrsfm.metrics._checks import as_finite, check_same_shape
+from isa_nrsfm.metrics._shapes import as_finite, check_same_shape
 
 
 def subspace_distance(
