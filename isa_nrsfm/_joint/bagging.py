@@ -15,6 +15,7 @@ docs/benchmarks/README.md, "Thresholds", has the errors of both.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +73,8 @@ def bagged(
         problem = replace(problem, widths=own)
         shapes = centred(model.shapes[: n_directions + 1, :, points])
         state = JointState(shapes, fit.motion[frames], model.noise_variance)
-        ends = {"max_iter": MOST_STEPS, "tol": settings.tol}
-        state = problem.refined(state, least_noise=LEAST_NOISE, **ends).state
+        limits: Any = {"max_iter": MOST_STEPS, "tol": settings.tol}
+        state = problem.refined(state, least_noise=LEAST_NOISE, **limits).state
         depths = centred(state.depths(problem.likelihood(*state).alpha))
         return frames, depths
 
