@@ -67,7 +67,6 @@ from isa_nrsfm._linalg.small_matrices import (
     procrustes,
     unpacked,
 )
-from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
@@ -304,8 +303,7 @@ def consensus(
             settings.on_step()
         if result is not None:
             groups.append(Group(points, count, *result))
-    possible = most_components(len(table.sizes), n_points, model.camera)
-    most = min(possible, MOST_COMPONENTS)
+    most = min(3 * n_points - 7, MOST_COMPONENTS)
 
     def modelled(S: NDArray, noise: float) -> FrameModel:
         """Return the model of shapes (I, 3, J): their principal components."""
