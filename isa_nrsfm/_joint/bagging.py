@@ -6,9 +6,12 @@ ones (bagging: Breiman, "Bagging predictors", Machine Learning, 1996):
 
 1. Five fits each leave out a group of neighbouring points, as in `depth_certainty`.
    They start from the joint fit, and have at most `MOST_DIRECTIONS` of its directions.
-2. The mean of their depths, less those of a fit of all points with as many directions,
-   changes the depths of the joint fit.
-3. The mean and the principal components of these shapes are the new model.
+2. Fewer points determine the size of the depths less. That of each fit is adjusted by
+   regression on a fit of all points with as many directions.
+3. The mean of their differences from that fit changes the depths of the joint fit. What
+   all frames share of it is left out: the joint fit has it from all points, and means
+   of photos of faces that hardly turn would be less accurate.
+4. The mean and the principal components of these shapes are the new model.
 
 The errors are those of `depth_certainty` for the joint fit, which are larger.
 docs/benchmarks/README.md, "Thresholds", has the errors of both.
@@ -91,9 +94,13 @@ def bagged(
         frames, depths = fitted(chosen[kept])
         at = np.ix_(frames, kept)
         own = centred(z[at])
-        change[at] += depths * np.copysign(1.0, np.sum(depths * own)) - own
+        size = np.sum(depths * own) / (np.sum(depths**2) or 1.0)
+        change[at] += size * depths - own
         count[at] += 1
     change = centred(change / np.maximum(count, 1))
+    fitted_frames = count.any(axis=1, keepdims=True)
+    shared = change.sum(axis=0) / max(fitted_frames.sum(), 1)
+    change -= fitted_frames * shared
     change = change @ interpolation(model.shapes[0], chosen) / scales[:, None]
     S = S + rotations[:, 2, :, None] * change[:, None]
     # The model of the changed shapes

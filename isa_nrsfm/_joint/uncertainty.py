@@ -9,9 +9,11 @@ therefore too small. The delete-a-group jackknife (Efron and Stein, The Annals o
 Statistics, 1981) needs no model of the noise: from fits without each of g groups of
 neighbouring points the variance of an estimate t is ::
 
-    (g - 1) / g sum_g (t_g - t)^2.
+    (g - 1) / g sum_g (t_g - mean_h t_h)^2.
 
-These fits do not have the prior of the extents, which would hide uncertain depths.
+With a prior, which holds all fits to itself, and for rotations it is t itself in place
+of the mean. These fits do not have the prior of the extents, which would hide uncertain
+depths.
 
 Random halves show how a fit would change on another table, without new fits. A sum over
 the groups of a table changes by ``sum_g h_g x_g`` for the groups with h_g = 1, counted
@@ -352,10 +354,11 @@ def depth_certainty(
             costs.append(0.5 * other.cost + FAR_FRAMES * rise)
             stretches.append(change)
         deformation += float(softmax(-np.array(costs)) @ stretches)
+    fits = [refit(kept) for kept in parts]
+    centre = depths if prior is not None else mean_depths(parts, fits, depths)
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
-    for kept in parts:
-        _, turned, z, _ = refit(kept)
-        square, turn, squares = differences(turned, z, rotations, depths[:, kept])
+    for kept, (_, turned, z, _) in zip(parts, fits, strict=True):
+        square, turn, squares = differences(turned, z, rotations, centre[:, kept])
         total, turns = total + square, turns + turn
         variances[kept] += squares
     factor = (N_GROUPS - 1) / N_GROUPS
@@ -364,6 +367,18 @@ def depth_certainty(
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
     total = float(np.sqrt(factor * total + deformation))
     return DepthCertainty(total, deformation, factor * turns, variances[nearest])
+
+
+def mean_depths(
+    parts: Sequence[NDArray], fits: Sequence[Any], depths: NDArray
+) -> NDArray:
+    """Return the mean depths (I, n) of fits of parts of the points, mirrored alike."""
+    total, number = np.zeros(depths.shape), np.sum(parts, axis=0)
+    for kept, (_, _, z, _) in zip(parts, fits, strict=True):
+        whole = depths[:, kept]
+        mirror = np.copysign(1.0, np.sum(z * centred(whole)))
+        total[:, kept] += mirror * z + whole.mean(axis=1, keepdims=True)
+    return total / number
 
 
 def differences(
