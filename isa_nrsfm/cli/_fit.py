@@ -38,7 +38,7 @@ from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
-from isa_nrsfm.metrics._reprojection import frame_energies
+from isa_nrsfm.metrics._measures import frame_energies
 
 # Columns that are probably labels or groups come first: action units, emotions, people.
 LABEL = re.compile(
