@@ -1,4 +1,9 @@
-"""Measures of the reprojection of a table."""
+"""Measures of tables, shapes and groupings of directions, up to what images leave open.
+
+Images leave an affinity of space undetermined, a 3x3 matrix that is multiplied from the
+right. Papers have several conventions for rotations. Shapes are (n, n_points, 3), one
+point a row.
+"""
 
 from bisect import bisect_left
 from collections.abc import Callable
