@@ -33,10 +33,10 @@ from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
     LandmarkColumns,
     find_landmark_columns,
+    frames_of,
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import unsure_points
-from isa_nrsfm.io._other_shapes import frames_of
 from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import (

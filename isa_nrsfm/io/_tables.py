@@ -19,9 +19,12 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
+from isa_nrsfm.io._landmark_columns import (
+    confidence_columns,
+    find_landmark_columns,
+    frames_of,
+)
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
-from isa_nrsfm.io._other_shapes import frames_of
 from isa_nrsfm.skeletons._column_names import (
     columns_of_individuals,
     parse_coordinate,
