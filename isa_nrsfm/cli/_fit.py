@@ -1,7 +1,8 @@
-"""The command fit."""
+"""The commands fit, and demo: fit artificial faces, and compare with the truth."""
 
 import contextlib
 import re
+import shlex
 import sys
 from argparse import Namespace
 from datetime import UTC, datetime
@@ -32,12 +33,21 @@ from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs, _reading, _report
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import figures_of, write_figures
-from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, FACE_PRIORS, NONE, flag_of
+from isa_nrsfm.cli._options import (
+    AUTO,
+    FACE_PRIOR,
+    FACE_PRIORS,
+    NONE,
+    PROGRAM,
+    build_parser,
+    flag_of,
+)
 from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.datasets import load_face_prior
+from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
+from isa_nrsfm.metrics import affine_shape_error
 from isa_nrsfm.metrics._measures import frame_energies
 
 # Columns that are probably labels or groups come first: action units, emotions, people.
@@ -50,12 +60,10 @@ LABEL = re.compile(
 # often alike.
 N_PARTS = 3
 # Options that are parameters of the same name; none stands for None.
-_PARAMETERS = (
-    *("block_recovery", "focal_length", "independence", "random_state", "n_jobs"),
-)
+_PARAMETERS = "block_recovery focal_length independence random_state n_jobs".split()
 
 
-def run(args: Namespace, warned: list[str]) -> str:
+def run_fit(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
     report, _ = fit_table(args, warned)
     return _report.text_of(_report.fit_title(report), report["summary"])
@@ -297,3 +305,30 @@ def choice_report(search: AffineNRSfMCV) -> dict[str, Any]:
         "held_out_error_of_parts": of_parts,
         "chosen": search.n_components_,
     }
+
+
+def run_demo(args: Namespace, warned: list[str]) -> str:
+    """Fit artificial faces, and compare the result with the truth."""
+    faces = make_face_tracks(400, n_components=3, random_state=0)
+    table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)
+    table.insert(0, "frame", [f"face{i:03d}" for i in range(len(table))])
+    folder = Path(args.output)
+    options = [
+        *("fit", str(folder / "tracks.csv"), "--output", str(folder)),
+        *["--force"] * args.force,
+        *["--no-figures"] * args.no_figures,
+        *_reading.drawing_options(args),
+    ]
+    started = Namespace(arguments=options, since=args.since)
+    parsed = build_parser().parse_args(options, started)
+    report, model = fit_table(parsed, warned, table=table)
+    shapes = model.shapes(model.alpha_)
+    rigid = np.broadcast_to(model.mean_shape_, shapes.shape)
+    error, alone = (affine_shape_error(faces.shapes, each) for each in (shapes, rigid))
+    truth = (
+        f"the 3D shapes of the frames are off by {100 * error:.1f} % (the mean shape "
+        f"alone: {100 * alone:.1f} %)"
+    )
+    again = shlex.join([PROGRAM, *options])
+    rows = [*report["summary"], ["truth", "", truth], ["again", "", again]]
+    return _report.text_of(_report.fit_title(report), rows)

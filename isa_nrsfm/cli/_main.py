@@ -27,9 +27,10 @@ def run(argv: Sequence[str] | None = None) -> int:
     try:
         with _warnings_as_lines() as warned, shown_progress(args.since):
             show_stage(args.command)
-            # Each command is a module, which is only loaded now: help does not wait.
-            command = importlib.import_module(f"isa_nrsfm.cli._{args.command}")
-            report = command.run(args, warned)
+            # The module of a command is only loaded now: help does not wait.
+            name = "_fit" if args.command in ("fit", "demo") else "_apply"
+            module = importlib.import_module(f"isa_nrsfm.cli.{name}")
+            report = getattr(module, f"run_{args.command}")(args, warned)
         encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
         report = printable(report)
         print(report.encode(encoding, "backslashreplace").decode(encoding), flush=True)
