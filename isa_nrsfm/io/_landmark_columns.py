@@ -38,6 +38,10 @@ _NO_POINT = re.compile(
 _COPY = re.compile(rf"(?i){WORDS['copies']}")
 
 
+# Names or patterns of columns, as users give them.
+Given = str | Sequence[str] | None
+
+
 class LandmarkColumns(NamedTuple):
     """The columns of one set of landmarks, each (n_points,), named as in the table.
 
@@ -59,7 +63,7 @@ class LandmarkColumns(NamedTuple):
 
 
 def find_landmark_columns(
-    names: Iterable[Hashable], columns: str | Sequence[str] | None = None
+    names: Iterable[Hashable], columns: Given = None
 ) -> LandmarkColumns:
     """
     Find the landmark columns among the columns of a table.
@@ -126,7 +130,7 @@ def find_landmark_columns(
     return _select(names, patterns)
 
 
-def split_patterns(columns: str | Sequence[str] | None) -> list[str]:
+def split_patterns(columns: Given) -> list[str]:
     """Return the patterns or names of columns that are given."""
     listed = columns.split(",") if isinstance(columns, str) else columns or []
     return [pattern.strip() for pattern in listed]
@@ -464,13 +468,13 @@ _WRITTEN = (
 _INNERMOST = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
 # A table, and the names of its columns that tell frames and points apart.
 Keys = tuple["pd.DataFrame", list[str], list[str]]
+# A table, and the names of the columns of points if they are known; None for others.
+Apart = tuple["pd.DataFrame", list[str] | None] | None
 
 
 def frames_of(
-    frame: "pd.DataFrame",
-    columns: str | Sequence[str] | None = None,
-    row_per_point: str | Sequence[str] | None = None,
-) -> tuple["pd.DataFrame", str | Sequence[str] | None]:
+    frame: "pd.DataFrame", columns: Given = None, row_per_point: Given = None
+) -> tuple["pd.DataFrame", Given]:
     """Return a table with a row for each frame, and what chooses the columns of points.
 
     Tables that have one are returned as they are.
@@ -479,7 +483,7 @@ def frames_of(
     if not all(isinstance(name, str) for name in names):
         return frame, columns
     pair = patterns if len(patterns) == 2 and {*patterns} <= {*names} else None
-    found: tuple[pd.DataFrame, list[str] | None] | None = None
+    found: Apart = None
     if row_per_point is None and pair is None:
         sets = landmark_sets(only_points(names))
         if patterns:
@@ -496,9 +500,7 @@ def frames_of(
     return found[0], columns if patterns and not pair else found[1]
 
 
-def _cells_apart(
-    frame: "pd.DataFrame",
-) -> tuple["pd.DataFrame", list[str] | None] | None:
+def _cells_apart(frame: "pd.DataFrame") -> Apart:
     """Return a table whose cells hold points with a column for each coordinate.
 
     Also the names of these columns; None if they are x and y of one point a row.
@@ -587,9 +589,7 @@ def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
     return frame
 
 
-def _points_apart(
-    frame: "pd.DataFrame", pair: Sequence[str] | None, given: str | Sequence[str] | None
-) -> tuple["pd.DataFrame", list[str] | None] | None:
+def _points_apart(frame: "pd.DataFrame", pair: Given, given: Given) -> Apart:
     """Return a table with a row for each frame in place of one for each point."""
     frame = frame.rename(columns=lambda name: str(name).strip())
     names = list(frame)

@@ -296,6 +296,9 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
     if not frames.joint:
         mean_shape, *basis = frames.shapes.mT
         return {**entries, "mean_shape": mean_shape, "basis": np.array(basis)}
+    certainty = frames.certainty._asdict() | {
+        "images": np.array(frames.certainty.images)
+    }
     return {
         **entries,
         "loss": frames.loss,
@@ -304,14 +307,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "coefficient_starts": frames.starts,
         "mixing": frames.gauge.mixing,
         "space": frames.gauge.space,
-        "certainty": frames.certainty.total,
-        "deformation": frames.certainty.deformation,
-        "turns": frames.certainty.turns,
-        "depth_variances": frames.certainty.points,
-        "leverage": frames.certainty.leverage,
-        "residual": frames.certainty.residual,
-        "image_errors": np.array(frames.certainty.images),
-        "weighted": frames.certainty.weighted,
+        **dict(zip(PARTS["certainty"], certainty.values(), strict=True)),
     }
 
 
@@ -328,6 +324,10 @@ def _frame_model(entries: dict[str, Any]) -> FrameModel:
     if "loss" not in entries:
         shapes = entries["mean_shape"], entries["basis"]
         return FrameModel.rigid(*shapes, entries["camera"])
+    certainty = [entries[name] for name in PARTS["certainty"]]
+    total, deformation, *errors, residual, images, weighted = certainty
+    certainty = [float(total), float(deformation), *errors, float(residual)]
+    certainty += [tuple(images), weighted is True]
     return FrameModel(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -335,16 +335,7 @@ def _frame_model(entries: dict[str, Any]) -> FrameModel:
         loss=entries["loss"],
         gauge=FrameMap(entries["mixing"], entries["space"]),
         camera=entries["camera"],
-        certainty=DepthCertainty(
-            float(entries["certainty"]),
-            float(entries["deformation"]),
-            entries["turns"],
-            entries["depth_variances"],
-            entries["leverage"],
-            float(entries["residual"]),
-            tuple(entries["image_errors"]),
-            entries["weighted"] is True,
-        ),
+        certainty=DepthCertainty(*certainty),
     )
 
 
