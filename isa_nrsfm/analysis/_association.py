@@ -202,12 +202,9 @@ def permuted_energies(
         units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
         # Blocks of frames, permuted within groups
         block = order.blocks(length) if runs is None or length > 1 else runs
-        places = (
-            rng.random_sample(block[-1] + 1)[block] for _ in range(n_permutations)
-        )
-        shuffled: Iterator[NDArray] = (
-            alpha[np.lexsort((place, order.groups))] for place in places
-        )
+        draws = (rng.random_sample(block[-1] + 1) for _ in range(n_permutations))
+        orders = (np.lexsort((draw[block], order.groups)) for draw in draws)
+        shuffled: Iterator[NDArray] = (alpha[i] for i in orders)
         if length == 1:
             units = "frames" if runs is None else "runs of a label"
         elif not in_runs:
@@ -657,8 +654,12 @@ def predictability(
     check_scalar(n_folds, "n_folds", Integral, min_val=2)
     features, labels, numbers, order = _known_frames(features, y, groups, time)
     kind = _frame_columns.kind_of(labels, kind)
-    if groups is None:
-        numbers = _dependent_frames(features, labels, kind, order, n_folds)
+    if groups is None:  # blocks of frames that depend on each other
+        columns, numbers = _label_columns(labels, kind)[order.rows], None
+        residuals = unexplained(_unit_columns(features)[order.rows], columns, order)
+        if (length := independent_length(residuals)) > 1:
+            numbers = np.empty(len(labels), dtype=int)
+            numbers[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
     most, model = len(labels), RidgeCV(np.logspace(-3, 3, 13))
     splitter = KFold if numbers is None else GroupKFold
     if kind == "classes":
@@ -674,9 +675,7 @@ def predictability(
         )
     folds = splitter(min(n_folds, most), shuffle=True, random_state=random_state)
     model = make_pipeline(StandardScaler(), model)
-    return np.asarray(
-        cross_val_score(model, features, labels, groups=numbers, cv=folds)
-    )
+    return cross_val_score(model, features, labels, groups=numbers, cv=folds)
 
 
 def _known_frames(
@@ -755,21 +754,3 @@ def _unit_columns(values: NDArray) -> NDArray:
     values = values - values.mean(axis=0)
     size = np.linalg.norm(values, axis=0)
     return np.asarray(values / np.where(size > 0, size, 1.0))
-
-
-def _dependent_frames(
-    features: NDArray,
-    labels: NDArray,
-    kind: str,
-    order: FrameOrder,
-    n_folds: int,
-) -> NDArray | None:
-    """Return the block of each frame (n_frames,), None for independent frames."""
-    columns = _label_columns(labels, kind)[order.rows]
-    residuals = unexplained(_unit_columns(features)[order.rows], columns, order)
-    length = independent_length(residuals)
-    if length == 1:
-        return None
-    blocks = np.empty(len(labels), dtype=int)
-    blocks[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
-    return blocks

@@ -255,7 +255,7 @@ def diagnose(
         outlier_energy=found.outlier_energy,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
-        pose=_of_pose(found, mean_shape, basis, layout, estimator),
+        pose=_of_pose(found, layout, estimator),
     )
     return found._replace(
         messages=_advice.advice(facts),
@@ -320,20 +320,14 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
     return text if phrases else ""
 
 
-def _of_pose(
-    found: Diagnostics,
-    mean_shape: NDArray,
-    basis: NDArray,
-    layout: Skeleton | None,
-    model: Any,
-) -> str:
+def _of_pose(found: Diagnostics, layout: Skeleton | None, model: Any) -> str:
     """Describe coefficients that the pose predicts; empty if there are none."""
     large = np.flatnonzero(found.pose_share > MOST_POSE)
     if not len(large):
         return ""
     phrases = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
     text = f"the pose predicts {first_items(phrases, 5)}"
-    shape = basis[np.nanargmax(found.pose_share)]
+    shape, mean_shape = model.basis_[np.nanargmax(found.pose_share)], model.mean_shape_
     deformation = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
     if 2 * np.sum(deformation**2) < np.sum(shape**2):
         return (
@@ -431,10 +425,9 @@ def stability(
     whole, found = scores(gauge), list[NDArray]()
     for shapes, half in zip(tables.shapes, tables.halves, strict=True):
         motion, alpha = tables.motion[half], tables.alpha[half]
-        own_scores = scores(independent_gauge(shapes, motion, alpha, *tables.kind)[2])
-        found.append(
-            own_scores[:, linear_sum_assignment(-np.abs(whole.T @ own_scores))[1]]
-        )
+        other = scores(independent_gauge(shapes, motion, alpha, *tables.kind)[2])
+        pairs = linear_sum_assignment(-np.abs(whole.T @ other))
+        found.append(other[:, pairs[1]])
     every, n, K = np.hstack(found), len(found), n_components
     cross = (every.T @ every).reshape(n, K, n, K).swapaxes(1, 2)
     within, others = cross[np.arange(n), np.arange(n)], ~np.eye(n, dtype=bool)

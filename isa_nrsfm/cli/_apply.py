@@ -14,7 +14,6 @@ from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm.cli import _reading, _report
 from isa_nrsfm.cli._options import EXPORTS, NONE, flag_of
-from isa_nrsfm.cli._outputs import check_outputs, read_model, write_alpha
 from isa_nrsfm.io._tables import table_suffix
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -23,7 +22,7 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
     """Write the coefficients of a table's rows, and return the report."""
     output = Path(args.output)
     table_suffix(output)
-    estimator = read_model(args)
+    estimator = _report.read_model(args)
     with errors_of(args.model):
         check_requirements({"std": args.std, "refinement": estimator.refinement})
     if args.viewer is None and _reading.drawing_options(args):
@@ -31,7 +30,7 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
     frames = _reading.read_frames(args, estimator)
     drawn = _reading.drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]
-    check_outputs(args, [args.table, args.model], outputs)
+    _report.check_outputs(args, [args.table, args.model], outputs)
     X, n_components = _reading.as_fitted(estimator, frames.X), len(estimator.basis_)
     alpha = std = np.empty((0, n_components))
     quality = ["fit", "", "no frame was fitted"]
@@ -39,16 +38,17 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
         motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
         explained = estimator.inverse_transform(alpha, motion, translation)
         square = np.nanmean((explained - np.asarray(X)) ** 2)
-        error = -estimator.score(X, **frames.weighting)
-        quality = _report.quality_row(
-            _report.quality_report(error, square, bool(frames.weighting))
+        error, weighted = (
+            -estimator.score(X, **frames.weighting),
+            bool(frames.weighting),
         )
+        quality = _report.quality_row(_report.quality_report(error, square, weighted))
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting
             )[1]
         alpha = alpha - removed_part(estimator, motion)
-    write_alpha(output, frames, alpha, std if args.std else None)
+    _report.write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
     files = "  ".join(map(str, outputs))
@@ -82,8 +82,8 @@ def run_export(args: Namespace, warned: list[str]) -> str:
         )
     content = contents[output.suffix.lower()]
     options = _given(args, content)
-    estimator = read_model(args)
-    check_outputs(args, [args.model], [output])
+    estimator = _report.read_model(args)
+    _report.check_outputs(args, [args.model], [output])
     if "edges" in EXPORTS[content]["options"]:
         options |= _reading.drawing(args, names_of_points(estimator), None)
     if args.mirrored:

@@ -86,9 +86,8 @@ def column_results(
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
     if frames.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
-        smooth = estimator.smooth(
-            X, time=frames.times, groups=frames.groups, **frames.weighting
-        )
+        options = {"groups": frames.groups} | frames.weighting
+        smooth = estimator.smooth(X, time=frames.times, **options)
         found, images = smooth.alpha, frames.images[X.index]
         report["time"] = {
             "column": args.time or images.name,
@@ -105,9 +104,8 @@ def column_results(
         a, b = args.unit or EYES
         try:
             pairs = [*args.distance, (a, b)]  # the unit of positions as well
-            found = point_distances(
-                estimator, pairs, unit=args.unit, length=args.length
-            )
+            length = {"unit": args.unit, "length": args.length}
+            found = point_distances(estimator, pairs, **length)
             columns |= zip(names, found.T[:-1], strict=True)
             if has_positions:
                 size = np.linalg.norm(np.subtract(*estimator.mean_shape_[[a, b]]))
@@ -219,7 +217,7 @@ def _label_report(
     features: dict[str, NDArray],
     frames: Frames,
     seed: int,
-    std: NDArray | None,
+    std: Any,
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
     alpha = features["alpha"]

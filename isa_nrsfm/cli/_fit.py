@@ -30,7 +30,7 @@ from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
-from isa_nrsfm.cli import _outputs, _reading, _report
+from isa_nrsfm.cli import _reading, _report
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import figures_of, write_figures
 from isa_nrsfm.cli._options import (
@@ -42,8 +42,8 @@ from isa_nrsfm.cli._options import (
     build_parser,
     flag_of,
 )
-from isa_nrsfm.cli._outputs import Fit
 from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.cli._report import Fit
 from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
@@ -110,20 +110,20 @@ def fit_table(
         )
     figures = {} if args.no_figures else figures_of(frames)
     drawn = _reading.drawing(args, frames.columns.points, frames.skeleton)
-    results = dict.fromkeys(_outputs.RESULTS, "")
+    results = dict.fromkeys(_report.RESULTS, "")
     inputs = [prior] * (prior not in (None, NONE, *FACE_PRIORS))
     if table is None:
         inputs.append(args.table)
     else:
         results[Path(args.table).name] = ""
     with whole_files.folder_for_writing(folder):
-        targets = [folder / name for name in (*results, *figures, _outputs.REPORT)]
-        earlier = _outputs.entry_of_report(folder, "sha256")
-        own_files = {*earlier, _outputs.REPORT} if earlier else ()
-        _outputs.check_outputs(args, inputs, targets, own_files)
+        targets = [folder / name for name in (*results, *figures, _report.REPORT)]
+        earlier = _report.entry_of_report(folder, "sha256")
+        own_files = {*earlier, _report.REPORT} if earlier else ()
+        _report.check_outputs(args, inputs, targets, own_files)
         for target in targets:
             whole_files.check_replaceable(target)
-        old = _outputs.entry_of_report(folder, "files")
+        old = _report.entry_of_report(folder, "files")
         removed = {*figures, *(name for name in old if name.endswith(".png"))}
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
@@ -137,7 +137,7 @@ def fit_table(
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
-            _outputs.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
+            _report.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
             labels = first_classes(frames.labels)
             viewer_data = {"labels": labels, "times": frames.times}
             if args.std and estimator.camera_ != "affine":
@@ -149,7 +149,7 @@ def fit_table(
             energy, error, _ = frame_energies(X, explained, estimator.layout)
             snr = error / energy
             fit = Fit(estimator, frames, smooth, drawn, explained, snr)
-            _outputs.write_results(new, fit, unit, **viewer_data)
+            _report.write_results(new, fit, unit, **viewer_data)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
                 answers["prior"] = {"name": prior or FACE_PRIOR, "std": std}
             report = {
@@ -170,7 +170,7 @@ def fit_table(
             return report, estimator
         # A figure that fails, or takes long, costs no results: they are in place.
         with whole_files.files_together(folder) as new:
-            if _outputs.digests_of(folder, report["sha256"]) != report["sha256"]:
+            if _report.digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
@@ -200,7 +200,7 @@ def _moving_points(
 
 def _check_options(args: Namespace) -> None:
     """Raise before a long fit if options exclude each other or a library is absent."""
-    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in _outputs.RESULTS)}
+    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in _report.RESULTS)}
     if Path(args.output).suffix.lower() in suffixes and not Path(args.output).is_dir():
         raise ValueError(
             f"--output {args.output}: expected a folder, because fit writes several "

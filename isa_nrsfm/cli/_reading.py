@@ -202,12 +202,9 @@ def _warn_of_unsure(confidence: NDArray, seen: NDArray) -> None:
     """
     unsure = seen & (confidence < UNSURE)
     if unsure.any() and UNSURE <= np.nanmax(confidence) <= 1:
-        remaining = (seen & ~unsure).sum(axis=1)
-        minimum = max(seen.sum(), 1) / 2, (seen.sum(axis=1) >= FEWEST_POINTS).sum() / 2
-        enough = (
-            remaining.sum() >= minimum[0]
-            and (remaining >= FEWEST_POINTS).sum() >= minimum[1]
-        )
+        before, after = seen.sum(axis=1), (seen & ~unsure).sum(axis=1)
+        enough = 2 * after.sum() >= before.sum()
+        enough &= 2 * sum(after >= FEWEST_POINTS) >= sum(before >= FEWEST_POINTS)
         way = f"leave them out with --min-confidence {UNSURE:g}"
         warn_caller(
             f"{100 * unsure.sum() / seen.sum():.3g} % of the points have a confidence "

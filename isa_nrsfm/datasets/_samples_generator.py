@@ -992,7 +992,4 @@ def _take_turns(time: NDArray, n_poses: int, rng: RandomState) -> NDArray[np.flo
     begins = length * np.arange(1, n_turns)
     passed = np.clip((time[:, None] - begins) / change + 0.5, 0.0, 1.0)
     begun = np.insert((1 - np.cos(np.pi * passed)) / 2, 0, 1.0, axis=1)
-    share = -np.diff(begun, axis=1, append=0.0)
-    weights = np.zeros((len(time), n_poses))
-    np.add.at(weights.T, turns, share.T)
-    return weights
+    return -np.diff(begun, axis=1, append=0.0) @ np.eye(n_poses)[turns]

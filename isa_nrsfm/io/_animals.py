@@ -131,14 +131,11 @@ def read_deeplabcut(path: Path) -> Landmarks:
         frames: dict[str, list[Any]] = {"frame": [int(label) for label in labels]}
     except (TypeError, ValueError):
         frames = {"image": [str(label) for label in labels]}
-    return assemble_individuals(
-        found[..., :2],
-        list(places) if len(columns[0]) == len(_LEVELS_OF_MANY) else None,
-        list(first),
-        frames,
-        format="deeplabcut",
-        confidence=found[..., 2] if (where[..., 2] >= 0).any() else None,
-    )
+    known: dict[str, Any] = {"format": "deeplabcut"}
+    if (where[..., 2] >= 0).any():
+        known["confidence"] = found[..., 2]
+    names = list(places) if len(columns[0]) == len(_LEVELS_OF_MANY) else None
+    return assemble_individuals(found[..., :2], names, list(first), frames, **known)
 
 
 def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
@@ -162,15 +159,11 @@ def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
     names = [str(i) for i in range(len(columns))]
     coordinates = [names[i] for i in numbers]
-    frame = read_columns(
-        path,
-        leave_out={*names[:n_before], *names[n_index:]}.difference(coordinates),
-        numbers=coordinates,
-        text=names[n_before:n_index],
-        n_header=len(levels),
-        names=names,
-    )
-    cells = frame[names[n_before:n_index]].fillna("").to_numpy()
+    index = names[n_before:n_index]
+    left_out = {*names}.difference(index, coordinates)
+    known: dict[str, Any] = {"text": index, "n_header": len(levels), "names": names}
+    frame = read_columns(path, leave_out=left_out, numbers=coordinates, **known)
+    cells = frame[index].fillna("").to_numpy()
     labels = ["/".join(row) for row in cells]
     values = frame[coordinates].to_numpy(dtype=np.float64)
     return values, [columns[i] for i in numbers], labels
@@ -360,16 +353,11 @@ def read_sleap(path: Path) -> Landmarks:
         raise ValueError(f"tracks holds {n_tracks} tracks, track_names {len(names)}")
     of_instances = scores.pop("instance_scores", np.array(np.nan))
     scored = {} if np.isnan(of_instances).all() else {"instance_score": of_instances}
-    return assemble_individuals(
-        tracks,
-        names or (range(n_tracks) if n_tracks > 1 else None),
-        nodes,
-        {"frame": range(len(tracks))},
-        of_instances=scored,
-        format="sleap",
-        confidence=scores.get("point_scores"),
-        skeleton=skeleton,
-    )
+    known: dict[str, Any] = {"of_instances": scored, "format": "sleap"}
+    known |= {"confidence": scores.get("point_scores"), "skeleton": skeleton}
+    who = names or (range(n_tracks) if n_tracks > 1 else None)
+    frames = {"frame": range(len(tracks))}
+    return assemble_individuals(tracks, who, nodes, frames, **known)
 
 
 def is_facemap(path: Path) -> bool:
@@ -389,13 +377,8 @@ def read_facemap(path: Path) -> Landmarks:
         values = [[numbers_of(part, name) for name in _VALUES] for part in parts]
         names = list(group)
     points = np.moveaxis(np.array(values), 2, 0)
-    return assemble(
-        points[..., :2],
-        names,
-        {"frame": range(len(points))},
-        format="facemap",
-        confidence=points[..., 2],
-    )
+    frames, sure = {"frame": range(len(points))}, points[..., 2]
+    return assemble(points[..., :2], names, frames, format="facemap", confidence=sure)
 
 
 def _array(

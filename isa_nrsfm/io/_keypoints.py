@@ -27,13 +27,8 @@ _LEFT_OUT = (
     *("license", "coco_url", "flickr_url", "date_captured"),
 )
 # COCO-WholeBody: the lists of an instance, and their numbers of points.
-_LISTS = {
-    "keypoints": 17,
-    "foot_kpts": 6,
-    "face_kpts": 68,
-    "lefthand_kpts": 21,
-    "righthand_kpts": 21,
-}
+_LISTS = {"keypoints": 17, "foot_kpts": 6, "face_kpts": 68}
+_LISTS |= {"lefthand_kpts": 21, "righthand_kpts": 21}
 # The places of parts in whole bodies of so many points: COCO-WholeBody, Halpe.
 _PLACES = {
     133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
@@ -112,18 +107,19 @@ def read_coco(path: Path, part: str | None = None) -> Landmarks:
     content = read_json(path)
     if isinstance(content, list):
         entries = _results(content)
-        return entries_as_rows(entries, None, part, "coco", "result")
+        return entries_as_rows(entries, "coco", "result", part=part)
     entries, names = _annotations(content)
-    found = entries_as_rows(entries, names, part, "coco", "annotation")
+    found = entries_as_rows(entries, "coco", "annotation", names, part)
     return replace(found, confidence=None)
 
 
+# Instances as in results of COCO, and names of their points if they are known.
+Entries = Sequence[dict[str, Any]]
+Names = list[str] | None
+
+
 def entries_as_rows(
-    entries: Sequence[dict[str, Any]],
-    names: list[str] | None,
-    part: str | None,
-    format: str,
-    what: str,
+    entries: Entries, format: str, what: str, names: Names = None, part: Any = None
 ) -> Landmarks:
     """Return landmarks of entries with ``keypoints``; of images without any, too.
 
@@ -142,13 +138,9 @@ def entries_as_rows(
     absent = (values[..., :2] == 0).all(axis=2) | (values[..., 2] == 0)
     rows = [_scalars(entry) for entry in entries]
     columns = dict.fromkeys(name for row in rows for name in row)
-    return assemble(
-        np.where(absent[..., None], np.nan, values[..., :2]),
-        names,
-        {name: [row.get(name) for row in rows] for name in columns},
-        format=format,
-        confidence=values[..., 2],
-    )
+    tracks = np.where(absent[..., None], np.nan, values[..., :2])
+    frames = {name: [row.get(name) for row in rows] for name in columns}
+    return assemble(tracks, names, frames, format=format, confidence=values[..., 2])
 
 
 def read_json(path: Path) -> Any:
@@ -174,7 +166,7 @@ def _results(entries: list[Any]) -> list[dict[str, Any]]:
     return sorted(entries, key=lambda entry: by_number(str(entry.get("image_id"))))
 
 
-def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
+def _annotations(content: Any) -> tuple[list[dict[str, Any]], Names]:
     """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
     contents = first_items(content) if isinstance(content, dict) else content
@@ -223,9 +215,7 @@ def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
     return sorted(entries, key=lambda e: by_number(names_of[e["image_id"]])), names
 
 
-def _chosen_categories(
-    categories: list[dict[str, Any]],
-) -> tuple[dict[Any, dict[str, Any]], list[str] | None]:
+def _chosen_categories(categories: Entries) -> tuple[dict[Any, dict[str, Any]], Names]:
     """Return the categories to read by their ids, and their common keypoints.
 
     Where no category has names of keypoints, all are read.
@@ -246,7 +236,7 @@ def _chosen_categories(
     return _by_id(used, "categories"), points or None
 
 
-def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]]:
+def _by_id(entries: Entries, what: str) -> dict[Any, dict[str, Any]]:
     """Return entries by their identifiers, or raise."""
     if not all(isinstance(entry.get("id"), int | str) for entry in entries):
         raise ValueError(f"each of the {what} needs an id")
@@ -261,11 +251,8 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
 
 
 def _keypoints(
-    entries: Sequence[dict[str, Any]],
-    names: list[str] | None,
-    part: str | None,
-    what: str,
-) -> tuple[NDArray[np.float64], list[str] | None]:
+    entries: Entries, names: Names, part: str | None, what: str
+) -> tuple[NDArray[np.float64], Names]:
     """Return keypoints of instances (n_instances, n_points, 3) and names, of a part."""
     gap = {key: [0] * 3 * n for key, n in _LISTS.items()} | {"keypoints": None}
     further = [key for key in gap if any(key in entry for entry in entries)][1:]
@@ -385,7 +372,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             if part in each
         ]
         entries += rows or [of_file]
-    found = entries_as_rows(entries, None, None, "openpose", "person")
+    found = entries_as_rows(entries, "openpose", "person")
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
@@ -452,7 +439,7 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     files = json_files(path, "mmpose", "none")
     _, contents = _each_file(path, files, "no file is of MMPose", _instances_in)
     entries = [entry for found in contents for entry in found]
-    return entries_as_rows(entries, None, part, "mmpose", "instance")
+    return entries_as_rows(entries, "mmpose", "instance", part=part)
 
 
 def _instances_in(file: Path) -> list[dict[str, Any]]:
@@ -491,8 +478,20 @@ def read_pts(path: Path) -> Landmarks:
     It has ``version: 1``, ``n_points: 68`` and, between braces, a line ``x y`` for each
     point. Coordinates are as they are written; iBUG counts pixels from 1.
     """
+    text = path.read_bytes().decode("utf-8-sig")
+    match = _PTS.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
+            f"got {text[:40]!r}"
+        )
+    coordinates, n_points = floats_of(match["points"].split()), int(match["n_points"])
+    if len(coordinates) != 2 * n_points or n_points == 0:
+        raise ValueError(
+            f"n_points is {n_points}, but there are {len(coordinates)} coordinates"
+        )
     frames = {"file": [as_utf8(path.name)]}
-    return assemble(_points_of(path)[None], None, frames, format="pts")
+    return assemble(coordinates.reshape(1, n_points, 2), None, frames, format="pts")
 
 
 def read_tps(path: Path) -> Landmarks:
@@ -521,10 +520,8 @@ def read_tps(path: Path) -> Landmarks:
             if entries and not entries[0][1]:
                 raise ValueError(f"there are more than {count} landmarks")
         n_left += sum(not equals for _, equals, _ in entries)
-        values_of = {name.strip().lower(): value.strip() for name, _, value in entries}
-        rows.append(
-            {name: values_of[name] for name in _TPS_ENTRIES if name in values_of}
-        )
+        found = {name.strip().lower(): value.strip() for name, _, value in entries}
+        rows.append({name: found[name] for name in _TPS_ENTRIES if name in found})
     if n_left and not any(len(each[0]) for each in tracks):
         raise ValueError(
             f"all its {n_left} points are on curves, which are left out: append them "
@@ -570,24 +567,6 @@ def read_wflw(path: Path) -> Landmarks:
         frames |= zip(_WFLW_BOX, box.T, strict=True)
         frames |= zip(_WFLW_ATTRIBUTES, attributes.T.astype(int), strict=True)
     return assemble(points.reshape(-1, _N_WFLW, 2), None, frames, format="wflw")
-
-
-def _points_of(file: Path) -> NDArray[np.float64]:
-    """Return the points (n_points, 2) that a .pts file holds."""
-    text = file.read_bytes().decode("utf-8-sig")
-    match = _PTS.fullmatch(text)
-    if match is None:
-        raise ValueError(
-            "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
-            f"got {text[:40]!r}"
-        )
-    coordinates = floats_of(match["points"].split())
-    n_points = int(match["n_points"])
-    if len(coordinates) != 2 * n_points or n_points == 0:
-        raise ValueError(
-            f"n_points is {n_points}, but there are {len(coordinates)} coordinates"
-        )
-    return coordinates.reshape(n_points, 2)
 
 
 def floats_of(fields: list[str]) -> NDArray[np.float64]:
@@ -640,7 +619,7 @@ def read_ultralytics(path: Path) -> Landmarks:
             places = zip(x, y, visible or [1.0] * len(x), strict=True)
             known = {"frame": frame, "person": person} | each
             entries.append(known | {"keypoints": [v for p in places for v in p]})
-    return entries_as_rows(entries, None, None, "ultralytics", "detection")
+    return entries_as_rows(entries, "ultralytics", "detection")
 
 
 def is_yolo(path: Path) -> bool:
@@ -681,7 +660,7 @@ def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmark
         | {"keypoints": (each * np.append(size, 1.0)).ravel().tolist()}
         for person, each in enumerate(points)
     ]
-    found = entries_as_rows(entries, None, None, "yolo", "line")
+    found = entries_as_rows(entries, "yolo", "line")
     of_labels = np.isin(points[..., 2], (0, 1, 2)).all()
     return replace(found, confidence=None) if of_labels else found
 

@@ -250,18 +250,15 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
         for (before, axes, after), (x, y, _) in members.items()
         if x and y
     }
-    # Leave out a "*" set that has no more points than a "#" set inside it.
-    return {
-        ",".join(patterns): size
-        for patterns, size in sizes.items()
-        if "*" not in patterns[0]
-        or not any(
-            other_size == size
-            and "#" in other[0]
-            and regular_expression(patterns[0]).fullmatch(other[0])
-            for other, other_size in sizes.items()
-        )
-    }
+    numbered = [(one, size) for (one, _), size in sizes.items() if "#" in one]
+
+    def is_same(pattern: str, size: int) -> bool:
+        """Return whether a "*" set has no more points than a "#" set inside it."""
+        inside = [one for one, n in numbered if n == size]
+        return "*" in pattern and any(matches(one, pattern) for one in inside)
+
+    kept = {each: size for each, size in sizes.items() if not is_same(each[0], size)}
+    return {",".join(patterns): size for patterns, size in kept.items()}
 
 
 def confidence_columns(
@@ -396,14 +393,9 @@ def _warn_of_left_out(
     names: Sequence[Hashable], chosen: Sequence[str], pattern: str
 ) -> None:
     """Warn if patterns match only a part of a set of x and y columns."""
-    sets = {point[0] for _, _, point in _coordinates(chosen)}
-    used = {*chosen}
-    omitted = [
-        name
-        for name, axis, point in _coordinates(names)
-        if name not in used and axis < 2 and point[0] in sets
-    ]
-    if omitted:
+    sets, used = {point[0] for _, _, point in _coordinates(chosen)}, {*chosen}
+    others = (each for each in _coordinates(names) if each[0] not in used)
+    if omitted := [name for name, axis, (of, _) in others if axis < 2 and of in sets]:
         warn_caller(
             f"the patterns {pattern!r} match {len(chosen)} columns and leave out "
             f"{len(omitted)} that are named alike; the first is {omitted[0]!r}"
@@ -573,11 +565,8 @@ def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
         if not {"x", "y"} <= {*axes} <= {"x", "y", "z", *CONFIDENCES}:
             continue
         columns = frame.drop(columns=name).assign(**known)
-        keys = [
-            n
-            for n in columns
-            if 1 < columns[n].nunique() < len(columns) / 2 or n in known
-        ]
+        counts, few = columns.nunique(), len(columns) / 2
+        keys = [n for n in columns if 1 < counts[n] < few or n in known]
         others = [n for n in columns if n not in keys and n not in CONFIDENCES]
         value = ([n for n in columns if _VALUE.search(str(n))] or others)[-1]
         keys = [n for n in keys if n not in (value, *CONFIDENCES)]

@@ -27,11 +27,7 @@ from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.models import (
-    DepthCertainty,
-    FrameMap,
-    FrameModel,
-)
+from isa_nrsfm._frames.models import DepthCertainty, FrameMap, FrameModel
 from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters.choices import LOSSES
@@ -212,17 +208,12 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     if "focal_length_" in values:
         values["focal_length_"] = np.ravel(values["focal_length_"])
     _check_shapes(values)
-    estimator._model = TableModel(
-        _frame_model(entries),
-        estimator.mean_shape_,
-        np.concatenate([estimator.basis_, entries["further_basis"]]),
-        len(estimator.basis_),
-        entries["layout"],
-        entries["unit"],
-        *(_pinhole(entries.get(name)) for name in ("pinhole", "axes")),
-    )
-    estimator.n_components_ = estimator._n_features_out = len(estimator.basis_)
-    pinhole = estimator._model.pinhole
+    K = estimator.n_components_ = estimator._n_features_out = len(estimator.basis_)
+    basis = np.concatenate([estimator.basis_, entries["further_basis"]])
+    parts = _frame_model(entries), estimator.mean_shape_, basis, K
+    pinhole, axes = (_pinhole(entries.get(name)) for name in ("pinhole", "axes"))
+    kinds = entries["layout"], entries["unit"]
+    estimator._model = TableModel(*parts, *kinds, pinhole, axes)
     estimator.camera_ = entries["camera"] if pinhole is None else "perspective"
     estimator.frames_scaled_ = entries["unit"] is None
     if entries["sizes"] is not None:

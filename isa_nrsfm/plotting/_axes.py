@@ -160,10 +160,8 @@ def add_legend(figure: Any, entries: list[Any], skeleton: Any, **options: Any) -
         lines = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR}
     elif skeleton is not None and skeleton.name == SPANNING_TREE:
         lines = {f"lines: {SPANNING_TREE}": MEAN_COLOUR}
-    entries = entries + [
-        Line2D([], [], color=colour, label=label, linewidth=1.5)
-        for label, colour in lines.items()
-    ]
+    drawn = (Line2D([], [], color=c, label=n, linewidth=1.5) for n, c in lines.items())
+    entries = [*entries, *drawn]
     style = {"loc": "outside lower center", "frameon": False, "fontsize": "small"}
     figure.legend(handles=entries, ncols=len(entries), **(style | options))
 

@@ -232,9 +232,7 @@ def columns_of_individuals(
     best: dict[str, dict[Hashable, str]] = {}
     for division in _divisions(names):
         divisions = [division.get(name, {}) for name in who]
-        common = [
-            stem for stem in divisions[0] if all(stem in each for each in divisions)
-        ]
+        common = [stem for stem in divisions[0] if all(stem in d for d in divisions)]
         if len(common) > max(map(len, best.values()), default=0):
             pairs = zip(who, divisions, strict=True)
             best = {name: {each[stem]: stem for stem in common} for name, each in pairs}
