@@ -91,12 +91,11 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
 
 def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients by a label."""
-    alpha = fit.estimator.alpha_[:, :MOST_DRAWN]
-    return plotting.CoefficientsDisplay(
-        alpha=alpha[label.notna()],
-        y=label.dropna(),
-        component_names=names_of_components(None, alpha.shape[1]),
-    ).plot(kind="classes" if has_classes(label) else "number")
+    alpha = fit.estimator.alpha_[label.notna(), :MOST_DRAWN]
+    names = names_of_components(None, alpha.shape[1])
+    options = {"y": label.dropna(), "component_names": names}
+    display = plotting.CoefficientsDisplay(alpha=alpha, **options)
+    return display.plot(kind="classes" if has_classes(label) else "number")
 
 
 def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:

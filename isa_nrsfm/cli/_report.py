@@ -40,15 +40,8 @@ from isa_nrsfm.skeletons._column_names import names_of_points
 PAGE = "report.html"
 REPORT = "report.json"
 # The files of every fit; docs/command_line.md has their contents.
-RESULTS = (
-    PAGE,
-    "model.npz",
-    "alpha.csv",
-    "cameras.csv",
-    "shapes.csv",
-    "shapes.npz",
-    "viewer.html",
-)
+_TABLES = ("alpha.csv", "cameras.csv", "shapes.csv", "shapes.npz")
+RESULTS = (PAGE, "model.npz", *_TABLES, "viewer.html")
 
 
 class Fit(NamedTuple):
@@ -122,11 +115,9 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
     """
     estimator, frames, smooth, drawn, *_ = fit
     X, motion = frames.X, estimator.motion_
-    cameras = pd.DataFrame(
-        np.hstack([motion.reshape(-1, 6), estimator.translation_]),
-        index=X.index,
-        columns=[*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"],
-    )
+    names = [*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"]
+    numbers = np.hstack([motion.reshape(-1, 6), estimator.translation_])
+    cameras = pd.DataFrame(numbers, X.index, names)
     cameras["inverse_snr"] = fit.inverse_snr
     if hasattr(estimator, "positions_"):
         names = [f"position_{axis}" for axis in "xyz"]
@@ -268,19 +259,17 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         warn_caller(message)
     error = found.held_out_error if found else -estimator.score(X, **frames.weighting)
     figures = ("effective_frames", "pose_share", "pose_removed")
-    coefficients = pd.DataFrame(
-        {
-            "name": names_of_components(None, alpha.shape[1]),
-            "energy_share": estimator.energy_share_,
-            "min": alpha.min(axis=0),
-            "row_of_min": X.index[alpha.argmin(axis=0)],
-            "max": alpha.max(axis=0),
-            "row_of_max": X.index[alpha.argmax(axis=0)],
-            "stability": getattr(estimator, "stability_", None),
-            "stability_word": getattr(found, "stability", None),
-            **{name: getattr(found, name, None) for name in figures},
-        }
-    )
+    coefficients = {
+        "name": names_of_components(None, alpha.shape[1]),
+        "energy_share": estimator.energy_share_,
+        "min": alpha.min(axis=0),
+        "row_of_min": X.index[alpha.argmin(axis=0)],
+        "max": alpha.max(axis=0),
+        "row_of_max": X.index[alpha.argmax(axis=0)],
+        "stability": getattr(estimator, "stability_", None),
+        "stability_word": getattr(found, "stability", None),
+        **{name: getattr(found, name, None) for name in figures},
+    }
     outliers = None
     if found is not None:
         names, worst = names_of_points(estimator), found.outliers[:MOST_LISTED]
@@ -312,7 +301,7 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         or getattr(lines, "name", SPANNING_TREE) != SPANNING_TREE,
         "outliers": outliers,
         "parameters": estimator.get_params(deep=True),
-        "alpha": coefficients.to_dict("records"),
+        "alpha": pd.DataFrame(coefficients).to_dict("records"),
     }
 
 

@@ -704,8 +704,7 @@ def _angles(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDAr
     for side, sign in (("left", 1), ("right", -1)):
         angles |= {
             f"{side}_hip": 0.5 * sign * walk * swing + 1.5 * squat,
-            f"{side}_knee": walk * (0.5 - 0.4 * np.cos(step + sign * np.pi / 2))
-            + 2.0 * squat,
+            f"{side}_knee": walk * (0.5 + 0.4 * sign * swing) + 2.0 * squat,
             f"{side}_shoulder": -0.45 * sign * walk * swing + 1.3 * squat,
             f"{side}_elbow": 0.3 + 0.2 * walk,
             f"{side}_spread": np.full(len(time), 0.12),

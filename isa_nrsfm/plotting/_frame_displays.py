@@ -177,16 +177,9 @@ class CoefficientsDisplay:
             alpha, deviation = estimator.alpha_, getattr(estimator, "alpha_std_", None)
         else:
             _, _, alpha, deviation = estimator.decompose(X)
-        display = cls(
-            alpha=alpha,
-            alpha_std=deviation,
-            y=y,
-            time=time,
-            groups=groups,
-            label=label,
-            component_names=component_names,
-        )
-        return display.plot(ax, **kw)
+        given: dict[str, Any] = {"y": y, "time": time, "groups": groups, "label": label}
+        given["component_names"] = component_names
+        return cls(alpha=alpha, alpha_std=deviation, **given).plot(ax, **kw)
 
     def plot(
         self, ax: Any = None, *, kind: Literal["auto"] | Kind = "auto"
@@ -515,16 +508,10 @@ class ReprojectionDisplay:
             table_to_tracks(np.asarray(each, dtype=float), estimator.layout)
             for each in (unmasked(table), estimator.reproject(table))
         )
-        labelled = hasattr(X, "iloc")  # pandas: rows have names
-        display = cls(
-            observed=observed,
-            reprojected=reprojected,
-            frames=rows,
-            frame_names=[str(name) for name in X.index[rows]] if labelled else None,
-            edges=skeleton,
-            origin=origin,
-        )
-        return display.plot(ax, **kw)
+        given: dict[str, Any] = {"frames": rows, "edges": skeleton, "origin": origin}
+        if hasattr(X, "iloc"):  # pandas: rows have names
+            given["frame_names"] = [*map(str, X.index[rows])]
+        return cls(observed=observed, reprojected=reprojected, **given).plot(ax, **kw)
 
     def plot(
         self, ax: Any = None, *, n_columns: int | None = None

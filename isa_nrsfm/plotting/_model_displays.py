@@ -273,9 +273,8 @@ class BasisShapeDisplay:
         )
         n_drawn = len(self.components_)
         drift, mean = n_std * self.basis[self.components_], self.mean_shape
-        limits, reduction = _axes.block_limits(
-            [mean[None], *(np.stack([mean, mean + d, mean - d]) for d in drift)]
-        )
+        moved = [np.stack([mean, mean + d, mean - d]) for d in drift]
+        limits, reduction = _axes.block_limits([mean[None], *moved])
         page = ax
         if ax is None:
             page = _axes.new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
@@ -453,10 +452,8 @@ class ModeCovarianceDisplay:
             single Axes.
         """
         check_is_fitted(estimator, "mode_covariance_")
-        display = cls(
-            mode_covariance=estimator.mode_covariance_, component_names=component_names
-        )
-        return display.plot(ax)
+        matrix = estimator.mode_covariance_
+        return cls(mode_covariance=matrix, component_names=component_names).plot(ax)
 
     def plot(self, ax: Any = None) -> ModeCovarianceDisplay:
         """
