@@ -13,22 +13,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import (
-    BaseEstimator,
-    ClassNamePrefixFeaturesOutMixin,
-    TransformerMixin,
-)
+from sklearn import base
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import (
-    Interval,
-    StrOptions,
-    fit_context,
-    with_numpy_defaults,
-)
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, project
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.search import FrameSearch
@@ -40,21 +31,14 @@ from isa_nrsfm._linalg.small_matrices import orientations, polar
 from isa_nrsfm._paper.pipeline import leading_triplets
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
+from isa_nrsfm._tables import tracks
 from isa_nrsfm._tables.sources import open_table
-from isa_nrsfm._tables.tracks import (
-    LAYOUTS,
-    Layout,
-    centred_frames,
-    refuse_one_place,
-    table_to_rows,
-    tracks_to_table,
-)
 from isa_nrsfm.calibration import orthonormal_cameras
 
 
-@with_numpy_defaults
+@scikit_learn.with_numpy_defaults
 class ShapeSequenceNRSfM(
-    ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
+    base.ClassNamePrefixFeaturesOutMixin, base.TransformerMixin, base.BaseEstimator
 ):
     """
     Base of the methods that find one shape for each frame.
@@ -77,8 +61,8 @@ class ShapeSequenceNRSfM(
     """
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        "n_components": [Interval(Integral, 1, None, closed="left")],
-        "layout": [StrOptions(set(LAYOUTS))],
+        "n_components": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "layout": [scikit_learn.StrOptions(set(tracks.LAYOUTS))],
         "scale_frames": ["boolean"],
         "ordered": ["boolean"],
     }
@@ -87,7 +71,7 @@ class ShapeSequenceNRSfM(
         self,
         n_components: int = 3,
         *,
-        layout: Layout = "interleaved",
+        layout: tracks.Layout = "interleaved",
         scale_frames: bool = False,
         ordered: bool = False,
     ):
@@ -105,7 +89,7 @@ class ShapeSequenceNRSfM(
         square one. Space may be turned or mirrored; signs of frames are chosen later.
         """
 
-    @fit_context(nested=False)
+    @scikit_learn.fit_context(nested=False)
     @one_blas_thread
     def fit(self, X: Any, y: Any = None) -> Self:
         """
@@ -249,7 +233,7 @@ class ShapeSequenceNRSfM(
         """
         motion, translation, alpha, _ = self.decompose(X)
         shapes = compose(self.mean_shape_, self.basis_, alpha)
-        return tracks_to_table(project(shapes, motion, translation), self.layout)
+        return tracks.tracks_to_table(project(shapes, motion, translation), self.layout)
 
     def __sklearn_tags__(self) -> Any:
         """Return the estimator's tags."""
@@ -271,11 +255,11 @@ class ShapeSequenceNRSfM(
 
     def _decompose(self, X: NDArray) -> Decomposition:
         """Return camera and coefficients of each frame of a valid table."""
-        rows = table_to_rows(X, self.layout).astype(np.float64)
+        rows = tracks.table_to_rows(X, self.layout).astype(np.float64)
         sizes = np.full(len(rows), self._unit)
         if self.scale_frames:
-            _, report = centred_frames(rows)
-            refuse_one_place(report, rows.shape[2])
+            _, report = tracks.centred_frames(rows)
+            tracks.refuse_one_place(report, rows.shape[2])
             sizes = report.size
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
         shapes = shapes.transpose(0, 2, 1).astype(float)
@@ -569,15 +553,15 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **ShapeSequenceNRSfM._parameter_constraints,
-        "max_iter": [Interval(Integral, 1, None, closed="left")],
-        "tol": [Interval(Real, 0, None, closed="left")],
+        "max_iter": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "tol": [scikit_learn.Interval(Real, 0, None, closed="left")],
     }
 
     def __init__(
         self,
         n_components: int = 3,
         *,
-        layout: Layout = "interleaved",
+        layout: tracks.Layout = "interleaved",
         scale_frames: bool = False,
         ordered: bool = False,
         max_iter: int = 10_000,

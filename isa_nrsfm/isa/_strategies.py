@@ -24,30 +24,25 @@ from sklearn.utils import check_array, check_random_state, gen_batches
 from sklearn.utils.parallel import Parallel, delayed
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import (
-    N_JOBS,
-    Interval,
-    fit_context,
-    with_numpy_defaults,
-)
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._tables.sources import unmasked
 
 
-@with_numpy_defaults
+@scikit_learn.with_numpy_defaults
 class BaseSubspaceAnalysis(
     ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator, metaclass=ABCMeta
 ):
     """Validation, whitening and projection. Subclasses implement `_unmix`."""
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        "subspace_size": [Interval(Integral, 1, None, closed="left")],
-        "n_init": [Interval(Integral, 1, None, closed="left")],
-        "max_iter": [Interval(Integral, 1, None, closed="left")],
-        "tol": [Interval(Real, 0, None, closed="neither")],
+        "subspace_size": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "n_init": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "max_iter": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "tol": [scikit_learn.Interval(Real, 0, None, closed="neither")],
         "random_state": ["random_state"],
     }
 
@@ -356,7 +351,7 @@ class FastISA(BaseSubspaceAnalysis):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **BaseSubspaceAnalysis._parameter_constraints,
-        "n_jobs": N_JOBS,
+        "n_jobs": scikit_learn.N_JOBS,
         "verbose": ["verbose"],
     }
 
@@ -379,7 +374,7 @@ class FastISA(BaseSubspaceAnalysis):
         self.n_jobs = n_jobs
         self.verbose = verbose
 
-    @fit_context(nested=False)
+    @scikit_learn.fit_context(nested=False)
     def fit(self, signals: Any, y: Any = None) -> Self:
         """
         Find the independent subspaces.
@@ -538,7 +533,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         self.tol = tol
         self.random_state = random_state
 
-    @fit_context(nested=False)
+    @scikit_learn.fit_context(nested=False)
     def fit(
         self,
         signals: Any,

@@ -15,23 +15,16 @@ from scipy.optimize import linear_sum_assignment, minimize
 from sklearn.utils import check_array
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
+from isa_nrsfm._tables import tracks
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import CHECKS, unmasked
-from isa_nrsfm._tables.tracks import (
-    LAYOUTS,
-    Layout,
-    centred_frames,
-    seen_points,
-    table_to_tracks,
-    without_half_points,
-)
 
 
 def inverse_snr(
     X: ArrayLike,
     X_hat: ArrayLike,
     *,
-    layout: Layout = "interleaved",
+    layout: tracks.Layout = "interleaved",
     scale_frames: bool = False,
 ) -> float:
     r"""
@@ -76,8 +69,8 @@ def inverse_snr(
     >>> inverse_snr(X, X_hat)
     0.125
     """
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout must be one of {LAYOUTS}; got {layout!r}")
+    if layout not in tracks.LAYOUTS:
+        raise ValueError(f"layout must be one of {tracks.LAYOUTS}; got {layout!r}")
     energy, error, seen = frame_energies(X, X_hat, layout)
     if scale_frames:
         used = seen.any(axis=1)
@@ -99,17 +92,17 @@ def inverse_snr(
 
 
 def frame_energies(
-    X: ArrayLike, X_hat: ArrayLike, layout: Layout
+    X: ArrayLike, X_hat: ArrayLike, layout: tracks.Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
     checks = CHECKS | {"dtype": np.float64}
     truth = check_array(unmasked(X), input_name="X", **checks)
     fitted = check_array(unmasked(X_hat), input_name="X_hat", **checks)
     check_same_shape("X", truth, "X_hat", fitted)
-    both = (table_to_tracks(table, layout).mT for table in (truth, fitted))
-    truth, fitted = (without_half_points(rows)[0] for rows in both)
-    seen = seen_points(truth)
-    lost = seen & ~seen_points(fitted)
+    both = (tracks.table_to_tracks(table, layout).mT for table in (truth, fitted))
+    truth, fitted = (tracks.without_half_points(rows)[0] for rows in both)
+    seen = tracks.seen_points(truth)
+    lost = seen & ~tracks.seen_points(fitted)
     if lost.any():
         rows = np.flatnonzero(lost.any(axis=1))
         raise ValueError(
@@ -120,8 +113,8 @@ def frame_energies(
 
     def energies(truth: NDArray, fitted: NDArray) -> tuple[NDArray, NDArray]:
         """Return the energies of a block of frames, and of their errors."""
-        fitted = np.where(seen_points(truth)[:, None], fitted, np.nan)
-        truth, fitted = (centred_frames(rows)[0] for rows in (truth, fitted))
+        fitted = np.where(tracks.seen_points(truth)[:, None], fitted, np.nan)
+        truth, fitted = (tracks.centred_frames(rows)[0] for rows in (truth, fitted))
         error = np.nansum((truth - fitted) ** 2, axis=(1, 2))
         return np.nansum(truth**2, axis=(1, 2)), error
 
