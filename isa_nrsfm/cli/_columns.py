@@ -13,8 +13,8 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import DEFAULTS
-from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import as_numbers, read_times, video_times
 from isa_nrsfm.export import point_distances

@@ -14,7 +14,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._columns import class_means, has_classes
-from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.cli._report import MOST_CLASSES, Fit
 from isa_nrsfm.export._names import names_of_components

@@ -33,6 +33,7 @@ from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _reading, _report
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import figures_of, write_figures
+from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import (
     AUTO,
     FACE_PRIOR,
@@ -42,7 +43,6 @@ from isa_nrsfm.cli._options import (
     build_parser,
     flag_of,
 )
-from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._report import Fit
 from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
