@@ -48,14 +48,10 @@ from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 from isa_nrsfm.metrics import affine_shape_error
-from isa_nrsfm.metrics._measures import frame_energies
+from isa_nrsfm.skeletons._column_names import WORDS
 
 # Columns that are probably labels or groups come first: action units, emotions, people.
-LABEL = re.compile(
-    r"^\W*AU\W?\d|emotion|expression|label|class|gesture|action|behaviou?r|condition|"
-    r"subject|person|participant|sex|gender|^\W*age\b|group",
-    re.IGNORECASE,
-)
+LABEL = re.compile(WORDS["labels"], re.IGNORECASE)
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
@@ -112,9 +108,8 @@ def fit_table(
     drawn = _reading.drawing(args, frames.columns.points, frames.skeleton)
     results = dict.fromkeys(_report.RESULTS, "")
     inputs = [prior] * (prior not in (None, NONE, *FACE_PRIORS))
-    if table is None:
-        inputs.append(args.table)
-    else:
+    inputs += [args.table] * (table is None)
+    if table is not None:
         results[Path(args.table).name] = ""
     with whole_files.folder_for_writing(folder):
         targets = [folder / name for name in (*results, *figures, _report.REPORT)]
@@ -146,9 +141,7 @@ def fit_table(
                 )[1]
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
             explained = estimator.reproject(X, **frames.weighting)
-            energy, error, _ = frame_energies(X, explained, estimator.layout)
-            snr = error / energy
-            fit = Fit(estimator, frames, smooth, drawn, explained, snr)
+            fit = Fit(estimator, frames, smooth, drawn, explained)
             _report.write_results(new, fit, unit, **viewer_data)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
                 answers["prior"] = {"name": prior or FACE_PRIOR, "std": std}

@@ -35,6 +35,7 @@ from isa_nrsfm.cli._reading import Frames, drawing_files
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS, load_model, save_model, write_table
 from isa_nrsfm.io._formats import TABLE
+from isa_nrsfm.metrics._measures import frame_energies
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 PAGE = "report.html"
@@ -47,7 +48,7 @@ RESULTS = (PAGE, "model.npz", *_TABLES, "viewer.html")
 class Fit(NamedTuple):
     """A fit to write and draw: model, frames, smoothing, lines.
 
-    ``explained`` is the table of the model, ``inverse_snr`` (n_frames,) that of frames.
+    ``explained`` is the table of the model.
     """
 
     estimator: AffineNRSfM
@@ -55,7 +56,6 @@ class Fit(NamedTuple):
     smooth: Any
     drawn: dict[str, Any]
     explained: NDArray
-    inverse_snr: NDArray
 
 
 def check_outputs(
@@ -113,12 +113,13 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
     The cameras have a row for each frame, empty if it could not be fitted. `unit` is
     the length of a unit of the shapes, for positions.
     """
-    estimator, frames, smooth, drawn, *_ = fit
+    estimator, frames, smooth, drawn, explained = fit
     X, motion = frames.X, estimator.motion_
     names = [*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"]
     numbers = np.hstack([motion.reshape(-1, 6), estimator.translation_])
     cameras = pd.DataFrame(numbers, X.index, names)
-    cameras["inverse_snr"] = fit.inverse_snr
+    energy, error, _ = frame_energies(X, explained, estimator.layout)
+    cameras["inverse_snr"] = error / energy
     if hasattr(estimator, "positions_"):
         names = [f"position_{axis}" for axis in "xyz"]
         cameras[names] = unit * estimator.positions_

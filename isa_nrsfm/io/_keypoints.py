@@ -764,9 +764,8 @@ def read_places(path: Path) -> Landmarks:
     lines = path.read_text(encoding="utf-8-sig").replace(",", " ").splitlines()
     rows = [line.split() for line in lines if line.strip()]
     image = " ".join(rows.pop(0)) if len(rows[0]) != 2 else ""
-    if any(len(row) != 2 for row in rows) or image.isdigit() > (
-        image == str(len(rows))
-    ):
+    wrong = image.isdigit() and image != str(len(rows))
+    if wrong or any(len(row) != 2 for row in rows):
         raise ValueError("the lines are not x and y of as many points as it says")
     tracks = np.array([floats_of(row) for row in rows])[None]
     return assemble(tracks, None, pd.DataFrame({"image": [image]}), format="places")

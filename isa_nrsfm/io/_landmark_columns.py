@@ -690,9 +690,8 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
         by_frame, by_point = [name for name in keys if name != point], [point]
         if count(keys) < len(frame):
             break
-        for name in sorted(
-            by_frame, key=lambda n: (is_frame[n], -sizes[n], n == image)
-        ):
+        by_size = sorted(by_frame, key=lambda n: (is_frame[n], -sizes[n], n == image))
+        for name in by_size:
             fewer = [other for other in by_frame if other != name]
             if count([*fewer, point]) == len(frame):
                 by_frame = fewer

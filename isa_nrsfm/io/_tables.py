@@ -27,6 +27,7 @@ from isa_nrsfm.io._landmark_columns import (
 )
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
 from isa_nrsfm.skeletons._column_names import (
+    WORDS,
     columns_of_individuals,
     parse_coordinate,
     point_names,
@@ -46,11 +47,7 @@ _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
 _SEEN = dict.fromkeys((True, "True", "TRUE", "true"), 1.0)
 _SEEN |= dict.fromkeys((False, "False", "FALSE", "false"), 0.0)
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
-_MISSING = (
-    *("", "na", "nan", "-nan", "n/a", "null", "none"),
-    # Of spreadsheets, pandas, and C programs on Windows.
-    *("#n/a", "<na>", "nan(ind)", "-nan(ind)"),
-)
+_MISSING = WORDS["missing"].split("|")
 
 
 Missing = float | Sequence[float] | None

@@ -173,12 +173,8 @@ def chosen_numbers(
     if values is None:
         return np.arange(most)
     numbers = np.asarray(values)
-    if (
-        numbers.ndim != 1
-        or not numbers.size
-        or numbers.dtype.kind not in "iu"
-        or np.any((numbers < 0) | (numbers >= most))
-    ):
+    whole = numbers.ndim == 1 and numbers.size and numbers.dtype.kind in "iu"
+    if not whole or np.any((numbers < 0) | (numbers >= most)):
         raise ValueError(
             f"{name} must be a list of {content}, from 0 to {most - 1}; got {values!r}"
         )
