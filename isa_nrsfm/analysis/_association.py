@@ -81,10 +81,6 @@ class FrameOrder:
         self.groups, self.sizes = numbers[self.rows], np.bincount(numbers)
         self.first = np.cumsum(self.sizes) - self.sizes
 
-    def means(self, values: NDArray) -> NDArray:
-        """Average ordered values (n_frames, k) over each group (n_groups, k)."""
-        return np.asarray(np.add.reduceat(values, self.first) / self.sizes[:, None])
-
     def spectrum(self, values: NDArray, inverse: bool = False) -> NDArray:
         """Transform ordered values (n_frames, k) of each group to cosines, or back."""
         transform = idct if inverse else dct
@@ -160,10 +156,10 @@ def permuted_energies(
     """
     alpha, labels = alpha[order.rows], labels[order.rows]
     n_components = alpha.shape[1]
-    sizes = order.sizes[:, None]
-    means = order.means(alpha)
+    sizes, by_group = order.sizes[:, None], indicators(order.groups).T
+    means = by_group @ alpha / sizes
     # Sparse: there may be as many classes as groups.
-    of_labels = (indicators(order.groups).T @ labels).multiply(1.0 / sizes).tocsr()
+    of_labels = (by_group @ labels).multiply(1.0 / sizes).tocsr()
     alpha = alpha - means[order.groups]
     square = np.sum(labels.data**2)
     total = square - len(alpha) * np.sum((sizes.T @ of_labels / len(alpha)) ** 2)
@@ -190,7 +186,6 @@ def permuted_energies(
         residuals = unexplained(alpha, labels, order)
         length, in_runs = independent_length(residuals), _are_sorted(labels, order)
     runs = _runs(labels, order) if inside and len(means) > 1 else None
-    by_group = indicators(order.groups).T
     varying = np.sum((by_group @ labels.power(2)) - sizes * of_labels.power(2), axis=1)
     many = np.sum(varying > OF_DIFFERENCES) >= MANY_GROUPS
     if inside and many and (length > 1 or runs is not None):

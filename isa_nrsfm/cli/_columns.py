@@ -72,10 +72,8 @@ def column_results(
     if frames.labels:
         features = {"alpha": alpha} | _aligned_pca(estimator, X)
         std = getattr(estimator, "alpha_std_", None)
-        report["labels"] = [
-            _label_report(label, features, frames, args.random_state, std)
-            for label in frames.labels
-        ]
+        options = features, frames, args.random_state, std
+        report["labels"] = [_label_report(each, *options) for each in frames.labels]
     if frames.groups is not None:
         report["groups"] = {"column": args.group}
         try:
@@ -86,8 +84,8 @@ def column_results(
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
     if frames.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
-        options = {"groups": frames.groups} | frames.weighting
-        smooth = estimator.smooth(X, time=frames.times, **options)
+        of_rows = {"groups": frames.groups} | frames.weighting
+        smooth = estimator.smooth(X, time=frames.times, **of_rows)
         found, images = smooth.alpha, frames.images[X.index]
         report["time"] = {
             "column": args.time or images.name,

@@ -199,10 +199,9 @@ def build_parser() -> Parser:
                 is_one = isinstance(option, str)
                 place = group if is_one else group.add_mutually_exclusive_group()
                 for name in [option] if is_one else option:
-                    flag = name if name in POSITIONAL else flag_of(name)
-                    place.add_argument(
-                        *SHORT.get(name, []), flag, **_settings(command, name)
-                    )
+                    flags = [name if name in POSITIONAL else flag_of(name)]
+                    flags = SHORT.get(name, []) + flags
+                    place.add_argument(*flags, **_settings(command, name))
     return top
 
 

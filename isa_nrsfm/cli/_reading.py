@@ -101,8 +101,7 @@ def read_frames(
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE or (table is None and Path(args.table).is_dir()):
-        given = {name: getattr(args, name) for name in _OF_FORMATS}
-        given["missing"] = args.missing_value
+        given = vars(args) | {"missing": args.missing_value}
         known = FORMATS[args.format].options
         options = {name: given[name] for name in known if given.get(name)}
         found = FORMATS[args.format].read(args.table, **options)

@@ -196,9 +196,8 @@ class PointDistributionModel(NamedTuple):
         PointDistributionModel
             With ``factor * mean`` and ``factor ** 2 * eigenvalues``.
         """
-        return self._replace(
-            mean=factor * self.mean, eigenvalues=factor**2 * self.eigenvalues
-        )
+        mean, eigenvalues = factor * self.mean, factor**2 * self.eigenvalues
+        return self._replace(mean=mean, eigenvalues=eigenvalues)
 
 
 @checked_parameters({"n_modes": [NUMBER_OF_MODES, SHARE_OF_VARIANCE, None]})

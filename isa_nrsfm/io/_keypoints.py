@@ -262,17 +262,15 @@ def _keypoints(
             f"the points of bodies are read, and those in {', '.join(further)} are "
             f"left out: choose with {named('part')}, one of {', '.join(WHOLE_PARTS)}"
         )
-    n_lists = len(_LISTS) if further and part != "body" else 1
-    n_points = len(names) if names and n_lists == 1 else 0
+    keys = [*_LISTS] if further and part != "body" else ["keypoints"]
+    n_points = len(names) if names and len(keys) == 1 else 0
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
         of_file = f" of {entry['file']}" if "file" in entry else ""
         name = f"{what} {number} (counted from 0){of_file}"
-        lists = [
-            _triples(entry.get(key, gap[key]), f"{key} of {name}", True)
-            for key in [*_LISTS][:n_lists]
-        ]
-        found.append(np.concatenate(lists))
+        lists = {key: entry.get(key, gap[key]) for key in keys}
+        points = [_triples(lists[key], f"{key} of {name}", True) for key in keys]
+        found.append(np.concatenate(points))
         n_points = n_points or len(found[0])
         if len(found[-1]) != max(n_points, 1):
             raise ValueError(

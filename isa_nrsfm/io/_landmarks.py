@@ -209,14 +209,10 @@ def assemble_individuals(
     rows[~visible.any(axis=1), 0] = True
     frame, individual = np.nonzero(rows)
     nobody = several & ~visible[frame, individual]
-    columns: dict[str, Any] = {
-        name: [values[i] for i in frame.tolist()] for name, values in frames.items()
-    }
+    places, who = frame.tolist(), zip(individual.tolist(), nobody, strict=True)
+    columns: dict[str, Any] = {n: [v[i] for i in places] for n, v in frames.items()}
     if names is not None:
-        columns["individual"] = [
-            None if absent else names[i]
-            for i, absent in zip(individual.tolist(), nobody, strict=True)
-        ]
+        columns["individual"] = [None if absent else names[i] for i, absent in who]
     for name, of_each in (of_instances or {}).items():
         columns[name] = np.where(nobody, np.nan, of_each[frame, individual])
     if confidence is not None:
@@ -335,10 +331,8 @@ def from_mediapipe(
     part = part or "".join(parts)
     sizes = checked_sizes("image_sizes", image_sizes, len(results))
     names = [f"result {i} (counted from 0)" for i in range(len(results))]
-    persons = [
-        dict(enumerate(_persons(result, part, name)))
-        for result, name in zip(results, names, strict=True)
-    ]
+    pairs = zip(results, names, strict=True)
+    persons = [dict(enumerate(_persons(each, part, name))) for each, name in pairs]
     if not any(len(values) for each in persons for values in each.values()):
         raise ValueError(f"none of the {len(results)} results has any landmarks")
     frame, individual, values = stacked(persons, names)

@@ -51,9 +51,8 @@ class BaseSubspaceAnalysis(
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals, size = unmasked(signals), self.subspace_size
-        signals = validate_data(
-            self, signals, dtype=float, ensure_min_samples=2, ensure_min_features=size
-        )
+        least = {"ensure_min_samples": 2, "ensure_min_features": size}
+        signals = validate_data(self, signals, dtype=float, **least)
         n_signals = signals.shape[1]
         if n_signals % size:
             raise ValueError(
