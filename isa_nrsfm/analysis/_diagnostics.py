@@ -219,9 +219,8 @@ def diagnose(
     mean_shape = estimator.mean_shape_.astype(np.float64)
     basis = estimator.basis_.astype(np.float64)
     images = motion.reshape(-1, 3)
-    deformation = np.einsum(
-        "ik,il,kjc,ljc->", alpha, alpha, basis, basis, optimize=True
-    ) / len(alpha)
+    flat = basis.reshape(len(basis), -1)
+    deformation = np.vdot(alpha.T @ alpha, flat @ flat.T) / len(alpha)
     fourth = np.sum(alpha**4, axis=0)
     square = np.sum(alpha**2, axis=0) ** 2
     # The traces of the V_k, one direction each, are not determined. Leave them out.

@@ -199,9 +199,7 @@ def _xyv(point: dict[str, Any], seen: bool) -> Iterator[float]:
     return map(float, (point["x"], point["y"], visibility))
 
 
-def _in_pixels(
-    tracks: NDArray[np.float64], image_size: Any, sizes: NDArray | None
-) -> NDArray[np.float64]:
+def _in_pixels(tracks: NDArray, image_size: Any, sizes: NDArray | None) -> NDArray:
     """Return tracks (n_frames, n_points, 2) in pixels, by the size of the images."""
     n_known = np.count_nonzero(~np.isnan(tracks))
     # Pixels of a face reach beyond this, and fractions of the image's size do not.

@@ -38,7 +38,8 @@ _NO_POINT = re.compile(
 _COPY = re.compile(rf"(?i){WORDS['copies']}")
 
 
-# Names or patterns of columns, as users give them.
+# Names of the columns of a table; names or patterns of columns, as users give them.
+Columns = Sequence[Hashable]
 Given = str | Sequence[str] | None
 
 
@@ -62,9 +63,7 @@ class LandmarkColumns(NamedTuple):
         return list(chain.from_iterable(zip(self.x, self.y, strict=True)))
 
 
-def find_landmark_columns(
-    names: Iterable[Hashable], columns: Given = None
-) -> LandmarkColumns:
+def find_landmark_columns(names: Columns, columns: Given = None) -> LandmarkColumns:
     """
     Find the landmark columns among the columns of a table.
 
@@ -148,7 +147,7 @@ def only_points(names: Iterable[Hashable]) -> list[Hashable]:
     return [name for name in names if name not in others] if few else names
 
 
-def _refuse_copies(names: Sequence[Hashable]) -> None:
+def _refuse_copies(names: Columns) -> None:
     """Raise if most points are there once more, with a further word in their names."""
     texts = [name.strip() for name, axis, _ in _coordinates(names) if axis == 0]
     parts = {t: re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", t) for t in texts}
@@ -171,7 +170,7 @@ def _refuse_copies(names: Sequence[Hashable]) -> None:
 
 
 def _ask_which(
-    names: Sequence[Hashable], which: str, words: list[str], without: Sequence[str] = ()
+    names: Columns, which: str, words: list[str], without: Sequence[str] = ()
 ) -> NoReturn:
     """Raise the question which of points that are there twice are to be read."""
     copies = [name for word in words for name in _chosen(names, [f"+*{word}*"])]
@@ -188,7 +187,7 @@ def _ask_which(
     )
 
 
-def _chosen(names: Sequence[Hashable], patterns: Iterable[str]) -> list[Hashable]:
+def _chosen(names: Columns, patterns: Iterable[str]) -> list[Hashable]:
     """Return names without those of patterns after -, only those of ones after +."""
     chosen = list(names)
     for sign, pattern in ((each[0], each[1:]) for each in patterns):
@@ -286,7 +285,7 @@ def confidence_columns(
     return []
 
 
-def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None:
+def _refuse_individuals(names: Columns, sets: dict[str, int]) -> None:
     """Raise if points have the names of several individuals in one row."""
     patterns = [pattern.split(",")[0] for pattern in sets]
     lists = [_columns_matching(names, pattern).values() for pattern in patterns]
@@ -315,7 +314,7 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     )
 
 
-def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:
+def _select(names: Columns, patterns: Sequence[str]) -> LandmarkColumns:
     """Return the columns that match pairs of patterns of x and y columns."""
     x: list[str] = []
     y: list[str] = []
@@ -345,7 +344,7 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
     return LandmarkColumns(joined, points, tuple(x), tuple(y), z)
 
 
-def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:
+def _columns_matching(names: Columns, pattern: str) -> dict[tuple, str]:
     """Return the columns that match a pattern, with keys from its wildcards.
 
     A key is a tuple with one entry a wildcard: an int for ``#``, a text for ``*``. A
@@ -389,9 +388,7 @@ def regular_expression(pattern: str) -> re.Pattern[str]:
     return re.compile(expression, re.DOTALL)  # names may hold line breaks
 
 
-def _warn_of_left_out(
-    names: Sequence[Hashable], chosen: Sequence[str], pattern: str
-) -> None:
+def _warn_of_left_out(names: Columns, chosen: Sequence[str], pattern: str) -> None:
     """Warn if patterns match only a part of a set of x and y columns."""
     sets, used = {point[0] for _, _, point in _coordinates(chosen)}, {*chosen}
     others = (each for each in _coordinates(names) if each[0] not in used)
@@ -402,7 +399,7 @@ def _warn_of_left_out(
         )
 
 
-def _z_of(names: Sequence[Hashable], x_columns: Iterable[str]) -> tuple[str, ...]:
+def _z_of(names: Columns, x_columns: Iterable[str]) -> tuple[str, ...]:
     """Return the columns with the third coordinate of the points of x columns."""
     points = {point for _, _, point in _coordinates(x_columns)}
     found = _coordinates(names)
@@ -415,7 +412,7 @@ def _coordinates(names: Iterable[Hashable]) -> list[tuple[str, int, tuple]]:
     return [(name, c[0], c[2][0]) for name, c in found if c is not None]
 
 
-def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str:
+def _several_found(names: Columns, candidates: dict[str, int]) -> str:
     """List the sets of landmarks of a table, and how to choose one."""
     listed, example = [], max(candidates, key=lambda pattern: candidates[pattern])
     whole = regular_expression(example.split(",")[0])
@@ -434,7 +431,7 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
     )
 
 
-def _first_columns(names: Sequence[Hashable]) -> str:
+def _first_columns(names: Columns) -> str:
     """List the first columns of a table."""
     listed = ", ".join(map(repr, names[:4])) + ", ..." * (len(names) > 4)
     return f"the table's {len(names)} columns are {listed}"

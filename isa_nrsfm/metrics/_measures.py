@@ -372,9 +372,7 @@ def best_affinity(truth: NDArray, shapes: NDArray) -> NDArray[np.float64]:
     return whitener @ affinity.reshape(-1, 3)
 
 
-def _climb(
-    start: NDArray, cross: NDArray, scatter: NDArray
-) -> tuple[float, NDArray[np.float64]]:
+def _climb(start: NDArray, cross: NDArray, scatter: NDArray) -> tuple[float, NDArray]:
     """Maximise ``sum <a, cross_i>^2 / <a, scatter_i a>`` from a start.
 
     What is left of each pair is minimised, which rounds less: return minus that, and a.
