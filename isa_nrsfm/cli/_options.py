@@ -158,6 +158,7 @@ _WORDS = {name: ", ".join(map(str, values)) for name, values in _LISTS.items()}
 HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
 # What export writes: suffixes of the files, and options.
 EXPORTS = _DATA["exports"]
+TIMES = _DATA["times"]
 # The values of options that have few.
 CHOICES: dict[str, Sequence[str]] = _DATA["choices"] | {
     "format": ("auto", *FORMATS),
