@@ -704,7 +704,8 @@ def _angles(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDAr
     for side, sign in (("left", 1), ("right", -1)):
         angles |= {
             f"{side}_hip": 0.5 * sign * walk * swing + 1.5 * squat,
-            f"{side}_knee": walk * (0.5 + 0.4 * sign * swing) + 2.0 * squat,
+            f"{side}_knee": walk * (0.5 - 0.4 * np.cos(step + sign * np.pi / 2))
+            + 2.0 * squat,
             f"{side}_shoulder": -0.45 * sign * walk * swing + 1.3 * squat,
             f"{side}_elbow": 0.3 + 0.2 * walk,
             f"{side}_spread": np.full(len(time), 0.12),
@@ -991,4 +992,7 @@ def _take_turns(time: NDArray, n_poses: int, rng: RandomState) -> NDArray[np.flo
     begins = length * np.arange(1, n_turns)
     passed = np.clip((time[:, None] - begins) / change + 0.5, 0.0, 1.0)
     begun = np.insert((1 - np.cos(np.pi * passed)) / 2, 0, 1.0, axis=1)
-    return -np.diff(begun, axis=1, append=0.0) @ np.eye(n_poses)[turns]
+    share = -np.diff(begun, axis=1, append=0.0)
+    weights = np.zeros((len(time), n_poses))
+    np.add.at(weights.T, turns, share.T)
+    return weights

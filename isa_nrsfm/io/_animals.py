@@ -55,10 +55,14 @@ def is_hdf5(path: Path) -> bool:
         return file.read(len(_SIGNATURE)) == _SIGNATURE
 
 
+def opened(path: Path) -> Any:
+    """Return an HDF5 file, open for reading."""
+    return import_optional("h5py", extra="h5").File(path, "r")
+
+
 def root_groups(path: Path) -> set[str]:
     """Return the names at the root of an HDF5 file, or raise where it is damaged."""
-    h5py = import_optional("h5py", extra="h5")
-    with reading(path, "HDF5"), h5py.File(path, "r") as file:
+    with reading(path, "HDF5"), opened(path) as file:
         return set(file)
 
 
@@ -224,8 +228,7 @@ def _read_h5(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     Returns numbers (n_rows, n_columns), levels of the columns, and labels of the rows.
     Damaged files lead to errors of h5py and pickle.
     """
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         group = own_member(file, _KEY)
         if not hasattr(group, "attrs"):
             raise ValueError(f"it has no group {_KEY}")
@@ -333,8 +336,7 @@ def read_sleap(path: Path) -> Landmarks:
     confidences, ``edge_names`` the pairs of nodes that the skeleton joins. Frames are
     counted from 0.
     """
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         absent = _NEEDED.difference(file)
         if absent:
             raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
@@ -370,8 +372,7 @@ def read_facemap(path: Path) -> Landmarks:
 
     Body parts are in the order of their names, frames are counted from 0.
     """
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         group = own_member(file, "Facemap")
         parts = [own_member(group, name) for name in group]
         values = [[numbers_of(part, name) for name in _VALUES] for part in parts]
@@ -491,8 +492,7 @@ def _arrays_in(path: Path) -> dict[str, NDArray]:
         from scipy.io import loadmat  # takes a while
 
         return {n: a for n, a in loadmat(path).items() if isinstance(a, np.ndarray)}
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:  # MATLAB 7.3, whose axes are turned round
+    with opened(path) as file:  # MATLAB 7.3, whose axes are turned round
         names = [name for name in file if hasattr(own_member(file, name), "dtype")]
         return {name: np.asarray(content_of(file, name)).T for name in names}
 
