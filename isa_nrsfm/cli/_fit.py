@@ -92,8 +92,10 @@ def fit_table(
     X = frames.X
     X.attrs[TOLD] = True
     if X.empty:
-        out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
-        raise ValueError(f"{args.table} has no row that can be fitted: {out}")
+        out = [f"{e['n_rows']} left out ({e['reason']})" for e in frames.left_out]
+        raise ValueError(
+            f"{args.table} has no row that can be fitted: {', '.join(out)}"
+        )
     frames = asked_columns(args, frames)
     needs_centre = args.camera == "perspective" or args.focal_length is not None
     if needs_centre and frames.principal_point is None:

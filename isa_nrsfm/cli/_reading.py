@@ -48,6 +48,8 @@ from isa_nrsfm.skeletons._column_names import (
 # Options of some formats.
 _OF_FORMATS = ("image_size", "columns", "individuals", "row_per_point", "part")
 INNER, WITHOUT = "inner", "without:"
+# Rows and points that are listed in reports, at most.
+MOST_LISTED = 10
 # The columns of the size of an image, in pixels, by format.
 _SIZES = {"coco": ("width", "height"), "pyfeat": ("FrameWidth", "FrameHeight")}
 # Words for an empty cell in the column of a label or a group. "None" is a class, such
@@ -60,8 +62,8 @@ class Frames(NamedTuple):
 
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
     are not skipped, by the number of the row in the table. ``X`` has the landmarks of
-    ``usable`` rows, which can be fitted. ``left_out`` has reason, rows, and whether
-    they were skipped on request, ``not_used`` the sizes of unused sets of coordinates.
+    ``usable`` rows, which can be fitted. ``left_out`` has the entries of the report on
+    other rows, ``not_used`` the sizes of unused sets of coordinates.
     ``images`` are the numbers of the images that all rows show, under the name of their
     column, if any.
     ``weighting`` has the weights of the points of X as an argument of `fit`, if asked
@@ -76,7 +78,7 @@ class Frames(NamedTuple):
     usable: NDArray
     columns: LandmarkColumns
     not_used: dict[str, int]
-    left_out: list[tuple[str, NDArray, bool]]
+    left_out: list[dict[str, Any]]
     skeleton: Skeleton | None
     images: "pd.Series"
     weighting: dict[str, Any]
@@ -167,7 +169,7 @@ def read_frames(
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
-    left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
+    left_out += [_left_out(why, rows[which]) for why, which in reasons.items()]
     usable = slice(None) if report.usable.all() else report.usable
     warn_of_places(tracks[usable], confidence[usable], args.format)
     if args.min_confidence is None and args.weights is None:
@@ -186,7 +188,7 @@ def read_frames(
         usable=report.usable,
         columns=columns,
         not_used=not_used,
-        left_out=[out for out in left_out if len(out[1])],
+        left_out=[out for out in left_out if out["n_rows"]],
         skeleton=layout,
         images=image_numbers(table, vars(args).get("fps")),
         weighting={name: each[report.usable] for name, each in weighting.items()},
@@ -203,7 +205,8 @@ def _warn_of_unsure(confidence: NDArray, seen: NDArray) -> None:
     if unsure.any() and UNSURE <= np.nanmax(confidence) <= 1:
         before, after = seen.sum(axis=1), (seen & ~unsure).sum(axis=1)
         enough = 2 * after.sum() >= before.sum()
-        enough &= 2 * sum(after >= FEWEST_POINTS) >= sum(before >= FEWEST_POINTS)
+        left, whole = (np.sum(each >= FEWEST_POINTS) for each in (after, before))
+        enough &= 2 * left >= whole
         way = f"leave them out with --min-confidence {UNSURE:g}"
         warn_caller(
             f"{100 * unsure.sum() / seen.sum():.3g} % of the points have a confidence "
@@ -317,7 +320,7 @@ def _with_confidences(
 
 def _rows_to_keep(
     args: Namespace, table: "pd.DataFrame"
-) -> tuple[NDArray, list[tuple[str, NDArray, bool]]]:
+) -> tuple[NDArray, list[dict[str, Any]]]:
     """Return which rows no rule skips, and the rows that each rule skips."""
     kept = np.ones(len(table), dtype=bool)
     skipped = []
@@ -326,9 +329,15 @@ def _rows_to_keep(
         texts = cells.astype(object).where(cells.notna(), "").astype(str)
         matches = kept & texts.map(expression.search).notna().to_numpy()
         reason = f"{column} matches {expression.pattern!r}"
-        skipped.append((reason, np.flatnonzero(matches), True))
+        skipped.append(_left_out(reason, np.flatnonzero(matches), True))
         kept &= ~matches
     return kept, skipped
+
+
+def _left_out(reason: str, rows: NDArray, skipped: bool = False) -> dict[str, Any]:
+    """Return the entry of the report on rows that are left out."""
+    entry = {"reason": reason, "skipped_on_request": skipped, "n_rows": len(rows)}
+    return entry | {"first_rows": rows[:MOST_LISTED]}
 
 
 def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:

@@ -31,7 +31,7 @@ from isa_nrsfm.analysis._advice import FIT, camera_meaning, verdict
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.analysis._frame_columns import STATISTICS
 from isa_nrsfm.cli._options import PROGRAM
-from isa_nrsfm.cli._reading import Frames, drawing_files
+from isa_nrsfm.cli._reading import MOST_LISTED, Frames, drawing_files
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS, load_model, save_model, write_table
 from isa_nrsfm.io._formats import TABLE
@@ -195,8 +195,8 @@ def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
     return dict(zip(existing, digests, strict=True))
 
 
-# Rows and points that are listed, and classes whose means are shown, at most.
-MOST_LISTED, MOST_CLASSES = 10, 12
+# Classes whose means are shown, at most.
+MOST_CLASSES = 12
 
 
 def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
@@ -216,15 +216,7 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
         "first_columns": names[:4],
         "last_columns": names[-2:],
         "coordinates_not_used": frames.not_used,
-        "rows_left_out": [
-            {
-                "reason": reason,
-                "skipped_on_request": skipped,
-                "n_rows": len(rows),
-                "first_rows": rows[:MOST_LISTED],
-            }
-            for reason, rows, skipped in frames.left_out
-        ],
+        "rows_left_out": frames.left_out,
     }
 
 

@@ -338,9 +338,8 @@ def from_mediapipe(
     frame, individual, values = stacked(persons, names)
     frames = {"frame": frame, "individual": individual}
     if part == "hand":
-        sides = [
-            [*map(_side, _entry(result, "handedness") or ())] for result in results
-        ]
+        hands = (_entry(result, "handedness") or () for result in results)
+        sides = [[*map(_side, each)] for each in hands]
         places = zip(frame, pd.Series(individual).fillna(-1), strict=True)
         side = [sides[i][k] if 0 <= k < len(sides[i]) else None for i, k in places]
         frames |= {"handedness": side} if any(side) else {}
