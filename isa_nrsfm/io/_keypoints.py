@@ -651,13 +651,10 @@ def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmark
     fits = [(n, k) for k, n in parts if (values.shape[1] - _N_BOX - k) % n == 0]
     n, k = max(fits, key=lambda part: _share_inside(values, *part))
     points, after = _points_of_yolo(values, n, k), values[:, values.shape[1] - k :]
-    numbers = dict(zip(("score", "track_id"), after.T.tolist(), strict=False))
-    entries = [
-        {"person": person, "class": int(values[person, 0])}
-        | {name: of_all[person] for name, of_all in numbers.items()}
-        | {"keypoints": (each * np.append(size, 1.0)).ravel().tolist()}
-        for person, each in enumerate(points)
-    ]
+    frames = {"person": range(len(rows)), "class": [*map(int, values[:, 0])]}
+    frames |= zip(("score", "track_id"), after.T, strict=False)
+    places = (points * np.append(size, 1.0)).reshape(len(rows), -1).tolist()
+    entries = pd.DataFrame(frames | {"keypoints": places}).to_dict("records")
     found = entries_as_rows(entries, "yolo", "line")
     of_labels = np.isin(points[..., 2], (0, 1, 2)).all()
     return replace(found, confidence=None) if of_labels else found
