@@ -15,7 +15,7 @@ from layers import slow_after
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli import main
-from isa_nrsfm.cli._progress import show_stage, shown_progress
+from isa_nrsfm.cli._main import show_stage, shown_progress
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import load_model, read_landmarks
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._joint.uncertainty import SIGNS
-from isa_nrsfm.analysis._stability import stability_words
+from isa_nrsfm.analysis._diagnostics import stability_words
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import load_model, save_model
 

@@ -392,7 +392,7 @@ def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
     assert set(found.frames["subject"]) == {"007"}
     assert set(found.frames["age"]) == {30}
     _, frames = read_by_fit(path)
-    assert [reason for reason, *_ in frames.left_out] == ["tracking failed"]
+    assert [each["reason"] for each in frames.left_out] == ["tracking failed"]
     assert len(frames.X) == 8
 
 

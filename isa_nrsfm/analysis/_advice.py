@@ -284,10 +284,7 @@ LARGEST_WIDTH = 0.2
 
 
 def warn_after_fit(
-    model: Any,
-    prior: Any,
-    motion: NDArray,
-    left_out: tuple[NDArray, NDArray] | None,
+    model: Any, prior: Any, motion: NDArray, left_out: tuple[NDArray, NDArray] | None
 ) -> None:
     """Warn of what a joint fit shows of its table.
 
@@ -352,10 +349,8 @@ def _across_and_up(model: Any, prior: Any) -> NDArray | None:
     layout = layout_of(model if prior is None else prior)
     if layout is not None and layout.kind == "face":
         shape = model.mean_shape_
-        pairs = layout.left_right, np.array(layout.up)
-        return np.array(
-            [np.mean(shape[b] - shape[a], 0) for a, b in (p.T for p in pairs)]
-        )
+        ends = layout.left_right.T, np.transpose(layout.up)
+        return np.array([np.mean(shape[b] - shape[a], axis=0) for a, b in ends])
     sights = None if prior is None else getattr(prior, "motion_", None)
     if sights is None:
         return None

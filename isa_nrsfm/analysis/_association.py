@@ -1,12 +1,34 @@
-"""Association of coefficients with a label: a class or a number for each frame."""
+"""Association of coefficients with a label: a class or a number for each frame.
 
+Labels may be permuted only between units that are exchangeable under the null
+hypothesis of no association (Winkler, Webster, Vidaurre, Nichols, Smith, "Multi-level
+block permutation", 2015). The means of labels over groups are permuted among the
+groups. Within many groups, what each adds to the covariance with the labels gets a
+random sign. That allows for any dependence of its frames, such as on sessions. Within
+few groups independent frames are permuted. If neighbouring frames of a video
+depend on each other, the frequencies of the coefficients are independent instead: the
+cosine transform nearly diagonalises the covariance of any stationary series, and of
+random walks.
+
+The statistics of independent units are studentised: permutations then keep the level
+for classes with other variances (Janssen, "Studentized permutation tests for non-i.i.d.
+hypotheses and the generalized Behrens-Fisher problem", 1997; Chung, Romano, "Exact and
+asymptotically robust permutation tests", 2013; DiCiccio, Romano, "Robust permutation
+tests for correlation and regression coefficients", 2017).
+"""
+
+from collections.abc import Iterable, Iterator
 from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.stats import rankdata
+from scipy.fft import dct, idct
+from scipy.sparse import csr_array, hstack
+from scipy.sparse.linalg import lsmr
+from scipy.spatial import cKDTree
+from scipy.special import softmax
+from scipy.stats import norm, rankdata
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import (
@@ -23,7 +45,377 @@ from sklearn.utils import check_array, check_random_state, check_scalar
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import aligned
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
-from isa_nrsfm.analysis import _frame_columns, _permutations
+from isa_nrsfm.analysis import _frame_columns
+
+# Why a label cannot be tested.
+ONE_EVENT = (
+    "the coefficients and the label change slowly or with one period: they have one "
+    "event in common, which may be chance. Record more events, or give several people "
+    "or videos as groups"
+)
+REPEATED = (
+    "frames with nearly the same coefficients have the same label far more often than "
+    "their coefficients tell, as photos of the same people do. Give the people as "
+    "groups"
+)
+JUMPS = (
+    "the coefficients jump {} times, first after {} frames, as where clips are joined. "
+    "Give the clips as groups"
+)
+# Within so many groups, signs of groups are drawn: 128 different results.
+MANY_GROUPS = 8
+# Number of the nearest frames whose labels are compared, and level of this test.
+NEAREST, REPEATED_LEVEL = 3, 0.01
+
+
+class FrameOrder:
+    """Frames sorted by group (n_frames,), and by time (n_frames,) within each group.
+
+    rows, groups (n_frames,): numbers of the frames in this order, and of their groups.
+    sizes, first (n_groups,): number of frames of each group, and place of its first.
+    """
+
+    def __init__(self, groups: NDArray, time: NDArray):
+        numbers = np.unique(groups, return_inverse=True)[1]
+        self.rows = np.lexsort((time, numbers))
+        self.groups, self.sizes = numbers[self.rows], np.bincount(numbers)
+        self.first = np.cumsum(self.sizes) - self.sizes
+
+    def spectrum(self, values: NDArray, inverse: bool = False) -> NDArray:
+        """Transform ordered values (n_frames, k) of each group to cosines, or back."""
+        transform = idct if inverse else dct
+        parts = np.split(values, self.first[1:])
+        return np.concatenate([transform(a, axis=0, norm="ortho") for a in parts])
+
+    def blocks(self, length: int) -> NDArray:
+        """Number the blocks of `length` ordered frames within groups (n_frames,)."""
+        place = np.arange(len(self.rows)) - self.first[self.groups]
+        n_blocks = -(-self.sizes // length)
+        first = np.cumsum(n_blocks) - n_blocks
+        return np.asarray(place // length + first[self.groups])
+
+
+def unexplained(alpha: NDArray, labels: csr_array, order: FrameOrder) -> NDArray:
+    """Return the part of ordered alpha that neither labels nor groups explain."""
+    # Neighbours of one class are alike because of the class: measure the residuals.
+    design = hstack([labels, indicators(order.groups)], format="csr")
+    return np.stack([a - design @ lsmr(design, a)[0] for a in alpha.T], axis=1)
+
+
+def independent_length(rest: NDArray) -> int:
+    """Return the length of blocks of ordered frames that are independent.
+
+    One if neighbours are uncorrelated: frames, and means of 2, 4, 8, ..., which show
+    slow drifts that single frames hide. Otherwise five times the length of the shortest
+    means that are.
+    """
+    n_scales = max(1, int(np.log2(len(rest) / 8)) + 1)
+    threshold = norm.isf(0.05 / (rest.shape[1] * n_scales))
+    length, scale = 1, 1
+    while len(rest) >= 8:
+        energy = np.sum(rest**2, axis=0)
+        r = np.sum(rest[1:] * rest[:-1], axis=0) * np.sqrt(len(rest))
+        scale *= 2
+        if np.any(r > threshold * energy):
+            length = 5 * scale
+        rest = rest[: len(rest) // 2 * 2].reshape(-1, 2, rest.shape[1]).mean(axis=1)
+        rest = rest - rest.mean(axis=0)
+    return length
+
+
+def seams(alpha: NDArray) -> NDArray:
+    """Return the frames (n,) before which coefficients jump, as where clips are joined.
+
+    A jump is larger than any of so many normally distributed steps, and, unlike a
+    movement, twice as large as the steps before and after it.
+    """
+    steps = np.abs(np.diff(alpha, axis=0))
+    scale = np.median(steps, axis=0) / norm.isf(0.25)
+    steps = steps / np.where(scale > 0, scale, np.inf)
+    size = np.pad(np.linalg.norm(steps, axis=1), 1)
+    apart = size[1:-1] > 2 * np.maximum(size[:-2], size[2:])
+    large = np.any(steps > norm.isf(0.025 / steps.size), axis=1)
+    return np.flatnonzero(apart & large) + 1
+
+
+def permuted_energies(
+    values: NDArray,
+    alpha: NDArray,
+    labels: csr_array,
+    order: FrameOrder,
+    n_permutations: int,
+    rng: np.random.RandomState,
+) -> tuple[NDArray, str, str]:
+    """
+    Compute squared covariances of coefficients with labels, and with permuted labels.
+
+    Coefficients are given as values, and as ranks or values of norm one (alpha).
+    Returns them (n_permutations + 1, n_components), the given labels first; the
+    permuted units; and why they are no test, or nothing. The parts between and within
+    groups are summed, each divided by its mean over the permutations.
+    """
+    alpha, labels = alpha[order.rows], labels[order.rows]
+    n_components = alpha.shape[1]
+    sizes, by_group = order.sizes[:, None], indicators(order.groups).T
+    means = by_group @ alpha / sizes
+    # Sparse: there may be as many classes as groups.
+    of_labels = (by_group @ labels).multiply(1.0 / sizes).tocsr()
+    alpha = alpha - means[order.groups]
+    square = np.sum(labels.data**2)
+    total = square - len(alpha) * np.sum((sizes.T @ of_labels / len(alpha)) ** 2)
+    energies, permuted = np.zeros((n_permutations + 1, n_components)), []
+    untested = ""
+    inside = square - np.sum(sizes.T @ of_labels.power(2)) > OF_DIFFERENCES * total
+    weights = _weights(labels, of_labels, order)
+    between = of_labels.multiply(weights).tocsr()
+    # Less the mean of the labels: a part along the weights, and one along ones
+    along = weights / np.sqrt(np.sum(weights**2))
+    part = along.T @ between
+    mean = between.sum(axis=0) - np.sum(along) * part
+    energy = np.sum(between.data**2) - np.sum(part**2) - np.sum(mean**2) / len(means)
+    if energy > OF_DIFFERENCES * total:
+        centres = _standard(means, weights)
+        orders = (rng.permutation(len(means)) for _ in range(n_permutations))
+        permuted_centres = (centres[i] for i in orders)
+        if inside:
+            energies += _energies(centres, between, permuted_centres, along)
+        else:
+            energies += _studentised(centres, _unit(of_labels), permuted_centres)
+        permuted.append("groups")
+    if inside:
+        residuals = unexplained(alpha, labels, order)
+        length, in_runs = independent_length(residuals), _are_sorted(labels, order)
+    runs = _runs(labels, order) if inside and len(means) > 1 else None
+    varying = np.sum((by_group @ labels.power(2)) - sizes * of_labels.power(2), axis=1)
+    many = np.sum(varying > OF_DIFFERENCES) >= MANY_GROUPS
+    if inside and many and (length > 1 or runs is not None):
+        signs = rng.choice([-1.0, 1.0], (n_permutations + 1, len(means)))
+        signs[0] = 1.0
+        energies += _signed(alpha, labels, by_group, signs)
+        permuted.append("signs of groups within them")
+    elif inside:
+        units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
+        # Blocks of frames, permuted within groups
+        block = order.blocks(length) if runs is None or length > 1 else runs
+        draws = (rng.random_sample(block[-1] + 1) for _ in range(n_permutations))
+        orders = (np.lexsort((draw[block], order.groups)) for draw in draws)
+        shuffled: Iterator[NDArray] = (alpha[i] for i in orders)
+        if length == 1:
+            units = "frames" if runs is None else "runs of a label"
+        elif not in_runs:
+            units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
+            one_event = _one_event(alpha, labels, order)
+        if length > 1 and not permuted:
+            untested = ONE_EVENT * one_event
+            if len(means) == 1:
+                cuts = np.intersect1d(seams(values[order.rows]), seams(residuals))
+                if len(cuts):
+                    untested = JUMPS.format(len(cuts), cuts[0])
+        if length == len(means) == 1 and _people_repeat(alpha, labels):
+            untested = REPEATED
+        if not untested:
+            statistic = _studentised if length == 1 else _energies
+            energies += statistic(alpha, labels, shuffled)
+        permuted.append(f"{units} within groups" if len(means) > 1 else units)
+    return energies, ", and ".join(permuted), untested
+
+
+def indicators(numbers: NDArray) -> csr_array:
+    """Return columns (n, n_numbers) with one where a row has the number."""
+    rows = np.arange(len(numbers))
+    return csr_array((np.ones(len(numbers)), (rows, numbers)))
+
+
+def _are_sorted(labels: csr_array, order: FrameOrder) -> bool:
+    """Return whether each class is one run of a single group, or numbers only rise."""
+    if len(order.sizes) > 1:
+        return False
+    if labels.shape[1] > 1:
+        return bool(np.count_nonzero(np.diff(labels.indices)) < labels.shape[1])
+    steps = np.diff(labels.toarray(), axis=0)
+    return bool((steps >= 0).all() or (steps <= 0).all())
+
+
+def _runs(labels: csr_array, order: FrameOrder) -> NDArray | None:
+    """Number the runs of equal labels in groups (n_frames,); None if they are chance.
+
+    Frames of a session have one label, and what else the session does to them.
+    """
+    values = labels.indices if labels.shape[1] > 1 else labels.toarray()[:, 0]
+    numbers = np.unique(values, return_inverse=True)[1]
+    changes = (np.diff(numbers) != 0) | (np.diff(order.groups) != 0)
+    kinds, counts = np.unique([order.groups, numbers], axis=1, return_counts=True)
+    expected = np.sum(counts * (counts - 1) / order.sizes[kinds[0]])
+    if np.count_nonzero(~changes) - expected <= 2 * np.sqrt(expected):
+        return None
+    return np.cumsum(np.append(False, changes))
+
+
+def _one_event(alpha: NDArray, labels: csr_array, order: FrameOrder) -> bool:
+    """Return whether labels share less than two frequencies with alpha, in effect.
+
+    The part of a frequency is the product of the powers of both.
+    """
+    power = np.zeros((len(alpha), 1))
+    for c in range(labels.shape[1]):
+        power += order.spectrum(labels[:, [c]].toarray()) ** 2
+    power[order.first] = 0.0  # means of groups
+    products = power * order.spectrum(alpha) ** 2
+    shared = np.sum(products / np.maximum(products.sum(axis=0), 1e-300), axis=1)
+    return bool(np.sum(shared) ** 2 < 2 * np.sum(shared**2))
+
+
+def _waves(
+    alpha: NDArray, order: FrameOrder, n_permutations: int, rng: np.random.RandomState
+) -> Iterator[NDArray]:
+    """Yield ordered coefficients whose frequencies have random signs and sizes.
+
+    Random signs alone keep the power of each frequency. But neighbouring frequencies of
+    a regular rhythm have signs that depend on each other; with random sizes, too, they
+    do not appear as independent (docs/questions.md).
+    """
+    spectrum = order.spectrum(alpha)
+    for _ in range(n_permutations):
+        factors = rng.uniform(-np.sqrt(3.0), np.sqrt(3.0), (len(alpha), 1))
+        yield order.spectrum(factors * spectrum, inverse=True)
+
+
+def _weights(labels: csr_array, means: csr_array, order: FrameOrder) -> NDArray:
+    """Return weights (n_groups, 1) with which means of labels have equal variances.
+
+    The shares of the variance are those of `isa_nrsfm.analysis.between_share`.
+    """
+    sizes = order.sizes[:, None]
+    if (sizes == sizes[0]).all():
+        return np.ones(sizes.shape)
+    square, of_means = labels.power(2).sum(axis=0), (sizes.T @ means.power(2))[0]
+    total = square - labels.sum(axis=0) ** 2 / len(order.rows)
+    within = square - of_means
+    share = np.average(between_shares(within, total - within, sizes), weights=total)
+    return np.asarray(1.0 / np.sqrt(share + (1.0 - share) / sizes))
+
+
+def between_shares(within: NDArray, apart: NDArray, sizes: NDArray) -> NDArray:
+    """Return shares of variances between groups, from sums of squares."""
+    n_frames, n_groups = sizes.sum(), len(sizes)
+    # Mean squares of the analysis of variance, and the typical size of a group
+    within, apart = within / (n_frames - n_groups), apart / (n_groups - 1)
+    size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
+    # Variance components
+    between = np.maximum(apart - within, 0.0) / size
+    total = between + within
+    return np.divide(between, total, where=total > 0, out=np.zeros_like(total))
+
+
+def _standard(means: NDArray, weights: NDArray) -> NDArray:
+    """Weight the means of groups (n_groups, k), relative to their mean."""
+    centre = np.sum(weights**2 * means, axis=0) / np.sum(weights**2)
+    weighted = weights * (means - centre)
+    return np.asarray(weighted - weighted.mean(axis=0))
+
+
+def _energies(
+    alpha: NDArray, labels: csr_array, permuted: Iterable[NDArray], without: Any = 0.0
+) -> NDArray:
+    """Return squared covariances (n_permutations + 1, n_components) of mean one.
+
+    The part of the labels along a column `without` (n, 1) of norm one does not count.
+    """
+    energy = np.sum(alpha**2, axis=0)
+    rests = (a - without * np.sum(without * a, axis=0) for a in (alpha, *permuted))
+    energies = np.array([np.sum((labels.T @ a) ** 2, axis=0) for a in rests])
+    energies /= np.where(energy > 0, energy, 1.0)
+    return np.asarray(energies / (energies.mean() or 1.0))
+
+
+def _unit(labels: csr_array) -> csr_array:
+    """Return indicators, or a centred column, with norm one."""
+    if labels.shape[1] == 1:
+        labels = csr_array(labels.toarray() - labels.mean())
+    return csr_array(labels / np.sqrt(labels.power(2).sum(axis=0)))
+
+
+def _studentised(
+    alpha: NDArray, labels: csr_array, permuted: Iterable[NDArray]
+) -> NDArray:
+    """Return statistics (n_permutations + 1, n_components) of mean one.
+
+    Of indicators of classes, of norm one, that of Welch ("On the comparison of several
+    mean values", 1951) without the factor for the degrees of freedom; of a centred
+    column x the square of ``sum_i x_i a_i`` over the sum of the squares of its terms.
+    Each class has one more frame of the pooled variance.
+    """
+    squares, n_classes = labels.power(2), labels.shape[1]
+    sizes = labels.sum(axis=0)[:, None] ** 2
+
+    def statistic(a: NDArray) -> NDArray:
+        means, moments = labels.T @ a, squares.T @ a**2  # sqrt(n) m, mean of squares
+        if n_classes == 1:
+            return _ratio(means**2, moments)[0]
+        within = np.maximum(sizes * moments - means**2, 0.0)
+        pooled = within.sum(axis=0) / max(len(a) - n_classes, 1)
+        weights = _ratio(sizes**2, within + pooled)
+        means = means / np.sqrt(sizes)
+        centre = _ratio(np.sum(weights * means, axis=0), weights.sum(axis=0))
+        return np.asarray(np.sum(weights * (means - centre) ** 2, axis=0))
+
+    found = np.array([statistic(a) for a in (alpha, *permuted)])
+    return np.asarray(found / (found.mean() or 1.0))
+
+
+def _ratio(above: NDArray, below: NDArray) -> NDArray:
+    """Return a ratio, zero where the divisor is."""
+    above, below = np.broadcast_arrays(above, below)
+    return np.divide(above, below, where=below > 0, out=np.zeros(below.shape))
+
+
+def _signed(
+    alpha: NDArray, labels: csr_array, by_group: csr_array, signs: NDArray
+) -> NDArray:
+    """Return statistics (n, n_components) of mean one for signs (n, n_groups).
+
+    ``sum_c (sum_g s_g u_gc)^2 / sum_g u_gc^2`` with the covariances u_gc of a group and
+    a label, of coefficients less their means over groups.
+    """
+    found = []
+    for a in alpha.T:
+        covariances = (by_group @ labels.multiply(a[:, None])).toarray()
+        shares = _ratio((signs @ covariances) ** 2, np.sum(covariances**2, axis=0))
+        found.append(shares.sum(axis=1))
+    energies = np.stack(found, axis=1)
+    return np.asarray(energies / (energies.mean() or 1.0))
+
+
+def _people_repeat(alpha: NDArray, labels: csr_array) -> bool:
+    """Return whether near frames have one label more often than coefficients tell.
+
+    Each class, or quarter of the ranks, has a normal distribution of the coefficients.
+    If frames are independent, so are the errors of the predicted classes.
+    """
+    classes = labels.indices
+    if labels.shape[1] == 1:
+        classes = rankdata(labels.toarray()[:, 0]) * 4 // (len(alpha) + 1)
+    classes = np.unique(classes, return_inverse=True)[1]
+    variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
+    kept = variance > OF_DIFFERENCES * max(variance[-1], OF_DIFFERENCES)
+    z, K = alpha @ axes[:, kept] / np.sqrt(variance[kept]), int(kept.sum())
+    if not K or len(z) <= 2 * NEAREST:
+        return False
+    scores = []
+    for number, size in enumerate(np.bincount(classes)):
+        members = z[classes == number]
+        residuals = members - members.mean(axis=0)
+        covariance = (residuals.T @ residuals + np.eye(K)) / (size + 1)
+        d = z - members.mean(axis=0)
+        off = np.vecdot(d, d @ np.linalg.inv(covariance))
+        scores.append(np.log(size) - (off + np.linalg.slogdet(covariance)[1]) / 2)
+    errors = (classes[:, None] == np.arange(len(scores))) - softmax(scores, axis=0).T
+    near = cKDTree(z).query(z, NEAREST + 1)[1][:, 1:]
+    pairs = np.column_stack([np.repeat(np.arange(len(z)), NEAREST), near.ravel()])
+    first, second = np.unique(np.sort(pairs, axis=1), axis=0).T
+    products = np.vecdot(errors[first], errors[second])
+    limit = norm.isf(REPEATED_LEVEL) * np.linalg.norm(products)
+    return bool(products.sum() > limit)
 
 
 class Association(NamedTuple):
@@ -199,7 +591,7 @@ def association(
     covariances = columns.T @ standard
     statistic = np.sum(covariances**2, axis=0) if classes else covariances[0]
     rng = check_random_state(random_state)
-    energies, permuted, untested = _permutations.permuted_energies(
+    energies, permuted, untested = permuted_energies(
         alpha, standard, columns, order, n_permutations, rng
     )
     p_value = _step_down_p_values(energies)
@@ -257,8 +649,12 @@ def predictability(
     check_scalar(n_folds, "n_folds", Integral, min_val=2)
     features, labels, numbers, order = _known_frames(features, y, groups, time)
     kind = _frame_columns.kind_of(labels, kind)
-    if groups is None:
-        numbers = _dependent_frames(features, labels, kind, order, n_folds)
+    if groups is None:  # blocks of frames that depend on each other
+        columns, numbers = _label_columns(labels, kind)[order.rows], None
+        residuals = unexplained(_unit_columns(features)[order.rows], columns, order)
+        if (length := independent_length(residuals)) > 1:
+            numbers = np.empty(len(labels), dtype=int)
+            numbers[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
     most, model = len(labels), RidgeCV(np.logspace(-3, 3, 13))
     splitter = KFold if numbers is None else GroupKFold
     if kind == "classes":
@@ -274,14 +670,12 @@ def predictability(
         )
     folds = splitter(min(n_folds, most), shuffle=True, random_state=random_state)
     model = make_pipeline(StandardScaler(), model)
-    return np.asarray(
-        cross_val_score(model, features, labels, groups=numbers, cv=folds)
-    )
+    return cross_val_score(model, features, labels, groups=numbers, cv=folds)
 
 
 def _known_frames(
     features: Any, y: Any, groups: Any, time: Any
-) -> tuple[NDArray, NDArray, NDArray | None, _permutations.FrameOrder]:
+) -> tuple[NDArray, NDArray, NDArray | None, FrameOrder]:
     """Return features, labels, groups and order of different frames without NaN."""
     features = check_array(
         features, dtype=np.float64, ensure_all_finite="allow-nan", input_name="alpha"
@@ -298,7 +692,7 @@ def _known_frames(
     classes = np.unique(labels, return_inverse=True)[1][finite]
     rows = np.column_stack([_rounded(features[finite]), classes])
     finite = finite[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
-    order = _permutations.FrameOrder(numbers[finite], seconds[finite])
+    order = FrameOrder(numbers[finite], seconds[finite])
     return features[finite], labels[finite], numbers[finite], order
 
 
@@ -346,7 +740,7 @@ def _label_columns(labels: NDArray, kind: str) -> csr_array:
     """
     if kind == "number":
         return csr_array(_unit_columns(rankdata(labels)[:, None]))
-    columns = _permutations.indicators(np.unique(labels, return_inverse=True)[1])
+    columns = indicators(np.unique(labels, return_inverse=True)[1])
     return csr_array(columns / np.sqrt(columns.sum(axis=0)))
 
 
@@ -355,23 +749,3 @@ def _unit_columns(values: NDArray) -> NDArray:
     values = values - values.mean(axis=0)
     size = np.linalg.norm(values, axis=0)
     return np.asarray(values / np.where(size > 0, size, 1.0))
-
-
-def _dependent_frames(
-    features: NDArray,
-    labels: NDArray,
-    kind: str,
-    order: _permutations.FrameOrder,
-    n_folds: int,
-) -> NDArray | None:
-    """Return the block of each frame (n_frames,), None for independent frames."""
-    columns = _label_columns(labels, kind)[order.rows]
-    residuals = _permutations.unexplained(
-        _unit_columns(features)[order.rows], columns, order
-    )
-    length = _permutations.independent_length(residuals)
-    if length == 1:
-        return None
-    blocks = np.empty(len(labels), dtype=int)
-    blocks[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
-    return blocks

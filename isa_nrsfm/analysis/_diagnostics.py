@@ -1,4 +1,7 @@
-"""Diagnostics of a fit: figures, messages that interpret them, and a summary."""
+"""Diagnostics of a fit: figures, their messages, a summary, and the stability.
+
+Stability is the agreement of the coefficients of fits of different people.
+"""
 
 import html
 import math
@@ -8,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from sklearn.base import TransformerMixin
 from sklearn.utils import estimator_html_repr
 
@@ -16,6 +20,9 @@ from isa_nrsfm._compat.cached import cached_property
 from isa_nrsfm._compat.scikit_learn import CoefficientsMixin
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._fitted_model import removed_part
+from isa_nrsfm._frames.camera_models import pose_effect, pose_part
+from isa_nrsfm._frames.models import FrameMap
+from isa_nrsfm._gauge import independent_gauge
 from isa_nrsfm._joint.uncertainty import HalfTables
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
@@ -23,7 +30,6 @@ from isa_nrsfm._parameters.naming import named
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.analysis import _advice
 from isa_nrsfm.analysis._advice import camera_meaning
-from isa_nrsfm.analysis._stability import stability, stability_words
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -213,9 +219,8 @@ def diagnose(
     mean_shape = estimator.mean_shape_.astype(np.float64)
     basis = estimator.basis_.astype(np.float64)
     images = motion.reshape(-1, 3)
-    deformation = np.einsum(
-        "ik,il,kjc,ljc->", alpha, alpha, basis, basis, optimize=True
-    ) / len(alpha)
+    flat = basis.reshape(len(basis), -1)
+    deformation = np.vdot(alpha.T @ alpha, flat @ flat.T) / len(alpha)
     fourth = np.sum(alpha**4, axis=0)
     square = np.sum(alpha**2, axis=0) ** 2
     # The traces of the V_k, one direction each, are not determined. Leave them out.
@@ -249,7 +254,7 @@ def diagnose(
         outlier_energy=found.outlier_energy,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
-        pose=_of_pose(found, mean_shape, basis, layout, estimator),
+        pose=_of_pose(found, layout, estimator),
     )
     return found._replace(
         messages=_advice.advice(facts),
@@ -314,20 +319,14 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
     return text if phrases else ""
 
 
-def _of_pose(
-    found: Diagnostics,
-    mean_shape: NDArray,
-    basis: NDArray,
-    layout: Skeleton | None,
-    model: Any,
-) -> str:
+def _of_pose(found: Diagnostics, layout: Skeleton | None, model: Any) -> str:
     """Describe coefficients that the pose predicts; empty if there are none."""
     large = np.flatnonzero(found.pose_share > MOST_POSE)
     if not len(large):
         return ""
     phrases = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
     text = f"the pose predicts {first_items(phrases, 5)}"
-    shape = basis[np.nanargmax(found.pose_share)]
+    shape, mean_shape = model.basis_[np.nanargmax(found.pose_share)], model.mean_shape_
     deformation = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
     if 2 * np.sum(deformation**2) < np.sum(shape**2):
         return (
@@ -392,3 +391,70 @@ def summary_html(model: Any) -> str:
         lines.append(repr(model.diagnostics()))
     text = html.escape("\n".join(lines))
     return f'<pre class="isa-nrsfm-summary">{text}</pre>'
+
+
+# Least correlation of what counts as the same coefficient, as for the congruence of
+# factors: Lorenzo-Seva, ten Berge, "Tucker's congruence coefficient as a meaningful
+# index of factor similarity", 2006.
+SAME = 0.85
+# Largest number of coefficients that are named together.
+MOST_TOGETHER = 3
+
+
+@one_blas_thread
+def stability(
+    tables: HalfTables, gauge: FrameMap, n_components: int
+) -> tuple[NDArray, NDArray]:
+    """Return root mean squares (K,) of correlations between halves, and stable sets.
+
+    The set of a coefficient, a row of a mask (K, K), has the fewest coefficients, it
+    first, of which a combination is the same as it in another half.
+    """
+
+    def scores(gauge: FrameMap) -> NDArray:
+        """Return coefficients (I, K) with mean zero and norm one; zero if constant."""
+        cameras, alpha, _ = gauge.apply(tables.motion, tables.alpha, None)
+        alpha = alpha[:, :n_components]
+        if tables.kind[-1]:
+            alpha = alpha - pose_part(cameras, pose_effect(cameras, alpha))
+        alpha = alpha - alpha.mean(axis=0)
+        size = np.linalg.norm(alpha, axis=0)
+        return np.asarray(alpha / np.where(size > 0, size, 1.0))
+
+    whole, found = scores(gauge), list[NDArray]()
+    for shapes, half in zip(tables.shapes, tables.halves, strict=True):
+        motion, alpha = tables.motion[half], tables.alpha[half]
+        other = scores(independent_gauge(shapes, motion, alpha, *tables.kind)[2])
+        pairs = linear_sum_assignment(-np.abs(whole.T @ other))
+        found.append(other[:, pairs[1]])
+    every, n, K = np.hstack(found), len(found), n_components
+    cross = (every.T @ every).reshape(n, K, n, K).swapaxes(1, 2)
+    within, others = cross[np.arange(n), np.arange(n)], ~np.eye(n, dtype=bool)
+
+    def same(k: int, chosen: list[int]) -> float:
+        """Return the mean multiple correlation of coefficient k with those chosen."""
+        inverse = np.linalg.pinv(within[:, chosen][:, :, chosen], hermitian=True)
+        r = cross[:, :, k, chosen]
+        return float(np.einsum("hgs,gst,hgt->hg", r, inverse, r)[others].mean() ** 0.5)
+
+    sets = np.zeros((K, K), dtype=bool)
+    for k in range(K):
+        chosen = [k]
+        while same(k, chosen) < SAME and len(chosen) < min(MOST_TOGETHER, K):
+            remaining = [i for i in range(K) if i not in chosen]
+            chosen.append(max(remaining, key=lambda i: same(k, [*chosen, i])))
+        sets[k, chosen] = same(k, chosen) >= SAME
+    return np.array([same(k, [k]) for k in range(K)]), sets
+
+
+def stability_words(model: Any) -> tuple[str, ...]:
+    """Return a word for each coefficient of a model; empty if it is not known."""
+    known = getattr(model, "stability_", np.full(len(model.basis_), np.nan))
+    if np.isnan(known).any():
+        return ("",) * len(known)
+    words, sets = [], np.asarray(model.stable_sets_)
+    for k, chosen in enumerate(sets):
+        others = first_items(f"alpha_{i + 1}" for i in np.flatnonzero(chosen) if i != k)
+        word = f"only together with {others}" if others else "stable"
+        words.append(word if chosen.any() else "unstable")
+    return tuple(words)

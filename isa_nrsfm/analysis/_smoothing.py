@@ -100,10 +100,8 @@ class Dynamics(NamedTuple):
         K, n = len(self.shares), len(self.rates) + len(self.walks)
         steady = np.ones(K), np.zeros(K), self.between
         blocks = ([[np.diag(b) for b in row] for row in each] for each in self.blocks())
-        F, Q, first = (
-            block_diag(np.block(each), np.diag(r))
-            for each, r in zip(blocks, steady, strict=True)
-        )
+        pairs = zip(blocks, steady, strict=True)
+        F, Q, first = (block_diag(np.block(each), np.diag(r)) for each, r in pairs)
         return F, Q, first, np.hstack([np.eye(n), np.zeros((n, n)), np.eye(n, K)])
 
 
@@ -159,12 +157,11 @@ def smooth(
     )
     frames, rates = _smoothed_frames(alone, camera, sequences, estimate)
     scales = np.where(rates > LEAST_RATE * (1 + 1e-6), unit / rates, np.inf)
-    motion, alpha, deviation = gauge.apply(
-        frames.motion, frames.alpha, frames.covariance
-    )
+    fit = frames.motion, frames.alpha, frames.covariance
+    motion, alpha, deviation = gauge.apply(*fit)
     parts = motion, frames.translation, alpha, deviation
-    fit = Decomposition(*(part.astype(dtype) for part in parts))
-    return SmoothedCoefficients(fit.alpha, fit.alpha_std, scales, fit)
+    found = Decomposition(*(part.astype(dtype) for part in parts))
+    return SmoothedCoefficients(found.alpha, found.alpha_std, scales, found)
 
 
 def _smoothed_frames(

@@ -25,7 +25,7 @@ from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._tables.tracks import Layout
-from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
+from isa_nrsfm.baselines._low_rank import ShapeSequenceNRSfM
 from isa_nrsfm.calibration._metric import (
     LARGEST_STRETCH,
     conformal_equations,

@@ -13,8 +13,8 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import DEFAULTS
-from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import as_numbers, read_times, video_times
 from isa_nrsfm.export import point_distances
@@ -72,10 +72,8 @@ def column_results(
     if frames.labels:
         features = {"alpha": alpha} | _aligned_pca(estimator, X)
         std = getattr(estimator, "alpha_std_", None)
-        report["labels"] = [
-            _label_report(label, features, frames, args.random_state, std)
-            for label in frames.labels
-        ]
+        options = features, frames, args.random_state, std
+        report["labels"] = [_label_report(each, *options) for each in frames.labels]
     if frames.groups is not None:
         report["groups"] = {"column": args.group}
         try:
@@ -86,9 +84,8 @@ def column_results(
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
     if frames.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
-        smooth = estimator.smooth(
-            X, time=frames.times, groups=frames.groups, **frames.weighting
-        )
+        of_rows = {"groups": frames.groups} | frames.weighting
+        smooth = estimator.smooth(X, time=frames.times, **of_rows)
         found, images = smooth.alpha, frames.images[X.index]
         report["time"] = {
             "column": args.time or images.name,
@@ -105,9 +102,8 @@ def column_results(
         a, b = args.unit or EYES
         try:
             pairs = [*args.distance, (a, b)]  # the unit of positions as well
-            found = point_distances(
-                estimator, pairs, unit=args.unit, length=args.length
-            )
+            length = {"unit": args.unit, "length": args.length}
+            found = point_distances(estimator, pairs, **length)
             columns |= zip(names, found.T[:-1], strict=True)
             if has_positions:
                 size = np.linalg.norm(np.subtract(*estimator.mean_shape_[[a, b]]))
@@ -219,7 +215,7 @@ def _label_report(
     features: dict[str, NDArray],
     frames: Frames,
     seed: int,
-    std: NDArray | None,
+    std: Any,
 ) -> dict[str, Any]:
     """Return the association of coefficients with a label."""
     alpha = features["alpha"]

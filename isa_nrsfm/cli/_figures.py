@@ -14,10 +14,9 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._columns import class_means, has_classes
-from isa_nrsfm.cli._outputs import Fit
-from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._reading import Frames
-from isa_nrsfm.cli._report import MOST_CLASSES
+from isa_nrsfm.cli._report import MOST_CLASSES, Fit
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.plotting import _axes
 
@@ -92,12 +91,11 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
 
 def _by_label(label: "pd.Series", fit: Fit) -> plotting.CoefficientsDisplay:
     """Draw the coefficients by a label."""
-    alpha = fit.estimator.alpha_[:, :MOST_DRAWN]
-    return plotting.CoefficientsDisplay(
-        alpha=alpha[label.notna()],
-        y=label.dropna(),
-        component_names=names_of_components(None, alpha.shape[1]),
-    ).plot(kind="classes" if has_classes(label) else "number")
+    alpha = fit.estimator.alpha_[label.notna(), :MOST_DRAWN]
+    names = names_of_components(None, alpha.shape[1])
+    options = {"y": label.dropna(), "component_names": names}
+    display = plotting.CoefficientsDisplay(alpha=alpha, **options)
+    return display.plot(kind="classes" if has_classes(label) else "number")
 
 
 def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:

@@ -1,7 +1,8 @@
-"""The command fit."""
+"""The commands fit, and demo: fit artificial faces, and compare with the truth."""
 
 import contextlib
 import re
+import shlex
 import sys
 from argparse import Namespace
 from datetime import UTC, datetime
@@ -29,33 +30,36 @@ from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
-from isa_nrsfm.cli import _outputs, _reading, _report
+from isa_nrsfm.cli import _reading, _report
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
 from isa_nrsfm.cli._figures import figures_of, write_figures
-from isa_nrsfm.cli._options import AUTO, FACE_PRIOR, FACE_PRIORS, NONE, flag_of
-from isa_nrsfm.cli._outputs import Fit
-from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.datasets import load_face_prior
+from isa_nrsfm.cli._main import show_stage
+from isa_nrsfm.cli._options import (
+    AUTO,
+    FACE_PRIOR,
+    FACE_PRIORS,
+    NONE,
+    PROGRAM,
+    build_parser,
+    flag_of,
+)
+from isa_nrsfm.cli._report import Fit
+from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
-from isa_nrsfm.metrics._reprojection import frame_energies
+from isa_nrsfm.metrics import affine_shape_error
+from isa_nrsfm.skeletons._column_names import WORDS
 
 # Columns that are probably labels or groups come first: action units, emotions, people.
-LABEL = re.compile(
-    r"^\W*AU\W?\d|emotion|expression|label|class|gesture|action|behaviou?r|condition|"
-    r"subject|person|participant|sex|gender|^\W*age\b|group",
-    re.IGNORECASE,
-)
+LABEL = re.compile(WORDS["labels"], re.IGNORECASE)
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
 # Options that are parameters of the same name; none stands for None.
-_PARAMETERS = (
-    *("block_recovery", "focal_length", "independence", "random_state", "n_jobs"),
-)
+_PARAMETERS = "block_recovery focal_length independence random_state n_jobs".split()
 
 
-def run(args: Namespace, warned: list[str]) -> str:
+def run_fit(args: Namespace, warned: list[str]) -> str:
     """Fit a table, write everything, and return the text of the report."""
     report, _ = fit_table(args, warned)
     return _report.text_of(_report.fit_title(report), report["summary"])
@@ -88,8 +92,10 @@ def fit_table(
     X = frames.X
     X.attrs[TOLD] = True
     if X.empty:
-        out = ", ".join(f"{len(i)} left out ({why})" for why, i, _ in frames.left_out)
-        raise ValueError(f"{args.table} has no row that can be fitted: {out}")
+        out = [f"{e['n_rows']} left out ({e['reason']})" for e in frames.left_out]
+        raise ValueError(
+            f"{args.table} has no row that can be fitted: {', '.join(out)}"
+        )
     frames = asked_columns(args, frames)
     needs_centre = args.camera == "perspective" or args.focal_length is not None
     if needs_centre and frames.principal_point is None:
@@ -102,20 +108,19 @@ def fit_table(
         )
     figures = {} if args.no_figures else figures_of(frames)
     drawn = _reading.drawing(args, frames.columns.points, frames.skeleton)
-    results = dict.fromkeys(_outputs.RESULTS, "")
+    results = dict.fromkeys(_report.RESULTS, "")
     inputs = [prior] * (prior not in (None, NONE, *FACE_PRIORS))
-    if table is None:
-        inputs.append(args.table)
-    else:
+    inputs += [args.table] * (table is None)
+    if table is not None:
         results[Path(args.table).name] = ""
     with whole_files.folder_for_writing(folder):
-        targets = [folder / name for name in (*results, *figures, _outputs.REPORT)]
-        earlier = _outputs.entry_of_report(folder, "sha256")
-        own_files = {*earlier, _outputs.REPORT} if earlier else ()
-        _outputs.check_outputs(args, inputs, targets, own_files)
+        targets = [folder / name for name in (*results, *figures, _report.REPORT)]
+        earlier = _report.entry_of_report(folder, "sha256")
+        own_files = {*earlier, _report.REPORT} if earlier else ()
+        _report.check_outputs(args, inputs, targets, own_files)
         for target in targets:
             whole_files.check_replaceable(target)
-        old = _outputs.entry_of_report(folder, "files")
+        old = _report.entry_of_report(folder, "files")
         removed = {*figures, *(name for name in old if name.endswith(".png"))}
         used = {args.group, args.time, frames.images.name}
         used |= {label.name for label in frames.labels}
@@ -129,7 +134,7 @@ def fit_table(
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
-            _outputs.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
+            _report.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
             labels = first_classes(frames.labels)
             viewer_data = {"labels": labels, "times": frames.times}
             if args.std and estimator.camera_ != "affine":
@@ -138,10 +143,8 @@ def fit_table(
                 )[1]
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
             explained = estimator.reproject(X, **frames.weighting)
-            energy, error, _ = frame_energies(X, explained, estimator.layout)
-            snr = error / energy
-            fit = Fit(estimator, frames, smooth, drawn, explained, snr)
-            _outputs.write_results(new, fit, unit, **viewer_data)
+            fit = Fit(estimator, frames, smooth, drawn, explained)
+            _report.write_results(new, fit, unit, **viewer_data)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
                 answers["prior"] = {"name": prior or FACE_PRIOR, "std": std}
             report = {
@@ -162,7 +165,7 @@ def fit_table(
             return report, estimator
         # A figure that fails, or takes long, costs no results: they are in place.
         with whole_files.files_together(folder) as new:
-            if _outputs.digests_of(folder, report["sha256"]) != report["sha256"]:
+            if _report.digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
@@ -192,7 +195,7 @@ def _moving_points(
 
 def _check_options(args: Namespace) -> None:
     """Raise before a long fit if options exclude each other or a library is absent."""
-    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in _outputs.RESULTS)}
+    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in _report.RESULTS)}
     if Path(args.output).suffix.lower() in suffixes and not Path(args.output).is_dir():
         raise ValueError(
             f"--output {args.output}: expected a folder, because fit writes several "
@@ -297,3 +300,30 @@ def choice_report(search: AffineNRSfMCV) -> dict[str, Any]:
         "held_out_error_of_parts": of_parts,
         "chosen": search.n_components_,
     }
+
+
+def run_demo(args: Namespace, warned: list[str]) -> str:
+    """Fit artificial faces, and compare the result with the truth."""
+    faces = make_face_tracks(400, n_components=3, random_state=0)
+    table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)
+    table.insert(0, "frame", [f"face{i:03d}" for i in range(len(table))])
+    folder = Path(args.output)
+    options = [
+        *("fit", str(folder / "tracks.csv"), "--output", str(folder)),
+        *["--force"] * args.force,
+        *["--no-figures"] * args.no_figures,
+        *_reading.drawing_options(args),
+    ]
+    started = Namespace(arguments=options, since=args.since)
+    parsed = build_parser().parse_args(options, started)
+    report, model = fit_table(parsed, warned, table=table)
+    shapes = model.shapes(model.alpha_)
+    rigid = np.broadcast_to(model.mean_shape_, shapes.shape)
+    error, alone = (affine_shape_error(faces.shapes, each) for each in (shapes, rigid))
+    truth = (
+        f"the 3D shapes of the frames are off by {100 * error:.1f} % (the mean shape "
+        f"alone: {100 * alone:.1f} %)"
+    )
+    again = shlex.join([PROGRAM, *options])
+    rows = [*report["summary"], ["truth", "", truth], ["again", "", again]]
+    return _report.text_of(_report.fit_title(report), rows)

@@ -1,10 +1,12 @@
-"""Run a command, and turn errors and warnings into messages and exit codes."""
+"""Run a command: its progress, messages of errors and warnings, and exit codes."""
 
 import contextlib
 import importlib
+import io
 import os
 import shlex
 import sys
+import threading
 import time
 import warnings
 from argparse import Namespace
@@ -15,7 +17,6 @@ from typing import Any, TextIO
 from isa_nrsfm._compat.texts import printable
 from isa_nrsfm._parameters.naming import WRITTEN, in_python
 from isa_nrsfm.cli._options import NONE, PROGRAM, build_parser, flag_of
-from isa_nrsfm.cli._progress import show_stage, shown_progress
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -27,9 +28,10 @@ def run(argv: Sequence[str] | None = None) -> int:
     try:
         with _warnings_as_lines() as warned, shown_progress(args.since):
             show_stage(args.command)
-            # Each command is a module, which is only loaded now: help does not wait.
-            command = importlib.import_module(f"isa_nrsfm.cli._{args.command}")
-            report = command.run(args, warned)
+            # The module of a command is only loaded now: help does not wait.
+            name = "_fit" if args.command in ("fit", "demo") else "_apply"
+            module = importlib.import_module(f"isa_nrsfm.cli.{name}")
+            report = getattr(module, f"run_{args.command}")(args, warned)
         encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
         report = printable(report)
         print(report.encode(encoding, "backslashreplace").decode(encoding), flush=True)
@@ -95,3 +97,65 @@ def _silence(stream: TextIO) -> None:
     """Write to nowhere from now on: Python flushes a stream once more at exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+# Seconds between two lines: a twentieth of the time so far, within these limits. An
+# hour has about 90 lines.
+SHORTEST, LONGEST = 5.0, 60.0
+
+
+def show_stage(text: str) -> None:
+    """Name the stage that begins, for `shown_progress`."""
+    print(text, end="\r", flush=True)
+
+
+@contextlib.contextmanager
+def shown_progress(since: float, shortest: float = SHORTEST) -> Iterator[None]:
+    """Repeat the last printed line every few seconds on the standard error.
+
+    Nothing of the block reaches the standard output. On a terminal whole lines are
+    shown at once; those that end with a carriage return only in turn. Lines begin with
+    the program's name and its time since `time.perf_counter` was `since`.
+    """
+    stream = sys.stderr
+    latest = _LatestLine(stream if stream.isatty() else None)
+    ended = threading.Event()
+
+    def repeat() -> None:
+        while not ended.wait(min(max(_seconds(since) / 20, shortest), LONGEST)):
+            with contextlib.suppress(OSError, ValueError):
+                line = f"{PROGRAM}: {_seconds(since):.0f} s: {latest.line}"
+                print(line, file=stream, flush=True)
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        with contextlib.redirect_stdout(latest):
+            yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _seconds(since: float) -> float:
+    """Return the seconds since a time of `time.perf_counter`."""
+    return time.perf_counter() - since
+
+
+class _LatestLine(io.TextIOBase):
+    """A stream that keeps its latest line, and passes whole lines on to a terminal."""
+
+    def __init__(self, terminal: TextIO | None) -> None:
+        self.terminal = terminal
+        self.line = self.begun = ""
+
+    def write(self, text: str) -> int:
+        """Take a text that was printed."""
+        for part in text.splitlines(keepends=True):
+            self.begun += part
+            if part.endswith(("\n", "\r")):
+                if self.terminal is not None and part.endswith("\n"):
+                    self.terminal.write(self.begun)
+                    self.terminal.flush()
+                self.line, self.begun = self.begun.strip() or self.line, ""
+        return len(text)

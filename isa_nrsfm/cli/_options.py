@@ -152,17 +152,13 @@ POSITIONAL = ("table", "model")
 SHORT = {"output": ["-o"], "n_components": ["-k"]}
 # The commands with their options, and the help of each option by its name and value.
 _DATA = tomllib.loads(Path(__file__).with_name("options.toml").read_text("utf-8"))
-_LISTS = {
-    "formats": [name for name in FORMATS if name != TABLE],
-    "openpose_parts": choices.OPENPOSE_PARTS,
-    "whole_parts": choices.WHOLE_PARTS,
-    "skeletons": choices.SKELETON_NAMES,
-    "face_priors": choices.FACE_PRIORS,
-}
-_WORDS = {name: ", ".join(values) for name, values in _LISTS.items()}
+_LISTS = {name: each for name, each in vars(choices).items() if name.isupper()}
+_LISTS["FORMATS"] = [name for name in FORMATS if name != TABLE]
+_WORDS = {name: ", ".join(map(str, values)) for name, values in _LISTS.items()}
 HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
 # What export writes: suffixes of the files, and options.
 EXPORTS = _DATA["exports"]
+TIMES = _DATA["times"]
 # The values of options that have few.
 CHOICES: dict[str, Sequence[str]] = _DATA["choices"] | {
     "format": ("auto", *FORMATS),
@@ -204,10 +200,9 @@ def build_parser() -> Parser:
                 is_one = isinstance(option, str)
                 place = group if is_one else group.add_mutually_exclusive_group()
                 for name in [option] if is_one else option:
-                    flag = name if name in POSITIONAL else flag_of(name)
-                    place.add_argument(
-                        *SHORT.get(name, []), flag, **_settings(command, name)
-                    )
+                    flags = [name if name in POSITIONAL else flag_of(name)]
+                    flags = SHORT.get(name, []) + flags
+                    place.add_argument(*flags, **_settings(command, name))
     return top
 
 

@@ -33,10 +33,10 @@ from isa_nrsfm.io._landmark_columns import (
     CONFIDENCES,
     LandmarkColumns,
     find_landmark_columns,
+    frames_of,
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import unsure_points
-from isa_nrsfm.io._other_shapes import frames_of
 from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
 from isa_nrsfm.skeletons._column_names import (
@@ -48,6 +48,8 @@ from isa_nrsfm.skeletons._column_names import (
 # Options of some formats.
 _OF_FORMATS = ("image_size", "columns", "individuals", "row_per_point", "part")
 INNER, WITHOUT = "inner", "without:"
+# Rows and points that are listed in reports, at most.
+MOST_LISTED = 10
 # The columns of the size of an image, in pixels, by format.
 _SIZES = {"coco": ("width", "height"), "pyfeat": ("FrameWidth", "FrameHeight")}
 # Words for an empty cell in the column of a label or a group. "None" is a class, such
@@ -60,8 +62,8 @@ class Frames(NamedTuple):
 
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
     are not skipped, by the number of the row in the table. ``X`` has the landmarks of
-    ``usable`` rows, which can be fitted. ``left_out`` has reason, rows, and whether
-    they were skipped on request, ``not_used`` the sizes of unused sets of coordinates.
+    ``usable`` rows, which can be fitted. ``left_out`` has the entries of the report on
+    other rows, ``not_used`` the sizes of unused sets of coordinates.
     ``images`` are the numbers of the images that all rows show, under the name of their
     column, if any.
     ``weighting`` has the weights of the points of X as an argument of `fit`, if asked
@@ -76,7 +78,7 @@ class Frames(NamedTuple):
     usable: NDArray
     columns: LandmarkColumns
     not_used: dict[str, int]
-    left_out: list[tuple[str, NDArray, bool]]
+    left_out: list[dict[str, Any]]
     skeleton: Skeleton | None
     images: "pd.Series"
     weighting: dict[str, Any]
@@ -101,8 +103,7 @@ def read_frames(
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE or (table is None and Path(args.table).is_dir()):
-        given = {name: getattr(args, name) for name in _OF_FORMATS}
-        given["missing"] = args.missing_value
+        given = vars(args) | {"missing": args.missing_value}
         known = FORMATS[args.format].options
         options = {name: given[name] for name in known if given.get(name)}
         found = FORMATS[args.format].read(args.table, **options)
@@ -168,7 +169,7 @@ def read_frames(
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
     _, report = centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
-    left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
+    left_out += [_left_out(why, rows[which]) for why, which in reasons.items()]
     usable = slice(None) if report.usable.all() else report.usable
     warn_of_places(tracks[usable], confidence[usable], args.format)
     if args.min_confidence is None and args.weights is None:
@@ -187,7 +188,7 @@ def read_frames(
         usable=report.usable,
         columns=columns,
         not_used=not_used,
-        left_out=[out for out in left_out if len(out[1])],
+        left_out=[out for out in left_out if out["n_rows"]],
         skeleton=layout,
         images=image_numbers(table, vars(args).get("fps")),
         weighting={name: each[report.usable] for name, each in weighting.items()},
@@ -202,12 +203,10 @@ def _warn_of_unsure(confidence: NDArray, seen: NDArray) -> None:
     """
     unsure = seen & (confidence < UNSURE)
     if unsure.any() and UNSURE <= np.nanmax(confidence) <= 1:
-        remaining = (seen & ~unsure).sum(axis=1)
-        minimum = max(seen.sum(), 1) / 2, (seen.sum(axis=1) >= FEWEST_POINTS).sum() / 2
-        enough = (
-            remaining.sum() >= minimum[0]
-            and (remaining >= FEWEST_POINTS).sum() >= minimum[1]
-        )
+        before, after = seen.sum(axis=1), (seen & ~unsure).sum(axis=1)
+        enough = 2 * after.sum() >= before.sum()
+        left, whole = (np.sum(each >= FEWEST_POINTS) for each in (after, before))
+        enough &= 2 * left >= whole
         way = f"leave them out with --min-confidence {UNSURE:g}"
         warn_caller(
             f"{100 * unsure.sum() / seen.sum():.3g} % of the points have a confidence "
@@ -321,7 +320,7 @@ def _with_confidences(
 
 def _rows_to_keep(
     args: Namespace, table: "pd.DataFrame"
-) -> tuple[NDArray, list[tuple[str, NDArray, bool]]]:
+) -> tuple[NDArray, list[dict[str, Any]]]:
     """Return which rows no rule skips, and the rows that each rule skips."""
     kept = np.ones(len(table), dtype=bool)
     skipped = []
@@ -330,9 +329,15 @@ def _rows_to_keep(
         texts = cells.astype(object).where(cells.notna(), "").astype(str)
         matches = kept & texts.map(expression.search).notna().to_numpy()
         reason = f"{column} matches {expression.pattern!r}"
-        skipped.append((reason, np.flatnonzero(matches), True))
+        skipped.append(_left_out(reason, np.flatnonzero(matches), True))
         kept &= ~matches
     return kept, skipped
+
+
+def _left_out(reason: str, rows: NDArray, skipped: bool = False) -> dict[str, Any]:
+    """Return the entry of the report on rows that are left out."""
+    entry = {"reason": reason, "skipped_on_request": skipped, "n_rows": len(rows)}
+    return entry | {"first_rows": rows[:MOST_LISTED]}
 
 
 def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:

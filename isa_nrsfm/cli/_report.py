@@ -1,22 +1,27 @@
-"""The report of a run: as data, and how these become text, JSON and a page.
+"""The results and the report of a run: as data, text, JSON and a page.
 
-A section of the page has paragraphs (texts) and tables (`Cells`).
+The report has the SHA-256 digests of the model and the other files of its run. A
+section of the page has paragraphs (texts) and tables (`Cells`).
 """
 
 import base64
+import hashlib
 import json
 import math
 import shlex
 import textwrap
+import warnings
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import as_utf8, escape, first_items, percent
@@ -26,15 +31,172 @@ from isa_nrsfm.analysis._advice import FIT, camera_meaning, verdict
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.analysis._frame_columns import STATISTICS
 from isa_nrsfm.cli._options import PROGRAM
-from isa_nrsfm.cli._outputs import PAGE, REPORT, Fit, digests_of
-from isa_nrsfm.cli._reading import Frames
+from isa_nrsfm.cli._reading import MOST_LISTED, Frames, drawing_files
 from isa_nrsfm.export._names import names_of_components
-from isa_nrsfm.io import FORMATS
+from isa_nrsfm.io import FORMATS, load_model, save_model, write_table
 from isa_nrsfm.io._formats import TABLE
+from isa_nrsfm.metrics._measures import frame_energies
 from isa_nrsfm.skeletons._column_names import names_of_points
 
-# Rows and points that are listed, and classes whose means are shown, at most.
-MOST_LISTED, MOST_CLASSES = 10, 12
+PAGE = "report.html"
+REPORT = "report.json"
+# The files of every fit; docs/command_line.md has their contents.
+_TABLES = ("alpha.csv", "cameras.csv", "shapes.csv", "shapes.npz")
+RESULTS = (PAGE, "model.npz", *_TABLES, "viewer.html")
+
+
+class Fit(NamedTuple):
+    """A fit to write and draw: model, frames, smoothing, lines.
+
+    ``explained`` is the table of the model.
+    """
+
+    estimator: AffineNRSfM
+    frames: Frames
+    smooth: Any
+    drawn: dict[str, Any]
+    explained: NDArray
+
+
+def check_outputs(
+    args: Namespace, inputs: Iterable[str], targets: Iterable[Path], own: Any = ()
+) -> None:
+    """Raise if files of inputs would be replaced, or others but for own ones by name.
+
+    With --force only inputs are kept.
+    """
+    existing = [target for target in targets if target.exists()]
+    for source in (*inputs, *drawing_files(args)):
+        if any(target.samefile(source) for target in existing):
+            raise ValueError(
+                f"{source} would be overwritten by the results: choose another --output"
+            )
+    others = [str(path) for path in existing if path.is_file() and path.name not in own]
+    if others and not args.force:
+        raise ValueError(
+            f"existing files would be replaced: {', '.join(others)}. Choose another "
+            "--output, or replace them with --force"
+        )
+
+
+def write_alpha(
+    path: Path, frames: Frames, alpha: NDArray, std: NDArray | None, further: Any = None
+) -> None:
+    """Write coefficients after the row number and the other columns of the table.
+
+    Frames that could not be fitted have empty coefficients. Results with the name of
+    another column get an underscore.
+    """
+    names = names_of_components(None, alpha.shape[1])
+    results = pd.DataFrame(alpha, index=frames.X.index, columns=names)
+    if std is not None:
+        results[[f"{name}_std" for name in names]] = std
+    if further is not None:
+        results = results.join(further)
+    results = results.reindex(frames.points.index)
+    results.insert(0, "row", results.index)
+    taken = {str(name) for name in frames.other.columns}
+    if renamed := [name for name in results if name in taken]:
+        warn_caller(
+            f"the table has columns {', '.join(renamed)}: results of these names have "
+            "an underscore after theirs"
+        )
+    while not taken.isdisjoint(results):
+        results = results.rename(columns=lambda name: f"{name}{'_' * (name in taken)}")
+    parts = [results.iloc[:, :1], frames.other, results.iloc[:, 1:]]
+    write_table(pd.concat(parts, axis=1), path)
+
+
+def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> None:
+    """Write cameras, shapes, the viewer with the `shown` data, and the model.
+
+    The cameras have a row for each frame, empty if it could not be fitted. `unit` is
+    the length of a unit of the shapes, for positions.
+    """
+    estimator, frames, smooth, drawn, explained = fit
+    X, motion = frames.X, estimator.motion_
+    names = [*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"]
+    numbers = np.hstack([motion.reshape(-1, 6), estimator.translation_])
+    cameras = pd.DataFrame(numbers, X.index, names)
+    energy, error, _ = frame_energies(X, explained, estimator.layout)
+    cameras["inverse_snr"] = error / energy
+    if hasattr(estimator, "positions_"):
+        names = [f"position_{axis}" for axis in "xyz"]
+        cameras[names] = unit * estimator.positions_
+    shown["camera"] = None
+    if frames_of(estimator).certainty.determined:  # otherwise the fit has warned
+        try:
+            with warnings.catch_warnings(action="error", category=UserWarning):
+                poses = export.frame_poses(estimator, X, **frames.weighting, **drawn)
+            columns = pd.DataFrame(poses._asdict(), index=X.index)
+            columns = columns.dropna(axis="columns", how="all")
+            shown["camera"] = "weak_perspective" if len(columns.columns) else None
+            if smooth is not None:
+                poses = export.frame_poses(estimator, smooth.decomposition, **drawn)
+                for name in columns.columns.intersection(["yaw", "pitch", "roll"]):
+                    columns[f"{name}_smooth"] = getattr(poses, name)
+            cameras = cameras.join(columns)
+        except (ValueError, UserWarning) as error:
+            warn_caller(
+                f"viewer.html has affine shapes, and cameras.csv has no angles: {error}"
+            )
+    cameras = cameras.reindex(frames.points.index)
+    cameras.insert(0, "row", cameras.index)
+    write_table(cameras, folder / "cameras.csv")
+    shapes = [estimator.mean_shape_, *estimator.basis_]
+    names = ["mean", *(f"basis_{k}" for k in range(1, len(shapes)))]
+    columns = [f"{name}_{axis}" for name in names for axis in "XYZ"]
+    points = pd.DataFrame(np.hstack(shapes), columns=columns)
+    points.insert(0, "point", names_of_points(estimator))
+    write_table(points, folder / "shapes.csv")
+    export.write_shapes(estimator, folder / "shapes.npz")
+    shown |= {"X": X, **frames.weighting, **drawn}
+    export.write_viewer(estimator, folder / "viewer.html", **shown)
+    save_model(estimator, folder / "model.npz")
+
+
+def read_model(args: Namespace) -> AffineNRSfM:
+    """Load a model; its missing points have the coordinates of those of its fit.
+
+    These are in the report beside the model. Without a report of that model there are
+    none. Warn if files beside it are not of the run of the report.
+    """
+    estimator, path = load_model(args.model), Path(args.model)
+    folder, recorded = path.parent, entry_of_report(path.parent, "sha256")
+    if path.name not in recorded:  # without a report, or with one of something else
+        return estimator
+    beside = digests_of(folder, [each for each in recorded if Path(each).name == each])
+    differing = [each for each in beside if beside[each] != recorded[each]]
+    if differing:
+        warn_caller(
+            f"{folder / REPORT} is of another run than {', '.join(differing)} beside "
+            "it, or these were changed since"
+        )
+    if path.name not in differing:
+        missing = entry_of_report(folder, "table").get("missing_values", [])
+        args.missing_value = [*args.missing_value, *missing]
+    return estimator
+
+
+def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
+    """Return an entry of the report in a folder, without one an empty dict."""
+    try:
+        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+        return dict(report[name])
+    except (OSError, ValueError, TypeError, KeyError):
+        return {}
+
+
+def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return the digests of the named files that exist in a folder."""
+    existing = [name for name in names if (folder / name).is_file()]
+    contents = ((folder / name).read_bytes() for name in existing)
+    digests = [hashlib.sha256(content).hexdigest() for content in contents]
+    return dict(zip(existing, digests, strict=True))
+
+
+# Classes whose means are shown, at most.
+MOST_CLASSES = 12
 
 
 def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
@@ -54,15 +216,7 @@ def table_report(args: Namespace, frames: Frames) -> dict[str, Any]:
         "first_columns": names[:4],
         "last_columns": names[-2:],
         "coordinates_not_used": frames.not_used,
-        "rows_left_out": [
-            {
-                "reason": reason,
-                "skipped_on_request": skipped,
-                "n_rows": len(rows),
-                "first_rows": rows[:MOST_LISTED],
-            }
-            for reason, rows, skipped in frames.left_out
-        ],
+        "rows_left_out": frames.left_out,
     }
 
 
@@ -98,19 +252,17 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         warn_caller(message)
     error = found.held_out_error if found else -estimator.score(X, **frames.weighting)
     figures = ("effective_frames", "pose_share", "pose_removed")
-    coefficients = pd.DataFrame(
-        {
-            "name": names_of_components(None, alpha.shape[1]),
-            "energy_share": estimator.energy_share_,
-            "min": alpha.min(axis=0),
-            "row_of_min": X.index[alpha.argmin(axis=0)],
-            "max": alpha.max(axis=0),
-            "row_of_max": X.index[alpha.argmax(axis=0)],
-            "stability": getattr(estimator, "stability_", None),
-            "stability_word": getattr(found, "stability", None),
-            **{name: getattr(found, name, None) for name in figures},
-        }
-    )
+    coefficients = {
+        "name": names_of_components(None, alpha.shape[1]),
+        "energy_share": estimator.energy_share_,
+        "min": alpha.min(axis=0),
+        "row_of_min": X.index[alpha.argmin(axis=0)],
+        "max": alpha.max(axis=0),
+        "row_of_max": X.index[alpha.argmax(axis=0)],
+        "stability": getattr(estimator, "stability_", None),
+        "stability_word": getattr(found, "stability", None),
+        **{name: getattr(found, name, None) for name in figures},
+    }
     outliers = None
     if found is not None:
         names, worst = names_of_points(estimator), found.outliers[:MOST_LISTED]
@@ -142,7 +294,7 @@ def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
         or getattr(lines, "name", SPANNING_TREE) != SPANNING_TREE,
         "outliers": outliers,
         "parameters": estimator.get_params(deep=True),
-        "alpha": coefficients.to_dict("records"),
+        "alpha": pd.DataFrame(coefficients).to_dict("records"),
     }
 
 
@@ -203,13 +355,17 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
     tried = [each["text"] for each in report["tried"] if each["seconds"]]
     others = [each for each in report["tried"] if not each["seconds"]]
     if "choice" in report:
-        tried.insert(0, _choice(report["choice"]))
+        names = ("n_components", "held_out_error", "held_out_error_standard_error")
+        each = zip(*(report["choice"][name] for name in names), strict=True)
+        found = (f"{k} ({100 * error:.3g} +- {100 * s:.2g} %)" for k, error, s in each)
+        text = f"K = {first_items(found, 12)}: {report['choice']['chosen']} is used"
+        tried.insert(0, text)
     listed = "; ".join(f"{each['setting']} ({each['result']})" for each in others)
     tried += [f"not tried: {listed}"] * bool(others)
     rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
     rows.append(left_out_row(table))
-    if names := table.get("other_columns"):
-        listed = first_items(map(str, names), 6)
+    if columns := table.get("other_columns"):
+        listed = first_items(map(str, columns), 6)
         rows.append(["next", "", f"--label, --group or --time COLUMN: {listed}"])
     return [*rows, ["open", "", f"{Path(folder, PAGE)}  viewer.html  alpha.csv"]]
 
@@ -472,14 +628,6 @@ def _alpha(model: dict[str, Any]) -> Section:
             "that the objects move alike in all views"
         )
     return parts
-
-
-def _choice(choice: dict[str, Any]) -> str:
-    """Return the held-out error of each number of basis shapes, in percent."""
-    names = ("n_components", "held_out_error", "held_out_error_standard_error")
-    each = zip(*(choice[name] for name in names), strict=True)
-    listed = (f"{k} ({100 * error:.3g} +- {100 * s:.2g} %)" for k, error, s in each)
-    return f"K = {first_items(listed, 12)}: {choice['chosen']} is used"
 
 
 def _label(label: dict[str, Any]) -> Section:

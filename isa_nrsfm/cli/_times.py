@@ -11,17 +11,12 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import FRAME, IMAGE, IMAGE_NAME, frame_numbers, have_times
+from isa_nrsfm.cli._options import TIMES
 from isa_nrsfm.io._tables import with_points
 
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
 _DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
-_DATES = (
-    *("%d{0}%m{0}%Y", "%m{0}%d{0}%Y"),
-    *("%d{0}%m{0}%y", "%m{0}%d{0}%y", "%y{0}%m{0}%d"),
-    *("%d{0}%b{0}%Y", "%d{0}%B{0}%Y", "%d{0}%b{0}%y", "%b{0}%d,{0}%Y"),
-    "%B{0}%d,{0}%Y",
-)
-_OF_DAY = ("%H:%M", "%H:%M:%S", "%H:%M:%S.%f", "%I:%M %p", "%I:%M:%S %p")
+_DATES, _OF_DAY = TIMES["dates"], TIMES["of_day"]
 _DAYS = [date.format(sign) for date, sign in product(_DATES, "/-. ")]
 _TIMES = [" ".join(pair) for pair in product(_DAYS, _OF_DAY)]
 # The ways in which dates and durations are usually written.

@@ -80,10 +80,8 @@ def model_of_points(
     K = n_stored if n_components is None else n_components
     check_scalar(K, "n_components", Integral, min_val=1, max_val=n_stored)
     C, every = stored["moments"], stored["shapes"]
-    some, ibug = (
-        B - B.mean(axis=1, keepdims=True)
-        for B in (every[:, points], every[:, FACE_PRIORS["ibug-68"]])
-    )
+    layouts = (every[:, numbers] for numbers in (points, FACE_PRIORS["ibug-68"]))
+    some, ibug = (B - B.mean(axis=1, keepdims=True) for B in layouts)
     # Frames of these points have size one, and their mean shape: those of iBUG-68 have
     # in the file.
     square, square_in_file = (
@@ -97,14 +95,12 @@ def model_of_points(
     others = shapes[K + 1 :]
     left = np.einsum("ab,kja,kjb->", C, others, others) / (2 * len(mean_shape))
     total, residual, constant, slope = certain
-    certainty = DepthCertainty(
-        total,
-        0.0,
-        stored["turns"],
+    variances, residual = (
         stored["points"][points] / share,
-        residual=residual / share + 2.0 * left,
-        images=(constant, slope),
+        residual / share + 2.0 * left,
     )
+    errors = {"residual": residual, "images": (constant, slope)}
+    certainty = DepthCertainty(total, 0.0, stored["turns"], variances, **errors)
     noise, camera = noise / share + left, "weak_perspective"
     shapes = np.ascontiguousarray(shapes[: K + 1].mT)
     gauge, starts = FrameMap.identity(K), np.zeros((0, K))

@@ -11,11 +11,6 @@ from typing import TYPE_CHECKING
 from isa_nrsfm._compat.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from isa_nrsfm.export._points import (
-        FramePoints as FramePoints,
-        frame_points as frame_points,
-        write_points as write_points,
-    )
     from isa_nrsfm.export._poses import (
         FramePoses as FramePoses,
         frame_poses as frame_poses,
@@ -23,12 +18,15 @@ if TYPE_CHECKING:
         pose_function as pose_function,
     )
     from isa_nrsfm.export._shape_files import (
+        FramePoints as FramePoints,
         PointDistributionModel as PointDistributionModel,
         ShapeArrays as ShapeArrays,
+        frame_points as frame_points,
         point_distribution_model as point_distribution_model,
         read_pdm as read_pdm,
         shape_arrays as shape_arrays,
         write_pdm as write_pdm,
+        write_points as write_points,
         write_shapes as write_shapes,
     )
     from isa_nrsfm.export._viewer import (

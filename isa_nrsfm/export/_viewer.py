@@ -25,19 +25,18 @@ from isa_nrsfm.export import _upright
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
 from isa_nrsfm.plotting._views import UPSIDE_DOWN, Edges, Origin
+from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # The colours of more labels than this look alike.
 MOST_LABELS = 30
 UNLABELLED = "(no label)"
 ABOUT = {
-    "weak_perspective": "Proportions are estimated with weak-perspective cameras.",
-    "orthographic": "Proportions are estimated with orthographic cameras.",
-    "perspective": "Proportions are estimated with perspective cameras.",
     None: "Affine shapes: angles and depth are not those of the object.",
     "unknown": "The depth is not determined: angles and proportions are not those of "
     "the object.",
 }
+ESTIMATED = "Proportions are estimated with {} cameras."
 MIRRORED = " The mirror image in depth fits the images as well."
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
 FLOATS, INTEGERS = 5126, 5125
@@ -187,7 +186,8 @@ def write_viewer(
         rotations = UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
     labelled = hasattr(X, "iloc")  # pandas: rows have names
     kind = space.camera if frames_of(model).certainty.determined else "unknown"
-    about = ABOUT[kind] + MIRRORED * (not sees_perspective(model))
+    about = ABOUT.get(kind, ESTIMATED.format(str(kind).replace("_", "-")))
+    about += MIRRORED * (not sees_perspective(model))
     if lines is not None and lines.name == SPANNING_TREE:
         about += f" Points without a known layout are joined by a {SPANNING_TREE}."
     content = {
@@ -372,32 +372,20 @@ def write_glb(
         if lines is None or lines.kind in ("face", "other"):
             surface = frontal_triangles(shapes[0])
 
-    file = Binary()
-    drawn_edges = None if lines is None else lines.edges
-    primitives = _primitives(file, shapes, surface, drawn_edges)
-    extras = {
+    # One node and mesh, matt materials that are seen from both sides, one animation
+    document, file = json.loads(_resource("scene.gltf")), Binary()
+    document["asset"]["generator"] = f"isa_nrsfm {__version__}"
+    (mesh,), (animation,) = document["meshes"], document["animations"]
+    mesh["primitives"] = _primitives(file, shapes, surface, lines)
+    mesh["weights"] = [0.0] * len(targets)
+    mesh["extras"] = {
         "targetNames": targets,
         "pointNames": list(names_of_points(model)),
         "lines": None if lines is None else lines.name,
         "factor": factor,
     }
-    mesh = {
-        "name": "mean shape",
-        "primitives": primitives,
-        "weights": [0.0] * len(targets),
-        "extras": extras,
-    }
-    times, weights = _swings(len(targets))
-    sampler = {"input": file.add(times), "interpolation": "LINEAR"}
-    animation = {
-        "name": "basis shapes in turn",
-        "samplers": [sampler | {"output": file.add(weights.ravel())}],
-        "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
-    }
-    # One node, and matt materials that are seen from both sides
-    document = json.loads(_resource("scene.gltf"))
-    document["asset"]["generator"] = f"isa_nrsfm {__version__}"
-    document |= {"meshes": [mesh], "animations": [animation]}
+    times, weights = map(file.add, _swings(len(targets)))
+    animation["samplers"][0] |= {"input": times, "output": weights}
     write_whole(path, file.with_document(document))
 
 
@@ -451,7 +439,7 @@ def _padded(content: bytes, filler: bytes) -> bytes:
 
 
 def _primitives(
-    file: Binary, shapes: NDArray, surface: NDArray | None, edges: NDArray | None
+    file: Binary, shapes: NDArray, surface: NDArray | None, lines: Skeleton | None
 ) -> list[dict[str, Any]]:
     """Return a surface, the points, unless there are many on it, and the edges."""
     position, *drifts = map(file.add, shapes)
@@ -466,14 +454,14 @@ def _primitives(
     if surface is not None:
         indices = file.add(surface.ravel())
         primitives.append(bare | {"mode": TRIANGLES, "indices": indices, "material": 1})
-    if edges is not None and len(edges):
-        indices = file.add(edges.ravel())
+    if lines is not None and len(lines.edges):
+        indices = file.add(lines.edges.ravel())
         primitives.append(bare | {"mode": LINES, "indices": indices})
     return primitives
 
 
 def _swings(n_components: int) -> tuple[NDArray, NDArray]:
-    """Return times (n,) and weights (n, n_components) of swings one after the other."""
+    """Return times (n,) and weights (n * n_components,) of swings one after another."""
     phase = np.linspace(0, 1, 17)[1:]
     swing = 2.0 * np.sin(2 * np.pi * phase)  # standard deviations
     # Weights are exactly zero at the start of the next swing.
@@ -481,7 +469,7 @@ def _swings(n_components: int) -> tuple[NDArray, NDArray]:
     weights = np.kron(np.eye(n_components), swing[:, None])
     times = np.add.outer(np.arange(n_components), phase)
     # From rest on, two seconds each
-    return 2.0 * np.insert(times, 0, 0.0), np.pad(weights, ((1, 0), (0, 0)))
+    return 2.0 * np.insert(times, 0, 0.0), np.pad(weights, ((1, 0), (0, 0))).ravel()
 
 
 def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:

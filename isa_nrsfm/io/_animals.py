@@ -55,10 +55,14 @@ def is_hdf5(path: Path) -> bool:
         return file.read(len(_SIGNATURE)) == _SIGNATURE
 
 
+def opened(path: Path) -> Any:
+    """Return an HDF5 file, open for reading."""
+    return import_optional("h5py", extra="h5").File(path, "r")
+
+
 def root_groups(path: Path) -> set[str]:
     """Return the names at the root of an HDF5 file, or raise where it is damaged."""
-    h5py = import_optional("h5py", extra="h5")
-    with reading(path, "HDF5"), h5py.File(path, "r") as file:
+    with reading(path, "HDF5"), opened(path) as file:
         return set(file)
 
 
@@ -131,14 +135,11 @@ def read_deeplabcut(path: Path) -> Landmarks:
         frames: dict[str, list[Any]] = {"frame": [int(label) for label in labels]}
     except (TypeError, ValueError):
         frames = {"image": [str(label) for label in labels]}
-    return assemble_individuals(
-        found[..., :2],
-        list(places) if len(columns[0]) == len(_LEVELS_OF_MANY) else None,
-        list(first),
-        frames,
-        format="deeplabcut",
-        confidence=found[..., 2] if (where[..., 2] >= 0).any() else None,
-    )
+    known: dict[str, Any] = {"format": "deeplabcut"}
+    if (where[..., 2] >= 0).any():
+        known["confidence"] = found[..., 2]
+    names = list(places) if len(columns[0]) == len(_LEVELS_OF_MANY) else None
+    return assemble_individuals(found[..., :2], names, list(first), frames, **known)
 
 
 def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
@@ -162,15 +163,11 @@ def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
     names = [str(i) for i in range(len(columns))]
     coordinates = [names[i] for i in numbers]
-    frame = read_columns(
-        path,
-        leave_out={*names[:n_before], *names[n_index:]}.difference(coordinates),
-        numbers=coordinates,
-        text=names[n_before:n_index],
-        n_header=len(levels),
-        names=names,
-    )
-    cells = frame[names[n_before:n_index]].fillna("").to_numpy()
+    index = names[n_before:n_index]
+    left_out = {*names}.difference(index, coordinates)
+    known: dict[str, Any] = {"text": index, "n_header": len(levels), "names": names}
+    frame = read_columns(path, leave_out=left_out, numbers=coordinates, **known)
+    cells = frame[index].fillna("").to_numpy()
     labels = ["/".join(row) for row in cells]
     values = frame[coordinates].to_numpy(dtype=np.float64)
     return values, [columns[i] for i in numbers], labels
@@ -231,8 +228,7 @@ def _read_h5(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     Returns numbers (n_rows, n_columns), levels of the columns, and labels of the rows.
     Damaged files lead to errors of h5py and pickle.
     """
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         group = own_member(file, _KEY)
         if not hasattr(group, "attrs"):
             raise ValueError(f"it has no group {_KEY}")
@@ -340,8 +336,7 @@ def read_sleap(path: Path) -> Landmarks:
     confidences, ``edge_names`` the pairs of nodes that the skeleton joins. Frames are
     counted from 0.
     """
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         absent = _NEEDED.difference(file)
         if absent:
             raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
@@ -360,16 +355,11 @@ def read_sleap(path: Path) -> Landmarks:
         raise ValueError(f"tracks holds {n_tracks} tracks, track_names {len(names)}")
     of_instances = scores.pop("instance_scores", np.array(np.nan))
     scored = {} if np.isnan(of_instances).all() else {"instance_score": of_instances}
-    return assemble_individuals(
-        tracks,
-        names or (range(n_tracks) if n_tracks > 1 else None),
-        nodes,
-        {"frame": range(len(tracks))},
-        of_instances=scored,
-        format="sleap",
-        confidence=scores.get("point_scores"),
-        skeleton=skeleton,
-    )
+    known: dict[str, Any] = {"of_instances": scored, "format": "sleap"}
+    known |= {"confidence": scores.get("point_scores"), "skeleton": skeleton}
+    who = names or (range(n_tracks) if n_tracks > 1 else None)
+    frames = {"frame": range(len(tracks))}
+    return assemble_individuals(tracks, who, nodes, frames, **known)
 
 
 def is_facemap(path: Path) -> bool:
@@ -382,20 +372,14 @@ def read_facemap(path: Path) -> Landmarks:
 
     Body parts are in the order of their names, frames are counted from 0.
     """
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:
+    with opened(path) as file:
         group = own_member(file, "Facemap")
         parts = [own_member(group, name) for name in group]
         values = [[numbers_of(part, name) for name in _VALUES] for part in parts]
         names = list(group)
     points = np.moveaxis(np.array(values), 2, 0)
-    return assemble(
-        points[..., :2],
-        names,
-        {"frame": range(len(points))},
-        format="facemap",
-        confidence=points[..., 2],
-    )
+    frames, sure = {"frame": range(len(points))}, points[..., 2]
+    return assemble(points[..., :2], names, frames, format="facemap", confidence=sure)
 
 
 def _array(
@@ -508,8 +492,7 @@ def _arrays_in(path: Path) -> dict[str, NDArray]:
         from scipy.io import loadmat  # takes a while
 
         return {n: a for n, a in loadmat(path).items() if isinstance(a, np.ndarray)}
-    h5py = import_optional("h5py", extra="h5")
-    with h5py.File(path, "r") as file:  # MATLAB 7.3, whose axes are turned round
+    with opened(path) as file:  # MATLAB 7.3, whose axes are turned round
         names = [name for name in file if hasattr(own_member(file, name), "dtype")]
         return {name: np.asarray(content_of(file, name)).T for name in names}
 

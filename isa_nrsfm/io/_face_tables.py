@@ -1,7 +1,7 @@
 """Read the csv tables of OpenFace, py-feat and MediaPipe's face mesh."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -134,9 +134,7 @@ def is_mediapipe_json(path: Path) -> bool:
 
 
 def read_mediapipe_json(
-    path: Path,
-    image_size: tuple[float, float] | None = None,
-    part: str | None = None,
+    path: Path, image_size: tuple[float, float] | None = None, part: str | None = None
 ) -> Landmarks:
     """Read json of results: lists of objects with x and y, of frames and persons.
 
@@ -161,14 +159,13 @@ def read_mediapipe_json(
         )
     every = [p for _, found in entries for each in found.values() for p in each]
     seen = any(point.get("visibility") for points in every for point in points)
+    persons = (enumerate(found.get(chosen[0]) or [[]]) for _, found in entries)
     rows = [
-        known
-        | {"person": k}
-        | {"keypoints": [float(v) for p in points for v in _xyv(p, seen)]}
-        for known, found in entries
-        for k, points in enumerate(found.get(chosen[0]) or [[]])
+        known | {"person": k, "keypoints": [v for p in points for v in _xyv(p, seen)]}
+        for (known, _), each in zip(entries, persons, strict=True)
+        for k, points in each
     ]
-    read = entries_as_rows(rows, None, None, "mediapipe_json", "result")
+    read = entries_as_rows(rows, "mediapipe_json", "result")
     tracks = read.points.to_numpy().reshape(len(rows), -1, 2)
     points = read.points.copy()
     points[:] = _in_pixels(tracks, image_size, None).reshape(len(rows), -1)
@@ -196,14 +193,13 @@ def _persons(value: Any) -> list[list[dict[str, Any]]]:
     return [each[0] for each in inner] if all(len(i) == 1 for i in inner) else []
 
 
-def _xyv(point: dict[str, Any], seen: bool) -> tuple[Any, Any, Any]:
+def _xyv(point: dict[str, Any], seen: bool) -> Iterator[float]:
     """Return x, y and the visibility of a point, 1 if there is none."""
-    return point["x"], point["y"], point.get("visibility", 1.0) if seen else 1.0
+    visibility = point.get("visibility", 1.0) if seen else 1.0
+    return map(float, (point["x"], point["y"], visibility))
 
 
-def _in_pixels(
-    tracks: NDArray[np.float64], image_size: Any, sizes: NDArray | None
-) -> NDArray[np.float64]:
+def _in_pixels(tracks: NDArray, image_size: Any, sizes: NDArray | None) -> NDArray:
     """Return tracks (n_frames, n_points, 2) in pixels, by the size of the images."""
     n_known = np.count_nonzero(~np.isnan(tracks))
     # Pixels of a face reach beyond this, and fractions of the image's size do not.
@@ -258,14 +254,11 @@ def _assembled(
     n_each, used = len(found.points) // max(len(scores), 1), found.interleaved
     confidence = table[[*scores] * n_each].to_numpy(np.float64) if scores else None
     used += scores if n_each == 1 else []
-    return assemble(
-        tracks_in(table, found.interleaved) if tracks is None else tracks,
-        found.points,
-        table.drop(columns=used),
-        format=format,
-        columns=found.interleaved,
-        confidence=confidence,
-    )
+    if tracks is None:
+        tracks = tracks_in(table, found.interleaved)
+    known: dict[str, Any] = {"columns": found.interleaved, "confidence": confidence}
+    frames = table.drop(columns=used)
+    return assemble(tracks, found.points, frames, format=format, **known)
 
 
 def _need(names: list[str], needed: Iterable[str]) -> None:

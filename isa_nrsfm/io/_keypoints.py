@@ -1,22 +1,25 @@
-"""Read landmarks in images: COCO, OpenPose, MMPose, .pts, .tps and lists of WFLW."""
+"""Read json and texts of trackers, data sets of images and annotation programs."""
 
 import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import errors_of, refuse_special
+from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items, frame_numbers
 from isa_nrsfm._parameters.choices import OPENPOSE_PARTS, WHOLE_PARTS
 from isa_nrsfm._parameters.naming import named
-from isa_nrsfm.io._landmarks import Landmarks, assemble, stacked
-from isa_nrsfm.io._tables import first_lines
+from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes, stacked
+from isa_nrsfm.io._tables import first_lines, header_names, parse_table
 
 # Entries of images and instances that are no columns under their own name.
 _LEFT_OUT = (
@@ -24,13 +27,8 @@ _LEFT_OUT = (
     *("license", "coco_url", "flickr_url", "date_captured"),
 )
 # COCO-WholeBody: the lists of an instance, and their numbers of points.
-_LISTS = {
-    "keypoints": 17,
-    "foot_kpts": 6,
-    "face_kpts": 68,
-    "lefthand_kpts": 21,
-    "righthand_kpts": 21,
-}
+_LISTS = {"keypoints": 17, "foot_kpts": 6, "face_kpts": 68}
+_LISTS |= {"lefthand_kpts": 21, "righthand_kpts": 21}
 # The places of parts in whole bodies of so many points: COCO-WholeBody, Halpe.
 _PLACES = {
     133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
@@ -109,18 +107,19 @@ def read_coco(path: Path, part: str | None = None) -> Landmarks:
     content = read_json(path)
     if isinstance(content, list):
         entries = _results(content)
-        return entries_as_rows(entries, None, part, "coco", "result")
+        return entries_as_rows(entries, "coco", "result", part=part)
     entries, names = _annotations(content)
-    found = entries_as_rows(entries, names, part, "coco", "annotation")
+    found = entries_as_rows(entries, "coco", "annotation", names, part)
     return replace(found, confidence=None)
 
 
+# Instances as in results of COCO, and names of their points if they are known.
+Entries = Sequence[dict[str, Any]]
+Names = list[str] | None
+
+
 def entries_as_rows(
-    entries: Sequence[dict[str, Any]],
-    names: list[str] | None,
-    part: str | None,
-    format: str,
-    what: str,
+    entries: Entries, format: str, what: str, names: Names = None, part: Any = None
 ) -> Landmarks:
     """Return landmarks of entries with ``keypoints``; of images without any, too.
 
@@ -139,13 +138,9 @@ def entries_as_rows(
     absent = (values[..., :2] == 0).all(axis=2) | (values[..., 2] == 0)
     rows = [_scalars(entry) for entry in entries]
     columns = dict.fromkeys(name for row in rows for name in row)
-    return assemble(
-        np.where(absent[..., None], np.nan, values[..., :2]),
-        names,
-        {name: [row.get(name) for row in rows] for name in columns},
-        format=format,
-        confidence=values[..., 2],
-    )
+    tracks = np.where(absent[..., None], np.nan, values[..., :2])
+    frames = {name: [row.get(name) for row in rows] for name in columns}
+    return assemble(tracks, names, frames, format=format, confidence=values[..., 2])
 
 
 def read_json(path: Path) -> Any:
@@ -171,7 +166,7 @@ def _results(entries: list[Any]) -> list[dict[str, Any]]:
     return sorted(entries, key=lambda entry: by_number(str(entry.get("image_id"))))
 
 
-def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
+def _annotations(content: Any) -> tuple[list[dict[str, Any]], Names]:
     """Return images with their annotations, and the names of points."""
     lists = ("images", "annotations", "categories")
     contents = first_items(content) if isinstance(content, dict) else content
@@ -220,9 +215,7 @@ def _annotations(content: Any) -> tuple[list[dict[str, Any]], list[str] | None]:
     return sorted(entries, key=lambda e: by_number(names_of[e["image_id"]])), names
 
 
-def _chosen_categories(
-    categories: list[dict[str, Any]],
-) -> tuple[dict[Any, dict[str, Any]], list[str] | None]:
+def _chosen_categories(categories: Entries) -> tuple[dict[Any, dict[str, Any]], Names]:
     """Return the categories to read by their ids, and their common keypoints.
 
     Where no category has names of keypoints, all are read.
@@ -243,7 +236,7 @@ def _chosen_categories(
     return _by_id(used, "categories"), points or None
 
 
-def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]]:
+def _by_id(entries: Entries, what: str) -> dict[Any, dict[str, Any]]:
     """Return entries by their identifiers, or raise."""
     if not all(isinstance(entry.get("id"), int | str) for entry in entries):
         raise ValueError(f"each of the {what} needs an id")
@@ -258,11 +251,8 @@ def _by_id(entries: list[dict[str, Any]], what: str) -> dict[Any, dict[str, Any]
 
 
 def _keypoints(
-    entries: Sequence[dict[str, Any]],
-    names: list[str] | None,
-    part: str | None,
-    what: str,
-) -> tuple[NDArray[np.float64], list[str] | None]:
+    entries: Entries, names: Names, part: str | None, what: str
+) -> tuple[NDArray[np.float64], Names]:
     """Return keypoints of instances (n_instances, n_points, 3) and names, of a part."""
     gap = {key: [0] * 3 * n for key, n in _LISTS.items()} | {"keypoints": None}
     further = [key for key in gap if any(key in entry for entry in entries)][1:]
@@ -272,17 +262,15 @@ def _keypoints(
             f"the points of bodies are read, and those in {', '.join(further)} are "
             f"left out: choose with {named('part')}, one of {', '.join(WHOLE_PARTS)}"
         )
-    n_lists = len(_LISTS) if further and part != "body" else 1
-    n_points = len(names) if names and n_lists == 1 else 0
+    keys = [*_LISTS] if further and part != "body" else ["keypoints"]
+    n_points = len(names) if names and len(keys) == 1 else 0
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
         of_file = f" of {entry['file']}" if "file" in entry else ""
         name = f"{what} {number} (counted from 0){of_file}"
-        lists = [
-            _triples(entry.get(key, gap[key]), f"{key} of {name}", True)
-            for key in [*_LISTS][:n_lists]
-        ]
-        found.append(np.concatenate(lists))
+        lists = {key: entry.get(key, gap[key]) for key in keys}
+        points = [_triples(lists[key], f"{key} of {name}", True) for key in keys]
+        found.append(np.concatenate(points))
         n_points = n_points or len(found[0])
         if len(found[-1]) != max(n_points, 1):
             raise ValueError(
@@ -382,7 +370,7 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             if part in each
         ]
         entries += rows or [of_file]
-    found = entries_as_rows(entries, None, None, "openpose", "person")
+    found = entries_as_rows(entries, "openpose", "person")
     # Points that are cut off can be outside of the image.
     if np.nanmedian(np.abs(found.points)) <= 1:
         raise ValueError(
@@ -449,7 +437,7 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     files = json_files(path, "mmpose", "none")
     _, contents = _each_file(path, files, "no file is of MMPose", _instances_in)
     entries = [entry for found in contents for entry in found]
-    return entries_as_rows(entries, None, part, "mmpose", "instance")
+    return entries_as_rows(entries, "mmpose", "instance", part=part)
 
 
 def _instances_in(file: Path) -> list[dict[str, Any]]:
@@ -488,8 +476,20 @@ def read_pts(path: Path) -> Landmarks:
     It has ``version: 1``, ``n_points: 68`` and, between braces, a line ``x y`` for each
     point. Coordinates are as they are written; iBUG counts pixels from 1.
     """
+    text = path.read_bytes().decode("utf-8-sig")
+    match = _PTS.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
+            f"got {text[:40]!r}"
+        )
+    coordinates, n_points = floats_of(match["points"].split()), int(match["n_points"])
+    if len(coordinates) != 2 * n_points or n_points == 0:
+        raise ValueError(
+            f"n_points is {n_points}, but there are {len(coordinates)} coordinates"
+        )
     frames = {"file": [as_utf8(path.name)]}
-    return assemble(_points_of(path)[None], None, frames, format="pts")
+    return assemble(coordinates.reshape(1, n_points, 2), None, frames, format="pts")
 
 
 def read_tps(path: Path) -> Landmarks:
@@ -518,10 +518,8 @@ def read_tps(path: Path) -> Landmarks:
             if entries and not entries[0][1]:
                 raise ValueError(f"there are more than {count} landmarks")
         n_left += sum(not equals for _, equals, _ in entries)
-        values_of = {name.strip().lower(): value.strip() for name, _, value in entries}
-        rows.append(
-            {name: values_of[name] for name in _TPS_ENTRIES if name in values_of}
-        )
+        found = {name.strip().lower(): value.strip() for name, _, value in entries}
+        rows.append({name: found[name] for name in _TPS_ENTRIES if name in found})
     if n_left and not any(len(each[0]) for each in tracks):
         raise ValueError(
             f"all its {n_left} points are on curves, which are left out: append them "
@@ -569,24 +567,6 @@ def read_wflw(path: Path) -> Landmarks:
     return assemble(points.reshape(-1, _N_WFLW, 2), None, frames, format="wflw")
 
 
-def _points_of(file: Path) -> NDArray[np.float64]:
-    """Return the points (n_points, 2) that a .pts file holds."""
-    text = file.read_bytes().decode("utf-8-sig")
-    match = _PTS.fullmatch(text)
-    if match is None:
-        raise ValueError(
-            "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
-            f"got {text[:40]!r}"
-        )
-    coordinates = floats_of(match["points"].split())
-    n_points = int(match["n_points"])
-    if len(coordinates) != 2 * n_points or n_points == 0:
-        raise ValueError(
-            f"n_points is {n_points}, but there are {len(coordinates)} coordinates"
-        )
-    return coordinates.reshape(n_points, 2)
-
-
 def floats_of(fields: list[str]) -> NDArray[np.float64]:
     """Return the numbers that fields hold."""
     # Python reads 1_0 as a number.
@@ -598,3 +578,189 @@ def floats_of(fields: list[str]) -> NDArray[np.float64]:
         infinite = fields[int(np.isinf(numbers).argmax())]
         raise ValueError(f"a coordinate should be finite; got {infinite!r}")
     return numbers
+
+
+_PLACE = re.compile(r"\s*[-+.\deE]+\s*[\s,]\s*[-+.\deE]+\s*")
+# Fields of a line of YOLO before its points: class and box.
+_N_BOX = 5
+_XYV = ("x", "y", "visible")
+_SIDES = ("left", "top", "width", "height")
+
+# Columns of a row, and its points by name.
+Row = tuple[dict[str, Any], dict[str, NDArray]]
+
+
+def is_ultralytics(path: Path) -> bool:
+    """Return whether keypoints are objects, or a column beside the box."""
+    if path.suffix.lower() == ".json":
+        return json_kind(path) == "ultralytics"
+    return {"class", "box", "keypoints"}.issubset(header_names(path))
+
+
+def read_ultralytics(path: Path) -> Landmarks:
+    """Read results of Ultralytics, ``to_json`` or ``to_csv`` of one image or a list.
+
+    A detection has ``keypoints`` with the lists x, y and, for most models, visible. A
+    list of such lists has the detections of an image each. A csv has Python's text.
+    """
+    if path.suffix.lower() == ".json":
+        images = read_json(path)
+        images = images if all(isinstance(i, list) for i in images) else [images]
+    else:
+        table = parse_table(path)
+        texts = table["keypoints"].str.replace("'", '"')
+        images = [table.assign(keypoints=texts.map(json.loads)).to_dict("records")]
+    entries: list[dict[str, Any]] = []
+    for frame, found in enumerate(images):
+        for person, each in enumerate(found or [{}]):
+            x, y, visible = (each.get("keypoints", {}).get(n) or [] for n in _XYV)
+            places = zip(x, y, visible or [1.0] * len(x), strict=True)
+            known = {"frame": frame, "person": person} | each
+            entries.append(known | {"keypoints": [v for p in places for v in p]})
+    return entries_as_rows(entries, "ultralytics", "detection")
+
+
+def is_yolo(path: Path) -> bool:
+    """Return whether the first line has a class, a box in shares, and points."""
+    fields = "".join(first_lines(path, 1)).split()
+    try:
+        box = floats_of(fields)[1:_N_BOX]
+    except ValueError:
+        return False
+    shares = len(fields) > 2 * _N_BOX and bool(np.all((box >= 0) & (box <= 1)))
+    return shares and fields[0].isdigit()
+
+
+def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmarks:
+    """Read poses in YOLO's format, labels or predictions of one image.
+
+    A line has the class, the box (middle, width, height) and x, y and mostly a third
+    number of each point; predictions may have the score and the number of a track
+    after them. The third number is 0, 1 or 2 in labels, a confidence in predictions.
+    All are fractions of the image's width and height, multiplied by ``image_size``.
+    """
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    rows = [floats_of(line.split()) for line in lines if line.strip()]
+    if len(lengths := sorted({*map(len, rows)})) > 1:
+        raise ValueError(
+            f"its lines have {first_items(lengths)} numbers: all must have as many"
+        )
+    values = np.array(rows)
+    size = [1, 1] if image_size is None else checked_sizes("image_size", image_size, 1)
+    parts = product(range(3), (3, 2))  # numbers after all points, and of a point
+    fits = [(n, k) for k, n in parts if (values.shape[1] - _N_BOX - k) % n == 0]
+    n, k = max(fits, key=lambda part: _share_inside(values, *part))
+    points, after = _points_of_yolo(values, n, k), values[:, values.shape[1] - k :]
+    frames = {"person": range(len(rows)), "class": [*map(int, values[:, 0])]}
+    frames |= zip(("score", "track_id"), after.T, strict=False)
+    places = (points * np.append(size, 1.0)).reshape(len(rows), -1).tolist()
+    entries = pd.DataFrame(frames | {"keypoints": places}).to_dict("records")
+    found = entries_as_rows(entries, "yolo", "line")
+    of_labels = np.isin(points[..., 2], (0, 1, 2)).all()
+    return replace(found, confidence=None) if of_labels else found
+
+
+def _points_of_yolo(values: NDArray, n: int, k: int) -> NDArray:
+    """Return x, y and a third number (n_lines, n_points, 3), one if there is none."""
+    points = values[:, _N_BOX : values.shape[1] - k].reshape(len(values), -1, n)
+    return np.pad(points, ((0, 0), (0, 0), (0, 3 - n)), constant_values=1.0)
+
+
+def _share_inside(values: NDArray, n: int, k: int) -> float:
+    """Return which share of points is in or near its box, if lines are split so."""
+    points, box = _points_of_yolo(values, n, k)[..., :2], values[:, None, 1:_N_BOX]
+    inside = (np.abs(points - box[..., :2]) <= 0.6 * box[..., 2:]).all(axis=2)
+    return float(np.mean(inside[points.any(axis=2)])) if points.any() else 0.0
+
+
+def is_labelme(path: Path) -> bool:
+    """Return whether a json file, or one of a folder, has shapes."""
+    return bool(json_files(path, "labelme"))
+
+
+def read_labelme(path: Path) -> Landmarks:
+    """Read points of labelme (also X-AnyLabeling): a file, or a folder of images.
+
+    A shape of the type ``point`` is a landmark, its ``label`` the name, its
+    ``group_id`` the individual. A point without a shape is missing.
+    """
+    rows: list[Row] = []
+    for file in json_files(path):
+        with reading(file, "labelme"):
+            content = read_json(file)
+            if not isinstance(shapes := dict(content).get("shapes"), list):
+                raise ValueError("it has no list of shapes")
+            points = [s for s in shapes if s.get("shape_type", "point") == "point"]
+            if len(points) < len(shapes):
+                warn_caller("shapes that are no points, such as boxes, are left out")
+            image = as_utf8(str(content.get("imagePath") or file.name))
+            for group in dict.fromkeys(s.get("group_id") for s in points) or [None]:
+                group_shapes = [s for s in points if s.get("group_id") == group]
+                places = [(str(s["label"]), s["points"][0]) for s in group_shapes]
+                rows.append(({"image": image, "individual": group}, _named(places)))
+    return _rows_of_names(rows, "labelme")
+
+
+def read_imglab(path: Path) -> Landmarks:
+    """Read an xml file of dlib's imglab: boxes of images, with parts.
+
+    An image without a box has one row without points.
+    """
+    content = path.read_bytes()
+    if b"<!" in content.replace(b"<!--", b""):
+        raise ValueError("it has declarations (<!...): delete them")
+    rows: list[Row] = []
+    for image in ElementTree.fromstring(content).iter("image"):
+        for box in image.findall("box") or [ElementTree.Element("box")]:
+            sides = {side: float(box.get(side, "nan")) for side in _SIDES}
+            parts = [
+                (p.get("name"), (p.get("x"), p.get("y"))) for p in box.iter("part")
+            ]
+            rows.append(({"image": image.get("file"), **sides}, _named(parts)))
+    return _rows_of_names(rows, "imglab")
+
+
+def _named(places: Sequence[tuple[Any, Any]]) -> dict[str, NDArray]:
+    """Return points by name, or raise if two have the same."""
+    names = [name for name, _ in places]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(
+            f"more than one point is called {twice[0]!r}: each needs its own name"
+        )
+    found = {name: floats_of([str(v) for v in place]) for name, place in places}
+    if any(len(place) != 2 for place in found.values()):
+        raise ValueError("each point should have two numbers, x and y")
+    return found
+
+
+def _rows_of_names(rows: Sequence[Row], format: str) -> Landmarks:
+    """Return landmarks of rows; names that are numbers are sorted by size."""
+    names = list(dict.fromkeys(name for _, points in rows for name in points))
+    if all(map(str.isdigit, names)):
+        names.sort(key=int)
+    gap = np.full(2, np.nan)
+    tracks = [[points.get(name, gap) for name in names] for _, points in rows]
+    frames = pd.DataFrame([known for known, _ in rows]).dropna(axis=1, how="all")
+    places = np.reshape(tracks, (len(rows), len(names), 2))
+    return assemble(places, names, frames, format=format)
+
+
+def is_places(path: Path) -> bool:
+    """Return whether a text has lines x y, perhaps after their number or the image."""
+    lines = first_lines(path, 3)
+    return len(lines) == 3 and all(map(_PLACE.fullmatch, lines[1:]))
+
+
+def read_places(path: Path) -> Landmarks:
+    """Read a text with a line x y for each point of one image (CK+, Helen).
+
+    A first line may have the number of points or the name of the image.
+    """
+    lines = path.read_text(encoding="utf-8-sig").replace(",", " ").splitlines()
+    rows = [line.split() for line in lines if line.strip()]
+    image = " ".join(rows.pop(0)) if len(rows[0]) != 2 else ""
+    wrong = image.isdigit() and image != str(len(rows))
+    if wrong or any(len(row) != 2 for row in rows):
+        raise ValueError("the lines are not x and y of as many points as it says")
+    tracks = np.array([floats_of(row) for row in rows])[None]
+    return assemble(tracks, None, pd.DataFrame({"image": [image]}), format="places")

@@ -1,6 +1,8 @@
 """Find the landmark columns of a table by their names, or by patterns.
 
-In patterns ``#`` is a number and ``*`` is any text.
+In patterns ``#`` is a number and ``*`` is any text. Tables of other shapes, with a row
+for each point or coordinate, or a point in each cell, become tables with a row for each
+frame, and two columns for each point.
 """
 
 import re
@@ -10,39 +12,35 @@ from fnmatch import fnmatchcase
 from itertools import chain
 from typing import Any, NamedTuple, NoReturn
 
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
 from isa_nrsfm._parameters.naming import named
 from isa_nrsfm.skeletons._column_names import (
+    WORDS,
     individuals_in,
     parse_coordinate,
     point_names,
     without_boxes,
 )
 
-# What stands for the axis letter in the names of confidences: nose_conf, conf_0.
-CONFIDENCES = (
-    *("confidence", "conf", "likelihood", "score", "visibility", "c"),
-    *("p", "prob", "probability", "v", "vis", "presence"),
-)
+CONFIDENCES = tuple(WORDS["confidences"].split("|"))
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
 
-# Words of columns with x and y that are no points, and of the same points once more: in
-# another unit, filtered, or their velocities.
 _NO_POINT = re.compile(
-    "(?i)(?<![a-z])(?:gyro|gyroscope|acc|accel|accelerometer|acceleration|mag|magnetometer"
-    "|imu|gravity|force|torque|cop|touch|screen|scroll|wheel|eye_?track(?:er|ing)|"
-    "(?:optical_?)?flow|offset|image_?size|resolution|"
-    "gaze|fixation|cursor|joystick|rotation|head_?(?:rot|angle)|euler|angular_?velocity|"
-    "quaternion|translation|velocity|speed|b?box|roi|crop|centroid|cent(?:er|re)_?of_?mass"
-    "|com|cog|stimulus)(?![a-z])|^(?:mouse|target|origin|head_?pose)$"
+    rf"(?i)(?<![a-z])(?:{WORDS['no_points']})(?![a-z])"
+    "|^(?:mouse|target|origin|head_?pose)$"
 )
-_COPY = re.compile(
-    "(?i)world|pixels?|px|norm|normali[sz]ed|raw|filt|filtered|filter|smooth|smoothed|"
-    "interp|interpolated|vel|velocity|speed|acc|acceleration|[cm]?m|rel|relative|abs|"
-    "absolute|image|img|[23]d|pred|predicted|gt|true|truth|orig|original|corrected"
-)
+_COPY = re.compile(rf"(?i){WORDS['copies']}")
+
+
+# Names of the columns of a table; names or patterns of columns, as users give them.
+Columns = Sequence[Hashable]
+Given = str | Sequence[str] | None
 
 
 class LandmarkColumns(NamedTuple):
@@ -65,9 +63,7 @@ class LandmarkColumns(NamedTuple):
         return list(chain.from_iterable(zip(self.x, self.y, strict=True)))
 
 
-def find_landmark_columns(
-    names: Iterable[Hashable], columns: str | Sequence[str] | None = None
-) -> LandmarkColumns:
+def find_landmark_columns(names: Columns, columns: Given = None) -> LandmarkColumns:
     """
     Find the landmark columns among the columns of a table.
 
@@ -133,7 +129,7 @@ def find_landmark_columns(
     return _select(names, patterns)
 
 
-def split_patterns(columns: str | Sequence[str] | None) -> list[str]:
+def split_patterns(columns: Given) -> list[str]:
     """Return the patterns or names of columns that are given."""
     listed = columns.split(",") if isinstance(columns, str) else columns or []
     return [pattern.strip() for pattern in listed]
@@ -151,7 +147,7 @@ def only_points(names: Iterable[Hashable]) -> list[Hashable]:
     return [name for name in names if name not in others] if few else names
 
 
-def _refuse_copies(names: Sequence[Hashable]) -> None:
+def _refuse_copies(names: Columns) -> None:
     """Raise if most points are there once more, with a further word in their names."""
     texts = [name.strip() for name, axis, _ in _coordinates(names) if axis == 0]
     parts = {t: re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", t) for t in texts}
@@ -174,7 +170,7 @@ def _refuse_copies(names: Sequence[Hashable]) -> None:
 
 
 def _ask_which(
-    names: Sequence[Hashable], which: str, words: list[str], without: Sequence[str] = ()
+    names: Columns, which: str, words: list[str], without: Sequence[str] = ()
 ) -> NoReturn:
     """Raise the question which of points that are there twice are to be read."""
     copies = [name for word in words for name in _chosen(names, [f"+*{word}*"])]
@@ -191,7 +187,7 @@ def _ask_which(
     )
 
 
-def _chosen(names: Sequence[Hashable], patterns: Iterable[str]) -> list[Hashable]:
+def _chosen(names: Columns, patterns: Iterable[str]) -> list[Hashable]:
     """Return names without those of patterns after -, only those of ones after +."""
     chosen = list(names)
     for sign, pattern in ((each[0], each[1:]) for each in patterns):
@@ -253,18 +249,15 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
         for (before, axes, after), (x, y, _) in members.items()
         if x and y
     }
-    # Leave out a "*" set that has no more points than a "#" set inside it.
-    return {
-        ",".join(patterns): size
-        for patterns, size in sizes.items()
-        if "*" not in patterns[0]
-        or not any(
-            other_size == size
-            and "#" in other[0]
-            and regular_expression(patterns[0]).fullmatch(other[0])
-            for other, other_size in sizes.items()
-        )
-    }
+    numbered = [(one, size) for (one, _), size in sizes.items() if "#" in one]
+
+    def is_same(pattern: str, size: int) -> bool:
+        """Return whether a "*" set has no more points than a "#" set inside it."""
+        inside = [one for one, n in numbered if n == size]
+        return "*" in pattern and any(matches(one, pattern) for one in inside)
+
+    kept = {each: size for each, size in sizes.items() if not is_same(each[0], size)}
+    return {",".join(patterns): size for patterns, size in kept.items()}
 
 
 def confidence_columns(
@@ -292,7 +285,7 @@ def confidence_columns(
     return []
 
 
-def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None:
+def _refuse_individuals(names: Columns, sets: dict[str, int]) -> None:
     """Raise if points have the names of several individuals in one row."""
     patterns = [pattern.split(",")[0] for pattern in sets]
     lists = [_columns_matching(names, pattern).values() for pattern in patterns]
@@ -321,7 +314,7 @@ def _refuse_individuals(names: Sequence[Hashable], sets: dict[str, int]) -> None
     )
 
 
-def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:
+def _select(names: Columns, patterns: Sequence[str]) -> LandmarkColumns:
     """Return the columns that match pairs of patterns of x and y columns."""
     x: list[str] = []
     y: list[str] = []
@@ -351,7 +344,7 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
     return LandmarkColumns(joined, points, tuple(x), tuple(y), z)
 
 
-def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:
+def _columns_matching(names: Columns, pattern: str) -> dict[tuple, str]:
     """Return the columns that match a pattern, with keys from its wildcards.
 
     A key is a tuple with one entry a wildcard: an int for ``#``, a text for ``*``. A
@@ -395,25 +388,18 @@ def regular_expression(pattern: str) -> re.Pattern[str]:
     return re.compile(expression, re.DOTALL)  # names may hold line breaks
 
 
-def _warn_of_left_out(
-    names: Sequence[Hashable], chosen: Sequence[str], pattern: str
-) -> None:
+def _warn_of_left_out(names: Columns, chosen: Sequence[str], pattern: str) -> None:
     """Warn if patterns match only a part of a set of x and y columns."""
-    sets = {point[0] for _, _, point in _coordinates(chosen)}
-    used = {*chosen}
-    omitted = [
-        name
-        for name, axis, point in _coordinates(names)
-        if name not in used and axis < 2 and point[0] in sets
-    ]
-    if omitted:
+    sets, used = {point[0] for _, _, point in _coordinates(chosen)}, {*chosen}
+    others = (each for each in _coordinates(names) if each[0] not in used)
+    if omitted := [name for name, axis, (of, _) in others if axis < 2 and of in sets]:
         warn_caller(
             f"the patterns {pattern!r} match {len(chosen)} columns and leave out "
             f"{len(omitted)} that are named alike; the first is {omitted[0]!r}"
         )
 
 
-def _z_of(names: Sequence[Hashable], x_columns: Iterable[str]) -> tuple[str, ...]:
+def _z_of(names: Columns, x_columns: Iterable[str]) -> tuple[str, ...]:
     """Return the columns with the third coordinate of the points of x columns."""
     points = {point for _, _, point in _coordinates(x_columns)}
     found = _coordinates(names)
@@ -426,7 +412,7 @@ def _coordinates(names: Iterable[Hashable]) -> list[tuple[str, int, tuple]]:
     return [(name, c[0], c[2][0]) for name, c in found if c is not None]
 
 
-def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str:
+def _several_found(names: Columns, candidates: dict[str, int]) -> str:
     """List the sets of landmarks of a table, and how to choose one."""
     listed, example = [], max(candidates, key=lambda pattern: candidates[pattern])
     whole = regular_expression(example.split(",")[0])
@@ -445,7 +431,290 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
     )
 
 
-def _first_columns(names: Sequence[Hashable]) -> str:
+def _first_columns(names: Columns) -> str:
     """List the first columns of a table."""
     listed = ", ".join(map(repr, names[:4])) + ", ..." * (len(names) > 4)
     return f"the table's {len(names)} columns are {listed}"
+
+
+# Columns that name points, and frames or who is shown.
+_POINT = re.compile(r"(?i)point|landmark|joint|marker|node|part(?!ic)")
+_FRAME = re.compile(rf"(?i){WORDS['frames']}")
+_IMAGE = re.compile(rf"(?i)\s*(?:{FRAME}|{IMAGE_NAME}|slice)\s*")
+_VALUE = re.compile("(?i)value|position|coord|pos$")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan")
+# Cells of numbers, with brackets and separators, and cells of missing points.
+_NUMBERS = re.compile(r"[\d\s.,;:|()\[\]{}=+\-eEnax]+")
+_MISSING = re.compile(r"(?i)[\s,()\[\]{}]*(?:n/?a|nan|null|none)?[\s()\[\]{}]*")
+# In cells with brackets: missing numbers; keys and quotation marks; words but for nan
+# and exponents, such as in np.float64(1.5); and what then is in brackets by itself.
+_WRITTEN = (
+    (r"\b(?:None|null)\b", "nan"),
+    (r"""(["'])[^"']*\1\s*:|\b\d+\s*:(?=\s*[\[({])|["']""", " "),
+    (r"(?<![\w.])(?!nan\b)[A-Za-z_][\w.]*", " "),
+    (r"\(\s*([^\s,()]+)\s*\)", r"\1"),
+)
+_INNERMOST = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
+# A table, and the names of its columns that tell frames and points apart.
+Keys = tuple["pd.DataFrame", list[str], list[str]]
+# A table, and the names of the columns of points if they are known; None for others.
+Apart = tuple["pd.DataFrame", list[str] | None] | None
+
+
+def frames_of(
+    frame: "pd.DataFrame", columns: Given = None, row_per_point: Given = None
+) -> tuple["pd.DataFrame", Given]:
+    """Return a table with a row for each frame, and what chooses the columns of points.
+
+    Tables that have one are returned as they are.
+    """
+    names, patterns = list(frame.columns), split_patterns(columns)
+    if not all(isinstance(name, str) for name in names):
+        return frame, columns
+    pair = patterns if len(patterns) == 2 and {*patterns} <= {*names} else None
+    found: Apart = None
+    if row_per_point is None and pair is None:
+        sets = landmark_sets(only_points(names))
+        if patterns:
+            sets = {name: MIN_POINTS for name in names if matches(name, patterns[0])}
+        if max(sets.values(), default=0) >= MIN_POINTS:
+            return frame, columns
+    if pair is None and (row_per_point is None or not axis_pairs(names)):
+        found = _cells_apart(frame)
+    if found is None or found[1] is None:
+        frame = _axes_apart(frame) if found is None else found[0]
+        found = _points_apart(frame, pair, row_per_point)
+    if found is None:
+        return frame, columns
+    return found[0], columns if patterns and not pair else found[1]
+
+
+def _cells_apart(frame: "pd.DataFrame") -> Apart:
+    """Return a table whose cells hold points with a column for each coordinate.
+
+    Also the names of these columns; None if they are x and y of one point a row.
+    """
+    found: dict[str, NDArray] = {}
+    for name in frame.select_dtypes(["object", "string"]):
+        cells = frame[name].dropna().astype(str)
+        cells = cells[cells.map(_MISSING.fullmatch).isna()]
+        if not cells.empty and re.search(r"[\[({=]", cells.iloc[0]):
+            for pattern, other in _WRITTEN:
+                cells = cells.str.replace(pattern, other, regex=True)
+        if cells.empty or len(_NUMBER.findall(cells.iloc[0])) < 2:
+            continue
+        if cells.map(_NUMBERS.fullmatch).isna().any():
+            continue
+        if cells.str.contains("...", regex=False).any():
+            raise ValueError(
+                f"the cells of the column {name!r} hold arrays of which '...' leaves "
+                "out numbers: write all, such as with str(array.tolist())"
+            )
+        numbers, inner = cells.map(_NUMBER.findall), _INNERMOST.search(cells.iloc[0])
+        n_all = len(numbers.iloc[0])
+        n_each = len(_NUMBER.findall(inner[1])) if inner else n_all
+        n_each = n_each if 1 < n_each < 7 and n_all % n_each == 0 else 1
+        if (numbers.map(len) == n_all).all():
+            values = pd.DataFrame(numbers.tolist(), cells.index).reindex(frame.index)
+            values = values.to_numpy(float).reshape(len(frame), -1, n_each)
+            found[name] = values[..., :2].reshape(len(frame), -1)
+        elif n_all >= 2 * MIN_POINTS:
+            raise ValueError(
+                f"the cells of the column {name!r} hold several numbers, but not the "
+                f"same number of them: the first has {n_all}"
+            )
+    points = [name for name, values in found.items() if values.shape[1] == 2]
+    lists = [name for name, values in found.items() if values.shape[1] >= MIN_POINTS]
+    pairs = [[x, y] for x, y, _ in axis_pairs(lists)]
+    if len(points) >= MIN_POINTS:
+        used, tracks = points, np.stack([found[name] for name in points], axis=1)
+    elif len(pairs) == 1:
+        used, tracks = pairs[0], np.stack([found[name] for name in pairs[0]], axis=2)
+    elif len(lists) == 1 and found[lists[0]].shape[1] % 2 == 0:
+        used, tracks = lists, found[lists[0]].reshape(len(frame), -1, 2)
+    elif (
+        len(points) == 1 and frame[points[0]].astype(str).str.contains(r"[\[({]").all()
+    ):
+        x, y = found[points[0]].T
+        return frame.drop(columns=points).assign(x=x, y=y), None
+    else:
+        return None
+    warn_caller(
+        f"the cells of {first_items(map(repr, used))} hold several numbers: they are "
+        f"read as x and y of {tracks.shape[1]} points"
+    )
+    names = _names(points if used is points else range(tracks.shape[1]), "xy")
+    values = pd.DataFrame(tracks.reshape(len(frame), -1), frame.index, names)
+    return pd.concat([frame.drop(columns=used), values], axis=1), names
+
+
+def _axes_apart(frame: "pd.DataFrame") -> "pd.DataFrame":
+    """Return a table with a row for each coordinate with columns x and y instead."""
+    for name in frame.select_dtypes(["object", "string"]):
+        if frame[name].nunique() > len(frame) / 2:
+            continue
+        texts = frame[name].astype(str).str.strip()
+        axes, known = texts.str.lower(), {}
+        coordinates = {text: parse_coordinate(text) for text in texts.unique()}
+        if all(coordinates.values()) and len(coordinates) >= 2 * MIN_POINTS:
+            known = {name: texts.map({t: c[1] for t, c in coordinates.items() if c})}
+            axes = texts.map({t: "xyz"[c[0]] for t, c in coordinates.items() if c})
+        if not {"x", "y"} <= {*axes} <= {"x", "y", "z", *CONFIDENCES}:
+            continue
+        columns = frame.drop(columns=name).assign(**known)
+        counts, few = columns.nunique(), len(columns) / 2
+        keys = [n for n in columns if 1 < counts[n] < few or n in known]
+        others = [n for n in columns if n not in keys and n not in CONFIDENCES]
+        value = ([n for n in columns if _VALUE.search(str(n))] or others)[-1]
+        keys = [n for n in keys if n not in (value, *CONFIDENCES)]
+        table = columns[axes == "x"].rename(columns={value: "x"})
+        for axis in {*axes} - {"x"}:
+            part = columns[axes == axis][[*keys, value]].rename(columns={value: axis})
+            table = table.merge(part, how="left", on=keys, validate="one_to_one")
+        return table
+    return frame
+
+
+def _points_apart(frame: "pd.DataFrame", pair: Given, given: Given) -> Apart:
+    """Return a table with a row for each frame in place of one for each point."""
+    frame = frame.rename(columns=lambda name: str(name).strip())
+    names = list(frame)
+    pairs = axis_pairs(only_points(names)) or axis_pairs(names)  # beside width, height
+    if pair:
+        pairs = [(pair[0], pair[1], -1)]
+    plain = [each for each in pairs if "".join(each[:2]).lower() == "xy"]
+    if given is not None and not pairs:
+        raise ValueError(
+            f"with {named('row_per_point')}, columns named x and y are needed, or "
+            f"their names in {named('columns')}, such as 'u,v'"
+        )
+    if not 0 < len(pairs) < MIN_POINTS:
+        return None
+    x, y, place = (plain or pairs)[0]
+    z = f"{x[:place]}{'z' if x[place] == 'x' else 'Z'}{x[place + 1 :]}"
+    values = {"x": x, "y": y} | ({"z": z} if z in names else {})
+    words = {name.lower(): name for name in names if len(name) > 1}
+    values |= {word: words[word] for word in CONFIDENCES if word in words}
+    keys = [n for n in names if n not in values.values() and frame[n].nunique() > 1]
+    found = _keys_of(frame, keys) if given is None else _keys_as_given(frame, given)
+    if found is None:
+        return None
+    if len(pairs) > 1 and not plain:
+        listed = " or ".join(repr(f"{x},{y}") for x, y, _ in pairs)
+        raise ValueError(
+            "the table has a row for each point, and several pairs of coordinates. "
+            f"Choose with {named('columns')}, {listed}"
+        )
+    frame, by_frame, by_point = found
+    row = np.zeros(len(frame), int)
+    if by_frame:
+        row += frame.groupby(by_frame, sort=False, dropna=False).ngroup().to_numpy()
+    texts = frame[by_point].astype(str).apply(lambda column: column.str.strip())
+    texts = texts.agg("_".join, axis=1) if len(by_point) > 1 else texts[by_point[0]]
+    point, labels = pd.factorize(texts)
+    numbers = pd.to_numeric(pd.Series(labels), errors="coerce")
+    if (numbers % 1 == 0).all():
+        order = np.argsort(numbers.to_numpy(), kind="stable")
+        point, labels = np.argsort(order)[point], numbers.astype(int)[order].tolist()
+    if (twice := pd.DataFrame({"row": row, "point": point}).duplicated()).any():
+        raise ValueError(
+            f"a frame has several rows for the point {texts[twice].iloc[0]!r}: name "
+            f"all columns that tell frames apart in {named('row_per_point')}"
+        )
+    wide = frame.set_index([row, point])[[*values.values()]].unstack()
+    wide = wide.set_axis([n for a in values for n in _names(labels, [a])], axis=1)
+    first = np.unique(row, return_index=True)[1]
+    others = [name for name in frame if name not in {*values.values(), *by_point}]
+    codes = {name: pd.factorize(frame[name])[0] for name in others}
+    of_frame = [n for n, code in codes.items() if (code[first][row] == code).all()]
+    unassigned = [name for name in others if name not in of_frame]
+    told = f"; left out, as they differ between its points: {first_items(unassigned)}"
+    if given is None or unassigned:
+        option = ",".join([*by_frame, "+".join(by_point)])
+        warn_caller(
+            f"the table has a row for each point: {', '.join(by_frame) or 'nothing'} "
+            f"tells {len(first)} frames apart, {', '.join(by_point)} {len(labels)} "
+            f"points ({named('row_per_point', option)}){told * bool(unassigned)}"
+        )
+    kept = frame[of_frame].iloc[first].reset_index(drop=True)
+    points = _names(labels, "xy") if len(by_point) < 2 else None
+    return pd.concat([kept, wide], axis=1), points
+
+
+def _names(labels: Iterable[Any], axes: Iterable[str]) -> list[str]:
+    """Return the names of columns of points, such as x_0, or nose_x."""
+    pairs = [(str(label).strip(), axis) for label in labels for axis in axes]
+    return [f"{a}_{j}" if j.isdigit() else f"{j}_{a}" for j, a in pairs]
+
+
+def _keys_as_given(frame: "pd.DataFrame", given: str | Sequence[str]) -> Keys:
+    """Return a table, and the columns that tell its frames and points apart, as given.
+
+    One that is not there is counted among the rows that the others do not tell apart.
+    """
+    listed = given.split(",") if isinstance(given, str) else list(given)
+    *by_frame, point = [name.strip() for name in listed]
+    keys = [*by_frame, *point.split("+")]
+    present = [name for name in keys if name in frame]
+    absent = [name for name in keys if name not in frame]
+    if len(absent) > 1:
+        raise ValueError(
+            "row_per_point must name the columns that tell frames apart, and then that "
+            f"of the points, such as 'frame,landmark'; the table has no {absent}"
+        )
+    groups = frame.groupby(present or np.zeros(len(frame)), dropna=False)
+    counts = {name: groups.cumcount() for name in absent}
+    return frame.assign(**counts), by_frame, point.split("+")
+
+
+def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
+    """Return a table, and the fewest columns that tell its frames and points apart.
+
+    None if it has no row for each point.
+    """
+    codes = pd.DataFrame({name: pd.factorize(frame[name])[0] for name in keys})
+    sizes, is_frame = codes.nunique(), {n: bool(_FRAME.search(n)) for n in keys}
+    # Points have names or whole numbers.
+    no_point = (frame[keys].apply(pd.to_numeric, errors="coerce") % 1 > 0).any()
+
+    def count(names: list[str]) -> int:
+        return len(codes[names].drop_duplicates()) if names else 1
+
+    of_points = [name for name in keys if _POINT.search(name)]
+    image = next(filter(_IMAGE.fullmatch, keys), None)
+    others = [n for n in keys[::-1] if not (is_frame[n] or no_point[n])]
+    for point in dict.fromkeys([*of_points, *others]):
+        by_frame, by_point = [name for name in keys if name != point], [point]
+        if count(keys) < len(frame):
+            break
+        by_size = sorted(by_frame, key=lambda n: (is_frame[n], -sizes[n], n == image))
+        for name in by_size:
+            fewer = [other for other in by_frame if other != name]
+            if count([*fewer, point]) == len(frame):
+                by_frame = fewer
+        if not by_frame and any(is_frame.values()):
+            continue  # the points of all frames have numbers of their own
+        # Parts, such as hands and face, have other points; people have the same.
+        for name in sorted(by_frame, key=lambda n: -sizes[n])[1:]:
+            few = sizes[point] < MIN_POINTS
+            if not is_frame[name] and (
+                few or count([name, point]) < 0.75 * sizes[name] * sizes[point]
+            ):
+                by_frame.remove(name)
+                by_point.insert(0, name)
+        for name in by_point[::-1]:
+            fewer = [other for other in by_point if other != name]
+            if fewer and count([*by_frame, *fewer]) == len(frame):
+                by_point = fewer
+        n_points = count(by_point)
+        if n_points >= MIN_POINTS and len(frame) > 0.4 * n_points * count(by_frame):
+            return frame, by_frame, by_point
+    # What no column tells apart is counted, if there is the same number of each.
+    by = [name for name in keys if sizes[name] <= len(frame) / 2]
+    counted = "point" if not of_points else "individual" if len(by) > 1 else "frame"
+    alike = codes.groupby(by).size() if by else pd.Series([1])
+    minimum = 2 if of_points else MIN_POINTS if image in by else np.inf
+    if alike.nunique() > 1 or alike.iloc[0] < minimum:
+        return None
+    by = [name for name in by if name not in of_points[:1]]
+    return _keys_as_given(frame, [*by, counted, *of_points[:1]])

@@ -149,13 +149,13 @@ def assemble(
     refuse_same_names([*map(str, frames.columns), *columns])
     if skeleton is None and (format in LAYOUTS_OF_READERS or not numbered(point_names)):
         skeleton = find_skeleton(n_points, point_names, format)
+    if confidence is not None:
+        confidence = pd.DataFrame(np.asarray(confidence), columns=list(point_names))
     return Landmarks(
         points=pd.DataFrame(tracks.reshape(n_frames, -1), None, columns, copy=False),
         # The copy is in one piece, so that further columns can be added quickly.
         frames=frames.set_axis(pd.RangeIndex(n_frames), axis=0).copy(),
-        confidence=None
-        if confidence is None
-        else pd.DataFrame(np.asarray(confidence), columns=list(point_names)),
+        confidence=confidence,
         failed=np.asarray(np.isnan(tracks).all(axis=(1, 2))),
         format=format,
         point_names=tuple(point_names),
@@ -209,23 +209,15 @@ def assemble_individuals(
     rows[~visible.any(axis=1), 0] = True
     frame, individual = np.nonzero(rows)
     nobody = several & ~visible[frame, individual]
-    columns: dict[str, Any] = {
-        name: [values[i] for i in frame.tolist()] for name, values in frames.items()
-    }
+    places, who = frame.tolist(), zip(individual.tolist(), nobody, strict=True)
+    columns: dict[str, Any] = {n: [v[i] for i in places] for n, v in frames.items()}
     if names is not None:
-        columns["individual"] = [
-            None if absent else names[i]
-            for i, absent in zip(individual.tolist(), nobody, strict=True)
-        ]
+        columns["individual"] = [None if absent else names[i] for i, absent in who]
     for name, of_each in (of_instances or {}).items():
         columns[name] = np.where(nobody, np.nan, of_each[frame, individual])
-    return assemble(
-        tracks[frame, individual],
-        point_names,
-        columns,
-        confidence=None if confidence is None else confidence[frame, individual],
-        **known,
-    )
+    if confidence is not None:
+        known["confidence"] = confidence[frame, individual]
+    return assemble(tracks[frame, individual], point_names, columns, **known)
 
 
 def stacked(
@@ -236,22 +228,20 @@ def stacked(
     `persons` are those of each image by their numbers, `names` those of the images. An
     image without persons has a row of NaN.
     """
-    persons_seen = [
-        (i, values) for i, each in enumerate(persons) for values in each.values()
-    ]
-    first, points = persons_seen[0]
-    for i, values in persons_seen:
-        if len(values) != len(points):
-            raise ValueError(
-                f"{names[first]} has {len(points)} points, {names[i]} has "
-                f"{len(values)}: all must have the same number"
-            )
+    points = next(values for each in persons for values in each.values())
     nobody = {None: np.full(points.shape, np.nan)}
     rows = [
         (i, number, values)
         for i, each in enumerate(persons)
         for number, values in (each or nobody).items()
     ]
+    first = next(i for i, each in enumerate(persons) if each)
+    for i, _, values in rows:
+        if len(values) != len(points):
+            raise ValueError(
+                f"{names[first]} has {len(points)} points, {names[i]} has "
+                f"{len(values)}: all must have the same number"
+            )
     images, numbers, stack = zip(*rows, strict=True)
     return list(images), pd.array(numbers, dtype="Int64"), np.stack(stack)
 
@@ -341,30 +331,23 @@ def from_mediapipe(
     part = part or "".join(parts)
     sizes = checked_sizes("image_sizes", image_sizes, len(results))
     names = [f"result {i} (counted from 0)" for i in range(len(results))]
-    persons = [
-        dict(enumerate(_persons(result, part, name)))
-        for result, name in zip(results, names, strict=True)
-    ]
+    pairs = zip(results, names, strict=True)
+    persons = [dict(enumerate(_persons(each, part, name))) for each, name in pairs]
     if not any(len(values) for each in persons for values in each.values()):
         raise ValueError(f"none of the {len(results)} results has any landmarks")
     frame, individual, values = stacked(persons, names)
     frames = {"frame": frame, "individual": individual}
     if part == "hand":
-        sides = [
-            [*map(_side, _entry(result, "handedness") or ())] for result in results
-        ]
+        hands = (_entry(result, "handedness") or () for result in results)
+        sides = [[*map(_side, each)] for each in hands]
         places = zip(frame, pd.Series(individual).fillna(-1), strict=True)
         side = [sides[i][k] if 0 <= k < len(sides[i]) else None for i, k in places]
         frames |= {"handedness": side} if any(side) else {}
     # Faces and hands have no visibility, though some versions set it to zero.
-    has_visibility = part == "pose" and not np.isnan(values[..., 2]).all()
-    return assemble(
-        values[..., :2] * sizes[frame][:, None],
-        None,
-        frames,
-        format="mediapipe",
-        confidence=values[..., 2] if has_visibility else None,
-    )
+    sure = values[..., 2]
+    confidence = sure if part == "pose" and not np.isnan(sure).all() else None
+    tracks = values[..., :2] * sizes[frame][:, None]
+    return assemble(tracks, None, frames, format="mediapipe", confidence=confidence)
 
 
 def from_movement(dataset: Any) -> Landmarks:
@@ -406,20 +389,15 @@ def from_movement(dataset: Any) -> Landmarks:
             "the positions must be in an image, with space x and y; got "
             f"{', '.join(space)}"
         )
-    confidence = None
+    known: dict[str, Any] = {"format": "movement"}
     if "confidence" in dataset:
         found = _by_axes(dataset, "confidence", axes[:3])
-        confidence = np.asarray(found.values, dtype=np.float64)
+        known["confidence"] = np.asarray(found.values, dtype=np.float64)
     tracks = np.asarray(position.values, dtype=np.float64)
     tracks = tracks[..., [space.index("x"), space.index("y")]]
-    return assemble_individuals(
-        tracks,
-        _names(position, 1),
-        _names(position, 2),
-        {"frame": range(len(tracks)), "time": position.coords["time"].values},
-        format="movement",
-        confidence=confidence,
-    )
+    frames = {"frame": range(len(tracks)), "time": position.coords["time"].values}
+    names = _names(position, 1), _names(position, 2)
+    return assemble_individuals(tracks, *names, frames, **known)
 
 
 def from_sleap_io(labels: Any) -> Landmarks:
@@ -460,13 +438,9 @@ def from_sleap_io(labels: Any) -> Landmarks:
             file, found = frame.video.filename, list(frame.instances)
             video = file if isinstance(file, str) else str([*file, ""][0])
             corrected = [id(getattr(each, "from_predicted", None)) for each in found]
-            kept_instances = [each for each in found if id(each) not in corrected] or [
-                None
-            ]
-            rows += [
-                (video, frame.frame_idx, k, each)
-                for k, each in enumerate(kept_instances)
-            ]
+            kept = [each for each in found if id(each) not in corrected]
+            places = enumerate(kept or [None])
+            rows += [(video, frame.frame_idx, k, each) for k, each in places]
         skeletons = [row[3].skeleton for row in rows if row[3] is not None]
         kinds = {(tuple(s.node_names), tuple(s.edge_names)) for s in skeletons}
         ((nodes, edges),) = kinds
@@ -476,26 +450,24 @@ def from_sleap_io(labels: Any) -> Landmarks:
             f"skeleton; got {type(labels).__name__}: {error}"
         ) from error
     rows.sort(key=lambda row: row[:3])
-    videos, numbers, places, instances = zip(*rows, strict=True)
+    videos, numbers, of_frame, instances = zip(*rows, strict=True)
     values = np.full((len(rows), len(nodes), 3), np.nan)
     for row, each in zip(values, instances, strict=True):
         if each is not None:
             points = each.numpy(**{"scores": True} if hasattr(each, "score") else {})
             row[:, : points.shape[1]] = points
     tracks = [getattr(each, "track", None) for each in instances]
-    frames: dict[str, Any] = {"video": videos, "frame": numbers, "instance": places}
+    frames: dict[str, Any] = {"video": videos, "frame": numbers, "instance": of_frame}
     frames["individual"] = [getattr(track, "name", None) for track in tracks]
     frames["instance_score"] = [getattr(each, "score", None) for each in instances]
     frames = {name: each for name, each in frames.items() if {*each} != {None}}
-    given = {"name": "SLEAP", "source": "labels of sleap-io"}
-    return assemble(
-        values[..., :2],
-        nodes,
-        frames,
-        format="sleap-io",
-        confidence=values[..., 2] if "instance_score" in frames else None,
-        skeleton=skeleton_of_names(edges, nodes, **given) if edges else None,
-    )
+    known: dict[str, Any] = {"format": "sleap-io"}
+    if "instance_score" in frames:
+        known["confidence"] = values[..., 2]
+    if edges:
+        given = {"name": "SLEAP", "source": "labels of sleap-io"}
+        known["skeleton"] = skeleton_of_names(edges, nodes, **given)
+    return assemble(values[..., :2], nodes, frames, **known)
 
 
 def _entry(result: Any, name: str) -> Any:

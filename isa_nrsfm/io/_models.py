@@ -27,11 +27,7 @@ from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.models import (
-    DepthCertainty,
-    FrameMap,
-    FrameModel,
-)
+from isa_nrsfm._frames.models import DepthCertainty, FrameMap, FrameModel
 from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm._other_tables import fitted_prior
 from isa_nrsfm._parameters.choices import LOSSES
@@ -212,17 +208,12 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     if "focal_length_" in values:
         values["focal_length_"] = np.ravel(values["focal_length_"])
     _check_shapes(values)
-    estimator._model = TableModel(
-        _frame_model(entries),
-        estimator.mean_shape_,
-        np.concatenate([estimator.basis_, entries["further_basis"]]),
-        len(estimator.basis_),
-        entries["layout"],
-        entries["unit"],
-        *(_pinhole(entries.get(name)) for name in ("pinhole", "axes")),
-    )
-    estimator.n_components_ = estimator._n_features_out = len(estimator.basis_)
-    pinhole = estimator._model.pinhole
+    K = estimator.n_components_ = estimator._n_features_out = len(estimator.basis_)
+    basis = np.concatenate([estimator.basis_, entries["further_basis"]])
+    parts = _frame_model(entries), estimator.mean_shape_, basis, K
+    pinhole, axes = (_pinhole(entries.get(name)) for name in ("pinhole", "axes"))
+    kinds = entries["layout"], entries["unit"]
+    estimator._model = TableModel(*parts, *kinds, pinhole, axes)
     estimator.camera_ = entries["camera"] if pinhole is None else "perspective"
     estimator.frames_scaled_ = entries["unit"] is None
     if entries["sizes"] is not None:
@@ -296,6 +287,9 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
     if not frames.joint:
         mean_shape, *basis = frames.shapes.mT
         return {**entries, "mean_shape": mean_shape, "basis": np.array(basis)}
+    certainty = frames.certainty._asdict() | {
+        "images": np.array(frames.certainty.images)
+    }
     return {
         **entries,
         "loss": frames.loss,
@@ -304,14 +298,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "coefficient_starts": frames.starts,
         "mixing": frames.gauge.mixing,
         "space": frames.gauge.space,
-        "certainty": frames.certainty.total,
-        "deformation": frames.certainty.deformation,
-        "turns": frames.certainty.turns,
-        "depth_variances": frames.certainty.points,
-        "leverage": frames.certainty.leverage,
-        "residual": frames.certainty.residual,
-        "image_errors": np.array(frames.certainty.images),
-        "weighted": frames.certainty.weighted,
+        **dict(zip(PARTS["certainty"], certainty.values(), strict=True)),
     }
 
 
@@ -328,6 +315,10 @@ def _frame_model(entries: dict[str, Any]) -> FrameModel:
     if "loss" not in entries:
         shapes = entries["mean_shape"], entries["basis"]
         return FrameModel.rigid(*shapes, entries["camera"])
+    certainty = [entries[name] for name in PARTS["certainty"]]
+    total, deformation, *errors, residual, images, weighted = certainty
+    certainty = [float(total), float(deformation), *errors, float(residual)]
+    certainty += [tuple(images), weighted is True]
     return FrameModel(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -335,16 +326,7 @@ def _frame_model(entries: dict[str, Any]) -> FrameModel:
         loss=entries["loss"],
         gauge=FrameMap(entries["mixing"], entries["space"]),
         camera=entries["camera"],
-        certainty=DepthCertainty(
-            float(entries["certainty"]),
-            float(entries["deformation"]),
-            entries["turns"],
-            entries["depth_variances"],
-            entries["leverage"],
-            float(entries["residual"]),
-            tuple(entries["image_errors"]),
-            entries["weighted"] is True,
-        ),
+        certainty=DepthCertainty(*certainty),
     )
 
 

@@ -134,10 +134,8 @@ def _open_parquet(files: list[Path]) -> StoredTable:
 
 def _row_groups(file: Path, table: Any, dtype: Any) -> Callable[[int, int], NDArray]:
     """Return a function that reads rows of a parquet file, by groups of rows."""
-    sizes = [
-        table.metadata.row_group(group).num_rows
-        for group in range(table.metadata.num_row_groups)
-    ]
+    groups = map(table.metadata.row_group, range(table.metadata.num_row_groups))
+    sizes = [group.num_rows for group in groups]
     ends = np.cumsum(sizes, dtype=int)
 
     def read(first: int, last: int) -> NDArray:

@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,16 +20,22 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
+from isa_nrsfm.io._landmark_columns import (
+    confidence_columns,
+    find_landmark_columns,
+    frames_of,
+)
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
-from isa_nrsfm.io._other_shapes import frames_of
 from isa_nrsfm.skeletons._column_names import (
+    WORDS,
     columns_of_individuals,
     parse_coordinate,
     point_names,
 )
 
 SEPARATORS = {".csv": ",", ".tsv": "\t", ".txt": "\t"}
+# How pandas reads texts.
+_CSV: Any = {"index_col": False, "encoding": "utf-8-sig", "low_memory": False}
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
 _LONGEST_LINE = 2**20
 # Bytes at the end of a file that show how its numbers are written.
@@ -40,11 +47,7 @@ _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
 _SEEN = dict.fromkeys((True, "True", "TRUE", "true"), 1.0)
 _SEEN |= dict.fromkeys((False, "False", "FALSE", "false"), 0.0)
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
-_MISSING = (
-    *("", "na", "nan", "-nan", "n/a", "null", "none"),
-    # Of spreadsheets, pandas, and C programs on Windows.
-    *("#n/a", "<na>", "nan(ind)", "-nan(ind)"),
-)
+_MISSING = WORDS["missing"].split("|")
 
 
 Missing = float | Sequence[float] | None
@@ -235,10 +238,8 @@ def landmark_table(
     names = find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, missing).reshape(len(frame), len(names))
-    return LandmarkTable(
-        pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
-        frame.drop(columns=names),
-    )
+    points = pd.DataFrame(values, frame.index, [name.strip() for name in names])
+    return LandmarkTable(points, frame.drop(columns=names))
 
 
 def individuals_as_rows(
@@ -249,9 +250,7 @@ def individuals_as_rows(
         return frame
     columns_of = columns_of_individuals(frame.columns, individuals)
     frame = frame.reset_index(drop=True)
-    common = frame.drop(
-        columns=[name for names in columns_of.values() for name in names]
-    )
+    common = frame.drop(columns=[*chain.from_iterable(columns_of.values())])
     if "individual" in common:
         raise ValueError(
             "the table has a column 'individual' already, which individuals would "
@@ -311,14 +310,12 @@ def read_named_columns(
     points, other = landmark_table(table, columns=columns, missing=missing, **shape)
     names = points.columns
     confidence = confidences_in(other, names[::2], names[1::2])
-    return assemble(
-        points.to_numpy().reshape(len(points), -1, 2),
-        point_names(names[::2]),
-        other.drop(columns=confidence.columns),
-        format="table",
-        columns=list(names),
-        confidence=None if confidence.empty else confidence,
-    )
+    known: dict[str, Any] = {"format": "table", "columns": list(names)}
+    if not confidence.empty:
+        known["confidence"] = confidence
+    tracks = points.to_numpy().reshape(len(points), -1, 2)
+    frames = other.drop(columns=confidence.columns)
+    return assemble(tracks, point_names(names[::2]), frames, **known)
 
 
 def confidences_in(
@@ -528,19 +525,11 @@ def read_columns(
         separator = separator_of(path)
         if sum(1 for _ in checked_rows(path, separator)) <= n_header:
             raise ValueError("it has a header but no rows")
-        frame = pd.read_csv(
-            path,
-            sep=separator,
-            header=None,
-            names=names,
-            skiprows=n_header,
-            usecols=[name for name in names if name not in leave_out],
-            dtype={name: str for name in names if name not in numbers},
-            index_col=False,
-            skipinitialspace=True,
-            encoding="utf-8-sig",
-            low_memory=False,
-        )
+        lines: dict[str, Any] = {"sep": separator, "names": names, "header": None}
+        lines |= {"skiprows": n_header, "skipinitialspace": True}
+        kept = [name for name in names if name not in leave_out]
+        types = {name: str for name in names if name not in numbers}
+        frame = pd.read_csv(path, usecols=kept, dtype=types, **lines, **_CSV)
     others = [name for name in frame if name not in {*numbers, *text}]
     frame = with_points(frame, numbers, others)
     found: dict[str, Any] = {name: _numbers_if_all(frame[name]) for name in others}
@@ -652,8 +641,7 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     refuse_same_names(header)
     header[0] = header[0].removeprefix("# ")  # of numpy.savetxt
     coordinates = [name for name in header if parse_coordinate(name) is not None]
-    options = {"index_col": False, "encoding": "utf-8-sig", "low_memory": False}
-    read = partial(pd.read_csv, path, sep=separator, keep_default_na=False, **options)
+    read = partial(pd.read_csv, path, sep=separator, keep_default_na=False, **_CSV)
     with contextlib.suppress(ValueError):  # without texts, if all cells are numbers
         missing = {name: [*_MISSING, "NaN", "NA"] for name in coordinates}
         types = {name: float if name in missing else str for name in header}

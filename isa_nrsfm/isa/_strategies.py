@@ -24,29 +24,25 @@ from sklearn.utils import check_array, check_random_state, gen_batches
 from sklearn.utils.parallel import Parallel, delayed
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import (
-    N_JOBS,
-    Interval,
-    fit_context,
-    with_numpy_defaults,
-)
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
+from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._tables.sources import unmasked
 
 
-@with_numpy_defaults
+@scikit_learn.with_numpy_defaults
 class BaseSubspaceAnalysis(
     ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator, metaclass=ABCMeta
 ):
     """Validation, whitening and projection. Subclasses implement `_unmix`."""
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        "subspace_size": [Interval(Integral, 1, None, closed="left")],
-        "n_init": [Interval(Integral, 1, None, closed="left")],
-        "max_iter": [Interval(Integral, 1, None, closed="left")],
-        "tol": [Interval(Real, 0, None, closed="neither")],
+        "subspace_size": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "n_init": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "max_iter": [scikit_learn.Interval(Integral, 1, None, closed="left")],
+        "tol": [scikit_learn.Interval(Real, 0, None, closed="neither")],
         "random_state": ["random_state"],
     }
 
@@ -55,9 +51,8 @@ class BaseSubspaceAnalysis(
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals, size = unmasked(signals), self.subspace_size
-        signals = validate_data(
-            self, signals, dtype=float, ensure_min_samples=2, ensure_min_features=size
-        )
+        least = {"ensure_min_samples": 2, "ensure_min_features": size}
+        signals = validate_data(self, signals, dtype=float, **least)
         n_signals = signals.shape[1]
         if n_signals % size:
             raise ValueError(
@@ -130,34 +125,6 @@ def derivatives(energy: NDArray) -> tuple[NDArray, NDArray]:
     return -0.5 * root, 0.25 * root**2 * root
 
 
-def orthogonalise(W: NDArray) -> NDArray:
-    """Return the orthogonal matrices ``(W W^T)^(-1/2) W`` nearest to W (n_batch, n, n).
-
-    Eigenvectors of ``W W^T`` take two thirds of the time of an SVD of W. One Newton
-    step restores the precision that squaring costs (Higham 2008, chapter 8).
-    """
-    values, axes = np.linalg.eigh(W @ W.swapaxes(-1, -2))
-    poor = values[:, 0] <= 1e-8 * values[:, -1]  # nearly singular
-    values[poor] = 1.0
-    nearest = (axes / np.sqrt(values)[:, None]) @ (axes.swapaxes(-1, -2) @ W)
-    error = nearest @ nearest.swapaxes(-1, -2) - np.eye(W.shape[-1])
-    nearest -= 0.5 * error @ nearest
-    if poor.any():
-        U, _, Vt = np.linalg.svd(W[poor])
-        nearest[poor] = U @ Vt
-    return nearest
-
-
-def log_likelihood(W: NDArray, Z: NDArray, subspace_size: int) -> NDArray:
-    """Return ``sum_k E F(u_k)``, the mean log-likelihood of a sample up to a constant.
-
-    W is (..., n_signals, n_signals), orthogonal, Z (n_signals, n_samples), white.
-    """
-    Y = W @ Z
-    u = (Y * Y).reshape(*W.shape[:-2], -1, subspace_size, Z.shape[1]).sum(axis=-2)
-    return log_density(u).mean(axis=-1).sum(axis=-1)
-
-
 def fixed_point_step(
     W: NDArray, Z: NDArray, subspace_size: int, length: NDArray | float = 1.0
 ) -> NDArray:
@@ -178,7 +145,7 @@ def fixed_point_step(
     step -= curvature.reshape(n_batch, n_signals, 1) * W
     kept = np.vecdot(step, W) * (1.0 / np.reshape(length, (-1, 1)) - 1.0)
     step += kept[..., None] * W
-    return orthogonalise(step)
+    return polar(step)[0]
 
 
 def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
@@ -283,7 +250,10 @@ def energy_shares(covariance: NDArray) -> Values:
 
 
 def likelihoods(signals: NDArray) -> Values:
-    """Return the values for the likelihood ``sum_k E F(u_k)`` of white signals."""
+    """Return the values of subspaces in the mean log-likelihood of white signals.
+
+    It is their sum ``sum_k E F(u_k)``, up to a constant.
+    """
     square = signals**2
 
     def value(groups: NDArray) -> NDArray:
@@ -380,7 +350,7 @@ class FastISA(BaseSubspaceAnalysis):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **BaseSubspaceAnalysis._parameter_constraints,
-        "n_jobs": N_JOBS,
+        "n_jobs": scikit_learn.N_JOBS,
         "verbose": ["verbose"],
     }
 
@@ -403,7 +373,7 @@ class FastISA(BaseSubspaceAnalysis):
         self.n_jobs = n_jobs
         self.verbose = verbose
 
-    @fit_context(nested=False)
+    @scikit_learn.fit_context(nested=False)
     def fit(self, signals: Any, y: Any = None) -> Self:
         """
         Find the independent subspaces.
@@ -431,9 +401,8 @@ class FastISA(BaseSubspaceAnalysis):
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
         random_state = check_random_state(self.random_state)
         n_signals = len(Z)
-        starts = orthogonalise(
-            random_state.standard_normal((self.n_init, n_signals, n_signals))
-        )
+        shape = (self.n_init, n_signals, n_signals)
+        starts = polar(random_state.standard_normal(shape))[0]
         # Few starts at first, as they often agree. Then batches that reduce overhead of
         # NumPy, with arrays that fit into the cache.
         ends = [AGREEING, 2 * AGREEING, *range(2 * AGREEING + 16, self.n_init, 16)]
@@ -482,7 +451,9 @@ class FastISA(BaseSubspaceAnalysis):
             W[r] = W[r][swap_until_best([in_order], likelihoods(W[r] @ Z))[0]]
         # FastISA.
         W, n_iter, converged = iterate(W, Z, size, max_iter=max_iter, tol=tol)
-        return W, log_likelihood(W, Z, size), n_iter_ica + n_iter, converged
+        subspaces = np.arange(len(Z)).reshape(-1, size)
+        values = np.array([likelihoods(each @ Z)(subspaces).sum() for each in W])
+        return W, values, n_iter_ica + n_iter, converged
 
 
 class PooledFastICA(BaseSubspaceAnalysis):
@@ -561,7 +532,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         self.tol = tol
         self.random_state = random_state
 
-    @fit_context(nested=False)
+    @scikit_learn.fit_context(nested=False)
     def fit(
         self,
         signals: Any,
@@ -616,9 +587,8 @@ class PooledFastICA(BaseSubspaceAnalysis):
         n_signals, size = len(Z), self.subspace_size
         if covariance is not None:
             covariance = _check_covariance(covariance, n_signals)
-            if covariance.any():
-                covariance = whitening @ covariance @ whitening.T
-            else:  # all groupings are as good
+            covariance = whitening @ covariance @ whitening.T
+            if not covariance.any():  # all groupings are as good
                 covariance = np.eye(n_signals)
         random_state = check_random_state(self.random_state)
         starts = random_state.standard_normal((self.n_init, n_signals, n_signals))
@@ -645,11 +615,8 @@ class PooledFastICA(BaseSubspaceAnalysis):
         self.n_iter_ = n_iter
         if criterion is not None:
             # All swaps between subspaces that raise the criterion
-            components = W @ whitening
-            (rows,) = swap_until_best(
-                [in_order], lambda each: criterion(components[each])
-            )
-            W = W[rows]
+            found = W @ whitening
+            W = W[swap_until_best([in_order], lambda each: criterion(found[each]))[0]]
         if not converged:
             warn_caller(
                 f"{type(self).__name__} did not converge in max_iter={self.max_iter} "
@@ -673,7 +640,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         with warnings.catch_warnings(record=True, action="always") as caught:
             ica.fit(Z.T)
         converged = not any(w.category is ConvergenceWarning for w in caught)
-        return orthogonalise(ica.components_[None])[0], ica.n_iter_, converged
+        return polar(ica.components_)[0], ica.n_iter_, converged
 
 
 def _check_covariance(covariance: Any, n_signals: int) -> NDArray:

@@ -1,9 +1,7 @@
 """Figures of a factorisation, drawn with matplotlib."""
 
-from isa_nrsfm.plotting._basis_shapes import BasisShapeDisplay
-from isa_nrsfm.plotting._coefficients import CoefficientsDisplay
-from isa_nrsfm.plotting._mode_covariance import ModeCovarianceDisplay
-from isa_nrsfm.plotting._reprojection import ReprojectionDisplay
+from isa_nrsfm.plotting._frame_displays import CoefficientsDisplay, ReprojectionDisplay
+from isa_nrsfm.plotting._model_displays import BasisShapeDisplay, ModeCovarianceDisplay
 
 __all__ = [
     "BasisShapeDisplay",

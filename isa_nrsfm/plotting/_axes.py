@@ -160,10 +160,8 @@ def add_legend(figure: Any, entries: list[Any], skeleton: Any, **options: Any) -
         lines = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR}
     elif skeleton is not None and skeleton.name == SPANNING_TREE:
         lines = {f"lines: {SPANNING_TREE}": MEAN_COLOUR}
-    entries = entries + [
-        Line2D([], [], color=colour, label=label, linewidth=1.5)
-        for label, colour in lines.items()
-    ]
+    drawn = (Line2D([], [], color=c, label=n, linewidth=1.5) for n, c in lines.items())
+    entries = [*entries, *drawn]
     style = {"loc": "outside lower center", "frameon": False, "fontsize": "small"}
     figure.legend(handles=entries, ncols=len(entries), **(style | options))
 
@@ -175,12 +173,8 @@ def chosen_numbers(
     if values is None:
         return np.arange(most)
     numbers = np.asarray(values)
-    if (
-        numbers.ndim != 1
-        or not numbers.size
-        or numbers.dtype.kind not in "iu"
-        or np.any((numbers < 0) | (numbers >= most))
-    ):
+    whole = numbers.ndim == 1 and numbers.size and numbers.dtype.kind in "iu"
+    if not whole or np.any((numbers < 0) | (numbers >= most)):
         raise ValueError(
             f"{name} must be a list of {content}, from 0 to {most - 1}; got {values!r}"
         )

@@ -24,6 +24,9 @@ from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
 # A name of a layout or "auto", the layout itself, or pairs of points.
 Edges = ArrayLike | Skeleton | str | None
 Origin = Literal["auto", "upper", "lower"]
+Side = Literal["upper", "lower"]
+# The layout of points, the lines to draw, and where y is zero.
+Lines = tuple[Skeleton | None, Skeleton | None, Side]
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
@@ -52,7 +55,7 @@ def viewing_rotation(cameras: NDArray, reference: NDArray, spread: NDArray) -> N
 
 def view_and_layout(
     estimator: Any, edges: Any = "auto", origin: Origin = "auto"
-) -> tuple[NDArray, Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
+) -> tuple[NDArray, Skeleton | None, Skeleton | None, Side]:
     """Return the view of a fitted model, its layout, the lines to draw, the origin.
 
     The view is the transform (3, 3) from the space of the model. With calibrated
@@ -68,7 +71,7 @@ def view_and_layout(
 
 def lines_of_model(
     estimator: Any, edges: Edges, origin: Origin, shape: NDArray
-) -> tuple[Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
+) -> Lines:
     """Return layout, lines and origin of a model with a mean shape (n_points, 3).
 
     Points without a layout are near each other if they are near in the images.
@@ -118,12 +121,8 @@ def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
 
 
 def choose_lines(
-    edges: Edges,
-    origin: Origin,
-    shape: NDArray,
-    names: tuple[str, ...] | None = None,
-    seen: NDArray | None = None,
-) -> tuple[Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
+    edges: Edges, origin: Origin, shape: NDArray, names: Any = None, seen: Any = None
+) -> Lines:
     """Return layout, lines to draw and origin of a shape (n_points, 2 or 3).
 
     Points without a layout, unless there are many, are joined by a minimal spanning
@@ -157,9 +156,7 @@ def spanning_tree(points: NDArray) -> NDArray[np.intp]:
     return np.transpose(minimum_spanning_tree(lengths).nonzero())
 
 
-def choose_origin(
-    origin: Origin, shape: NDArray, layout: Skeleton | None
-) -> Literal["upper", "lower"]:
+def choose_origin(origin: Origin, shape: NDArray, layout: Skeleton | None) -> Side:
     """Return whether y points down in the image of a shape ("upper") or up ("lower").
 
     Hands determine nothing.
@@ -174,9 +171,7 @@ def choose_origin(
     return origin
 
 
-def upright_turn(
-    shape: NDArray, layout: Skeleton | None, origin: Literal["upper", "lower"]
-) -> NDArray:
+def upright_turn(shape: NDArray, layout: Skeleton | None, origin: Side) -> NDArray:
     """Return the orthogonal matrix that makes a shape (n_points, 3) stand upright.
 
     The y of the turned shape has the same direction. A shape without a layout stays.

@@ -11,8 +11,10 @@ sets, ``thumb_#_x`` and ``*_x``.
 """
 
 import re
+import tomllib
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from itertools import pairwise, zip_longest
+from pathlib import Path
 from typing import Any, Literal
 
 _SEPARATORS = r"[ _.\-]"
@@ -33,23 +35,13 @@ _HEIGHTS = {"w": "h", "W": "H", "width": "height", "Width": "Height"}
 _WIDTH = re.compile(r"(?<!\b[xyzXYZ])[wW](?:idth)?(?![xyzXYZ]\b)")
 # Parts of names, with the separator after them: words, or numbers in words.
 _PARTS = (r"[^ _.\-]+[ _.\-]*", r"\d+|\D+")
-# Words and letters that tell parts of one body apart, and the letter of an axis.
-_SIDE = re.compile(
-    "left|right|links|rechts|linke|rechte|gauche|droite?|izq(?:uierd[ao])?|derech[ao]|"
-    "esquerd[ao]|direit[ao]|sinistr[ao]|destr[ao]|v[äe]nst(?:er|re)|h[öøo][gjy]e?re?|"
-    "lew[aey]|praw[aey]|upper|lower|front|hind|fore|rear|back|top|bottom|inner|outer|"
-    "middle|^(?:l[it]|r[et]|der)$|^[lrx]|[lr]$"
-)
-# Parts that a body has several times.
-_SERIES = re.compile(
-    "(?<![a-z])(finger|thumb|index|middle|ring|pinky|pinkie|little|toe|leg|arm|limb|"
-    "wing|fin|coxa|trochanter|femur|tibia|tarsus|claw|antenna|tentacle|rib|vertebra|"
-    "daumen|zeige|mittel|kleiner|bein|row|col|column)(?:finger|tip|s)?(?![a-z])"
-)
-# Individuals, and views of one, are no parts of a body, though they may have sides.
-_ANIMAL = re.compile(
-    "mouse|mice|rat|fly|fish|bird|dog|cat|ape|monkey|animal|person|cam|view"
-)
+_FILE = Path(__file__).with_name("words.toml")
+WORDS = {
+    kind: "|".join(words)
+    for kind, words in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
+}
+_SIDE, _ANIMAL = re.compile(WORDS["sides"]), re.compile(WORDS["individuals"])
+_SERIES = re.compile(rf"(?<![a-z])({WORDS['series']})(?:finger|tip|s)?(?![a-z])")
 # The axis, 0, 1 or 2 for x, y or z; the point, the name without its axis letter ("3",
 # "nose", "eye_lmk_3"); and the sets, the narrowest first: the text before the axis
 # letter, the three letters and the text after it, each with the key of the point.
@@ -240,9 +232,7 @@ def columns_of_individuals(
     best: dict[str, dict[Hashable, str]] = {}
     for division in _divisions(names):
         divisions = [division.get(name, {}) for name in who]
-        common = [
-            stem for stem in divisions[0] if all(stem in each for each in divisions)
-        ]
+        common = [stem for stem in divisions[0] if all(stem in d for d in divisions)]
         if len(common) > max(map(len, best.values()), default=0):
             pairs = zip(who, divisions, strict=True)
             best = {name: {each[stem]: stem for stem in common} for name, each in pairs}

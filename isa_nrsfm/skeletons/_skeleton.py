@@ -293,16 +293,9 @@ def skeleton_of_names(
     swapped = (re.sub("left|Left|LEFT", lambda m: _RIGHT_OF[m[0]], n) for n in names)
     mirror = [place.get(point) for point in swapped]
     pairs = [(j, k) for j, k in enumerate(mirror) if k is not None and k != j]
-    return Skeleton(
-        name,
-        "other",
-        len(names),
-        curves,
-        source,
-        tuple(names),
-        left=tuple(left for left, _ in pairs),
-        right=tuple(right for _, right in pairs),
-    )
+    left, right = (tuple(pair[side] for pair in pairs) for side in (0, 1))
+    points = tuple(names)
+    return Skeleton(name, "other", len(names), curves, source, points, left, right)
 
 
 def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> Skeleton:

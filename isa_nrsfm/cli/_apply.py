@@ -1,4 +1,4 @@
-"""The command transform."""
+"""The commands transform and export, of a model that fit has written."""
 
 import warnings
 from argparse import Namespace
@@ -13,16 +13,16 @@ from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm.cli import _reading, _report
-from isa_nrsfm.cli._outputs import check_outputs, read_model, write_alpha
+from isa_nrsfm.cli._options import EXPORTS, NONE, flag_of
 from isa_nrsfm.io._tables import table_suffix
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 
-def run(args: Namespace, warned: list[str]) -> str:
+def run_transform(args: Namespace, warned: list[str]) -> str:
     """Write the coefficients of a table's rows, and return the report."""
     output = Path(args.output)
     table_suffix(output)
-    estimator = read_model(args)
+    estimator = _report.read_model(args)
     with errors_of(args.model):
         check_requirements({"std": args.std, "refinement": estimator.refinement})
     if args.viewer is None and _reading.drawing_options(args):
@@ -30,7 +30,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     frames = _reading.read_frames(args, estimator)
     drawn = _reading.drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]
-    check_outputs(args, [args.table, args.model], outputs)
+    _report.check_outputs(args, [args.table, args.model], outputs)
     X, n_components = _reading.as_fitted(estimator, frames.X), len(estimator.basis_)
     alpha = std = np.empty((0, n_components))
     quality = ["fit", "", "no frame was fitted"]
@@ -38,16 +38,17 @@ def run(args: Namespace, warned: list[str]) -> str:
         motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
         explained = estimator.inverse_transform(alpha, motion, translation)
         square = np.nanmean((explained - np.asarray(X)) ** 2)
-        error = -estimator.score(X, **frames.weighting)
-        quality = _report.quality_row(
-            _report.quality_report(error, square, bool(frames.weighting))
+        error, weighted = (
+            -estimator.score(X, **frames.weighting),
+            bool(frames.weighting),
         )
+        quality = _report.quality_row(_report.quality_report(error, square, weighted))
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting
             )[1]
         alpha = alpha - removed_part(estimator, motion)
-    write_alpha(output, frames, alpha, std if args.std else None)
+    _report.write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
     files = "  ".join(map(str, outputs))
@@ -68,3 +69,51 @@ def _write_viewer(path: Path, estimator: Any, **options: Any) -> None:
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
         export.write_viewer(estimator, path, camera=None, **options)
+
+
+def run_export(args: Namespace, warned: list[str]) -> str:
+    """Write a model for another program, and return the report."""
+    output = Path(args.output)
+    contents = {s: name for name, each in EXPORTS.items() for s in each["suffixes"]}
+    if output.suffix.lower() not in contents:
+        raise ValueError(
+            "--output: expected a file with one of the suffixes "
+            f"{', '.join(contents)}; got {output}"
+        )
+    content = contents[output.suffix.lower()]
+    options = _given(args, content)
+    estimator = _report.read_model(args)
+    _report.check_outputs(args, [args.model], [output])
+    if "edges" in EXPORTS[content]["options"]:
+        options |= _reading.drawing(args, names_of_points(estimator), None)
+    if args.mirrored:
+        estimator = estimator.mirrored()
+    if options.get("camera") == NONE:
+        options["camera"] = None
+
+    what = ""
+    if content == "pdm":
+        pdm = export.point_distribution_model(estimator, **options)
+        export.write_pdm(pdm, output)
+        what = f"{len(pdm.eigenvalues)} modes of {len(pdm.mean)} points, "
+    else:
+        getattr(export, f"write_{content}")(estimator, output, **options)
+    text = f"{output}  {what}{output.stat().st_size} bytes"
+    return _report.text_of("", [["model", "", args.model], ["output", "", text]])
+
+
+def _given(args: Namespace, content: str) -> dict[str, Any]:
+    """Return the options that are given; raise if the content does not have them."""
+    given = {}
+    for name in [name for each in EXPORTS.values() for name in each["options"]]:
+        if getattr(args, name) in (None, False):
+            continue
+        having = [kind for kind, each in EXPORTS.items() if name in each["options"]]
+        if content not in having:
+            raise ValueError(
+                f"{flag_of(name)} is an option of {' and '.join(having)}; "
+                f"{args.output} is {content}"
+            )
+        if name not in ("skeleton", "mirrored"):
+            given[name] = getattr(args, name)
+    return given

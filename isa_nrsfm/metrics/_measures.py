@@ -1,19 +1,125 @@
-"""Measures of shapes, up to an affinity of space or up to rotations.
+"""Measures of tables, shapes and groupings of directions, up to what images leave open.
 
-Images leave an affinity undetermined, a 3x3 matrix that is multiplied from the right.
-Papers have several conventions for rotations. Shapes are (n, n_points, 3), one point a
-row.
+Images leave an affinity of space undetermined, a 3x3 matrix that is multiplied from the
+right. Papers have several conventions for rotations. Shapes are (n, n_points, 3), one
+point a row.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment, minimize
+from sklearn.utils import check_array
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables import tracks
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.sources import CHECKS, unmasked
+
+
+def inverse_snr(
+    X: ArrayLike,
+    X_hat: ArrayLike,
+    *,
+    layout: tracks.Layout = "interleaved",
+    scale_frames: bool = False,
+) -> float:
+    r"""
+    Compute the energy of the reprojection error relative to that of the table.
+
+    This is :math:`\|W - \hat W\|_F^2 / \|W\|_F^2`, where W and :math:`\hat W` are the
+    two tables with every frame centred over its points.
+
+    Parameters
+    ----------
+    X : array-like of shape (n_frames, 2 * n_points)
+        The table. Points with a NaN coordinate were not seen. They are ignored in both
+        tables.
+    X_hat : array-like of shape (n_frames, 2 * n_points)
+        The reprojection. It must be finite at the points seen in `X`.
+    layout : {"interleaved", "planar"}, default="interleaved"
+        Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+    scale_frames : bool, default=False
+        Whether to divide each frame of both tables by the RMS of its centred, seen
+        coordinates in `X`. Small and large images then have the same weight, as in
+        ``AffineNRSfM(scale_frames=True)``.
+
+    Returns
+    -------
+    float
+        The inverse signal-to-noise ratio, a fraction (not percent): 0 for a perfect
+        reprojection, 1 if nothing but the centroids is reprojected.
+
+    Raises
+    ------
+    ValueError
+        If the tables differ in shape, have an odd number of columns or infinite
+        entries, if a seen point has no reprojection, or if there is no energy to
+        compare with: all seen points equal in every frame (with `scale_frames`, in any
+        frame where points are seen).
+
+    Examples
+    --------
+    >>> from isa_nrsfm.metrics import inverse_snr
+    >>> X = [[0.0, 0.0, 2.0, 0.0], [5.0, 5.0, 5.0, 7.0]]
+    >>> X_hat = [[0.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    >>> inverse_snr(X, X_hat)
+    0.125
+    """
+    if layout not in tracks.LAYOUTS:
+        raise ValueError(f"layout must be one of {tracks.LAYOUTS}; got {layout!r}")
+    energy, error, seen = frame_energies(X, X_hat, layout)
+    if scale_frames:
+        used = seen.any(axis=1)
+        flat = np.flatnonzero(used & (energy == 0))
+        if len(flat):
+            raise ValueError(
+                f"frames of X whose seen points are all in one place: {len(flat)} of "
+                f"{len(energy)} (first: row {flat[0]}). They have no size to scale "
+                "them by. Remove them, or use scale_frames=False"
+            )
+        weights = seen.sum(axis=1)[used] / energy[used]
+        energy, error = energy[used] * weights, error[used] * weights
+    if not energy.sum() > 0:
+        raise ValueError(
+            "in each frame of X all seen points are in one place, so that errors "
+            "cannot be related to a size. Check how X was read"
+        )
+    return float(error.sum() / energy.sum())
+
+
+def frame_energies(
+    X: ArrayLike, X_hat: ArrayLike, layout: tracks.Layout
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return energies of frames and of their errors, and the mask of seen points."""
+    checks = CHECKS | {"dtype": np.float64}
+    truth = check_array(unmasked(X), input_name="X", **checks)
+    fitted = check_array(unmasked(X_hat), input_name="X_hat", **checks)
+    check_same_shape("X", truth, "X_hat", fitted)
+    both = (tracks.table_to_tracks(table, layout).mT for table in (truth, fitted))
+    truth, fitted = (tracks.without_half_points(rows)[0] for rows in both)
+    seen = tracks.seen_points(truth)
+    lost = seen & ~tracks.seen_points(fitted)
+    if lost.any():
+        rows = np.flatnonzero(lost.any(axis=1))
+        raise ValueError(
+            f"X_hat lacks points that X shows (NaN): {lost.sum()} in {len(rows)} of "
+            f"{len(lost)} frames (first: row {rows[0]}). Fill them in, or make them "
+            "NaN in X"
+        )
+
+    def energies(truth: NDArray, fitted: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the energies of a block of frames, and of their errors."""
+        fitted = np.where(tracks.seen_points(truth)[:, None], fitted, np.nan)
+        truth, fitted = (tracks.centred_frames(rows)[0] for rows in (truth, fitted))
+        error = np.nansum((truth - fitted) ** 2, axis=(1, 2))
+        return np.nansum(truth**2, axis=(1, 2)), error
+
+    blocks = FrameBlocks.of_array(truth, 1024)  # copies that stay in the cache
+    return *blocks.joined(energies, fitted), seen
 
 
 def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
@@ -266,9 +372,7 @@ def best_affinity(truth: NDArray, shapes: NDArray) -> NDArray[np.float64]:
     return whitener @ affinity.reshape(-1, 3)
 
 
-def _climb(
-    start: NDArray, cross: NDArray, scatter: NDArray
-) -> tuple[float, NDArray[np.float64]]:
+def _climb(start: NDArray, cross: NDArray, scatter: NDArray) -> tuple[float, NDArray]:
     """Maximise ``sum <a, cross_i>^2 / <a, scatter_i a>`` from a start.
 
     What is left of each pair is minimised, which rounds less: return minus that, and a.
@@ -516,3 +620,102 @@ def normalise(shapes: NDArray, smallest: float) -> NDArray[np.float64]:
     """Return shapes of unit norm, and zero for those with a norm up to the smallest."""
     norms = np.linalg.norm(shapes, axis=(1, 2), keepdims=True)
     return np.divide(shapes, norms, out=np.zeros_like(shapes), where=norms > smallest)
+
+
+def subspace_distance(
+    components_a: ArrayLike, components_b: ArrayLike, subspace_size: int = 3
+) -> float:
+    r"""
+    Compare two groupings of directions into subspaces.
+
+    Consecutive groups of `subspace_size` rows span K subspaces on either side. They are
+    matched one to one. The distance of a pair is the root mean square of the sines of
+    its principal angles. The result is the distance of the worst pair in the best
+    matching.
+
+    Parameters
+    ----------
+    components_a, components_b : array-like of shape (n_components, n_features)
+        The directions, one per row. Only the span of each group matters: rows may be
+        rotated, scaled or mixed within their group, and groups may be permuted. They
+        need not be orthonormal.
+    subspace_size : int, default=3
+        Number of rows of each group.
+
+    Returns
+    -------
+    float
+        The distance, from 0 (the same subspaces) to 1 (some subspace is orthogonal to
+        its partner). It is a metric on sets of K subspaces.
+
+    Raises
+    ------
+    ValueError
+        If the arrays differ in shape, are not of the shape above, have entries that
+        are not finite, if `subspace_size` does not divide the number of rows, or if
+        the rows of a group are linearly dependent.
+
+    Notes
+    -----
+    To judge an independent subspace analysis of signals with a known mixing, compare
+    its `components_` with the true unmixing. Angles are meaningful only if the signals
+    are white. If the observed signals are x = A s, with groups of independent white
+    sources s, and z = V x are the whitened signals that were analysed, then compare
+    `components_` with the inverse of V A. If x itself was analysed, `components_`
+    includes the whitening, and its product with the inverse of V is to be compared.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.metrics import subspace_distance
+    >>> truth = np.eye(4)
+    >>> float(round(subspace_distance(truth, truth[[3, 2, 0, 1]], 2), 6))
+    0.0
+
+    The first plane turned about one of its axes by 30 degrees, which has the sine 0.5:
+
+    >>> turned = np.eye(4)
+    >>> turned[0] = np.cos(np.pi / 6), 0.0, np.sin(np.pi / 6), 0.0
+    >>> float(round(subspace_distance(truth, turned, 2), 6))
+    0.353553
+    """
+    bases_a = _orthonormal_blocks("components_a", components_a, subspace_size)
+    bases_b = _orthonormal_blocks("components_b", components_b, subspace_size)
+    check_same_shape("components_a", bases_a, "components_b", bases_b)
+    # Component of b orthogonal to a; 1 - cosine^2 would lose half of the digits.
+    inner = np.einsum("kim,ljm->klij", bases_a, bases_b)
+    outside = bases_b - np.einsum("klij,kim->kljm", inner, bases_a)
+    distances = np.sqrt(np.sum(outside**2, axis=(2, 3)) / subspace_size)
+    return min(_bottleneck(distances), 1.0)  # rounding may lead beyond 1
+
+
+def _orthonormal_blocks(name: str, components: ArrayLike, size: int) -> NDArray:
+    """Return orthonormal bases (K, size, n_features) of the groups of rows."""
+    if size != int(size) or size < 1:
+        raise ValueError(f"subspace_size must be a positive integer; got {size!r}")
+    rows = as_finite(name, components)
+    if rows.ndim != 2 or not rows.size or len(rows) % size:
+        raise ValueError(
+            f"{name} must be of the shape (n_components, n_features) with a multiple "
+            f"of subspace_size={size} rows; got the shape {rows.shape}"
+        )
+    blocks = rows.reshape(-1, size, rows.shape[1])
+    ranks = np.linalg.matrix_rank(blocks)
+    if (ranks < size).any():
+        block = np.flatnonzero(ranks < size)[0]
+        raise ValueError(
+            f"each group of {size} rows of {name} must be linearly independent; "
+            f"group {block} has rank {ranks[block]}"
+        )
+    return np.linalg.svd(blocks, full_matrices=False)[2]
+
+
+def _bottleneck(costs: NDArray) -> float:
+    """Return the largest cost of a matching, minimised over all matchings."""
+
+    def sufficient(level: float) -> bool:
+        too_large = costs > level
+        return not too_large[linear_sum_assignment(too_large)].any()
+
+    levels = np.unique(costs)
+    return float(levels[bisect_left(levels, True, key=sufficient)])
