@@ -12,8 +12,9 @@ from scipy.linalg import expm
 from scipy.special import gammaln
 
 from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
-from isa_nrsfm._linalg.small_matrices import orientations, polar
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._tables.blocks import spread
+from isa_nrsfm.isa._strategies import orthogonalise
 
 # Candidate densities of each signal, by their *tail*: degrees of freedom of Student's
 # t, or LIGHT for one with lighter tails than a Gaussian, exp(-c ||y||^4).
@@ -122,7 +123,7 @@ def _starts(Z: NDArray, n_starts: int) -> NDArray:
 
     rng = np.random.default_rng(0)
     turned = rng.standard_normal((n_starts - 1, n_signals, n_signals)) @ axes
-    return np.concatenate([axes[None], polar(turned)[0]])
+    return np.concatenate([axes[None], orthogonalise(turned)])
 
 
 def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
@@ -139,7 +140,7 @@ def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
         g, dg = _slopes(u, tail, size)
         curvature = np.mean(size * g + 2.0 * u * dg, axis=-1)
         step = (g[..., None] * Y).reshape(*W.shape[:2], -1) @ flat.T / n_samples
-        W = polar(step - curvature[..., None] * W)[0]
+        W = orthogonalise(step - curvature[..., None] * W)
     return W
 
 

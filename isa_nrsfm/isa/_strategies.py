@@ -125,6 +125,24 @@ def derivatives(energy: NDArray) -> tuple[NDArray, NDArray]:
     return -0.5 * root, 0.25 * root**2 * root
 
 
+def orthogonalise(W: NDArray) -> NDArray:
+    """Return the orthogonal matrices ``(W W^T)^(-1/2) W`` nearest to W (n_batch, n, n).
+
+    Eigenvectors of ``W W^T`` take two thirds of the time of an SVD of W. One Newton
+    step restores the precision that squaring costs (Higham 2008, chapter 8).
+    """
+    values, axes = np.linalg.eigh(W @ W.swapaxes(-1, -2))
+    poor = values[:, 0] <= 1e-8 * values[:, -1]  # nearly singular
+    values[poor] = 1.0
+    nearest = (axes / np.sqrt(values)[:, None]) @ (axes.swapaxes(-1, -2) @ W)
+    error = nearest @ nearest.swapaxes(-1, -2) - np.eye(W.shape[-1])
+    nearest -= 0.5 * error @ nearest
+    if poor.any():
+        U, _, Vt = np.linalg.svd(W[poor])
+        nearest[poor] = U @ Vt
+    return nearest
+
+
 def fixed_point_step(
     W: NDArray, Z: NDArray, subspace_size: int, length: NDArray | float = 1.0
 ) -> NDArray:
@@ -145,7 +163,7 @@ def fixed_point_step(
     step -= curvature.reshape(n_batch, n_signals, 1) * W
     kept = np.vecdot(step, W) * (1.0 / np.reshape(length, (-1, 1)) - 1.0)
     step += kept[..., None] * W
-    return polar(step)[0]
+    return orthogonalise(step)
 
 
 def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
@@ -402,7 +420,7 @@ class FastISA(BaseSubspaceAnalysis):
         random_state = check_random_state(self.random_state)
         n_signals = len(Z)
         shape = (self.n_init, n_signals, n_signals)
-        starts = polar(random_state.standard_normal(shape))[0]
+        starts = orthogonalise(random_state.standard_normal(shape))
         # Few starts at first, as they often agree. Then batches that reduce overhead of
         # NumPy, with arrays that fit into the cache.
         ends = [AGREEING, 2 * AGREEING, *range(2 * AGREEING + 16, self.n_init, 16)]
