@@ -13,7 +13,7 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 from scipy.special import logit
 
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.models import FrameMap, LinearisedFrames
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
@@ -381,12 +381,6 @@ class TestSmooth:
         found = model.smooth(few)
         assert found.time_scales.shape == (0,)
         assert_allclose(found.alpha, model.transform(few), atol=1e-12)
-
-    def test_needs_a_posterior(self, waving):
-        _, table = waving
-        model = AffineNRSfM(1, isa=FastISA(n_init=1), refinement=None).fit(table)
-        with pytest.raises(ValueError, match="refinement='joint'"):
-            model.smooth(table)
 
 
 test_refusals = refusals_of("dynamics", globals())

@@ -14,6 +14,7 @@ from layers import may_not_converge, slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refusals_of, refused
+from scenes import with_gaps
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
@@ -388,27 +389,34 @@ def test_methods_follow_the_formula(variant, which):
 
 
 @only(refinement=["alternating", None])
-@pytest.mark.parametrize("which", ["fitted", "new"])
+@pytest.mark.parametrize("which", ["fitted", "new", "missing"])
 def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
-    # Camera: the rigid fit to the mean shape. Coefficients: the fit that follows.
+    # Camera and position: the rigid fit to the mean shape. Coefficients, and their
+    # position: the fit that follows.
     model, table, new = variant
-    table = table if which == "fitted" else new
     assert model.refinement or model.n_iter_ == 1
-    motion, translation, alpha, _ = model.decompose(table)
+    table = table if which == "fitted" else new.copy()
     tracks = tracks_of(table, model.layout)
+    if which == "missing":
+        tracks = with_gaps(tracks)
+        table = tracks.reshape(table.shape)
+        table = planar(table) if model.layout == "planar" else table
+    motion, translation, alpha, _ = model.decompose(table)
     for i in range(0, len(table), 7):
-        assert_allclose(translation[i], tracks[i].mean(axis=0), rtol=1e-12)
-        centred = tracks[i] - tracks[i].mean(axis=0)
-        M = np.linalg.lstsq(model.mean_shape_, centred)[0].T
+        seen = np.isfinite(tracks[i, :, 0])
+        points, mean_shape = tracks[i, seen], model.mean_shape_[seen]
+        with_position = np.column_stack([mean_shape, np.ones(len(points))])
+        M = np.linalg.lstsq(with_position, points)[0][:3].T
         if model.camera != "affine":  # the nearest scaled rotation
             U, values, Vt = np.linalg.svd(M, full_matrices=False)
             scale = 1.0 if model.camera == "orthographic" else values.mean()
             M = scale * U @ Vt
         assert_allclose(motion[i], M, atol=1e-10 * np.abs(M).max())
-        design = (model.basis_ @ M.T).reshape(len(model.basis_), -1).T
-        rest = (centred - model.mean_shape_ @ M.T).ravel()
-        best = np.linalg.lstsq(design, rest)[0]
-        assert_allclose(alpha[i], best, atol=1e-8 * np.abs(best).max())
+        of_basis = (model.basis_[:, seen] @ M.T).reshape(len(model.basis_), -1).T
+        design = np.hstack([of_basis, np.tile(np.eye(2), (len(points), 1))])
+        best = np.linalg.lstsq(design, (points - mean_shape @ M.T).ravel())[0]
+        assert_allclose(alpha[i], best[:-2], atol=1e-8 * np.abs(best[:-2]).max())
+        assert_allclose(translation[i], best[-2:], rtol=1e-9)
 
 
 def test_table_that_the_model_has_made_is_taken_apart_again(model):
@@ -771,6 +779,9 @@ def test_mirror_images_fit_as_well(camera, refinement):
     if camera != "affine":
         assert_allclose(np.linalg.det(mirrored.rotations_), 1)
         assert_allclose(mirrored.rotations_, depth[:, None] * model.rotations_ * depth)
+    signs = np.tile(depth, len(model.basis_))
+    covariance = model.mode_covariance_ * np.outer(signs, signs)
+    assert_allclose(mirrored.mode_covariance_, covariance, rtol=0, atol=1e-15)
     again = mirrored.mirrored()
     assert_array_equal(again.basis_, model.basis_)
     assert_array_equal(again.mode_covariance_, model.mode_covariance_)

@@ -8,8 +8,8 @@ import pytest
 from frame_parts import depth_deviations, fit_posterior
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import warned
-from scenes import random_rotation, with_gaps
+from refusals import refusals_of, warned
+from scenes import with_gaps
 from scipy.spatial.transform import Rotation
 
 from benchmarks.depth import animal
@@ -56,72 +56,9 @@ def orthogonal_shapes(seed, n_components=2, n_points=20):
     return shapes[0].T, shapes[1:].transpose(0, 2, 1)
 
 
-def random_fit(seed, noise=0.0, n_frames=12, n_components=2):
-    """Return tracks made of shapes, and all that went into them."""
-    rng = np.random.default_rng(seed)
-    mean_shape, basis = orthogonal_shapes(seed, n_components)
-    motion = rng.normal(size=(n_frames, 2, 3))
-    translation = rng.normal(size=(n_frames, 2))
-    alpha = rng.normal(size=(n_frames, n_components))
-    tracks = project(compose(mean_shape, basis, alpha), motion, translation)
-    tracks = tracks + noise * rng.normal(size=tracks.shape)
-    return tracks, mean_shape, basis, (motion, translation, alpha)
-
-
-def rigid(tracks, mean_shape, basis, camera="affine"):
-    """Return the fit of the paper's model of a frame."""
-    rows = tracks.transpose(0, 2, 1)
-    frames = FrameModel.rigid(mean_shape, basis, camera)
-    return frames.fit(rows, np.ones(len(rows)), True, None)
-
-
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
 GAPS = pytest.mark.parametrize("missing", [0.0, 0.3])
 EACH_LOSS = pytest.mark.parametrize("loss", slow_after(1, LOSSES[:0:-1]))
-
-
-def least_squares(mean_shape, basis, points, camera):
-    """Return camera, position and coefficients of one frame, the one after the other.
-
-    Camera and position together are a linear least squares fit to the mean shape;
-    position and coefficients one to the basis shapes in the nearest camera.
-    """
-    seen = ~np.isnan(points[:, 0])
-    points, mean_shape, basis = points[seen], mean_shape[seen], basis[:, seen]
-    with_position = np.column_stack([mean_shape, np.ones(len(points))])
-    M = np.linalg.lstsq(with_position, points)[0][:3].T
-    if camera != "affine":
-        U, S, Vt = np.linalg.svd(M, full_matrices=False)
-        M = (S.mean() if camera == "weak_perspective" else 1.0) * U @ Vt
-    design = np.zeros((2 * len(points), len(basis) + 2))
-    for k, B in enumerate(basis):
-        design[:, k] = (B @ M.T).ravel()
-    design[0::2, -2], design[1::2, -1] = 1, 1
-    found = np.linalg.lstsq(design, (points - mean_shape @ M.T).ravel())[0]
-    return M, found[-2:], found[:-2]
-
-
-class TestRigidFrames:
-    @CAMERA
-    @GAPS
-    def test_camera_first_then_coefficients_by_least_squares(self, camera, missing):
-        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        tracks = with_gaps(tracks, missing)
-        fitted = rigid(tracks, mean_shape, basis, camera)
-        for i, points in enumerate(tracks):
-            M, t, alpha = least_squares(mean_shape, basis, points, camera)
-            assert_allclose(fitted.motion[i], M, atol=1e-12)
-            assert_allclose(fitted.translation[i], t, atol=1e-11)
-            assert_allclose(fitted.alpha[i], alpha, atol=1e-10)
-
-    def test_basis_shape_that_no_camera_sees(self):
-        # The mean shape is flat, so the cameras do not see along its normal.
-        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        mean_shape, basis = mean_shape * [1.0, 1.0, 0.0], basis.copy()
-        basis[1] *= [0.0, 0.0, 1.0]
-        R = random_rotation(0)
-        fitted = rigid(tracks, mean_shape @ R, basis @ R)
-        assert_allclose(fitted.alpha[:, 1], 0, atol=1e-14)
 
 
 NOISE = 0.05
@@ -299,21 +236,15 @@ class TestDepthDeviations:
         assert np.ptp(leverage) > 1.0
 
 
-class TestSamplePosterior:
-    def test_information_on_the_shapes(self):
-        rng = np.random.default_rng(0)
-        motion, alpha = rng.normal(size=(12, 2, 3)), rng.normal(size=(12, 2))
-        root, share = rng.normal(size=(2, 2)), rng.uniform(0.5, 1.0, 12)
-        information = np.zeros((9, 9))
-        for M, a, weight in zip(motion, alpha, share, strict=True):
-            c = np.append(1.0, a)
-            moments = np.outer(c, c)
-            moments[1:, 1:] += root @ root.T
-            information += weight * np.kron(moments, M.T @ M)
-        found = shape_information(
-            motion, alpha, root @ root.T, share, [slice(0, 5), slice(5, 12)]
-        )
-        assert_allclose(found, information, rtol=1e-12, atol=1e-12)
+def test_information_on_the_shapes(rng):
+    motion, alpha = rng.normal(size=(12, 2, 3)), rng.normal(size=(12, 2))
+    share, moments = rng.uniform(0.5, 1.0, 12), np.diag([0.0, 3.0, 2.0])
+    information = np.zeros((9, 9))
+    for M, c, weight in zip(motion, np.insert(alpha, 0, 1.0, 1), share, strict=True):
+        information += weight * np.kron(np.outer(c, c) + moments, M.T @ M)
+    given = motion, alpha, moments[1:, 1:], share
+    found = shape_information(*given, [slice(0, 5), slice(5, 12)])
+    assert_allclose(found, information, rtol=1e-12, atol=1e-12)
 
 
 def faces_turned_by(degrees, seed=0, n_frames=80, noise=0.01, missing=0.0):
@@ -393,16 +324,13 @@ class TestExtents:
             slope = np.subtract(*change) / 2
             assert_allclose(np.sum(gradient * step), slope, rtol=1e-5)
 
-    def test_by_definition_and_in_all_units(self):
-        shapes = np.zeros((1, 3, 6))
-        shapes[0, [0, 0, 1, 1, 2, 2], range(6)] = [8, -8, 1, -1, 1, -1]
+    def test_by_definition_and_in_all_units_also_of_flat_and_empty_shapes(self):
         a, b, c = 128.0, 2.0, 2.0
         ratio = (a + b + c) ** 2 / (3 * (a * b + b * c + c * a))
-        assert_allclose(extent_penalty(shapes)[0], ratio - 1, rtol=0.1)
-        value = extent_penalty(shapes)[0]
-        assert_allclose(extent_penalty(7 * shapes)[0], value, rtol=1e-12)
-
-    def test_is_zero_for_equal_extents_and_finite_for_flat_and_empty_shapes(self):
+        shapes = np.kron(np.diag([8.0, 1.0, 1.0]), [1, -1])[None]
+        values = [extent_penalty(unit * shapes)[0] for unit in (1, 7)]
+        assert_allclose(values, ratio - 1, rtol=0.1)
+        assert_allclose(*values, rtol=1e-12)
         cube = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(1, 3, 8)
         value, gradient = extent_penalty(cube.astype(float))
         assert_allclose(value, 0, atol=1e-12)
@@ -415,31 +343,24 @@ class TestExtents:
 
 
 class TestFrontalFaces:
-    def test_are_no_needles(self, frontal):
+    def test_are_no_needles_and_uncertain(self, frontal):
         _, model = frontal
         extents = np.linalg.svd(model.mean_shape_, compute_uv=False)
         assert extents[0] < 4 * extents[1]
-
-    def test_depths_are_uncertain(self, frontal):
-        assert frontal[1].depth_uncertainty_ > 0.2
-        found = frontal[1].diagnostics()
+        assert model.depth_uncertainty_ > 0.2
+        found = model.diagnostics()
         assert "isa_nrsfm.AutoNRSfM().fit(X)" in found.messages[0]
-        assert found.depth_uncertainty == frontal[1].depth_uncertainty_
+        assert found.depth_uncertainty == model.depth_uncertainty_
 
-    def test_angles_are_withheld(self, frontal):
+    def test_angles_and_proportions_are_withheld(self, frontal, tmp_path):
         X, model = frontal
         poses = warned("is not determined", frame_poses, model, X)
         assert np.isnan(poses[:3]).all()
         assert np.isnan(poses[4:]).all()
         assert np.isfinite(poses.scale).all()
-
-    def test_the_page_claims_no_proportions(self, frontal, tmp_path):
-        X, model = frontal
         write_viewer(model, tmp_path / "page.html", X=X, camera=None)
         assert "The depth is not determined" in (tmp_path / "page.html").read_text()
-
-    def test_side_views_are_marked(self, frontal):
-        display = BasisShapeDisplay.from_estimator(frontal[1])
+        display = BasisShapeDisplay.from_estimator(model)
         for axes in display.axes_[:, 1]:
             assert axes.get_xlabel() == "depth not determined"
 
@@ -497,19 +418,6 @@ class TestTurnedFaces:
         assert_allclose(found, model.reconstruct(X, return_std=True)[1])
 
 
-def test_affine_models_have_no_deviations_of_depths():
-    X, *_ = faces_turned_by(20, n_frames=60)
-    model = fitted(X, 1, camera="affine")
-    for name in ("depth_uncertainty_", "rotations_", "scales_"):
-        assert not hasattr(model, name)
-        with pytest.raises(AttributeError, match=f"{name} needs .* Fit with camera="):
-            getattr(model, name)
-    with pytest.raises(AttributeError, match="no attribute 'depth_error_'"):
-        _ = model.depth_error_
-    with pytest.raises(ValueError, match="return_std needs a model with calibrated"):
-        model.reconstruct(X, return_std=True)
-
-
 def test_orthographic_deviations_of_depths_are_the_errors():
     _, points, _ = faces_turned_by(20)
     points /= np.linalg.norm(points, axis=(1, 2), keepdims=True) / 100
@@ -519,12 +427,6 @@ def test_orthographic_deviations_of_depths_are_the_errors():
     off, _ = error_of_depths(model, X, points)
     relative = off / model.reconstruct(X, return_std=True)[1]
     assert 0.3 < np.sqrt(np.mean(relative**2)) < 2
-
-
-def test_unestimated_certainty_withholds_nothing():
-    assert DepthCertainty().determined
-    assert DepthCertainty(total=0.5).determined
-    assert not DepthCertainty(total=0.6).determined
 
 
 def test_uncertainty_of_a_consensus_has_the_share_of_deformation():
@@ -647,3 +549,6 @@ def test_weak_perspective_finds_what_orthographic_cameras_find():
     found = (model.reconstruct(X) for model in models)
     errors = [mean_shape_error_3d(shapes, each, convention="frame") for each in found]
     assert errors[0] < 1.2 * errors[1]
+
+
+test_refusals = refusals_of("frame_fit", globals())
