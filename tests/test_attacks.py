@@ -5,6 +5,8 @@ import pickle
 import re
 import threading
 from contextlib import suppress
+from io import BytesIO
+from zipfile import ZipFile
 
 import landmark_files as files
 import numpy as np
@@ -152,6 +154,24 @@ def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
         main([*options, f"{text}.csv"])
     shown = "".join(capsys.readouterr()) + (tmp_path / "b/report.html").read_text()
     assert not {*text} - {*"]0;a[2Jgpj.exe"} & {*shown}
+
+
+def bytes_of(array, **options):
+    """Return the bytes of an array in NumPy's format."""
+    content = BytesIO()
+    np.lib.format.write_array(content, array, **options)
+    return content.getvalue()
+
+
+def archive(folder, content):
+    """Write an archive of arrays, of which one has this content."""
+    with ZipFile(folder / "a.npz", "w") as file:
+        file.writestr("points.npy", content)
+    return folder / "a.npz"
+
+
+ARRAY = bytes_of(np.arange(8.0).reshape(2, 4), version=(2, 0))
+OBJECTS = bytes_of(np.array([None, None]), allow_pickle=True).partition(b"\n")[0]
 
 
 YOLO = "0 .5 .5 .2 .2" + " .5" * 10

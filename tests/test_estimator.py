@@ -419,22 +419,6 @@ def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
         assert_allclose(translation[i], best[-2:], rtol=1e-9)
 
 
-def test_table_that_the_model_has_made_is_taken_apart_again(model):
-    # Nothing but the model itself is in it. The prior draws the coefficients a little
-    # to zero.
-    table = model.reproject(TABLE)
-    drawn = np.abs(model.transform(table) - model.alpha_) / model.alpha_std_
-    assert drawn.max() < 1
-    assert -model.score(table) < 1e-2 * -model.score(TABLE)
-    again = estimator().fit(table)
-    assert again.rank_floor_ < 1e-20
-    assert again.inverse_snr_ < 1e-8
-    cosine = np.sum(again.basis_ * model.basis_, axis=(1, 2))
-    cosine /= np.linalg.norm(again.basis_, axis=(1, 2))
-    cosine /= np.linalg.norm(model.basis_, axis=(1, 2))
-    assert np.all(np.abs(cosine) > 0.99)
-
-
 def test_inverse_transform_takes_the_mean_view_by_default(model):
     sizes = 1 / np.sqrt(frame_weights(tracks_of(TABLE), True))
     mean_view = np.mean(model.motion_ / sizes[:, None, None], axis=0)

@@ -199,13 +199,9 @@ def lines_and_tiny_frames():
     return tracks
 
 
-def test_frames_that_are_lines_or_tiny():
-    tracks = lines_and_tiny_frames()
+def test_frames_that_are_lines_or_tiny_and_two_places_only(rng):
     for scale_frames in (True, False):
-        fitted(tracks, 2, scale_frames=scale_frames)
-
-
-def test_two_places_only(rng):
+        fitted(lines_and_tiny_frames(), 2, scale_frames=scale_frames)
     tracks = np.repeat(rng.normal(size=(40, 2, 2)), 10, axis=1)
     assert fitted(tracks, 1).inverse_snr_ < 1e-25
     assert jointly(tracks, 1).inverse_snr_ < 1e-20
@@ -226,14 +222,6 @@ def test_joint_refinement_of_the_shark(load_data, k, loss):
     tracks = real_tracks(load_data, "shark_torresani")[::8]
     model = jointly(tracks, k, repeat=k == 1, kind=OneStart, loss=loss, max_iter=100)
     assert model.inverse_snr_ < fitted(tracks, k).inverse_snr_
-
-
-@pytest.mark.parametrize(
-    ("n_components", "noise"), slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)])
-)
-def test_joint_refinement_of_flat_objects(n_components, noise):
-    model = jointly(bending_tracks(flat=(1, 1, 0), noise=noise), n_components)
-    assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 
 
 @pytest.mark.parametrize(
@@ -265,13 +253,23 @@ def test_joint_refinement_of_duplicated_points_and_frames():
 
 @pytest.mark.parametrize(
     ("n_components", "n_cameras", "noise"),
-    slow_after(2, [(1, 1, 0.0), (1, 2, 0.02), (2, 1, 0.0), (2, 2, 0.02)]),
+    slow_after(
+        2,
+        [
+            *((1, 1, 0.0), (1, None, 0.01), (1, 2, 0.02), (2, 1, 0.0), (2, 2, 0.02)),
+            *((3, None, 0.0), (3, None, 0.01)),
+        ],
+    ),
 )
-def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, noise):
+def test_joint_refinement_of_flat_objects_or_views(n_components, n_cameras, noise):
     # All frames from one place, or from two: depth is seen in part or not at all.
-    motion = cameras(np.random.default_rng(1), n_cameras)
-    tracks = bending_tracks(np.repeat(motion, 40 // n_cameras, axis=0), noise=noise)
-    model = jointly(tracks, n_components, kind=AllStarts)
+    if n_cameras is None:
+        tracks, kind = bending_tracks(flat=(1, 1, 0), noise=noise), AffineNRSfM
+    else:
+        motion = cameras(np.random.default_rng(1), n_cameras)
+        motion = np.repeat(motion, 40 // n_cameras, axis=0)
+        tracks, kind = bending_tracks(motion, noise=noise), AllStarts
+    model = jointly(tracks, n_components, kind=kind)
     assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 
 

@@ -48,6 +48,7 @@ from isa_nrsfm._linalg.small_matrices import (
     frames_last,
     unpacked,
 )
+from isa_nrsfm._tables.blocks import block_slices  # noqa: F401  in refusals.txt
 
 AS_USERS = ["few_frames", "widths"]
 NOISE = 0.02
