@@ -4,14 +4,12 @@ import pickle
 from functools import partial
 
 import numpy as np
-import pandas as pd
 import pytest
 from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 from scenes import random_cameras, with_gaps
-from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
@@ -97,15 +95,6 @@ class TestContract:
         again = pickle.loads(pickle.dumps(fitted(method)))
         assert_array_equal(again.transform(table().data), fitted(method).alpha_)
 
-    def test_names(self):
-        names = [f"{axis}{j}" for j in range(30) for axis in "xy"]
-        frame = pd.DataFrame(table().data, columns=names)
-        model = BlockMatrixNRSfM(2).set_output(transform="pandas").fit(frame)
-        shown = model.transform(frame)
-        assert list(shown.columns) == ["blockmatrixnrsfm0", "blockmatrixnrsfm1"]
-        assert_allclose(shown, fitted("block matrix").alpha_)
-        refused("contradicts the column names", model.fit, frame[sorted(names)])
-
     @each
     def test_refused_tables(self, method):
         X, make = table().data, METHODS[method]
@@ -172,15 +161,6 @@ class TestFitted:
         assert ordered.inverse_snr_ == pytest.approx(other.inverse_snr_)
         # Each shape agrees with the sum of all.
         assert (np.tensordot(other.shapes_, other.mean_shape_, 2) >= 0).all()
-
-    @pytest.mark.parametrize("method", slow_after(1, list(METHODS)[:2]))
-    def test_signs_agree_for_a_camera_that_turns_slowly(self, method):
-        turns = np.outer(np.radians(8.0) * np.arange(60), [0.1, 0.9, 0.3])
-        cameras = Rotation.from_rotvec(turns).as_matrix()[:, :2]
-        X = as_table(table().shapes @ cameras.swapaxes(1, 2))
-        ordered, other = (METHODS[method](2, ordered=o).fit(X) for o in (True, False))
-        assert_allclose(ordered.shapes_, other.shapes_)
-        assert_allclose(ordered.motion_, other.motion_)
 
 
 class TestInvariances:
@@ -275,15 +255,6 @@ class TestLowRank:
         assert error_in_cameras(truth.shapes, truth.motion, model) < 2e-3
         # The shapes are right without any coordinate system of the cameras, too.
         assert mean_shape_error_3d(truth.shapes, model.shapes_) < 2e-3
-
-    def test_shapes_have_the_least_nuclear_norm(self):
-        # Of wide tables the least nuclear norm is the truth's, up to its noise.
-        truth, model = table(), fitted("block matrix")
-        norms = (
-            np.linalg.norm(shapes.reshape(60, -1), "nuc")
-            for shapes in (model.shapes_, truth.shapes)
-        )
-        assert next(norms) == pytest.approx(next(norms), rel=0.02)
 
     def test_new_frames(self):
         truth = table(n_frames=200)

@@ -18,7 +18,6 @@ from scenes import with_gaps
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm.baselines import PseudoInverseNRSfM
@@ -204,14 +203,6 @@ def test_every_attribute_is_documented(model):
     assert fitted <= documented
     documented = {name for name in documented if name.endswith("_")}
     assert documented - fitted == set()
-
-
-def test_inputs_of_other_types_are_fitted_in_double_precision():
-    table = np.round(TABLE).astype(np.int32)
-    model = estimator(refinement="alternating").fit(table)
-    assert model.alpha_.dtype == np.float64
-    for same in (table.astype(float), table.tolist()):
-        assert_array_equal(clone(model).fit(same).alpha_, model.alpha_)
 
 
 def scaled_matrix(model, table):
@@ -671,18 +662,6 @@ def test_verbose_prints_a_line_for_each_stage(capsys):
 # --- scikit-learn -------------------------------------------------------------------
 
 
-def test_grid_search_over_own_and_nested_parameters():
-    grid = [{"n_components": [1]}, {"n_components": [K], "isa__n_init": [2]}]
-    model = AffineNRSfM(isa=FastISA(), refinement="alternating", random_state=0)
-    search = GridSearchCV(model, grid, cv=2)
-    search.fit(TABLE)
-    assert np.isfinite(search.cv_results_["mean_test_score"]).all()
-    assert search.best_params_["n_components"] == K
-    assert search.best_estimator_.isa_.n_init == 2
-    assert search.best_estimator_.basis_.shape == (3, N_POINTS, 3)
-    assert search.score(TABLE) == search.best_estimator_.score(TABLE)
-
-
 def test_another_refinement_leaves_nothing_of_the_joint_one():
     model = AffineNRSfM(1, random_state=0).fit(TABLE)
     assert model.noise_variance_ > 0
@@ -769,16 +748,6 @@ def test_mirror_images_fit_as_well(camera, refinement):
     again = mirrored.mirrored()
     assert_array_equal(again.basis_, model.basis_)
     assert_array_equal(again.mode_covariance_, model.mode_covariance_)
-
-
-@pytest.mark.parametrize("camera", CALIBRATED)
-def test_models_with_calibrated_cameras_reconstruct_for_these_only(camera):
-    model, truth = calibrated(camera)
-    shapes = model.reconstruct(truth.data)
-    assert_array_equal(model.reconstruct(truth.data, camera=camera), shapes)
-    other = "orthographic" if camera == "weak_perspective" else "weak_perspective"
-    with pytest.raises(ValueError, match=f"fitted with camera='{camera}'"):
-        model.reconstruct(truth.data, camera=other)
 
 
 @pytest.mark.parametrize("camera", ["weak_perspective", "affine"])

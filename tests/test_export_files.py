@@ -342,12 +342,6 @@ def test_labels_are_sorted_numbers_first_and_none_last(page):
     assert data["labels"][:4] == [1, 2, 0, 1]
 
 
-def test_affine_shapes_have_no_poses_and_say_so(page):
-    data = page(face_model(), camera=None)
-    assert data["rotations"] == ""
-    assert data["about"].startswith("Affine shapes: angles and depth are not")
-
-
 def test_the_sides_of_a_known_layout_are_told(page):
     data = page(face_model())
     assert data["sides"] == get_skeleton("ibug-68").sides.tolist()
@@ -454,17 +448,6 @@ class TestPointDistances:
         assert mouth.mean() == pytest.approx(50.0, rel=0.01)
         again = point_distances(model, [MOUTH], truth.data)
         assert_allclose(again, eyes, atol=2e-3)
-
-
-def test_uncertainty_needs_calibrated_cameras(fitted):
-    truth, model = fitted
-    if model.camera == "affine":
-        message = "needs a model with calibrated cameras; .* Fit with camera='weak_"
-        refused(message, model.rotation_covariance, truth.data)
-    else:
-        covariance = model.rotation_covariance(truth.data)
-        assert covariance.shape == (N_FRAMES, 3, 3)
-        assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
 # --- point distribution models -------------------------------------------------------

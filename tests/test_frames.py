@@ -5,6 +5,8 @@ those of a dense objective, the fit is its minimum, covariances are inverse Hess
 and the fit of a frame does not depend on the others.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import scenes
@@ -37,6 +39,7 @@ from isa_nrsfm._frames.search import (
     MAX_STEPS,
     REVERSED,
     FrameSearch,
+    State,
     _rise,
     calibrated_starts,
     scale_of,
@@ -213,16 +216,6 @@ class TestDerivatives:
         got = search.evaluate(problem, M).value
         expected = [value(scene, i, each) for i, each in enumerate(scene.motion)]
         assert_allclose(got, NOISE**2 * np.array(expected), rtol=1e-9)
-
-    @KINDS
-    @pytest.mark.parametrize("noise", [1e-4, 10.0])
-    def test_slope_by_differences(self, camera, kind, noise):
-        search, problem, M = problem_of(scene_of(camera, kind), camera, noise)
-        M = self.disturbed(M, CAMERAS[camera])
-        slope = search.evaluate(problem, M).slope
-        for c, (above, below) in enumerate(self.states(search, problem, M)):
-            expected = -(above.value - below.value) / (4 * self.H)
-            assert_allclose(slope[c], expected, rtol=1e-6, atol=1e-5)
 
     def numerical_hessian(self, search, problem, M):
         """Return half the Hessian of s2 F (p, p, n), by differences of the slope."""
@@ -438,15 +431,6 @@ class TestDegenerate:
             expected = W @ np.linalg.pinv(scene.shapes[0])
             assert_allclose(fits.motion, expected, atol=1e-11)
 
-    def test_basis_shape_of_zeros_has_the_prior(self, camera):
-        scene = scene_of(camera)
-        padded = np.concatenate([scene.shapes, np.zeros_like(scene.shapes[:1])])
-        expected = fitted(scene, camera)
-        fits = fitted(scene._replace(shapes=padded), camera)
-        assert_array_equal(fits.alpha[:, 3], 0.0)
-        assert_allclose(fits.covariance[:, 3, 3], 1.0)
-        assert_allclose(fits.alpha[:, :3], expected.alpha, atol=1e-8)
-
     def test_frames_that_determine_no_camera(self, camera):
         scene = scene_of(camera, n_frames=8)
         scene.shapes[0, 0, :6] = 0.3  # six points in a plane
@@ -624,20 +608,6 @@ class TestReversal:
             end = TestMinimum.minimum(scene, camera, i, start, noise)
             assert value(scene, i, fits.motion[i], noise) <= end + 1e-6
 
-    def test_rise_on_the_way_is_that_of_the_quadratic_approximation(self, camera):
-        scene = scene_of(camera, noise=0.0, n_frames=3)
-        search, problem, M = problem_of(scene, camera, 1e-9)
-        posterior = coefficient_posterior(problem[0], M, problem[1])
-        for i, rise in enumerate(_rise(problem, M, posterior)):
-
-            def f(change, i=i):
-                changed = M[..., i] + change.reshape(2, 3)
-                frame = Regression.of(scene, i, changed, search.shared.shapes)
-                return frame.square(frame.mean(1e-9), 1e-9)
-
-            Y, z = hessian_of(f, 6) / 2, (M[..., i] * [0, 0, 1]).ravel()
-            assert_allclose(rise, (z @ z) ** 2 / (z @ np.linalg.solve(Y, z)), rtol=1e-3)
-
 
 def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):
     """Also of equal singular values, of one, of none, and of axes in the columns."""
@@ -658,6 +628,39 @@ def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):
     some = np.arange(40) != 4
     assert_allclose(completed[:, :2, some] / size[some], M[:, :2, some] / size[some])
     assert (np.einsum("ri,ri->i", completed[:, 2], M[:, 2]) >= 0).all()
+
+
+class Energies(NamedTuple):
+    energy: np.ndarray
+
+
+class Wells(FrameSearch):
+    """The function ``x^4 / 4 - x^2 / 2`` of each frame, with minima ``+- 1``."""
+
+    def __init__(self, n_frames):
+        self.problem = Energies(np.ones(n_frames)), np.zeros(n_frames)
+        self.model = CAMERAS["affine"]  # steps are added
+
+    def evaluate(self, problem, x):
+        value = x[0] ** 4 / 4 - x[0] ** 2 / 2
+        return State(x, value, (x - x**3) / 2, np.ones_like(x), (3 * x**2 - 1) / 2)
+
+    def ended(self, start, known=None, max_steps=60):
+        state = self.evaluate(self.problem, np.array([start]))
+        found, converged = self.descend(self.problem, state, max_steps, known)
+        return found[0], converged
+
+
+def test_search_is_given_up_in_the_well_of_a_known_minimum_or_out_of_its_reach():
+    known = np.zeros((1, 2)), np.array([-10.0, -0.2]), np.zeros(2)
+    found, converged = Wells(2).ended([1.1, 1.1], known)
+    assert_array_equal(converged, [False, True])
+    assert_allclose(found, [1.1, 1.0], rtol=1e-7)
+    known = np.ones((1, 2)), np.full(2, -0.3), np.array([0.2, 0.01])
+    found, _ = Wells(2).ended([1.5, 1.5], known, 3)
+    steps = [Wells(1).ended([1.5], max_steps=n)[0][0] for n in range(4)]
+    assert found[0] == next(x for x in steps if abs(x - 1.0) < 0.2)
+    assert abs(found[1] - 1.0) < abs(found[0] - 1.0)
 
 
 test_refusals = refusals_of("frames", globals())
