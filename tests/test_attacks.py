@@ -30,7 +30,6 @@ SIGNALS = np.random.default_rng(0).laplace(size=(300, 6))
 WEAK = {"camera": "weak_perspective", "random_state": 0}
 METHODS = "reconstruct reproject score diagnostics smooth rotation_covariance".split()
 MODELS = {
-    "affine": (AffineNRSfM(1, random_state=0), X),
     "holes": (AffineNRSfM(1, **WEAK), (HOLES * X.reshape(40, 12, 2)).reshape(40, -1)),
     "paper": (AffineNRSfM(1, refinement=None, random_state=0), X),
     "cauchy": (AffineNRSfM(1, loss="cauchy", **WEAK), X[:20]),

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 from scenes import random_cameras, with_gaps
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.utils import estimator_checks
@@ -192,15 +191,6 @@ class TestInvariances:
         assert_allclose(other.alpha_, model.alpha_[frames], atol=1e-4)
 
     @each
-    def test_layouts_and_memory_order(self, method):
-        X, model = table().data, fitted(method)
-        planar = np.asfortranarray(as_table(table().tracks, "planar"))
-        other = METHODS[method](2, layout="planar").fit(planar)
-        assert_allclose(other.shapes_, model.shapes_, atol=1e-6)
-        images = as_table(model.reproject(X).reshape(60, 30, 2), "planar")
-        assert_allclose(other.reproject(planar), images, atol=1e-6)
-
-    @each
     def test_single_precision(self, method):
         X = table().data.astype(np.float32)
         model, single = fitted(method), METHODS[method](2).fit(X)
@@ -268,12 +258,6 @@ class TestLowRank:
         rest = np.linalg.lstsq(np.column_stack([alpha, np.ones(50)]), expected)[1]
         assert (rest / np.sum(expected**2, axis=0) < 0.02).all()
 
-    def test_too_few_steps(self):
-        model = BlockMatrixNRSfM(2, max_iter=2)
-        options = {"category": ConvergenceWarning}
-        warned("converge in max_iter=2 steps", model.fit, table().data, **options)
-        assert 18 <= model.n_iter_ <= 36
-
 
 def sparse_scene(n_frames, n_points, n_atoms, sparsity=2):
     """Return a table of sums of so many random atoms, its cameras and its shapes."""
@@ -325,16 +309,6 @@ class TestCompressible:
         if size[2] == 1:
             assert error_of_frames(shapes, cameras, model) < 1e-6
 
-    def test_atoms_without_shared_frames_are_aligned_by_their_shapes(self, rng):
-        # One shape, nearly, learnt as three atoms.
-        atoms = rng.normal(size=(30, 3)) + 0.05 * rng.normal(size=(3, 30, 3))
-        shapes = (atoms - atoms.mean(axis=1, keepdims=True))[np.arange(60) % 3]
-        cameras = random_cameras(rng, 60)
-        model = CompressibleNRSfM(2, n_atoms=3, sparsity=1, random_state=0)
-        model.fit(as_table(shapes @ cameras.swapaxes(1, 2)))
-        assert model.inverse_snr_ < 1e-3
-        assert error_of_frames(shapes, cameras, model) < 0.1
-
     def test_atoms_that_few_frames_use_are_replaced(self):
         # Twice as many atoms as the shapes have: without it one has no frames.
         X, *_ = sparse_scene(60, 20, 3, sparsity=1)
@@ -342,20 +316,6 @@ class TestCompressible:
         model = CompressibleNRSfM(2, **options).fit(X)
         assert model.n_users_.min() > 0
         assert model.dictionary_residual_ < 1e-12
-
-    def test_seeds_and_atoms(self):
-        X = table().data
-        first, other, named, many = (
-            CompressibleNRSfM(2, max_iter=2, random_state=s, n_atoms=n).fit(X)
-            for s, n in ((0, None), (1, None), (0, 3), (0, 8))
-        )
-        assert_array_equal(first.shapes_, named.shapes_)
-        assert first.dictionary_residual_ != other.dictionary_residual_
-        assert many.n_users_.shape == (8,)
-        assert many.basis_.shape == (2, 30, 3)
-        assert 60 <= many.n_users_.sum() <= 120
-        assert many.n_iter_ <= 2
-        assert many.dictionary_residual_ < first.dictionary_residual_
 
 
 SHARK, YOGA = "shark_torresani", "akhter_yoga"

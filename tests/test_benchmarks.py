@@ -53,7 +53,10 @@ def test_cells_say_median_range_and_failures():
     [
         (3, "ok", {"square": 9}, ""),
         (-1, "over time", {}, "over 0.5 s"),
-        ("a", "error", {}, "TypeError: '<' not supported between instances of"),
+        pytest.param(
+            *("a", "error", {}, "TypeError: '<' not supported between instances of"),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_runs_in_a_process_of_their_own_end(x, status, values, message):
@@ -158,15 +161,15 @@ def test_common_shape_does_not_depend_on_size_and_rotation(rng):
 
 @pytest.mark.subprocess
 def test_command_measures_writes_and_rewrites(tmp_path, capsys):
-    chosen = ["truth", "--sets", "synthetic", "--methods", "rigid", "floor"]
+    chosen = ["truth", "--sets", "synthetic", "--methods", "rigid"]
     output = ["--output", str(tmp_path)]
     command.main([*chosen, "--repeats", "1", "--jobs", "2", *output])
-    assert "[2/2] truth synthetic" in capsys.readouterr().out
+    assert "[1/1] truth synthetic" in capsys.readouterr().out
     page = (tmp_path / "truth.md").read_text(encoding="utf-8")
     assert "| rigid mean shape | " in page
     assert "time_limit 600" in page
     stored = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
-    assert {r["method"] for r in stored["records"]} == {"rigid", "floor"}
+    assert {r["method"] for r in stored["records"]} == {"rigid"}
 
     (tmp_path / "truth.md").unlink()
     command.main(["--tables-only", *output])

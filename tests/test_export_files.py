@@ -1,7 +1,6 @@
 """Exported files and poses: glTF, shapes and their distribution, pages, angles."""
 
 import base64
-import copy
 import hashlib
 import re
 
@@ -20,9 +19,8 @@ from export_models import (
 from exported_files import Read, content_of, numbers
 from layers import may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
-from refusals import refusals_of, refused, warned
+from refusals import refusals_of
 from scipy.io import loadmat
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -89,22 +87,6 @@ def test_names_and_bounds_are_exact(written):
         points = read.array(part["POSITION"])
         assert_array_equal(accessor["min"], points.min(axis=0))
         assert_array_equal(accessor["max"], points.max(axis=0))
-
-
-def test_the_surface_covers_the_front_view(written):
-    read = written(face_model())
-    surface = read.primitive(4)
-    corners = read.array(surface["indices"]).reshape(-1, 3).astype(int)
-    mean = read.array(surface["attributes"]["POSITION"]).astype(float)
-    a, b, c = mean[corners, :2].transpose(1, 0, 2)
-    areas = np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1))) / 2
-    assert areas.sum() == pytest.approx(ConvexHull(mean[:, :2]).volume)
-
-
-def test_points_on_a_line_have_no_triangles(written):
-    model = copy.copy(blob_model())
-    model.mean_shape_ = np.outer(np.arange(20.0), [1, 1, 0])
-    refused("on one line in the front view", written, model, camera=None)
 
 
 def test_the_animation_swings_each_basis_shape_in_turn(written):
@@ -260,13 +242,6 @@ def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
     assert np.sum(error**2) < 1e-3 * np.sum(images**2)
 
 
-def test_mirror_images_and_origins_change_signs(page):
-    shapes = shapes_of(page(blob_model()))
-    mirrored, lower = page(blob_model().mirrored()), page(blob_model(), origin="lower")
-    assert_allclose(shapes_of(mirrored), shapes * [1, 1, -1], atol=1e-6)
-    assert_allclose(shapes_of(lower), shapes * [1, -1, -1], atol=1e-6)
-
-
 @pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
 def test_basis_shapes_are_those_of_the_frames(page, camera):
     # The model's, or the least squares fit to Euclidean shapes of affine cameras.
@@ -305,13 +280,6 @@ def test_deviations_of_points_are_those_of_all_frames(page):
     found = numbers(data["deviations"]).reshape(N_FRAMES, 68)
     assert_allclose(found, np.tile(deviations * found[0, -1], (N_FRAMES, 1)), rtol=1e-5)
     assert np.isnan(found[:, 3]).all()
-
-
-def test_few_frames_are_spread_over_the_rows(page):
-    data = page(face_model(), n_frames=4)
-    assert data["rows"] == ["0", "49", "99", "149"]
-    assert data["count"] == f"4 of {N_FRAMES} rows, evenly spread."
-    assert page(face_model(), n_frames=0)["rows"] == []
 
 
 def test_other_tables_are_shown_by_their_index(page):
@@ -562,23 +530,6 @@ def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
     assert len(recwarn) == 0
 
 
-def test_affine_shapes_have_as_many_modes_as_basis_shapes():
-    model = face_model()
-    pdm = point_distribution_model(model, camera=None, n_modes=0.999999)
-    assert len(pdm.modes) == N_COMPONENTS
-
-
-def test_rows_without_points_are_left_out():
-    table = faces().data[:60].copy()
-    options = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
-    model = AffineNRSfM(1, **options).fit(table[:40])
-    table[40:] = np.nan
-    with_empty = warned("no point is visible", AffineNRSfM(1, **options).fit, table)
-    found, expected = map(point_distribution_model, (with_empty, model))
-    for one, other in zip(found, expected, strict=True):
-        assert_allclose(one, other, rtol=1e-9, atol=1e-9)
-
-
 def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):
     model = face_model()
     everything = point_distribution_model(model, n_modes=0.999999).eigenvalues
@@ -589,13 +540,6 @@ def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):
         assert len(found.modes) == n_modes
         exact = point_distribution_model(model, n_modes=n_modes)
         assert_equal(found, exact)
-
-
-def test_another_unit_of_length(pdm):
-    scaled = pdm.scaled(2.5)
-    assert_allclose(scaled.mean, 2.5 * pdm.mean)
-    assert_allclose(scaled.eigenvalues, 6.25 * pdm.eigenvalues)
-    assert scaled.modes is pdm.modes
 
 
 def test_files_have_the_same_numbers(pdm, tmp_path):
@@ -638,12 +582,6 @@ def test_texts_as_others_write_them_are_read(tmp_path):
     assert_array_equal(pdm.mean, [[1, 3, 5], [2, 4, 6]])
     assert_array_equal(pdm.modes, np.full((1, 2, 3), 0.5))
     assert_array_equal(pdm.eigenvalues, [7])
-
-
-def test_other_files_are_refused(pdm, tmp_path):
-    misfit = PointDistributionModel(pdm.mean, pdm.modes, pdm.eigenvalues[1:])
-    refused("eigenvalues", write_pdm, misfit, tmp_path / "a.txt")
-    assert not (tmp_path / "a.txt").exists()
 
 
 test_refusals = refusals_of("export_files", globals())
