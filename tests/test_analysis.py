@@ -2,12 +2,14 @@ import re
 
 import numpy as np
 import pytest
+import sklearn
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, warned
 from scipy.signal import lfilter
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import make_pipeline
 from sklearn.utils import shuffle
 
 from isa_nrsfm.analysis import (
@@ -193,6 +195,15 @@ class TestAssociation:
         alpha[:, 1] += 5.0 * y
         assert association(alpha, y, random_state=0).p_value[1] < 0.05
 
+    def test_copies_of_a_frame_count_once(self, rng):
+        alpha, y = related()
+        copies = rng.permutation(np.repeat(np.arange(120), 6))
+        found = association(alpha[copies], y[copies], random_state=0)
+        assert found.n_frames == 120
+        expected = association(alpha, y, random_state=0)
+        assert_allclose(found.statistic, expected.statistic)
+        assert_allclose(found.p_value, expected.p_value, atol=0.06)
+
     def test_labels_in_blocks_of_a_video_go_with_nothing_by_chance(self):
         # Nine in ten are significant if single frames are permuted.
         assert np.mean(least_p(video, n_trials=40) <= 0.05) < 0.15
@@ -207,6 +218,22 @@ class TestAssociation:
             return alpha, y
 
         assert np.mean(least_p(trial, n_trials=20) <= 0.05) > 0.8
+
+    def test_blocks_follow_time(self):
+        alpha, y = video(0)
+        expected = association(alpha, y, random_state=0)
+        assert expected.permuted == "frequencies"
+        mixed = rng_of(0).permutation(len(y))
+        found = association(alpha[mixed], y[mixed], time=mixed / 25, random_state=0)
+        assert found.permuted == expected.permuted
+        assert_allclose(found.p_value, expected.p_value)
+
+    def test_photos_sorted_by_label_are_independent_frames(self):
+        alpha, y = related(effect=1.0)
+        order = np.argsort(y, kind="stable")
+        found = association(alpha[order], y[order], random_state=0)
+        assert found.permuted == "frames"
+        assert found.p_value[1] == 0.001
 
     @pytest.mark.parametrize("effect", slow_after(1, [0.0, 1.0]))
     def test_labels_that_vary_within_people_of_many_and_few_frames(self, effect):
@@ -324,6 +351,16 @@ class TestWithinGroups:
         got = WithinGroups().fit_transform(alpha, groups=self.people)
         assert np.isnan(got[3]).all()
         assert_allclose(got[:10][np.arange(10) != 3].mean(axis=0), 0, atol=1e-15)
+
+    def test_in_a_pipeline(self):
+        with sklearn.config_context(enable_metadata_routing=True):
+            step = WithinGroups()
+            step.set_fit_request(groups=True, neutral=False)
+            step.set_transform_request(groups=True, neutral=False)
+            pipeline = make_pipeline(step)
+            got = pipeline.fit_transform(self.alpha, groups=self.people)
+        expected = WithinGroups().fit_transform(self.alpha, groups=self.people)
+        assert_allclose(got, expected)
 
     def test_single_frames_are_told(self):
         message, step = "a single frame: 1 of", WithinGroups()

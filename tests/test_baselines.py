@@ -9,8 +9,9 @@ from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
-from scenes import random_cameras, with_gaps
+from scenes import random_cameras, table_of, with_gaps
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.utils import estimator_checks
@@ -43,12 +44,6 @@ def table(seed=0, noise=0.01, n_frames=60, **parameters):
 def fitted(method, **parameters):
     """Return a model of the table, to be left as it is."""
     return METHODS[method](2, **parameters).fit(table().data)
-
-
-def as_table(tracks, layout="interleaved"):
-    """Return tracks (I, J, 2) as a table."""
-    tracks = tracks.swapaxes(1, 2) if layout == "planar" else tracks
-    return tracks.reshape(len(tracks), -1)
 
 
 def rotations(motion):
@@ -110,7 +105,7 @@ class TestContract:
         refused("with 30 points the largest possible", make(9).fit, X)
         refused("needs at least 7 frames", make(2).fit, X[:6])
         refused("equal in 1 of 60 frames", make(2).fit, flat)
-        planar = as_table(table().tracks, "planar")
+        planar = table_of(table().tracks, "planar")
         warned("layout='planar' explains the table", make(2).fit, planar)
 
 
@@ -122,7 +117,7 @@ class TestFitted:
         X = truth.data
         images = model.shapes_ @ model.motion_.swapaxes(1, 2)
         images += model.translation_[:, None]
-        measured = inverse_snr(X, as_table(images), scale_frames=scale_frames)
+        measured = inverse_snr(X, table_of(images), scale_frames=scale_frames)
         assert model.inverse_snr_ == pytest.approx(measured)
         centroids = truth.tracks.mean(axis=1)
         assert_allclose(model.translation_, centroids)
@@ -184,11 +179,20 @@ class TestInvariances:
     def test_order_of_frames_and_points(self, method, rng):
         frames, points = rng.permutation(60), rng.permutation(30)
         tracks = table().tracks[frames][:, points]
-        model, other = fitted(method), METHODS[method](2).fit(as_table(tracks))
+        model, other = fitted(method), METHODS[method](2).fit(table_of(tracks))
         expected = model.shapes_[frames][:, points]
         assert_allclose(other.shapes_, expected, atol=1e-4)
         assert_allclose(other.motion_, model.motion_[frames], atol=1e-4)
         assert_allclose(other.alpha_, model.alpha_[frames], atol=1e-4)
+
+    @each
+    def test_layouts_and_memory_order(self, method):
+        X, model = table().data, fitted(method)
+        planar = np.asfortranarray(table_of(table().tracks, "planar"))
+        other = METHODS[method](2, layout="planar").fit(planar)
+        assert_allclose(other.shapes_, model.shapes_, atol=1e-6)
+        images = table_of(model.reproject(X).reshape(60, 30, 2), "planar")
+        assert_allclose(other.reproject(planar), images, atol=1e-6)
 
     @each
     def test_single_precision(self, method):
@@ -210,7 +214,7 @@ def test_degenerate_tables(method, kind, rng):
     shape[:, [2] * (kind == "flat")] = 0.0
     if kind == "repeated":
         cameras[:] = cameras[0]
-    X = as_table(shape @ cameras.swapaxes(1, 2))
+    X = table_of(shape @ cameras.swapaxes(1, 2))
     if kind == "a line":  # one frame of an ordinary table
         X = table().data.copy()
         X[3, 1::2] = 5.0
@@ -258,6 +262,12 @@ class TestLowRank:
         rest = np.linalg.lstsq(np.column_stack([alpha, np.ones(50)]), expected)[1]
         assert (rest / np.sum(expected**2, axis=0) < 0.02).all()
 
+    def test_too_few_steps(self):
+        model = BlockMatrixNRSfM(2, max_iter=2)
+        options = {"category": ConvergenceWarning}
+        warned("converge in max_iter=2 steps", model.fit, table().data, **options)
+        assert 18 <= model.n_iter_ <= 36
+
 
 def sparse_scene(n_frames, n_points, n_atoms, sparsity=2):
     """Return a table of sums of so many random atoms, its cameras and its shapes."""
@@ -270,7 +280,7 @@ def sparse_scene(n_frames, n_points, n_atoms, sparsity=2):
         used = rng.choice(n_atoms, sparsity, replace=False)
         row[used] = rng.uniform(0.5, 1.5, sparsity) * rng.choice([-1, 1], sparsity)
     shapes = np.tensordot(coefficients, atoms, 1)
-    return as_table(shapes @ cameras.swapaxes(1, 2)), cameras, shapes
+    return table_of(shapes @ cameras.swapaxes(1, 2)), cameras, shapes
 
 
 def error_of_frames(shapes, motion, model):
@@ -309,6 +319,16 @@ class TestCompressible:
         if size[2] == 1:
             assert error_of_frames(shapes, cameras, model) < 1e-6
 
+    def test_atoms_without_shared_frames_are_aligned_by_their_shapes(self, rng):
+        # One shape, nearly, learnt as three atoms.
+        atoms = rng.normal(size=(30, 3)) + 0.05 * rng.normal(size=(3, 30, 3))
+        shapes = (atoms - atoms.mean(axis=1, keepdims=True))[np.arange(60) % 3]
+        cameras = random_cameras(rng, 60)
+        model = CompressibleNRSfM(2, n_atoms=3, sparsity=1, random_state=0)
+        model.fit(table_of(shapes @ cameras.swapaxes(1, 2)))
+        assert model.inverse_snr_ < 1e-3
+        assert error_of_frames(shapes, cameras, model) < 0.1
+
     def test_atoms_that_few_frames_use_are_replaced(self):
         # Twice as many atoms as the shapes have: without it one has no frames.
         X, *_ = sparse_scene(60, 20, 3, sparsity=1)
@@ -345,7 +365,7 @@ sparse = partial(CompressibleNRSfM, 1)
 )
 def test_public_sequences(load_data, name, model, inverse_snr, error):
     data = load_data(name)
-    model.fit(as_table(data["W2d"]))
+    model.fit(table_of(data["W2d"]))
     assert model.inverse_snr_ < 1.05 * inverse_snr
     # The shark is in the axes of the cameras already.
     motion = data["R"] if "R" in data else np.broadcast_to(np.eye(2, 3), (240, 2, 3))

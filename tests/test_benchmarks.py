@@ -87,7 +87,7 @@ def test_true_shapes_and_cameras_have_no_error(tracks, name):
         rotations=mirror @ rotations @ turn / 0.5,
         scales=np.full(len(shapes), 2.0),
     )
-    truth = tracks.shapes @ rotations.transpose(0, 2, 1)
+    truth = tracks.shapes @ rotations.mT
     errors = _fits.errors_3d(SETS[name], truth, found)
     assert set(errors) == {"sequence_error", "frame_error"}
     np.testing.assert_allclose(list(errors.values()), 0.0, atol=1e-10)
@@ -110,7 +110,7 @@ def test_what_methods_find_explains_the_table(tracks, method):
     if method != "rigid":  # whose cameras are affine
         table = found.in_camera()[:, :, :2].reshape(len(found.X), -1)
         assert inverse_snr(found.X, table, scale_frames=True) < 1e-10
-    eye = found.rotations @ found.rotations.transpose(0, 2, 1)
+    eye = found.rotations @ found.rotations.mT
     np.testing.assert_allclose(eye, np.broadcast_to(np.eye(3), eye.shape), atol=1e-8)
 
 

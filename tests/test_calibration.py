@@ -69,12 +69,12 @@ class TestMetricUpgrade:
         assert_allclose(upgrade.Q, upgrade.Q.T, atol=1e-14)
         assert np.linalg.eigvalsh(upgrade.Q)[0] > 0
         R = upgrade.rotations
-        assert_allclose(R @ R.transpose(0, 2, 1) - np.eye(3), 0, atol=1e-12)
+        assert_allclose(R @ R.mT - np.eye(3), 0, atol=1e-12)
         assert_allclose(np.linalg.det(R), 1)
         assert np.sqrt(np.mean(upgrade.scales**2)) == pytest.approx(1, rel=1e-9)
         # The rotation is the nearest one.
-        inner = R[:, :2] @ (motion @ upgrade.Q).transpose(0, 2, 1)
-        assert_allclose(inner, inner.transpose(0, 2, 1), atol=1e-12)
+        inner = R[:, :2] @ (motion @ upgrade.Q).mT
+        assert_allclose(inner, inner.mT, atol=1e-12)
         if camera == "orthographic":
             assert (upgrade.scales == 1).all()
 
@@ -175,7 +175,7 @@ def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
     scales = rng.uniform(0.5, 2, n_frames)
     alpha = rng.standard_normal((n_frames, n_components))
     root = size * rng.standard_normal((n_components, 3, 3))
-    strain = root + root.transpose(0, 2, 1)
+    strain = root + root.mT
     strain -= np.trace(strain, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
     Q = affinity(rng)
     Q = Q @ Q.T
@@ -233,11 +233,11 @@ class TestEuclideanFrames:
         _, motion, alpha, mean, basis = fitted
         frames = euclidean_frames(*fitted)
         affine = mean + np.tensordot(alpha, basis, 1)
-        rows = frames.rotations[:, :2].transpose(0, 2, 1)
+        rows = frames.rotations[:, :2].mT
         images = frames.scales[:, None, None] * (frames.shapes @ rows)
-        assert_allclose(images, affine @ motion.transpose(0, 2, 1), atol=1e-12)
+        assert_allclose(images, affine @ motion.mT, atol=1e-12)
         R = frames.rotations
-        assert_allclose(R @ R.transpose(0, 2, 1) - np.eye(3), 0, atol=1e-12)
+        assert_allclose(R @ R.mT - np.eye(3), 0, atol=1e-12)
         assert_allclose(np.linalg.det(R), 1)
 
     def test_exact_cameras_give_the_shapes_in_their_metric(self):
@@ -247,7 +247,7 @@ class TestEuclideanFrames:
         metric = deformation_metric(motion, alpha)
         frames = euclidean_frames(metric, motion, alpha, mean, basis)
         affine = mean + np.tensordot(alpha, basis, 1)
-        true = affine @ np.linalg.inv(Q_i).transpose(0, 2, 1)
+        true = affine @ np.linalg.inv(Q_i).mT
         assert mean_shape_error_3d(true, frames.shapes, convention="frame") < 1e-7
         unit = scales / np.sqrt(np.mean(scales**2))
         assert_allclose(frames.scales / unit, frames.scales[0] / unit[0], rtol=1e-7)
@@ -269,7 +269,7 @@ class TestEuclideanFrames:
         for factor in (10.0, 1000.0):
             frames = euclidean_frames(metric, motion, factor * alpha, mean, 0 * basis)
             common = mean @ np.linalg.inv(metric.Q).T
-            depth = frames.rotations[:, 2:].transpose(0, 2, 1)
+            depth = frames.rotations[:, 2:].mT
             seen = np.linalg.norm(frames.shapes @ depth, axis=(1, 2))
             least, largest = np.linalg.svd(common, compute_uv=False)[[2, 0]]
             assert (seen > np.exp(-0.5) * least * (1 - 1e-9)).all()
@@ -320,7 +320,7 @@ class TestOrthonormalCameras:
         P, cameras = deforming_scene(0)
         found = orthonormal_cameras(P)
         assert found.cost < 1e-17
-        rows = found.cameras @ found.cameras.transpose(0, 2, 1)
+        rows = found.cameras @ found.cameras.mT
         assert_allclose(rows, np.broadcast_to(np.eye(2), rows.shape), atol=1e-8)
         # The cost is of fourth order in some directions.
         assert_allclose(gram(found.cameras), gram(cameras), atol=2e-4)
@@ -550,7 +550,7 @@ class TestReconstruct:
         ortho = model.reconstruct(photos.data, camera="orthographic")
         assert_allclose(ortho, frames.scales[:, None, None] * frames.shapes)
         # Cameras without scale see the orthographic shapes as the model does.
-        images = ortho @ frames.rotations[:, :2].transpose(0, 2, 1)
+        images = ortho @ frames.rotations[:, :2].mT
         images += translation[:, None]
         expected = model.reproject(photos.data)
         assert_allclose(images.reshape(expected.shape), expected, atol=1e-8)

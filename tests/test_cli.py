@@ -279,7 +279,7 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     # The images of cameras.csv and shapes.npz are scaled rotations of true shapes.
     M = found.cameras.filter(regex="^m[01][012]$").to_numpy().reshape(-1, 2, 3)
     scales = model.scales_[:, None, None] ** 2
-    gram, atol = M @ M.transpose(0, 2, 1), 1e-6 * scales.max()
+    gram, atol = M @ M.mT, 1e-6 * scales.max()
     assert_allclose(gram, scales * np.eye(2), atol=atol)
     page = (tmp_path / "viewer.html").read_text(encoding="utf-8")
     assert f"{camera.replace('_', '-')} cameras" in page

@@ -9,6 +9,7 @@ import pytest
 from frame_parts import assert_same_model
 from layers import with_limits
 from numpy.testing import assert_allclose
+from scenes import with_gaps
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import FastISA
@@ -23,10 +24,7 @@ FRAMES = (70, 150, 0, 80)
 
 def table(missing=0.0):
     X = make_nonrigid_tracks(300, 20, K, noise=0.01, random_state=0).data
-    if missing:
-        hidden = np.random.default_rng(0).random((300, 20)) < missing
-        X = np.where(np.repeat(hidden, 2, axis=1), np.nan, X)
-    return X
+    return with_gaps(X, missing)
 
 
 def chunked(X, columns=40):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
+from scenes import tracks_of
 
 from isa_nrsfm.datasets import (
     make_body_tracks,
@@ -38,11 +39,6 @@ def root_mean_square(values):
 
 def centred(tracks):
     return tracks - tracks.mean(axis=1, keepdims=True)
-
-
-def tracks_of(table, layout="interleaved"):
-    pairs = table.reshape(len(table), *((2, -1) if layout == "planar" else (-1, 2)))
-    return pairs.swapaxes(1, 2) if layout == "planar" else pairs
 
 
 @every

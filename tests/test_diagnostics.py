@@ -77,6 +77,16 @@ class TestReliabilities:
         # The margin of chance makes it a little smaller.
         assert correlation - 0.05 < found[0] < correlation + 0.02
 
+    @pytest.mark.parametrize(("gamma", "above"), [(0.2, 1.05), (2.0, 10.0)])
+    def test_by_their_formula_from_the_limit_of_detection_on(self, gamma, above):
+        signal = above * np.sqrt(gamma)
+        y = (1 + signal) * (1 + gamma / signal)
+        share, left = 1 - 1 / y, np.full((1, 1), 1 / y)
+        caused = np.full((1, 1), gamma / y * share / 1.5)  # the margin of chance
+        (found,) = reliabilities(np.full((50, 1), np.sqrt(share)), left, caused, 1.0)
+        expected = (signal**2 - gamma) / (signal * (signal + 1))
+        assert found == pytest.approx(expected)
+
     @pytest.mark.parametrize(
         ("n_frames", "n_points", "n_components"),
         slow_after(1, [(100, 68, 4), (300, 68, 1), (60, 478, 2)]),
@@ -130,6 +140,14 @@ class TestWeakInformation:
         expected = sum(map(information, motion, alpha))
         found = weak_information(shapes[0], shapes[1:], motion, alpha)
         assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+    def test_some_of_many_frames_stand_for_all(self, rng):
+        mean_shape, basis = rng.normal(size=(6, 3)), rng.normal(size=(1, 6, 3))
+        motion, alpha = rng.normal(size=(1, 2, 3)), rng.normal(size=(1, 1))
+        one = weak_information(mean_shape, basis, motion, alpha)
+        motion, alpha = np.repeat(motion, 1000, axis=0), np.repeat(alpha, 1000, 0)
+        many = weak_information(mean_shape, basis, motion, alpha)
+        assert_allclose(many, 1000 * one, atol=1e-9 * np.abs(many).max())
 
 
 @pytest.fixture(scope="module")

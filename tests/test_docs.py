@@ -75,7 +75,7 @@ def sequence(tables):
     """Write the tracks of one camera in the orders of MATLAB code; return them."""
     options = {"camera": "orthographic", "noise": 0.001, "missing": 0.0}
     scene = make_nonrigid_tracks(60, 20, 2, **options, random_state=0)
-    W = scene.tracks.transpose(0, 2, 1).reshape(120, 20)
+    W = scene.tracks.mT.reshape(120, 20)
     savemat(
         "tracks.mat",
         {
@@ -83,7 +83,7 @@ def sequence(tables):
             "P": np.concatenate([W[::2], W[1::2]]),
             "MD": np.zeros((60, 20)),
             "W3": scene.tracks.transpose(2, 1, 0),
-            "S": scene.shapes.transpose(0, 2, 1).reshape(180, 20),
+            "S": scene.shapes.mT.reshape(180, 20),
         },
     )
     return scene

@@ -1,6 +1,7 @@
 from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 from layers import slow_after
 from made_once import made_once
@@ -9,10 +10,11 @@ from refusals import refusals_of
 from scenes import waving_scene
 from scipy.linalg import block_diag
 from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
 from scipy.special import logit
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.models import FrameMap, LinearisedFrames
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
 from isa_nrsfm.analysis._smoothing import (
@@ -23,6 +25,7 @@ from isa_nrsfm.analysis._smoothing import (
     smoothed,
 )
 from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.metrics import mean_shape_error_3d
 
 K = 3
 # Of fits that are compared with each other
@@ -120,6 +123,10 @@ class TestDynamics:
             expected = np.diag((1 + rate * t) * np.exp(-rate * t))
             assert_allclose(shown @ across @ shown.T, expected, atol=1e-15)
             across = F @ across
+
+    def test_intercepts_keep_variance_one(self):
+        _, _, first, shown = some_dynamics(2).matrices()
+        assert_allclose((shown @ first @ shown.T)[:K, :K], np.eye(K))
 
 
 @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
@@ -224,7 +231,7 @@ def test_likelihood_of_frames_is_linearised(name, loss):
     )
     tracks = scene.data.reshape(60, 12, 2) + 50
     tracks[rng.random((60, 12)) < 0.2] = np.nan
-    table, rows, row = tracks.reshape(60, -1), tracks.transpose(0, 2, 1), 7
+    table, rows, row = tracks.reshape(60, -1), tracks.mT, 7
     options = {"camera": name, "loss": loss, "random_state": 0}
     model = AffineNRSfM(2, **options, scale_frames=False).fit(table)
     alone, frames = model._model.linearised(rows), model._model.frames
@@ -277,6 +284,27 @@ def smoothed_waves(**options):
 
 
 class TestSmooth:
+    def test_cameras_are_smoothed(self):
+        rng, t = np.random.default_rng(0), np.arange(100)
+        shapes = waving_scene(100, 20, [0.1, 0.07])[0].shapes
+        turns = np.stack([0.3 * np.sin(0.1 * t), 0.05 * t, 0.2 * np.cos(0.05 * t)], 1)
+        R = Rotation.from_rotvec(turns).as_matrix()
+        truth = shapes @ R.mT
+        tracks = truth[..., :2] + 0.1 * truth.std() * rng.normal(size=(100, 20, 2))
+        options = {"camera": "orthographic", "scale_frames": False, "random_state": 0}
+        model = AffineNRSfM(2, **options).fit(tracks.reshape(100, -1))
+
+        def error(fit):
+            turned, _ = full_rotations(fit.motion)
+            seen = model.reconstruct(fit) @ turned.mT
+            return min(
+                mean_shape_error_3d(truth, seen * [1, 1, sign]) for sign in (1, -1)
+            )
+
+        table = tracks.reshape(100, -1)
+        smooth = model.smooth(table).decomposition
+        assert error(smooth) < 0.7 * error(model.decompose(table))
+
     def test_ordered_frames_are_smoothed(self, waving):
         model, table = waving
         found = model.smooth(table)
@@ -308,6 +336,21 @@ class TestSmooth:
         assert np.isfinite(expected.alpha).all()
         assert (expected.alpha_std[63] > expected.alpha_std[30]).all()
 
+    def test_times_with_a_zone(self, waving):
+        model, table = waving
+        hours = pd.date_range("2024-03-30", periods=60, freq="h", tz="Europe/Berlin")
+        expected = model.smooth(table[:60], time=3600.0 * np.arange(60), **FEW_STEPS)
+        for times in (list(hours.to_pydatetime()), pd.Series(hours), hours):
+            found = model.smooth(table[:60], time=times, **FEW_STEPS)
+            assert_allclose(found.alpha, expected.alpha, atol=1e-12)
+
+    def test_uneven_times_are_rounded_but_stay_apart(self, waving):
+        model, table = waving
+        time = np.r_[0.0, 0.9, 2.0, 2.2, 4.3 + np.arange(156)]
+        found = model.smooth(table, time=time, **FEW_STEPS)
+        expected = model.smooth(table, time=np.r_[0:4, 5:161], **FEW_STEPS)
+        assert_allclose(found.alpha, expected.alpha, atol=1e-12)
+
     def test_nothing_goes_from_group_to_group(self, waving):
         model, table = waving
         groups = np.repeat(["a", "b"], 80)
@@ -315,6 +358,13 @@ class TestSmooth:
         mixed = np.argsort(np.tile(np.arange(80), 2), kind="stable")
         other = model.smooth(table[mixed], groups=groups[mixed], **FEW_STEPS)
         assert_allclose(other.alpha, found.alpha[mixed], atol=1e-10)
+
+    def test_frames_of_four_points_have_no_weight(self, waving):
+        model, table = waving
+        few, blank = table.copy(), table.copy()
+        few.reshape(160, 20, 2)[50, 4:], blank[50] = np.nan, np.nan
+        found, expected = (model.smooth(X, **FEW_STEPS).alpha for X in (few, blank))
+        assert_allclose(found, expected, atol=1e-12)
 
     def test_groups_without_points_have_no_coefficients(self, waving):
         model, table = waving

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from layers import may_not_converge, slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
+from scenes import table_of
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
@@ -27,13 +28,6 @@ def real_tracks(load_data, name):
     """Return the tracks of the frames with all points."""
     tracks = load_data(name)["W2d"].astype(float)
     return tracks[~np.isnan(tracks).any(axis=(1, 2))]
-
-
-def table_of(tracks, layout="interleaved"):
-    """Return the table of tracks."""
-    if layout == "planar":
-        tracks = tracks.transpose(0, 2, 1)
-    return tracks.reshape(len(tracks), -1)
 
 
 def messages_of_fit(table, **params):
@@ -138,7 +132,7 @@ def cameras(rng, n_frames):
 def seen(shapes, motion, rng):
     """Return the tracks of shapes, at random positions."""
     position = rng.normal(size=(len(motion), 1, 2))
-    return shapes @ motion.transpose(0, 2, 1) + position
+    return shapes @ motion.mT + position
 
 
 def rigid_tracks(flat=(1, 1, 1)):

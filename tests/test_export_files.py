@@ -1,6 +1,7 @@
 """Exported files and poses: glTF, shapes and their distribution, pages, angles."""
 
 import base64
+import copy
 import hashlib
 import re
 
@@ -19,8 +20,9 @@ from export_models import (
 from exported_files import Read, content_of, numbers
 from layers import may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
-from refusals import refusals_of
+from refusals import refusals_of, refused, warned
 from scipy.io import loadmat
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -87,6 +89,22 @@ def test_names_and_bounds_are_exact(written):
         points = read.array(part["POSITION"])
         assert_array_equal(accessor["min"], points.min(axis=0))
         assert_array_equal(accessor["max"], points.max(axis=0))
+
+
+def test_the_surface_covers_the_front_view(written):
+    read = written(face_model())
+    surface = read.primitive(4)
+    corners = read.array(surface["indices"]).reshape(-1, 3).astype(int)
+    mean = read.array(surface["attributes"]["POSITION"]).astype(float)
+    a, b, c = mean[corners, :2].transpose(1, 0, 2)
+    areas = np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1))) / 2
+    assert areas.sum() == pytest.approx(ConvexHull(mean[:, :2]).volume)
+
+
+def test_points_on_a_line_have_no_triangles(written):
+    model = copy.copy(blob_model())
+    model.mean_shape_ = np.outer(np.arange(20.0), [1, 1, 0])
+    refused("on one line in the front view", written, model, camera=None)
 
 
 def test_the_animation_swings_each_basis_shape_in_turn(written):
@@ -232,7 +250,7 @@ def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
     rotations = numbers(data["rotations"]).reshape(-1, 3, 3)
     assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-5)
     frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
-    seen = (frames @ rotations.transpose(0, 2, 1))[:, :, :2] * [1, -1]
+    seen = (frames @ rotations.mT)[:, :, :2] * [1, -1]
     # The page turns the images of y that points up.
     images = truth.clean * [1, -1 if "origin" in options else 1]
     images = images - images.mean(axis=1, keepdims=True)
@@ -240,6 +258,13 @@ def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
     scale = np.sum(seen * images, axis=(1, 2)) / np.sum(seen**2, axis=(1, 2))
     error = images - scale[:, None, None] * seen
     assert np.sum(error**2) < 1e-3 * np.sum(images**2)
+
+
+def test_mirror_images_and_origins_change_signs(page):
+    shapes = shapes_of(page(blob_model()))
+    mirrored, lower = page(blob_model().mirrored()), page(blob_model(), origin="lower")
+    assert_allclose(shapes_of(mirrored), shapes * [1, 1, -1], atol=1e-6)
+    assert_allclose(shapes_of(lower), shapes * [1, -1, -1], atol=1e-6)
 
 
 @pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
@@ -528,6 +553,17 @@ def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
         size = unit * np.linalg.norm(truth.mean_shape)
         assert np.linalg.norm(pdm.mean) == pytest.approx(size, rel=0.01)
     assert len(recwarn) == 0
+
+
+def test_rows_without_points_are_left_out():
+    table = faces().data[:60].copy()
+    options = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
+    model = AffineNRSfM(1, **options).fit(table[:40])
+    table[40:] = np.nan
+    with_empty = warned("no point is visible", AffineNRSfM(1, **options).fit, table)
+    found, expected = map(point_distribution_model, (with_empty, model))
+    for one, other in zip(found, expected, strict=True):
+        assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
 def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):

@@ -53,7 +53,7 @@ def orthogonal_shapes(seed, n_components=2, n_points=20):
     rows -= rows.mean(axis=1, keepdims=True)
     white = np.linalg.qr(rows.T)[0].T.reshape(n_components + 1, 3, n_points)
     shapes = rng.normal(size=(n_components + 1, 3, 3)) @ white
-    return shapes[0].T, shapes[1:].transpose(0, 2, 1)
+    return shapes[0].T, shapes[1:].mT
 
 
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
@@ -73,7 +73,7 @@ def posterior_frames(seed, loss="linear"):
     shapes = compose(mean_shape, basis, rng.normal(size=(12, 2)))
     tracks = project(shapes, motion, rng.normal(size=(12, 2)))
     tracks = tracks + NOISE * rng.normal(size=tracks.shape)
-    shapes = np.concatenate([mean_shape[None], basis]).transpose(0, 2, 1)
+    shapes = np.concatenate([mean_shape[None], basis]).mT
     # Frames with an outlier have several minima: as the estimator does, start from more
     # places than zero.
     starts = np.random.default_rng(0).normal(size=(8, 2))
@@ -87,7 +87,7 @@ class TestFrameModel:
         frames, tracks = posterior_frames(0)
         frames, tracks = replace(frames, camera=camera), with_gaps(tracks, missing)
         sizes = np.linspace(0.5, 200.0, len(tracks))
-        rows = (tracks * sizes[:, None, None]).transpose(0, 2, 1)
+        rows = (tracks * sizes[:, None, None]).mT
         fitted = frames.fit(rows, sizes, True, None)
         expected = fit_posterior(
             tracks, frames.shapes, NOISE**2, camera=camera, starts=frames.starts
@@ -102,7 +102,7 @@ class TestFrameModel:
 
     def test_errors_of_shapes_lower_the_precision_of_the_images(self):
         frames, tracks = posterior_frames(0)
-        rows, sizes = tracks.transpose(0, 2, 1), np.ones(len(tracks))
+        rows, sizes = tracks.mT, np.ones(len(tracks))
         alone = frames.fit(rows, sizes, True, None)
         certainty = DepthCertainty(images=(1.5, 0.2))
         fitted = replace(frames, certainty=certainty).fit(rows, sizes, True, None)
@@ -120,15 +120,15 @@ class TestFrameModel:
         frames, tracks = posterior_frames(0, loss)
         tracks = with_gaps(tracks, missing)
         tracks[:, 7] += 2.0
-        fitted = frames.posterior(tracks.transpose(0, 2, 1))
-        apart = distances(tracks.transpose(0, 2, 1), frames.shapes, *fitted[:3])
+        fitted = frames.posterior(tracks.mT)
+        apart = distances(tracks.mT, frames.shapes, *fitted[:3])
         weights = np.nan_to_num(WEIGHTS[loss](apart / NOISE))
         again = fit_posterior(
             tracks, frames.shapes, NOISE**2, weights=weights, initial=fitted.alpha
         )
         # The fit ends when its weights change by less than 1e-4. Entries of cameras can
         # change by more where points are missing.
-        apart = distances(tracks.transpose(0, 2, 1), frames.shapes, *again[:3])
+        apart = distances(tracks.mT, frames.shapes, *again[:3])
         new = np.nan_to_num(WEIGHTS[loss](apart / NOISE))
         assert_allclose(new, weights, rtol=0, atol=1e-4)
         assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
@@ -137,14 +137,11 @@ class TestFrameModel:
     @EACH_LOSS
     def test_robust_loss_is_not_drawn_to_an_outlier(self, loss, size, point):
         frames, tracks = posterior_frames(0)
-        expected = frames.posterior(tracks.transpose(0, 2, 1))
+        expected = frames.posterior(tracks.mT)
         deviation = np.sqrt(np.einsum("ikk->ik", expected.covariance))
         tracks[:, point] += size
-        drawn = frames.posterior(tracks.transpose(0, 2, 1)).alpha - expected.alpha
-        robust = (
-            replace(frames, loss=loss).posterior(tracks.transpose(0, 2, 1)).alpha
-            - expected.alpha
-        )
+        drawn = frames.posterior(tracks.mT).alpha - expected.alpha
+        robust = replace(frames, loss=loss).posterior(tracks.mT).alpha - expected.alpha
         assert np.median(np.abs(drawn / deviation)) > 3
         assert np.abs(robust / deviation).max() < 2
 
@@ -152,10 +149,10 @@ class TestFrameModel:
     def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
         frames, tracks = posterior_frames(0, loss)
         tracks[:, 7] = np.nan
-        expected = frames.posterior(tracks.transpose(0, 2, 1))
+        expected = frames.posterior(tracks.mT)
         for far in [1e3, 1e8, 1e16, 2e153]:
             tracks[:3, 7] = far
-            fitted = frames.posterior(tracks[:3].transpose(0, 2, 1))
+            fitted = frames.posterior(tracks[:3].mT)
             assert_allclose(fitted.alpha, expected.alpha[:3], atol=1e-6)
             assert_allclose(fitted.covariance, expected.covariance[:3], atol=1e-6)
 
@@ -169,8 +166,8 @@ class TestFrameModel:
         shapes = np.concatenate([mean_shape.T[None], 1e-3 * frames.shapes[1:]])
         seen = np.arange(len(mean_shape)) < 9
         tracks = np.where(seen[:, None], mean_shape[:, :2], np.nan)[None]
-        assert distant_points(tracks.transpose(0, 2, 1))[0, 6:9].all()
-        fitted = replace(frames, shapes=shapes).posterior(tracks.transpose(0, 2, 1))
+        assert distant_points(tracks.mT)[0, 6:9].all()
+        fitted = replace(frames, shapes=shapes).posterior(tracks.mT)
         images = project(mean_shape[None], fitted.motion, fitted.translation)
         assert_allclose(images[0, seen], tracks[0, seen], atol=1e-2)
 
@@ -192,13 +189,11 @@ class TestDepthDeviations:
         certainty = DepthCertainty(residual=RESIDUAL)
         frames = replace(frames, camera=camera, certainty=certainty)
         tracks = with_gaps(tracks, missing)
-        found = depth_deviations(
-            frames, tracks.transpose(0, 2, 1), np.ones(len(tracks))
-        )
-        fit = frames.posterior(tracks.transpose(0, 2, 1))
+        found = depth_deviations(frames, tracks.mT, np.ones(len(tracks)))
+        fit = frames.posterior(tracks.mT)
         n_pose = CAMERAS[camera].n_parameters
         prior = np.diag([0.0] * n_pose + [1.0] * 2)
-        factors = excess(frames, tracks.transpose(0, 2, 1))
+        factors = excess(frames, tracks.mT)
         assert factors.max() > 2
         for i, M in enumerate(fit.motion):
             seen = np.isfinite(tracks[i]).all(axis=1)
@@ -224,11 +219,11 @@ class TestDepthDeviations:
         frames, tracks = posterior_frames(0)
         frames = replace(frames, camera="weak_perspective")
         sizes = np.linspace(1.0, 2.0, len(tracks))
-        rows = (sizes[:, None, None] * tracks).transpose(0, 2, 1)
+        rows = (sizes[:, None, None] * tracks).mT
         alone = depth_deviations(frames, rows, sizes)
         certainty = DepthCertainty(points=np.linspace(0.0, 1e-2, 20), leverage=3.0)
         frames = replace(frames, certainty=certainty)
-        alpha = frames.posterior(tracks.transpose(0, 2, 1)).alpha
+        alpha = frames.posterior(tracks.mT).alpha
         leverage = 1.0 + np.sum(alpha**2, axis=1)
         expected = alone**2 + np.outer(sizes**2 * leverage / 3.0, certainty.points)
         found = depth_deviations(frames, rows, sizes)
@@ -257,7 +252,7 @@ def faces_turned_by(degrees, seed=0, n_frames=80, noise=0.01, missing=0.0):
     shapes = shapes - shapes.mean(axis=1, keepdims=True)
     vectors = np.radians(degrees) * rng.normal(size=(n_frames, 3)) * [0.7, 1.0, 0.5]
     rotations = Rotation.from_rotvec(np.clip(vectors, -1.4, 1.4)).as_matrix()
-    points = shapes @ rotations.transpose(0, 2, 1)
+    points = shapes @ rotations.mT
     points *= np.exp(0.2 * rng.normal(size=(n_frames, 1, 1)))
     tracks = points[:, :, :2]
     size = np.sqrt(np.mean(tracks**2, axis=(1, 2), keepdims=True))
@@ -271,7 +266,7 @@ def animal_seen_from_the_side(n_frames=150, noise=1.0):
     rng = np.random.default_rng(0)
     vectors = np.radians(3) * rng.normal(size=(n_frames, 1)) * [0, 1, 0]
     yaw = Rotation.from_rotvec(vectors).as_matrix()
-    points = animal(n_frames, rng) @ yaw.transpose(0, 2, 1)
+    points = animal(n_frames, rng) @ yaw.mT
     tracks = points[:, :, :2] + noise * rng.normal(size=(*points.shape[:2], 2))
     return tracks.reshape(n_frames, -1), points
 
@@ -510,7 +505,7 @@ def test_neighbours_are_groups_of_equal_size(rng):
 def test_deviations_hold_for_a_body_that_deforms_further_than_the_model(camera):
     scene = make_body_tracks(150, camera=camera, random_state=0)
     X, model = scene.data, fitted(scene.data, 3, camera)
-    points = scene.shapes @ full_rotations(scene.motion)[0].transpose(0, 2, 1)
+    points = scene.shapes @ full_rotations(scene.motion)[0].mT
     points *= full_rotations(scene.motion)[1][:, None, None]
     off, error = error_of_depths(model, X, points)
     assert error / 2 < model.depth_uncertainty_ < 2 * error
@@ -532,12 +527,12 @@ def swinging_body(seed, n_frames=150, turn=90):
         sway = np.sin(2.3 * time + rng.uniform(0, 6))
         vectors = vectors + np.outer(sway, 0.15 * rng.normal(size=3))
         turned = Rotation.from_rotvec(vectors).as_matrix()
-        parts.append(points @ turned.transpose(0, 2, 1))
+        parts.append(points @ turned.mT)
     shapes = np.concatenate(parts, axis=1)
     shapes -= shapes.mean(axis=1, keepdims=True)
     angles = np.linspace(0, turn, n_frames)[:, None]
     rotations = Rotation.from_euler("y", angles, degrees=True).as_matrix()
-    tracks = (shapes @ rotations.transpose(0, 2, 1))[:, :, :2]
+    tracks = (shapes @ rotations.mT)[:, :, :2]
     return tracks.reshape(n_frames, -1), shapes
 
 
