@@ -34,6 +34,6 @@ def test_the_mean_is_nearer_to_the_truth_than_the_joint_fit(kind, seed, n_frames
 
 
 def test_few_points_have_the_joint_fit_itself():
-    tracks = make_hand_tracks(60, random_state=0)
+    tracks = make_hand_tracks(30, random_state=0)
     tracks.data, tracks.shapes = tracks.data[:, :16], tracks.shapes[:, :8]
     assert shape_error(tracks) == shape_error(tracks, errors=False)

@@ -167,14 +167,11 @@ def test_confidences_of_a_plain_table(fits, transforms, tmp_path, axes, word):
     assert list(found.frames) == ["id"]
     if word != "conf":
         return
-    without.to_csv(tmp_path / "without.csv", index=False)
-    blanked = fits(tmp_path / "without.csv", *QUICK).alpha
     unsure = ["--min-confidence", "0.4"]
     found = fits(path, *QUICK, *unsure)
     assert list(found.alpha) == ["row", "id", "alpha_1"]
-    pd.testing.assert_frame_equal(found.alpha, blanked)
     again, *_ = transforms(found.path, path, *unsure)
-    np.testing.assert_allclose(again["alpha_1"], blanked["alpha_1"], atol=1e-3)
+    np.testing.assert_allclose(again["alpha_1"], found.alpha["alpha_1"], atol=1e-3)
     # Unused, they are counted, and not copied.
     found = fits(path, *QUICK)
     assert "not used: p0_conf, ... (confidences) (20)" in found.page

@@ -438,7 +438,7 @@ def test_uncertainty_of_a_consensus_has_the_share_of_deformation():
 
 
 def test_depth_of_an_animal_seen_from_the_side_is_withheld():
-    X, points = animal_seen_from_the_side(n_frames=80)
+    X, points = animal_seen_from_the_side(n_frames=50)
     model = AffineNRSfM(4, camera="weak_perspective", random_state=0)
     with pytest.warns(UserWarning, match="deformation explains the images as well"):
         model.fit(X)
