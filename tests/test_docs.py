@@ -97,6 +97,7 @@ def sequence(tables):
 
 LINKS = listed("README.md", r"\]\((?!https?:)([^)#]+)\)")
 PAGES = [*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")]
+PICTURES = sorted((ROOT / "docs" / "figures").glob("*.png"))
 MODULES = {m.name for m in iter_modules(isa_nrsfm.__path__) if m.name != "cli"}
 
 
@@ -128,15 +129,6 @@ def test_figures_of_the_readme_are_those_of_the_benchmarks():
         expected = [100 * float(cells[k].split()[0]) for k in columns]
         found = [float(cell.strip("*")) for cell in row[1:]]
         np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=method)
-
-
-def test_each_picture_is_shown_and_has_its_script():
-    pages = "".join(page.read_text("utf-8") for page in (ROOT / "docs").glob("*.md"))
-    pictures = sorted((ROOT / "docs" / "figures").glob("*.png"))
-    assert pictures
-    for picture in pictures:
-        assert picture.with_suffix(".py").is_file(), picture
-        assert f"figures/{picture.name}" in pages, picture
 
 
 def test_the_paper_cites_its_references_and_prints_what_commands_wrote():
