@@ -133,18 +133,6 @@ class TestFrameModel:
         assert_allclose(new, weights, rtol=0, atol=1e-4)
         assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
 
-    @pytest.mark.parametrize(("size", "point"), [(2.0, 0), (20.0, 7)])
-    @EACH_LOSS
-    def test_robust_loss_is_not_drawn_to_an_outlier(self, loss, size, point):
-        frames, tracks = posterior_frames(0)
-        expected = frames.posterior(tracks.mT)
-        deviation = np.sqrt(np.einsum("ikk->ik", expected.covariance))
-        tracks[:, point] += size
-        drawn = frames.posterior(tracks.mT).alpha - expected.alpha
-        robust = replace(frames, loss=loss).posterior(tracks.mT).alpha - expected.alpha
-        assert np.median(np.abs(drawn / deviation)) > 3
-        assert np.abs(robust / deviation).max() < 2
-
     @EACH_LOSS
     def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
         frames, tracks = posterior_frames(0, loss)
