@@ -178,7 +178,7 @@ def test_options_reach_the_estimator(fits, tmp_path, options, expected):
 
 def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     options = {"n_components": 2, "camera": "weak_perspective", "random_state": 0}
-    prior = AffineNRSfM(**options).fit(make_face_tracks(60, **options).data)
+    prior = AffineNRSfM(**options).fit(make_face_tracks(40, **options).data)
     path = tmp_path / "prior.npz"
     save_model(prior, path)
     X = make_face_tracks(30, **options | {"random_state": 1}).data

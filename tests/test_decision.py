@@ -49,10 +49,10 @@ def walks():
 SEED = {"camera": "weak_perspective", "random_state": 0}
 GIVEN = {"n_components": 2, "random_state": 0}
 TABLES = {
-    "walks": walks,
     "one scale": lambda: (
         make_nonrigid_tracks(60, 16, noise=0.02, camera="orthographic", **GIVEN).data
     ),
+    "walks": walks,
     "stretched": lambda: (
         make_nonrigid_tracks(
             60, 16, noise=0.005, camera="weak_perspective", **GIVEN
@@ -77,7 +77,7 @@ def fitted(estimator, X):
     return model, [*found.messages, *texts], found
 
 
-@pytest.mark.parametrize("name", slow_after(2, [*TABLES]))
+@pytest.mark.parametrize("name", slow_after(1, [*TABLES]))
 def test_advice_ends_after_one_more_fit_which_is_not_worse(name):
     X = TABLES[name]()
     model, messages, before = fitted(AffineNRSfM(random_state=0), X)
@@ -130,8 +130,8 @@ def test_one_scale_is_found():
 
 
 def test_one_scale_is_found_from_a_sample():
-    X = make_nonrigid_tracks(150, 16, noise=0.02, camera="orthographic", **GIVEN).data
-    sampled = with_limits(sample=60, small_table=1000)
+    X = make_nonrigid_tracks(80, 16, noise=0.02, camera="orthographic", **GIVEN).data
+    sampled = with_limits(sample=40, small_table=1000)
     auto = AutoNRSfM(sampled(random_state=0), loss="linear").fit(X)
     assert auto.best_estimator_.camera == "orthographic"
     assert auto.best_estimator_._continued is None

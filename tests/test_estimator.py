@@ -800,7 +800,7 @@ def test_intervals_contain_the_errors_of_shapes(loss, missing):
     ],
 )
 def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meaning):
-    made = make_nonrigid_tracks(80, 24, 2, camera=truth, noise=0.02, random_state=0)
+    made = make_nonrigid_tracks(40, 24, 2, camera=truth, noise=0.02, random_state=0)
     model = AffineNRSfM(2, camera=camera, random_state=0).fit(made.data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

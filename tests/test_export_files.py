@@ -4,6 +4,7 @@ import base64
 import copy
 import hashlib
 import re
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -183,16 +184,16 @@ def shapes_of(data):
     return numbers(data["shapes"]).reshape(1 + len(data["components"]), -1, 3)
 
 
+def page_of(folder, model, **options):
+    """Return the data on a page."""
+    write_viewer(model, folder / "viewer.html", **options)
+    return content_of(folder / "viewer.html")
+
+
 @pytest.fixture
 def page(tmp_path):
     """Return a function that writes a page and returns its data."""
-
-    def write(model, **options):
-        path = tmp_path / "viewer.html"
-        write_viewer(model, path, **options)
-        return content_of(path)
-
-    return write
+    return partial(page_of, tmp_path)
 
 
 def test_a_page_is_one_file_that_asks_for_nothing(tmp_path):
@@ -321,12 +322,6 @@ def test_other_tables_are_shown_by_their_index(page):
     assert data["rows"] == list("abdef")
     assert data["labels"] == [0, 1, 3, 4, 5]
     assert page(model, X=table, n_frames=0)["rows"] == []
-
-
-def page_of(folder, model, **options):
-    """Return the data on a page."""
-    write_viewer(model, folder / "viewer.html", **options)
-    return content_of(folder / "viewer.html")
 
 
 MIXED = np.array([10, 9.5, "b", None, "a", np.nan, 9.5, 10] * 5, dtype=object)
