@@ -9,7 +9,7 @@ from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
-from scenes import random_cameras, table_of, with_gaps
+from scenes import random_cameras, table_of, with_gaps  # noqa: F401  in refusals.txt
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
@@ -89,24 +89,10 @@ class TestContract:
         again = pickle.loads(pickle.dumps(fitted(method)))
         assert_array_equal(again.transform(table().data), fitted(method).alpha_)
 
-    @each
-    def test_refused_tables(self, method):
-        X, make = table().data, METHODS[method]
-        model = fitted(method)
-        message = (
-            rf"{type(model).__name__} takes no missing points \(NaN\), which \d+ of 60 "
-            r"rows have \(first: row \d+\). Remove these rows, or use AffineNRSfM"
-        )
-        for refusing in (make(2).fit, model.transform):
-            refused(message, refusing, with_gaps(X, 0.05))
-            refused("contains infinity", refusing, np.where(X == X[0, 0], np.inf, X))
-        flat = np.where(np.arange(60)[:, None] == 2, 1.0, X)
-        refused(r"per point.*n_features=59", make(2).fit, X[:, 1:])
-        refused("with 30 points the largest possible", make(9).fit, X)
-        refused("needs at least 7 frames", make(2).fit, X[:6])
-        refused("equal in 1 of 60 frames", make(2).fit, flat)
-        planar = table_of(table().tracks, "planar")
-        warned("layout='planar' explains the table", make(2).fit, planar)
+
+def spoilt(number=1.0):
+    """Return the table with one number in all points of a frame."""
+    return np.where(np.arange(60)[:, None] == 2, number, table().data)
 
 
 class TestFitted:
