@@ -274,7 +274,7 @@ UNREFINED = "--no-figures --refinement none --isa fast --n-init 1".split()
 
 
 @pytest.mark.parametrize("groups", slow_after(1, [True, False]))
-def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
+def test_the_choice_is_that_of_the_search(fits, tmp_path, groups):
     table, path = table_of()[::2], tmp_path / "table.csv"
     table.to_csv(path, index=False)
     options = ["-k", "1-3", *UNREFINED]
@@ -296,8 +296,6 @@ def test_the_choice_is_that_of_the_search(fits, fails, tmp_path, groups):
     ):
         np.testing.assert_allclose(report[name], values, rtol=1e-6)
     assert report["chosen"] == search.n_components_
-    message = fails("fit", path, "-o", tmp_path, *options, "--group", "same")
-    assert "needs two groups; got 1" in message
 
 
 def odd_columns():
