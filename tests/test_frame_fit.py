@@ -230,7 +230,7 @@ def test_information_on_the_shapes(rng):
     assert_allclose(found, information, rtol=1e-12, atol=1e-12)
 
 
-def faces_turned_by(degrees, seed=0, n_frames=80, noise=0.01, missing=0.0):
+def faces_turned_by(degrees, seed=0, n_frames=60, noise=0.01, missing=0.0):
     """Return a table of faces whose rotation vectors have this spread, and the truth.
 
     The truth are points in the axes of the camera, in pixels, and rotations.
@@ -283,7 +283,7 @@ def error_of_depths(model, X, points):
 
 @pytest.fixture(scope="module")
 def frontal():
-    X, *_ = faces_turned_by(2)
+    X, *_ = faces_turned_by(2, n_frames=80)
     model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
     with pytest.warns(UserWarning, match="AutoNRSfM"):
         return X, model.fit(X)
@@ -349,7 +349,7 @@ class TestFrontalFaces:
 
     @pytest.mark.slow
     def test_affine_angles_are_withheld_likewise(self):
-        X, *_ = faces_turned_by(2, n_frames=60)
+        X, *_ = faces_turned_by(2)
         model = fitted(X, camera="affine")
         poses = warned("hardly determine the metric", frame_poses, model, X)
         assert np.isnan(poses[:3]).all()
