@@ -264,6 +264,16 @@ class TestAllMethods:
         assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
         assert_allclose(direction(D), direction(np.linalg.inv(scene.E)), atol=1e-8)
 
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units(self, method, unit):
+        scene = structured_motion(0, noise=0.3)
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
+        for factors in ((unit, unit), (1.0, unit), (unit, 1.0)):
+            rigid, motion = factors[0] * scene.rigid, factors[1] * scene.motion
+            products = motion_products(rigid, motion)
+            other = recover_blocks(products, method)
+            assert_allclose(direction(other), direction(D), atol=1e-7)
+
     def test_subspace_without_motion(self, method):
         scene = structured_motion(0, noise=0.3)
         motion = scene.motion.copy()
