@@ -317,6 +317,14 @@ class TestSingleMethods:
         assert_allclose(np.linalg.norm(published, axis=(1, 2)), 1)
         assert_allclose(direction(D), direction(published), atol=1e-9)
 
+    def test_irls_where_the_first_frame_says_nothing(self):
+        scene = structured_motion(0, noise=0.5)
+        motion = scene.motion.copy()
+        motion[:2] = 0
+        products = motion_products(scene.rigid, motion)
+        expected = recover_blocks(products, "generalized_eigen")
+        assert_allclose(recover_blocks(products, "irls"), expected)
+
     @pytest.mark.parametrize("scale_frames", [True, False])
     def test_irls_explains_less_of_the_shark(self, load_data, scale_frames):
         # The block has rank two.
