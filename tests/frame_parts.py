@@ -68,9 +68,7 @@ def numbers_of(fits):
 
 def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     """Return the fit of frames by a new search."""
-    return FrameSearch(shapes, CAMERAS[camera]).fit_rows(
-        tracks.transpose(0, 2, 1), noise, **given
-    )
+    return FrameSearch(shapes, CAMERAS[camera]).fit_rows(tracks.mT, noise, **given)
 
 
 def depth_deviations(frames, *args):

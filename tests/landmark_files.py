@@ -318,14 +318,15 @@ def write_yolo(folder, tracks, *thirds, after=(), size=(500, 500)):
     return folder
 
 
-def labelme(i, points):
-    """Return the content of a file of labelme for one image."""
+def write_labelme(path, i, points):
+    """Write a file of labelme for one image."""
     shapes = [
         {"label": name, "points": [point], "group_id": None, "shape_type": "point"}
         for name, point in zip(BODYPARTS, points.tolist(), strict=True)
     ]
     known = {"version": "5.4.1", "flags": {}, "shapes": shapes, "imageData": None}
-    return known | {"imagePath": f"{i}.jpg", "imageHeight": 480, "imageWidth": 640}
+    known |= {"imagePath": f"{i}.jpg", "imageHeight": 480, "imageWidth": 640}
+    write_json(path, known)
 
 
 def write_imglab(path, tracks):
@@ -382,12 +383,33 @@ def write_array(path, **arrays):
     return path
 
 
-def write_each(folder, suffix, write, tracks):
-    """Write a file for each frame."""
+def write_each(folder, suffix, write):
+    """Write a file for each frame of `TRACKS`."""
     folder.mkdir()
-    for i, points in enumerate(tracks):
+    for i, points in enumerate(TRACKS):
         write(folder / f"image_{i}{suffix}", i, points)
     return folder
+
+
+def write_detection(path, _, points):
+    write_json(path, [detection(points)])
+
+
+def write_places(path, _, points):
+    write_text(path, *(f"  {x} {y}" for x, y in points))
+
+
+def write_helen(path, i, points):
+    write_text(path, f"{i}_1", *(f"{x} , {y}" for x, y in points))
+
+
+def write_row(path, _, points):
+    saved(path, pd.DataFrame(points.reshape(1, -1), columns=XY))
+
+
+def to(name, write, *args, **options):
+    """Return what writes a file of this name into a folder."""
+    return lambda folder: write(folder / name, *args, **options)
 
 
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
@@ -399,113 +421,77 @@ RESULTS = [
     for i, row in enumerate(SCORED)
 ]
 VIDEO = [{"frame_id": i, "instances": [mmpose(row)]} for i, row in enumerate(SCORED)]
+PREDICTIONS = [frame["instances"] for frame in VIDEO]
 POSES = [[openpose_person(pose=row)] for row in SCORED]
+POINTS = [[dict(zip("xy", p, strict=True)) for p in row] for row in TRACKS.tolist()]
+DETECTIONS = pd.DataFrame([detection(p, track_id=i) for i, p in enumerate(TRACKS)])
+COCO, TABLE = coco_annotations(TRACKS), pd.DataFrame(TRACKS.reshape(12, -1), columns=XY)
 # Of each format, files of one individual: what writes them into a folder and returns
 # their path. A further word tells variants of a format apart.
 WRITERS = {
-    "openface": lambda d: write_openface(d / "a.csv", TRACKS),
-    "openface-1": lambda d: write_openface(d / "a.csv", TRACKS, separator=", "),
-    "openface-image": lambda d: write_openface(d / "a.csv", TRACKS, video=False),
+    "openface": to("a.csv", write_openface, TRACKS),
+    "openface-1": to("a.csv", write_openface, TRACKS, separator=", "),
+    "openface-image": to("a.csv", write_openface, TRACKS, video=False),
     "openface-tsv": lambda d: saved_again(write_openface(d / "a.csv", TRACKS), ".tsv"),
     "openface-parquet": lambda d: saved_again(
         write_openface(d / "a.csv", TRACKS, separator=", "), ".parquet"
     ),
-    "pyfeat": lambda d: write_pyfeat(d / "a.csv", TRACKS),
-    "pyfeat-v2": lambda d: write_pyfeat(d / "a.csv", TRACKS, detector="Detectorv2"),
-    "pyfeat-mp": lambda d: write_pyfeat(d / "a.csv", MESH, detector="MPDetector"),
-    "mediapipe-pixels": lambda d: write_mesh(d / "a.csv", MESH, shares=False),
-    "mediapipe-sizes": lambda d: write_mesh(d / "a.csv", MESH, sizes=True),
-    "pts": lambda d: write_pts(d / "a", TRACKS),
+    "pyfeat": to("a.csv", write_pyfeat, TRACKS),
+    "pyfeat-v2": to("a.csv", write_pyfeat, TRACKS, detector="Detectorv2"),
+    "pyfeat-mp": to("a.csv", write_pyfeat, MESH, detector="MPDetector"),
+    "mediapipe-pixels": to("a.csv", write_mesh, MESH, shares=False),
+    "mediapipe-sizes": to("a.csv", write_mesh, MESH, sizes=True),
+    "pts": to("a", write_pts, TRACKS),
     "pts-file": lambda d: write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
-    "wflw": lambda d: write_wflw(d / "a.txt", WFLW),
-    "wflw-test": lambda d: write_wflw(d / "a.txt", WFLW, rest=False),
-    "deeplabcut": lambda d: write_deeplabcut(d / "a.csv", FRAME),
-    "deeplabcut-tsv": lambda d: write_deeplabcut(d / "a.tsv", FRAME),
-    "deeplabcut-table": lambda d: write_deeplabcut(d / "a.h5", FRAME),
-    "deeplabcut-fixed": lambda d: write_deeplabcut(d / "a.h5", FRAME, how="fixed"),
-    "deeplabcut-lines": lambda d: write_deeplabcut(
-        d / "a.csv", FRAME.droplevel("scorer", axis=1)
+    "wflw": to("a.txt", write_wflw, WFLW),
+    "wflw-test": to("a.txt", write_wflw, WFLW, rest=False),
+    "deeplabcut": to("a.csv", write_deeplabcut, FRAME),
+    "deeplabcut-tsv": to("a.tsv", write_deeplabcut, FRAME),
+    "deeplabcut-table": to("a.h5", write_deeplabcut, FRAME),
+    "deeplabcut-fixed": to("a.h5", write_deeplabcut, FRAME, how="fixed"),
+    "deeplabcut-lines": to(
+        "a.csv", write_deeplabcut, FRAME.droplevel("scorer", axis=1)
     ),
-    "deeplabcut-individuals": lambda d: write_deeplabcut(
-        d / "a.csv", FRAME.rename_axis(columns={"scorer": "individuals"})
+    "deeplabcut-individuals": to(
+        "a.csv", write_deeplabcut, FRAME.rename_axis(columns={"scorer": "individuals"})
     ),
     "deeplabcut-pandas": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=False),
     "deeplabcut-index": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=True),
-    "sleap": lambda d: write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),
-    "coco": lambda d: write_json(d / "a.json", coco_annotations(TRACKS)),
-    "coco-unnamed": lambda d: write_json(
-        d / "a.json", coco_annotations(TRACKS) | {"categories": [{"id": 1}]}
-    ),
-    "coco-without": lambda d: write_json(
-        d / "a.json", coco_annotations(TRACKS) | {"categories": []}
-    ),
-    "coco-results": lambda d: write_json(d / "a.json", RESULTS),
-    "openpose": lambda d: write_openpose(d / "a", POSES),
+    "sleap": to("a.h5", write_sleap, TRACKS[:, None], names=["a"]),
+    "coco": to("a.json", write_json, COCO),
+    "coco-unnamed": to("a.json", write_json, COCO | {"categories": [{"id": 1}]}),
+    "coco-without": to("a.json", write_json, COCO | {"categories": []}),
+    "coco-results": to("a.json", write_json, RESULTS),
+    "openpose": to("a", write_openpose, POSES),
     "openpose-file": lambda d: next(write_openpose(d / "a", POSES[:1]).iterdir()),
-    "mediapipe_json": lambda d: write_json(
-        d / "a.json",
-        [[dict(zip("xy", point, strict=True)) for point in p] for p in TRACKS.tolist()],
-    ),
-    "mmpose": lambda d: write_json(d / "a.json", VIDEO),
-    "mmpose-image": lambda d: write_json(d / "a.json", VIDEO[0]["instances"]),
-    "mmpose-demo": lambda d: write_json(
-        d / "a.json", {"meta_info": {}, "instance_info": VIDEO}
-    ),
-    "mmpose-results": lambda d: write_json(
-        d / "a.json", {"predictions": [frame["instances"] for frame in VIDEO]}
-    ),
-    "tps": lambda d: write_tps(d / "a.tps", TRACKS),
-    "ultralytics": lambda d: write_json(
-        d / "a.json", [[detection(points)] for points in TRACKS]
-    ),
-    "ultralytics-csv": lambda d: saved(
-        d / "a.csv",
-        pd.DataFrame([detection(p, track_id=i) for i, p in enumerate(TRACKS)]),
-    ),
-    "ultralytics-folder": lambda d: write_each(
-        d / "a",
-        ".json",
-        lambda p, _, points: write_json(p, [detection(points)]),
-        TRACKS,
-    ),
-    "yolo": lambda d: write_yolo(d / "a", TRACKS, 2),
-    "yolo-two": lambda d: write_yolo(d / "a", TRACKS),
-    "yolo-score": lambda d: write_yolo(d / "a", TRACKS, 0.7, after=[0.9]),
-    "yolo-track": lambda d: write_yolo(d / "a", TRACKS, 0.7, after=[0.9, 3]),
-    "labelme": lambda d: write_each(
-        d / "a", ".json", lambda p, *each: write_json(p, labelme(*each)), TRACKS
-    ),
-    "imglab": lambda d: write_imglab(d / "a.xml", TRACKS),
-    "places": lambda d: write_each(
-        d / "a",
-        ".txt",
-        lambda p, _, xy: write_text(p, *(f"  {x} {y}" for x, y in xy)),
-        TRACKS,
-    ),
-    "places-helen": lambda d: write_each(
-        d / "a",
-        ".txt",
-        lambda p, i, xy: write_text(p, f"{i}_1", *(f"{x} , {y}" for x, y in xy)),
-        TRACKS,
-    ),
-    "facemap": lambda d: write_facemap(d / "a.h5", TRACKS),
-    "trc": lambda d: write_trc(d / "a.trc", TRACKS),
-    "array": lambda d: write_array(d / "a.npy", xy=TRACKS),
-    "array-columns": lambda d: write_array(d / "a.npz", xy=TRACKS.reshape(12, -1)),
-    "array-planar": lambda d: write_array(d / "a.mat", xy=TRACKS.mT, fps=30.0),
+    "mediapipe_json": to("a.json", write_json, POINTS),
+    "mmpose": to("a.json", write_json, VIDEO),
+    "mmpose-image": to("a.json", write_json, PREDICTIONS[0]),
+    "mmpose-demo": to("a.json", write_json, {"meta_info": {}, "instance_info": VIDEO}),
+    "mmpose-results": to("a.json", write_json, {"predictions": PREDICTIONS}),
+    "tps": to("a.tps", write_tps, TRACKS),
+    "ultralytics": to("a.json", write_json, [[detection(points)] for points in TRACKS]),
+    "ultralytics-csv": to("a.csv", saved, DETECTIONS),
+    "ultralytics-folder": to("a", write_each, ".json", write_detection),
+    "yolo": to("a", write_yolo, TRACKS, 2),
+    "yolo-two": to("a", write_yolo, TRACKS),
+    "yolo-score": to("a", write_yolo, TRACKS, 0.7, after=[0.9]),
+    "yolo-track": to("a", write_yolo, TRACKS, 0.7, after=[0.9, 3]),
+    "labelme": to("a", write_each, ".json", write_labelme),
+    "imglab": to("a.xml", write_imglab, TRACKS),
+    "places": to("a", write_each, ".txt", write_places),
+    "places-helen": to("a", write_each, ".txt", write_helen),
+    "facemap": to("a.h5", write_facemap, TRACKS),
+    "trc": to("a.trc", write_trc, TRACKS),
+    "array": to("a.npy", write_array, xy=TRACKS),
+    "array-columns": to("a.npz", write_array, xy=TRACKS.reshape(12, -1)),
+    "array-planar": to("a.mat", write_array, xy=TRACKS.mT, fps=30.0),
     "table-txt": lambda d: saved_again(
         write_mesh(d / "a.csv", TRACKS, shares=False), ".txt"
     ),
-    "table-blanks": lambda d: saved(
-        d / "a.txt", pd.DataFrame(TRACKS.reshape(12, -1), columns=XY), sep=" "
-    ),
-    "table-folder": lambda d: write_each(
-        d / "a",
-        ".csv",
-        lambda p, _, points: saved(p, pd.DataFrame(points.reshape(1, -1), columns=XY)),
-        TRACKS,
-    ),
-    "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
+    "table-blanks": to("a.txt", saved, TABLE, sep=" "),
+    "table-folder": to("a", write_each, ".csv", write_row),
+    "table": to("a.csv", write_mesh, TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
 IN_MESH = [n for n in WRITERS if n[:10] in ("mediapipe", "mediapipe-", "pyfeat-mp")]

@@ -52,7 +52,7 @@ def warned(message, call, /, *args, category=UserWarning, **kwargs):
 def refusals_of(section, names):
     """Return a test that the calls in a section are refused, and write no file."""
     text = TABLE.read_text(encoding="utf-8").partition(f"[{section}]\n")[2]
-    lines = text.partition("\n[")[0].splitlines()
+    lines = text.partition("\n\n[")[0].splitlines()
     calls = [*zip(lines[::2], map(str.strip, lines[1::2]), strict=True)]
     assert calls, section
 

@@ -91,6 +91,18 @@ def with_gaps(tracks, share=0.3, seed=0):
     return pairs.reshape(tracks.shape)
 
 
+def tracks_of(table, layout="interleaved"):
+    """Return the points (I, J, 2) of a table."""
+    pairs = table.reshape(len(table), *((2, -1) if layout == "planar" else (-1, 2)))
+    return pairs.swapaxes(1, 2) if layout == "planar" else pairs
+
+
+def table_of(tracks, layout="interleaved"):
+    """Return tracks (I, J, 2) as a table."""
+    tracks = tracks.swapaxes(1, 2) if layout == "planar" else tracks
+    return tracks.reshape(len(tracks), -1)
+
+
 def random_cameras(rng, n_frames):
     """Return cameras with orthonormal rows, (I, 2, 3), in all orientations."""
     return Rotation.random(n_frames, rng).as_matrix()[:, :2]
@@ -152,7 +164,7 @@ def likelihood_of(tracks, weights, penalty, block_frames=2048):
     """Return the objective of the joint fit for tracks (n_frames, n_points, 2)."""
     blocks = [
         frame_tracks(
-            tracks[first : first + block_frames].transpose(0, 2, 1),
+            tracks[first : first + block_frames].mT,
             None if weights is None else weights[first : first + block_frames],
         )
         for first in range(0, len(tracks), block_frames)

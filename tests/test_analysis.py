@@ -145,9 +145,9 @@ class TestAssociation:
             return alpha, rng.integers(2, size=20)[person]
 
         for trial in (spread, sessions, repeated):
-            assert np.mean(least_p(trial, n_trials=40) <= 0.05) <= 0.15
-        found = [association(*repeated(seed), random_state=0) for seed in range(10)]
-        assert sum("Give the people as groups" in each.untested for each in found) > 7
+            assert np.mean(least_p(trial, n_trials=25) <= 0.05) <= 0.12
+        found = [association(*repeated(seed), random_state=0) for seed in range(5)]
+        assert sum("Give the people as groups" in each.untested for each in found) > 3
 
     def test_correction_for_attenuation(self):
         rng = rng_of(0)
@@ -160,8 +160,6 @@ class TestAssociation:
         assert found.corrected == pytest.approx(expected, abs=0.04)
         assert list(found.to_frame()) == ["spearman", "spearman_corrected", "p_value"]
         assert "corrected" in str(found)
-        with pytest.raises(ValueError, match="alpha_std must have the shape"):
-            association(alpha, y, alpha_std=std[:5])
 
     @pytest.mark.parametrize(
         "trial",
@@ -203,12 +201,6 @@ class TestAssociation:
         expected = association(alpha, y, random_state=0)
         assert_allclose(found.statistic, expected.statistic)
         assert_allclose(found.p_value, expected.p_value, atol=0.06)
-
-    def test_names_of_many_people(self):
-        alpha, name = rng_of(0).normal(size=(1200, 2)), np.arange(1200) // 4
-        alpha[:, 1] += rng_of(1).normal(size=300)[name]
-        found = association(alpha, name, n_permutations=99, random_state=0)
-        assert_array_equal(found.p_value <= 0.01, [False, True])
 
     def test_labels_in_blocks_of_a_video_go_with_nothing_by_chance(self):
         # Nine in ten are significant if single frames are permuted.
@@ -281,13 +273,6 @@ class TestAssociation:
         last = max(alone[strength[-1]], found.p_value[strength[-2]])
         assert found.p_value[strength[-1]] == last
 
-    def test_constant_coefficients_go_with_nothing(self):
-        alpha, y = related()
-        alpha[:, 2] = 1.0
-        found = association(alpha, y, random_state=0)
-        assert found.statistic[2] == 0
-        assert found.p_value[2] == 1
-
     def test_table(self):
         found = association(*related(), random_state=0)
         frame = found.to_frame()
@@ -337,11 +322,6 @@ class TestPredictability:
         assert alone > found + 0.15
         timed = predictability(alpha[mixed], y[mixed], time=mixed, random_state=0)
         assert timed.mean() == pytest.approx(found, abs=0.05)
-
-    def test_fewer_folds_for_small_classes(self):
-        alpha, y = related(n=40)
-        y = np.where(np.arange(40) < 3, 5, y)
-        assert len(predictability(alpha, y, random_state=0)) == 3
 
 
 class TestWithinGroups:

@@ -1,18 +1,15 @@
 """From affine to Euclidean space: metrics, cameras, poses, shapes of estimators."""
 
-from copy import deepcopy
-
 import numpy as np
 import pytest
 from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refusals_of, refused, warned
+from refusals import refusals_of, warned
 from scenes import measurements, random_rotation
 from scipy.linalg import expm
 from scipy.optimize import approx_fprime, minimize
 from scipy.spatial.transform import Rotation
-from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.calibration import (
@@ -72,12 +69,12 @@ class TestMetricUpgrade:
         assert_allclose(upgrade.Q, upgrade.Q.T, atol=1e-14)
         assert np.linalg.eigvalsh(upgrade.Q)[0] > 0
         R = upgrade.rotations
-        assert_allclose(R @ R.transpose(0, 2, 1) - np.eye(3), 0, atol=1e-12)
+        assert_allclose(R @ R.mT - np.eye(3), 0, atol=1e-12)
         assert_allclose(np.linalg.det(R), 1)
         assert np.sqrt(np.mean(upgrade.scales**2)) == pytest.approx(1, rel=1e-9)
         # The rotation is the nearest one.
-        inner = R[:, :2] @ (motion @ upgrade.Q).transpose(0, 2, 1)
-        assert_allclose(inner, inner.transpose(0, 2, 1), atol=1e-12)
+        inner = R[:, :2] @ (motion @ upgrade.Q).mT
+        assert_allclose(inner, inner.mT, atol=1e-12)
         if camera == "orthographic":
             assert (upgrade.scales == 1).all()
 
@@ -149,14 +146,6 @@ class TestLeastResidual:
             deformation_metric(motion[::-1], alpha[::-1]).strain, one.strain, atol=1e-8
         )
 
-    @few_cameras
-    def test_condition_number(self):
-        turns = Rotation.random(3000, random_state=0).as_matrix()[:, :2]
-        assert metric_upgrade(turns).condition_number == pytest.approx(1, abs=0.1)
-        for unit in (1e-20, 1e20):
-            condition = metric_upgrade(unit * turns).condition_number
-            assert condition == pytest.approx(1, abs=0.1)
-
 
 class TestDegenerateCameras:
     @both_cameras
@@ -173,28 +162,10 @@ class TestDegenerateCameras:
         assert conditions[0] < 50 < 500 < conditions[1]
         assert conditions[2] / conditions[1] == pytest.approx(100, rel=0.05)
 
-    @both_cameras
-    def test_two_cameras_are_not_enough(self, camera):
-        motion, *_ = scene(1, camera, n_frames=2)
-        upgrade = warned("hardly determine", metric_upgrade, motion, camera)
-        assert upgrade.condition_number > 1e6
-        assert np.isfinite(upgrade.Q).all()
-
     def test_no_scaled_rotations_in_any_metric(self, rng):
         upgrade = warned("condition number", metric_upgrade, lorentz_cameras(rng))
         assert upgrade.residual > 0.1
         assert np.isfinite(upgrade.rotations).all()
-
-
-def test_images_of_euclidean_shapes_stay_what_they_are(rng):
-    motion, *_ = scene(0, "weak_perspective")
-    mean, basis = rng.standard_normal((9, 3)), rng.standard_normal((2, 9, 3))
-    Q = metric_upgrade(motion).Q
-    for shapes in (mean, basis):
-        upgraded = euclidean_shapes(shapes, Q)
-        assert upgraded.shape == shapes.shape
-        images = [shapes @ M.T for M in motion]
-        assert_allclose([upgraded @ (M @ Q).T for M in motion], images, atol=1e-9)
 
 
 def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
@@ -204,7 +175,7 @@ def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
     scales = rng.uniform(0.5, 2, n_frames)
     alpha = rng.standard_normal((n_frames, n_components))
     root = size * rng.standard_normal((n_components, 3, 3))
-    strain = root + root.transpose(0, 2, 1)
+    strain = root + root.mT
     strain -= np.trace(strain, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
     Q = affinity(rng)
     Q = Q @ Q.T
@@ -217,7 +188,9 @@ def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
 class TestDeformationMetric:
     def test_exact_cameras(self):
         motion, alpha, Q, strain, *_ = strained_scene(0)
-        metric = deformation_metric(motion, alpha)
+        # Two frames without a camera are left out.
+        motion = np.concatenate([motion, np.full((2, 2, 3), np.nan)])
+        metric = deformation_metric(motion, np.pad(alpha, [(0, 2), (0, 0)]))
         assert_allclose(metric.Q / np.trace(metric.Q), Q / np.trace(Q), atol=1e-8)
         assert_allclose(metric.strain, strain, atol=1e-7)
         assert metric.residual < 1e-8
@@ -240,18 +213,6 @@ class TestDeformationMetric:
         assert metric.residual > 0.9 * metric_upgrade(motion).residual
         assert np.sqrt(np.mean(metric.strain**2)) < 0.01
 
-    def test_noise_does_not_hide_the_strain(self):
-        motion, alpha, _, strain, *_ = strained_scene(2, n_frames=400, noise=0.02)
-        assert_allclose(deformation_metric(motion, alpha).strain, strain, atol=0.03)
-
-    def test_leaves_out_frames_without_camera(self):
-        motion, alpha, *_ = strained_scene(6)
-        more = np.concatenate([motion, np.full((2, 2, 3), np.nan)])
-        with_nan = np.concatenate([alpha, np.full((2, 2), np.nan)])
-        one, two = deformation_metric(motion, alpha), deformation_metric(more, with_nan)
-        for a, b in zip(one, two, strict=True):
-            assert_allclose(a, b, rtol=1e-12)
-
 
 class TestEuclideanFrames:
     @pytest.fixture
@@ -268,36 +229,12 @@ class TestEuclideanFrames:
         _, motion, alpha, mean, basis = fitted
         frames = euclidean_frames(*fitted)
         affine = mean + np.tensordot(alpha, basis, 1)
-        rows = frames.rotations[:, :2].transpose(0, 2, 1)
+        rows = frames.rotations[:, :2].mT
         images = frames.scales[:, None, None] * (frames.shapes @ rows)
-        assert_allclose(images, affine @ motion.transpose(0, 2, 1), atol=1e-12)
+        assert_allclose(images, affine @ motion.mT, atol=1e-12)
         R = frames.rotations
-        assert_allclose(R @ R.transpose(0, 2, 1) - np.eye(3), 0, atol=1e-12)
+        assert_allclose(R @ R.mT - np.eye(3), 0, atol=1e-12)
         assert_allclose(np.linalg.det(R), 1)
-
-    def test_shapes_are_turned_to_the_mean_shape(self, fitted):
-        # By an orthogonal Procrustes problem: the inner product is symmetric, and
-        # positive definite but for the mirror image.
-        metric, _, _, mean, _ = fitted
-        frames = euclidean_frames(*fitted)
-        target = mean @ np.linalg.inv(metric.Q).T
-        inner = frames.shapes.transpose(0, 2, 1) @ (target - target.mean(axis=0))
-        assert_allclose(inner, inner.transpose(0, 2, 1), atol=1e-10)
-        values = np.linalg.eigvalsh(inner)
-        assert (values[:, 1:] > 0).all()
-        assert (values[:, 0] + values[:, 1] > 0).all()
-
-    def test_exact_cameras_give_the_shapes_in_their_metric(self):
-        motion, alpha, _, _, scales, Q_i = strained_scene(1, size=0.1)
-        rng = np.random.default_rng(1)
-        mean, basis = rng.standard_normal((9, 3)), 0.2 * rng.standard_normal((2, 9, 3))
-        metric = deformation_metric(motion, alpha)
-        frames = euclidean_frames(metric, motion, alpha, mean, basis)
-        affine = mean + np.tensordot(alpha, basis, 1)
-        true = affine @ np.linalg.inv(Q_i).transpose(0, 2, 1)
-        assert mean_shape_error_3d(true, frames.shapes, convention="frame") < 1e-7
-        unit = scales / np.sqrt(np.mean(scales**2))
-        assert_allclose(frames.scales / unit, frames.scales[0] / unit[0], rtol=1e-7)
 
     def test_frames_without_camera_are_nan(self, fitted):
         metric, motion, alpha, mean, basis = fitted
@@ -316,7 +253,7 @@ class TestEuclideanFrames:
         for factor in (10.0, 1000.0):
             frames = euclidean_frames(metric, motion, factor * alpha, mean, 0 * basis)
             common = mean @ np.linalg.inv(metric.Q).T
-            depth = frames.rotations[:, 2:].transpose(0, 2, 1)
+            depth = frames.rotations[:, 2:].mT
             seen = np.linalg.norm(frames.shapes @ depth, axis=(1, 2))
             least, largest = np.linalg.svd(common, compute_uv=False)[[2, 0]]
             assert (seen > np.exp(-0.5) * least * (1 - 1e-9)).all()
@@ -367,21 +304,18 @@ class TestOrthonormalCameras:
         P, cameras = deforming_scene(0)
         found = orthonormal_cameras(P)
         assert found.cost < 1e-17
-        rows = found.cameras @ found.cameras.transpose(0, 2, 1)
+        rows = found.cameras @ found.cameras.mT
         assert_allclose(rows, np.broadcast_to(np.eye(2), rows.shape), atol=1e-8)
         # The cost is of fourth order in some directions.
         assert_allclose(gram(found.cameras), gram(cameras), atol=2e-4)
-
-    def test_identities(self):
-        P, _ = deforming_scene(0, noise=0.02)
-        found = orthonormal_cameras(P)
-        assert_allclose(found.cameras.reshape(-1, 3), P @ found.mixing, atol=1e-10)
-        assert found.cost == pytest.approx(cost_of(found.cameras))
 
     @pytest.mark.parametrize("noise_variance", [0.0, 1e-2])
     def test_is_a_minimum(self, noise_variance, rng):
         P, _ = deforming_scene(0, noise=0.02)
         found = orthonormal_cameras(P, noise_variance)
+        assert_allclose(found.cameras.reshape(-1, 3), P @ found.mixing, atol=1e-10)
+        if noise_variance == 0.0:
+            assert found.cost == pytest.approx(cost_of(found.cameras))
 
         def cost(Q):
             price = 4 * noise_variance * np.sum(Q**2)
@@ -394,34 +328,12 @@ class TestOrthonormalCameras:
         steps = (size * rng.normal(size=Q.shape) for size in sizes)
         assert all(cost(Q + step) > least for step in steps)
 
-    def test_more_columns_never_cost_more(self):
-        P, _ = deforming_scene(0, noise=0.05)
-        costs = [orthonormal_cameras(P[:, :n]).cost for n in range(3, P.shape[1] + 1)]
-        assert (np.diff(costs) <= 1e-12).all()
-        assert costs[-1] < 0.1 * costs[0]
-
-    def test_scales_and_triangular_mixtures_of_columns_do_not_matter(self, rng):
-        P, _ = deforming_scene(1, noise=0.01)
-        expected = orthonormal_cameras(P)
-        upper = np.triu(rng.normal(size=(P.shape[1],) * 2), 1) + np.eye(P.shape[1])
-        for mixing in (upper, np.diag(10.0 ** rng.integers(-9, 9, P.shape[1]))):
-            found = orthonormal_cameras(P @ mixing)
-            assert_allclose(gram(found.cameras), gram(expected.cameras), atol=1e-6)
-
     def test_local_minimum_is_left(self, load_data):
         # From the first three columns alone the cost ends at 2e-4 and above.
         W = measurements(load_data("akhter_yoga")["W2d"], scale_frames=False)
         U = np.linalg.svd(W, full_matrices=False)[0]
         assert orthonormal_cameras(U[:, :6]).cost < 0.005
         assert orthonormal_cameras(U[:, :30]).cost < 3e-6
-
-    def test_dependent_columns_are_left_out(self):
-        P, _ = deforming_scene(0, noise=0.02)
-        expected = orthonormal_cameras(P)
-        more = np.insert(P, [2, 5], np.stack([P[:, 0], 0 * P[:, 0]], axis=1), axis=1)
-        found = orthonormal_cameras(more)
-        assert_array_equal(found.mixing[[2, 6]], 0)
-        assert_allclose(found.cameras, expected.cameras, atol=1e-6)
 
 
 # The directions of `face`, by points: nose, chin, brow, eyes and ears.
@@ -479,21 +391,6 @@ class TestPoses:
             if "front" in given:
                 assert (R @ images["front"])[2] < 0
 
-    @pytest.mark.parametrize("missing", ["left_right", "up", "front"])
-    def test_two_directions_determine_a_rotation(self, face, missing):
-        given = {name: pairs for name, pairs in POINTS.items() if name != missing}
-        for mirror in (np.eye(3), MIRROR):
-            pose = canonical_pose(face @ mirror, **given)
-            assert np.linalg.det(pose.rotation) == pytest.approx(1)
-            assert not pose.mirrored
-
-    def test_directions_and_pairs_mean_the_same(self, face):
-        pairs = [[8, 27], [57, 33]]
-        mean = np.mean([face[27] - face[8], face[33] - face[57]], axis=0)
-        one = canonical_pose(face, left_right=LEFT_RIGHT, up=pairs)
-        two = canonical_pose(face, left_right=LEFT_RIGHT, up=2.5 * mean)
-        assert_allclose(one.rotation, two.rotation, atol=1e-12)
-
     def test_true_faces_stand_upright(self, load_data):
         truth = load_data("ict_bu3dfe_like_68")["S3d"].astype(float)
         mean = (truth - truth.mean(axis=1, keepdims=True)).mean(axis=0)
@@ -503,13 +400,6 @@ class TestPoses:
         assert angle_between(pose.rotation, upright) < 4
         assert not pose.mirrored
         assert canonical_pose(mean @ MIRROR, scheme="ibug-68").mirrored
-
-    def test_what_is_given_comes_first(self, face):
-        up = face[27] - face[8] + [0, 0, 30.0]
-        one = canonical_pose(face, scheme="ibug-68", up=up)
-        assert one.rotation[2] @ up == pytest.approx(0, abs=1e-9)
-        two = canonical_pose(face, scheme="ibug-68")
-        assert angle_between(one.rotation, two.rotation) > 5
 
 
 def test_nearest_principal_axes(rng):
@@ -525,9 +415,6 @@ def test_nearest_principal_axes(rng):
     assert not pose.mirrored
 
 
-NOSE, CROWN = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
-
-
 def rotation(yaw, pitch, roll):
     """Return a rotation from its definition, right-handed turns about three axes."""
     turns = [("z", roll), ("x", -pitch), ("y", -yaw)]
@@ -541,21 +428,6 @@ def test_angles_of_their_definition(rng):
     wanted = rng.uniform([-180, -90, -180], [180, 90, 180], (50, 3))
     found = view_angles([rotation(*each) for each in wanted])
     assert_allclose(np.transpose(found), wanted, atol=1e-9)
-
-
-def test_signs_are_what_a_viewer_sees():
-    # The image of a point is the first two coordinates: x to the right, y down.
-    assert (rotation(30, 0, 0) @ NOSE)[0] > 0.4  # to the right
-    assert (rotation(0, 30, 0) @ NOSE)[1] < -0.4  # up
-    assert (rotation(0, 0, 30) @ CROWN)[0] > 0.4  # clockwise
-    assert_allclose(np.ravel(view_angles([np.eye(3)])), 0)
-
-
-def test_frames_without_a_rotation_have_no_angles():
-    R = np.stack([rotation(1, 2, 3), np.full((3, 3), np.nan)])
-    found = np.transpose(view_angles(R))
-    assert_allclose(found[0], [1, 2, 3])
-    assert np.isnan(found[1]).all()
 
 
 def test_deviations_of_angles_are_those_of_random_small_turns(rng):
@@ -603,14 +475,6 @@ class TestTruth:
         assert frame_error(tracks.shapes, shapes, scale=False) < 1e-4
         assert frame_error(tracks.shapes, model.reconstruct(tracks.data)) > 0.05
 
-    def test_noisy_faces(self, photos, model):
-        weak = model.reconstruct(photos.data, camera="weak_perspective")
-        assert frame_error(photos.shapes, weak) < 0.012
-        ortho = model.reconstruct(photos.data, camera="orthographic")
-        # Two pixels a millimetre.
-        assert frame_error(photos.shapes, ortho / 2, scale=False) < 0.012
-        assert mean_shape_error_3d(photos.shapes, ortho / 2) < 0.05
-
     @pytest.mark.parametrize(
         ("name", "n_components", "errors"),
         [
@@ -654,44 +518,10 @@ class TestReconstruct:
         ortho = model.reconstruct(photos.data, camera="orthographic")
         assert_allclose(ortho, frames.scales[:, None, None] * frames.shapes)
         # Cameras without scale see the orthographic shapes as the model does.
-        images = ortho @ frames.rotations[:, :2].transpose(0, 2, 1)
+        images = ortho @ frames.rotations[:, :2].mT
         images += translation[:, None]
         expected = model.reproject(photos.data)
         assert_allclose(images.reshape(expected.shape), expected, atol=1e-8)
-
-    @both_cameras
-    def test_new_frames_do_not_depend_on_each_other(self, model, camera):
-        new = make_face_tracks(n_frames=20, camera="orthographic", random_state=5)
-        shapes = model.reconstruct(new.data, camera=camera)
-        assert frame_error(new.shapes, shapes) < 0.03
-        some = model.reconstruct(new.data[7:9], camera=camera)
-        assert_allclose(some, shapes[7:9], rtol=1e-6)
-
-    @pytest.mark.parametrize("refinement", ["alternating", None])
-    def test_every_refinement(self, photos, refinement):
-        model = AffineNRSfM(n_components=2, refinement=refinement, random_state=0)
-        model.fit(photos.data)
-        for camera in CAMERAS:
-            shapes = model.reconstruct(photos.data, camera=camera)
-            assert frame_error(photos.shapes, shapes) < 0.08
-
-    def test_refuses_other_cameras(self, photos, model):
-        message = r"camera must be None or one of .*'weak_perspective'.* got 'affine'"
-        refused(message, model.reconstruct, photos.data, camera="affine")
-        with pytest.raises(NotFittedError):
-            AffineNRSfM().reconstruct(photos.data, camera="orthographic")
-
-    def test_warns_where_cameras_hardly_turn(self, rng):
-        options = {"camera": "orthographic", "amplitude": 0.1, "noise": 0}
-        tracks = make_nonrigid_tracks(100, 40, 1, **options, random_state=0)
-        motion = np.eye(2, 3) + np.zeros((100, 1, 1))
-        motion[:, :, 2] = 0.02 * rng.standard_normal((100, 2))
-        table = (tracks.shapes @ motion.transpose(0, 2, 1)).reshape(100, -1)
-        # The joint refinement takes long where cameras hardly turn.
-        model = AffineNRSfM(n_components=1, refinement="alternating", random_state=0)
-        model.fit(table)
-        with pytest.warns(UserWarning, match="hardly determine the metric"):
-            model.reconstruct(table, camera="weak_perspective")
 
     @pytest.mark.parametrize("seed", slow_after(1, [11, 17]))
     def test_noisy_cameras_that_hardly_turn(self, seed):
@@ -708,12 +538,6 @@ class TestReconstruct:
         mean, basis = rng.normal(size=(9, 3)), rng.normal(size=(3, 9, 3))
         frames = euclidean_frames(metric, cameras, alpha, mean, basis)
         assert np.isfinite(frames.shapes).all()
-
-    def test_refuses_cameras_that_see_two_directions(self, photos, model):
-        flat = deepcopy(model)
-        flat.motion_[:, :, 2] = 0
-        with pytest.raises(ValueError, match=r"three directions of space; .* see 2"):
-            flat.reconstruct(photos.data, camera="weak_perspective")
 
 
 test_refusals = refusals_of("calibration", globals())

@@ -93,12 +93,6 @@ class TestAlone:
         recorder.assert_nested()
         assert recorder.tasks() == [*PAPER_STAGES, LAST, "fit"]
 
-    def test_auto_begins_with_the_number_of_basis_shapes(self):
-        _, recorder = recorded(AffineNRSfM("auto", random_state=0))
-        recorder.assert_nested()
-        stages = [task for task in recorder.tasks() if task != "step"]
-        assert stages == ["number of basis shapes", *PAPER_STAGES, JOINT, LAST, "fit"]
-
     def test_callbacks_are_dismissed_when_a_fit_fails(self):
         recorder = Recorder()
         model = estimator(loss="huber", refinement=None).set_callbacks(recorder)
@@ -134,15 +128,6 @@ class TestInside:
             _, recorder = recorded(search)
         for task in ("table", LAST):
             assert recorder.tasks().count(task) == 5
-
-
-def test_progress_bars_of_scikit_learn(capsys):
-    pytest.importorskip("rich")
-    estimator(max_iter=200).set_callbacks(callback.ProgressBar()).fit(TABLE)
-    fit, joint = capsys.readouterr().out.strip().splitlines()
-    assert fit.startswith("AffineNRSfM - fit")
-    assert joint.strip().startswith(f"AffineNRSfM - {JOINT}")
-    assert all("100%" in bar for bar in (fit, joint))
 
 
 @pytest.mark.subprocess

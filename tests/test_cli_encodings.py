@@ -93,7 +93,8 @@ sys.exit(main(sys.argv[2:]))
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.subprocess
 @pytest.mark.parametrize(
-    "module", ["argparse", "isa_nrsfm.cli._main", "numpy", "isa_nrsfm._estimator"]
+    "module",
+    slow_after(2, ["argparse", "isa_nrsfm._estimator", "isa_nrsfm.cli._main", "numpy"]),
 )
 def test_interruption_while_modules_are_imported(faces, tmp_path, module):
     faces.to_csv(tmp_path / "faces.csv", index=False)

@@ -34,7 +34,6 @@ from isa_nrsfm._joint.consensus import (
 )
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
@@ -80,12 +79,6 @@ class TestNeighbours:
         assert set(np.concatenate([points for points, _ in groups])) == set(range(40))
         assert sum(count for _, count in groups) >= min(COVER * 40 // size, 40)
         assert len({tuple(points) for points, _ in groups}) == len(groups)
-
-    def test_one_group_of_few_points(self):
-        """Fewer points than the size are one group, as often as there are points."""
-        ((points, count),) = neighbourhoods(np.ones((6, 6)) - np.eye(6), 12)
-        assert_array_equal(points, np.arange(6))
-        assert count == 2  # COVER * 6 / 12
 
 
 class TestMerge:
@@ -147,33 +140,6 @@ class TestMerge:
             assert_allclose(after.weight, before.weight / (5 * square), rtol=1e-9)
 
 
-class TestPrincipalShapes:
-    """From the shapes of frames to a model."""
-
-    def test_fewer_components_leave_a_mean_square(self):
-        """The third result is the mean square of the rest."""
-        S = np.random.default_rng(9).standard_normal((20, 3, 5))
-        shapes, alpha, left = principal_shapes(S, 4)
-        rest = S - shapes[0] - np.tensordot(alpha, shapes[1:], 1)
-        assert_allclose(left, np.mean(rest**2))
-
-    def test_components_below_the_noise_are_left_out(self):
-        """The smallest number of components leaves no more than the noise."""
-        S = np.random.default_rng(10).standard_normal((20, 3, 5))
-        by_number = [principal_shapes(S, k)[2] for k in range(1, 12)]
-        shapes, _, left = principal_shapes(S, 11, 1.01 * by_number[5])
-        assert len(shapes) == 7
-        assert_allclose(left, by_number[5])
-
-    def test_surplus_components_are_zero(self):
-        """More components than frames are filled with zeros."""
-        S = np.random.default_rng(11).standard_normal((4, 3, 5))
-        shapes, alpha, _ = principal_shapes(S, 9)
-        assert shapes.shape == (10, 3, 5)
-        assert not shapes[5:].any()
-        assert not alpha[:, 4:].any()
-
-
 def test_interpolation_of_changes():
     """Chosen points keep their changes; others have means of three of them."""
     rng = np.random.default_rng(12)
@@ -185,36 +151,37 @@ def test_interpolation_of_changes():
     assert ((weights[:, others] > 0).sum(axis=0) == 3).all()
 
 
-class TestShareOfFirst:
-    """The share of the joint fit in the depths, from hidden points."""
+def test_principal_shapes_of_frames():
+    """Fewer components leave a mean square, which the third argument may bound."""
+    S = np.random.default_rng(9).standard_normal((20, 3, 5))
+    by_number = [principal_shapes(S, k) for k in range(1, 12)]
+    for shapes, alpha, left in by_number:
+        rest = S - shapes[0] - np.tensordot(alpha, shapes[1:], 1)
+        assert_allclose(left, np.mean(rest**2))
+    shapes, _, left = principal_shapes(S, 11, 1.01 * by_number[5][2])
+    assert len(shapes) == 7
+    assert_allclose(left, by_number[5][2])
+    # More components than frames are filled with zeros.
+    shapes, alpha, _ = principal_shapes(S[:4], 9)
+    assert shapes.shape == (10, 3, 5)
+    assert not shapes[5:].any()
+    assert not alpha[:, 4:].any()
 
-    @pytest.fixture
-    def fitted(self):
-        """Return rows of size one, the model that made them, and another one."""
-        tracks = make_nonrigid_tracks(60, 20, 2, camera="orthographic", random_state=0)
-        model = AffineNRSfM(2, camera="orthographic", random_state=0).fit(tracks.data)
-        frames = model._model.frames
-        rows = tracks.data.reshape(60, 20, 2).transpose(0, 2, 1) / model._model.unit
-        flat = replace(frames, shapes=frames.shapes * [[1.0], [1.0], [0.5]])
-        return rows, frames, flat
 
-    def test_hidden_points_of_the_true_model_are_predicted(self, fitted):
-        rows, frames, flat = fitted
-        assert np.abs(hidden_residuals(frames, rows)).max() < 1e-4
-        assert np.abs(hidden_residuals(flat, rows)).max() > 1e-2
-
-    def test_missing_points_do_not_count(self, fitted):
-        rows, frames, _ = fitted
-        rows = rows.copy()
-        rows[:5, :, 3] = np.nan
-        rest = hidden_residuals(frames, rows)
-        assert_array_equal(np.isnan(rest), np.isnan(rows))
-
-    def test_is_zero_for_a_worse_model_and_at_most_a_half(self, fitted):
-        rows, frames, flat = fitted
-        assert share_of_first(flat, frames, rows) < 0.01
-        assert share_of_first(frames, flat, rows) > 0.49
-        assert share_of_first(frames, frames, rows) == 0
+def test_share_of_the_joint_fit_by_hidden_points():
+    """The true model predicts hidden points, missing ones do not count."""
+    tracks = make_nonrigid_tracks(60, 20, 2, camera="orthographic", random_state=0)
+    model = Quick(2, camera="orthographic", random_state=0).fit(tracks.data)
+    frames = model._model.frames
+    rows = tracks.data.reshape(60, 20, 2).mT / model._model.unit
+    flat = replace(frames, shapes=frames.shapes * [[1.0], [1.0], [0.5]])
+    assert np.abs(hidden_residuals(frames, rows)).max() < 1e-4
+    assert np.abs(hidden_residuals(flat, rows)).max() > 1e-2
+    assert share_of_first(flat, frames, rows) < 0.01
+    assert share_of_first(frames, flat, rows) > 0.49
+    assert share_of_first(frames, frames, rows) == 0
+    rows[:5, :, 3] = np.nan
+    assert_array_equal(np.isnan(hidden_residuals(frames, rows)), np.isnan(rows))
 
 
 class TestGroupFit:
@@ -226,7 +193,7 @@ class TestGroupFit:
             n_frames, 12, 2, camera="orthographic", noise=0.0, random_state=0
         )
         rotations, scales = full_rotations(tracks.motion)
-        truth = scales[:, None, None] * rotations @ tracks.shapes.transpose(0, 2, 1)
+        truth = scales[:, None, None] * rotations @ tracks.shapes.mT
         truth = truth - truth.mean(axis=2, keepdims=True)
         size = np.sqrt(np.mean(truth[:, :2] ** 2))
         truth, motion = truth / size, tracks.motion / size
@@ -258,16 +225,12 @@ class TestGroupFit:
         assert np.sqrt(np.mean(off**2)) < 0.02
 
     def test_frames_with_few_points_are_left_out(self):
-        """A group is fitted to the frames that show at least four of its points."""
+        """Frames show at least four points of a group; more than basis shapes do."""
         scene, _ = self.scene()
         scene.rows[:5, :, 3:] = np.nan
         frames, found, _ = group_fit(scene, 2, SETTINGS)
         assert_array_equal(frames, np.arange(5, 60))
         assert found.shape == (55, 3, 12)
-
-    def test_too_few_frames(self):
-        """There is no fit if no more frames than basis shapes show the group."""
-        scene, _ = self.scene()
         scene.rows[2:, :, 3:] = np.nan
         assert group_fit(scene, 2, SETTINGS) is None
 
@@ -397,12 +360,10 @@ def test_aligning_rotations_leave_the_deformation(rng):
     S -= S.mean(axis=2, keepdims=True)
     S = Rotation.from_rotvec(0.1 * rng.standard_normal((50, 3))).as_matrix() @ S
     R = aligning_rotations(S, 1e-4)
-    assert_allclose(
-        R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12
-    )
+    assert_allclose(R @ R.mT, np.tile(np.eye(3), (50, 1, 1)), atol=1e-12)
     second = [
         np.linalg.svd((each - each.mean(axis=0)).reshape(50, -1))[1][1]
-        for each in (S, R.transpose(0, 2, 1) @ S)
+        for each in (S, R.mT @ S)
     ]
     assert second[1] < 0.05 * second[0]
 
@@ -419,11 +380,11 @@ def articulated(n_frames=80, noise=1e-4, seed=0, n_points=6):
         turns = Rotation.from_rotvec(0.3 * rng.standard_normal((n_frames, 3)))
         along = turns.apply([0.5, 0.0, 0.0])
         turned = turns.as_matrix() @ rod.T
-        parts.append(turned.transpose(0, 2, 1) + (joint + along)[:, None])
+        parts.append(turned.mT + (joint + along)[:, None])
         joint = joint + 2 * along
     shapes = np.concatenate(parts, axis=1)
     views = Rotation.from_rotvec(0.6 * rng.standard_normal((n_frames, 3)))
-    shapes = shapes @ views.as_matrix().transpose(0, 2, 1)
+    shapes = shapes @ views.as_matrix().mT
     shapes -= shapes.mean(axis=1, keepdims=True)
     tracks = shapes[:, :, :2]
     tracks = tracks + noise * rng.standard_normal(tracks.shape)
@@ -447,7 +408,7 @@ def consensus_fit(table=X, n_components=8, kind=AffineNRSfM, **parameters):
 def in_camera(model, table):
     """Return shapes in the axes of the cameras, in the units of the images."""
     rotations, scales = full_rotations(model.decompose(table).motion)
-    turned = model.reconstruct(table) @ rotations.transpose(0, 2, 1)
+    turned = model.reconstruct(table) @ rotations.mT
     return scales[:, None, None] * turned
 
 
@@ -466,7 +427,7 @@ class TestEstimator:
         assert_allclose(found.alpha, body.alpha_, atol=1e-9)
         assert_allclose(found.motion, body.motion_, atol=1e-9 * np.abs(X).max())
         model = body._model  # of all directions
-        alpha = model.decompose(X.reshape(len(X), -1, 2).transpose(0, 2, 1)).alpha
+        alpha = model.decompose(X.reshape(len(X), -1, 2).mT).alpha
         shapes = model.mean_shape + np.tensordot(alpha, model.basis, 1)
         assert_allclose(body.reconstruct(X), shapes, atol=1e-9)
 
@@ -487,21 +448,16 @@ class TestEstimator:
         assert len(found.basis_) == len(joint.basis_) <= 12
         assert 12 < len(found._model.basis) <= 60
 
-    def test_deviations_have_the_size_of_errors(self, body):
-        """Errors of depths are half to twice their standard deviations."""
-        z, d = (centred(each[:, :, 2]) for each in (SHAPES, in_camera(body, X)))
-        _, std = body.reconstruct(X, return_std=True)
-        off = np.sign(np.sum(z * d)) * d - z
-        assert 0.5 < np.sqrt(np.mean((off / std) ** 2)) < 2.0
-
-    def test_deviations_are_larger_in_frames_with_larger_errors(self, body):
-        """Errors and deviations of frames, also of new ones, have similar ranks."""
-        for table, truth in ((X, SHAPES), articulated(160, n_points=4)):
+    def test_deviations_of_depths_are_those_of_errors(self, body):
+        """Their size is right; in frames, also new ones, they have similar ranks."""
+        for table, truth in ((X, SHAPES), articulated(50, n_points=4)):
             z, d = (centred(each[:, :, 2]) for each in (truth, in_camera(body, table)))
             off = np.sign(np.sum(z * d)) * d - z
             _, std = body.reconstruct(table, return_std=True)
             ranks = spearmanr(np.mean(off**2, axis=1), np.mean(std**2, axis=1))
             assert ranks[0] > 0.4
+            if table is X:
+                assert 0.5 < np.sqrt(np.mean((off / std) ** 2)) < 2.0
 
     @pytest.mark.slow
     def test_number_of_processes_does_not_matter(self, body):
@@ -509,14 +465,6 @@ class TestEstimator:
         other = consensus_fit(n_jobs=2)
         assert_array_equal(other.basis_, body.basis_)
         assert_array_equal(other.alpha_, body.alpha_)
-
-    @pytest.mark.slow
-    @pytest.mark.xfail(reason="sums in another order end elsewhere in a flat valley")
-    def test_order_of_frames_does_not_matter(self, body):
-        """Permuted rows have permuted shapes."""
-        other = consensus_fit(X[np.random.default_rng(0).permutation(len(X))])
-        before, after = (in_camera(model, X) for model in (body, other))
-        assert mean_shape_error_3d(before, after, convention="camera") < 0.01
 
     @pytest.mark.slow
     def test_missing_points(self, body):
@@ -529,23 +477,6 @@ class TestEstimator:
         convention = {"convention": "camera"}
         error = mean_shape_error_3d(SHAPES, in_camera(model, table), **convention)
         assert error < 2 * mean_shape_error_3d(SHAPES, in_camera(body, X), **convention)
-
-    @pytest.mark.slow
-    @pytest.mark.xfail(reason="outliers double the errors: 0.065 in place of 0.034")
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-    def test_robust_losses(self, loss):
-        """A few outliers hardly change the shapes."""
-        table, truth = articulated()
-        wrong = table.copy()
-        rows = np.random.default_rng(2).choice(len(X), 10, replace=False)
-        wrong[rows, 6] += 0.3
-        good = np.setdiff1d(np.arange(len(X)), rows)
-        errors = []
-        for data, name in ((wrong, loss), (table, "linear")):
-            found = in_camera(consensus_fit(data, 14, loss=name), data)[good]
-            error = mean_shape_error_3d(truth[good], found, convention="camera")
-            errors.append(error)
-        assert errors[0] < 1.3 * errors[1]
 
     @pytest.mark.parametrize("noise", [0.0, 0.02])
     def test_a_sufficient_joint_fit_is_kept(self, noise):
@@ -580,24 +511,6 @@ class TestEstimator:
             off = np.sign(np.sum(z * d)) * d - z
             errors.append(np.mean(off[:, others] ** 2))
         assert errors[1] < errors[0]
-
-    def test_saved_models(self, body, tmp_path):
-        """A model that is read again gives the same results."""
-        save_model(body, tmp_path / "model.npz")
-        other = load_model(tmp_path / "model.npz")
-        assert_array_equal(other.transform(X), body.transform(X))
-        for each in zip(
-            other.reconstruct(X, return_std=True),
-            body.reconstruct(X, return_std=True),
-            strict=True,
-        ):
-            assert_array_equal(*each)
-
-    @pytest.mark.slow
-    def test_progress(self, capsys):
-        """The groups are a stage of the fit."""
-        consensus_fit(verbose=1)
-        assert "consensus of groups of points: " in capsys.readouterr().out
 
     @pytest.mark.slow
     def test_search_compares_joint_fits(self):

@@ -9,13 +9,13 @@ import pytest
 from frame_parts import assert_same_model
 from layers import with_limits
 from numpy.testing import assert_allclose
+from scenes import with_gaps
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import FastISA
-from isa_nrsfm._tables.blocks import DaskBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
-array = pytest.importorskip("dask.array")
+dask, array = pytest.importorskip("dask"), pytest.importorskip("dask.array")
 distributed = pytest.importorskip("distributed")
 
 K = 2
@@ -24,10 +24,7 @@ FRAMES = (70, 150, 0, 80)
 
 def table(missing=0.0):
     X = make_nonrigid_tracks(300, 20, K, noise=0.01, random_state=0).data
-    if missing:
-        hidden = np.random.default_rng(0).random((300, 20)) < missing
-        X = np.where(np.repeat(hidden, 2, axis=1), np.nan, X)
-    return X
+    return with_gaps(X, missing)
 
 
 def chunked(X, columns=40):
@@ -54,30 +51,29 @@ class TestCluster:
         assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
 
     def test_a_killed_worker_does_not_change_the_result(self, cluster, monkeypatch):
-        X = table()
-        compute, maps = DaskBlocks.map, []
+        X, compute, maps = table(), dask.compute, []
 
-        def map_and_kill(self, *args):
-            maps.append(args)
+        def compute_and_kill(*tasks):
+            maps.append(len(tasks))
             if len(maps) == 20:
                 first = next(iter(cluster.workers.values()))
                 os.kill(first.pid, signal.SIGKILL)
-            return compute(self, *args)
+            return compute(*tasks)
 
-        monkeypatch.setattr(DaskBlocks, "map", map_and_kill)
+        monkeypatch.setattr(dask, "compute", compute_and_kill)
         model = SampledNRSfM(K, random_state=0).fit(chunked(X))
         assert len(maps) > 20
         assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
 
     def test_nothing_as_large_as_the_table_comes_back(self, cluster, monkeypatch):
-        compute, largest = DaskBlocks.map, []
+        compute, largest = dask.compute, []
 
-        def measured(self, *args):
-            found = list(compute(self, *args))
-            largest.append(sum(map(size_of, found)))
-            return iter(found)
+        def measured(*tasks):
+            found = compute(*tasks)
+            largest.append(size_of(found))
+            return found
 
-        monkeypatch.setattr(DaskBlocks, "map", measured)
+        monkeypatch.setattr(dask, "compute", measured)
         X = np.tile(table(), (4, 1))
         blocks = array.from_array(X, chunks=(400, 40))
         SampledNRSfM(K, random_state=0, max_iter=5, tol=1e3).fit(blocks)
@@ -92,6 +88,7 @@ def size_of(found):
     return np.size(found)
 
 
+@pytest.mark.slow
 @pytest.mark.cluster
 def test_grid_search_and_restarts(cluster):
     X = table()

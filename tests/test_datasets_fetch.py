@@ -176,8 +176,6 @@ def test_addresses_name_one_version_of_one_file(module, name):
 
 @pytest.mark.parametrize("fetch", [fetch_shark, fetch_muct])
 def test_every_fetcher(fetch, tmp_path, shark_file, muct_file):
-    refused("'data_home' parameter of fetch_", fetch, data_home=3)
-    refused("'download_if_missing' parameter", fetch, download_if_missing="no")
     data = fetch(data_home=tmp_path)
     assert data.filename.startswith(str(tmp_path))
     assert re.search(r"Source: .*https://raw\.", data.DESCR, re.DOTALL)

@@ -5,7 +5,6 @@ import warnings
 from copy import deepcopy
 from itertools import product
 
-import joblib
 import numpy as np
 import pandas as pd
 import polars as pl
@@ -14,10 +13,10 @@ from layers import may_not_converge, slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refusals_of, refused
+from scenes import table_of, tracks_of, with_gaps
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm.baselines import PseudoInverseNRSfM
@@ -42,19 +41,6 @@ def estimator(n_components=K, **params):
 def fitted(refinement="joint"):
     """Return a model of the table, to be left as it is."""
     return estimator(refinement=refinement).fit(TABLE)
-
-
-def planar(table):
-    """Return an interleaved table as a planar one."""
-    return np.hstack([table[:, 0::2], table[:, 1::2]])
-
-
-def tracks_of(table, layout="interleaved"):
-    """Return the points of a table, (n_frames, n_points, 2), by hand."""
-    if layout == "planar":
-        half = table.shape[1] // 2
-        return np.stack([table[:, :half], table[:, half:]], axis=2)
-    return np.stack([table[:, 0::2], table[:, 1::2]], axis=2)
 
 
 def model_tracks(model, motion, translation, alpha):
@@ -139,7 +125,7 @@ def fitted_variant(number):
     fitted = estimator(**(VARIANTS + SLOW_VARIANTS)[number])
     table, new = TABLE, make_face_tracks(30, n_components=K, random_state=1).data
     if fitted.layout == "planar":
-        table, new = planar(table), planar(new)
+        table, new = (table_of(tracks_of(X), "planar") for X in (table, new))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         return fitted.fit(table), table, new
@@ -205,21 +191,13 @@ def test_every_attribute_is_documented(model):
     assert documented - fitted == set()
 
 
-def test_inputs_of_other_types_are_fitted_in_double_precision():
-    table = np.round(TABLE).astype(np.int32)
-    model = estimator(refinement="alternating").fit(table)
-    assert model.alpha_.dtype == np.float64
-    for same in (table.astype(float), table.tolist()):
-        assert_array_equal(clone(model).fit(same).alpha_, model.alpha_)
-
-
 def scaled_matrix(model, table):
     """Return the centred tracks of a table, scaled as in the fit, (2I, J)."""
     tracks = tracks_of(table, model.layout)
     centred = tracks - tracks.mean(axis=1, keepdims=True)
     weights = frame_weights(tracks, scales_frames(model))
     scaled = centred * np.sqrt(weights)[:, None, None]
-    return np.vstack(list(scaled.transpose(0, 2, 1)))
+    return np.vstack(list(scaled.mT))
 
 
 def is_joint(model):
@@ -319,17 +297,12 @@ def test_coefficients_have_unit_variance_and_energy_decreases(variant):
 
 
 @only_joint
-def test_objective_never_rises(variant):
+def test_objective_never_rises_and_deviations_are_below_the_prior(variant):
     model, *_ = variant
     history = model.objective_history_
     assert np.all(np.diff(history) <= 1e-9 * np.abs(history).max())
     assert 0 <= model.gradient_norm_ < 0.1
     assert model.camera_noise_ratio_ >= 1
-
-
-@only_joint
-def test_deviations_are_positive_and_below_the_prior(variant):
-    model, *_ = variant
     assert np.all(model.alpha_std_ > 0)
     # On average nothing is known less well than its spread over the frames, which is 1.
     assert np.all(np.mean(model.alpha_std_**2, axis=0) < 1)
@@ -388,43 +361,33 @@ def test_methods_follow_the_formula(variant, which):
 
 
 @only(refinement=["alternating", None])
-@pytest.mark.parametrize("which", ["fitted", "new"])
+@pytest.mark.parametrize("which", ["fitted", "new", "missing"])
 def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
-    # Camera: the rigid fit to the mean shape. Coefficients: the fit that follows.
+    # Camera and position: the rigid fit to the mean shape. Coefficients, and their
+    # position: the fit that follows.
     model, table, new = variant
-    table = table if which == "fitted" else new
     assert model.refinement or model.n_iter_ == 1
-    motion, translation, alpha, _ = model.decompose(table)
+    table = table if which == "fitted" else new.copy()
     tracks = tracks_of(table, model.layout)
+    if which == "missing":
+        tracks = with_gaps(tracks)
+        table = table_of(tracks, model.layout)
+    motion, translation, alpha, _ = model.decompose(table)
     for i in range(0, len(table), 7):
-        assert_allclose(translation[i], tracks[i].mean(axis=0), rtol=1e-12)
-        centred = tracks[i] - tracks[i].mean(axis=0)
-        M = np.linalg.lstsq(model.mean_shape_, centred)[0].T
+        seen = np.isfinite(tracks[i, :, 0])
+        points, mean_shape = tracks[i, seen], model.mean_shape_[seen]
+        with_position = np.column_stack([mean_shape, np.ones(len(points))])
+        M = np.linalg.lstsq(with_position, points)[0][:3].T
         if model.camera != "affine":  # the nearest scaled rotation
             U, values, Vt = np.linalg.svd(M, full_matrices=False)
             scale = 1.0 if model.camera == "orthographic" else values.mean()
             M = scale * U @ Vt
         assert_allclose(motion[i], M, atol=1e-10 * np.abs(M).max())
-        design = (model.basis_ @ M.T).reshape(len(model.basis_), -1).T
-        rest = (centred - model.mean_shape_ @ M.T).ravel()
-        best = np.linalg.lstsq(design, rest)[0]
-        assert_allclose(alpha[i], best, atol=1e-8 * np.abs(best).max())
-
-
-def test_table_that_the_model_has_made_is_taken_apart_again(model):
-    # Nothing but the model itself is in it. The prior draws the coefficients a little
-    # to zero.
-    table = model.reproject(TABLE)
-    drawn = np.abs(model.transform(table) - model.alpha_) / model.alpha_std_
-    assert drawn.max() < 1
-    assert -model.score(table) < 1e-2 * -model.score(TABLE)
-    again = estimator().fit(table)
-    assert again.rank_floor_ < 1e-20
-    assert again.inverse_snr_ < 1e-8
-    cosine = np.sum(again.basis_ * model.basis_, axis=(1, 2))
-    cosine /= np.linalg.norm(again.basis_, axis=(1, 2))
-    cosine /= np.linalg.norm(model.basis_, axis=(1, 2))
-    assert np.all(np.abs(cosine) > 0.99)
+        of_basis = (model.basis_[:, seen] @ M.T).reshape(len(model.basis_), -1).T
+        design = np.hstack([of_basis, np.tile(np.eye(2), (len(points), 1))])
+        best = np.linalg.lstsq(design, (points - mean_shape @ M.T).ravel())[0]
+        assert_allclose(alpha[i], best[:-2], atol=1e-8 * np.abs(best[:-2]).max())
+        assert_allclose(translation[i], best[-2:], rtol=1e-9)
 
 
 def test_inverse_transform_takes_the_mean_view_by_default(model):
@@ -494,36 +457,25 @@ def test_fit_transform_returns_a_copy_of_alpha(refinement):
 # --- kinds of tables ----------------------------------------------------------------
 
 
-def memory_mapped(table, folder):
-    joblib.dump(table, folder / "table")
-    return joblib.load(folder / "table", mmap_mode="r")
-
-
 TABLE_KINDS = {
-    "memory map": lambda folder: memory_mapped(TABLE, folder),
-    "backwards": lambda folder: TABLE[::-1].copy()[::-1],
-    "pandas with names": lambda folder: pd.DataFrame(
-        TABLE, columns=FACES.feature_names
-    ),
-    "polars": lambda folder: pl.DataFrame(TABLE, schema=FACES.feature_names),
-    "big endian": lambda folder: TABLE.astype(">f8"),
+    "backwards": TABLE[::-1].copy()[::-1],
+    "big endian": TABLE.astype(">f8"),
+    "pandas": pd.DataFrame(TABLE, columns=FACES.feature_names),
+    "polars": pl.DataFrame(TABLE, schema=FACES.feature_names),
 }
 
 
 @pytest.mark.parametrize("kind", TABLE_KINDS)
 @may_not_converge
-def test_results_do_not_depend_on_how_the_table_is_kept(kind, tmp_path):
-    before = TABLE.copy()
-    table = TABLE_KINDS[kind](tmp_path)
-    # Both refinements get the same blocks of frames.
-    joint = kind == "memory map"
-    reference = fitted(refinement="joint" if joint else "alternating")
+def test_results_do_not_depend_on_how_the_table_is_kept(kind):
+    before, table = TABLE.copy(), TABLE_KINDS[kind]
+    reference = fitted(refinement="alternating")
     model = clone(reference).fit(table)
     assert_array_equal(TABLE, before)
     assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
     assert_allclose(model.basis_, reference.basis_, atol=1e-10)
     # New tables may be of another kind than the fitted one, in the same order.
-    if kind not in ("pandas with names", "polars"):
+    if kind not in ("pandas", "polars"):
         assert_allclose(model.transform(TABLE), reference.alpha_, atol=1e-9)
         assert_allclose(reference.transform(table), reference.alpha_, atol=1e-9)
 
@@ -602,7 +554,7 @@ def test_refinement_that_is_cut_short_says_so():
 
 def test_layout_warning_points_to_the_caller():
     with pytest.warns(UserWarning, match="layout='planar' explains") as caught:
-        estimator(refinement=None).fit(planar(TABLE))
+        estimator(refinement=None).fit(table_of(FACES.tracks, "planar"))
     assert [warning.filename for warning in caught] == [__file__]
 
 
@@ -679,18 +631,6 @@ def test_verbose_prints_a_line_for_each_stage(capsys):
 # --- scikit-learn -------------------------------------------------------------------
 
 
-def test_grid_search_over_own_and_nested_parameters():
-    grid = [{"n_components": [1]}, {"n_components": [K], "isa__n_init": [2]}]
-    model = AffineNRSfM(isa=FastISA(), refinement="alternating", random_state=0)
-    search = GridSearchCV(model, grid, cv=2)
-    search.fit(TABLE)
-    assert np.isfinite(search.cv_results_["mean_test_score"]).all()
-    assert search.best_params_["n_components"] == K
-    assert search.best_estimator_.isa_.n_init == 2
-    assert search.best_estimator_.basis_.shape == (3, N_POINTS, 3)
-    assert search.score(TABLE) == search.best_estimator_.score(TABLE)
-
-
 def test_another_refinement_leaves_nothing_of_the_joint_one():
     model = AffineNRSfM(1, random_state=0).fit(TABLE)
     assert model.noise_variance_ > 0
@@ -722,10 +662,10 @@ def calibrated(camera, refinement="joint"):
 def test_images_are_those_of_scaled_rotations(camera, refinement):
     model, truth = calibrated(camera, refinement)
     S, R, s = model.reconstruct(truth.data), model.rotations_, model.scales_
-    assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (80, 1, 1)), atol=1e-9)
+    assert_allclose(R @ R.mT, np.tile(np.eye(3), (80, 1, 1)), atol=1e-9)
     assert_allclose(np.linalg.det(R), 1)
     assert_allclose(s[:, None, None] * R[:, :2], model.motion_, rtol=1e-9, atol=1e-12)
-    images = s[:, None, None] * S @ R[:, :2].transpose(0, 2, 1)
+    images = s[:, None, None] * S @ R[:, :2].mT
     images += model.translation_[:, None]
     reprojected = tracks_of(model.reproject(truth.data))
     assert_allclose(images, reprojected, atol=1e-9 * np.abs(reprojected).max())
@@ -771,19 +711,12 @@ def test_mirror_images_fit_as_well(camera, refinement):
     if camera != "affine":
         assert_allclose(np.linalg.det(mirrored.rotations_), 1)
         assert_allclose(mirrored.rotations_, depth[:, None] * model.rotations_ * depth)
+    signs = np.tile(depth, len(model.basis_))
+    covariance = model.mode_covariance_ * np.outer(signs, signs)
+    assert_allclose(mirrored.mode_covariance_, covariance, rtol=0, atol=1e-15)
     again = mirrored.mirrored()
     assert_array_equal(again.basis_, model.basis_)
     assert_array_equal(again.mode_covariance_, model.mode_covariance_)
-
-
-@pytest.mark.parametrize("camera", CALIBRATED)
-def test_models_with_calibrated_cameras_reconstruct_for_these_only(camera):
-    model, truth = calibrated(camera)
-    shapes = model.reconstruct(truth.data)
-    assert_array_equal(model.reconstruct(truth.data, camera=camera), shapes)
-    other = "orthographic" if camera == "weak_perspective" else "weak_perspective"
-    with pytest.raises(ValueError, match=f"fitted with camera='{camera}'"):
-        model.reconstruct(truth.data, camera=other)
 
 
 @pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
@@ -801,11 +734,6 @@ def test_shapes_of_fitted_frames(camera):
     found = model.reconstruct(frames, wanted)
     if camera == "affine":
         assert_array_equal(found, model.reconstruct(X, wanted))
-    with pytest.raises(ValueError, match="the decomposition must be that of a model"):
-        model.reconstruct(frames._replace(alpha=frames.alpha[:, 1:]))
-    if camera != "affine":
-        with pytest.raises(ValueError, match="return_std needs the table"):
-            model.reconstruct(frames, return_std=True)
 
 
 @pytest.mark.slow
@@ -860,7 +788,7 @@ def test_intervals_contain_the_errors_of_shapes(loss, missing):
     ],
 )
 def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meaning):
-    made = make_nonrigid_tracks(80, 24, 2, camera=truth, noise=0.02, random_state=0)
+    made = make_nonrigid_tracks(40, 24, 2, camera=truth, noise=0.02, random_state=0)
     model = AffineNRSfM(2, camera=camera, random_state=0).fit(made.data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

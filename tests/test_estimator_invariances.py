@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from layers import may_not_converge, slow_after, start_may_not_converge, with_limits
 from numpy.testing import assert_allclose
+from scenes import table_of
 from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
@@ -46,10 +47,6 @@ def faces(load_data, name):
     tracks = load_data(name)["W2d"].astype(float)
     tracks = tracks[~np.isnan(tracks).any(axis=(1, 2))]
     return tracks[:: len(tracks) // 200]
-
-
-def table_of(tracks):
-    return tracks.reshape(len(tracks), -1)
 
 
 def rotations(angle):

@@ -51,11 +51,6 @@ def model():
     return estimator().fit(HOLED.data)
 
 
-@pytest.fixture(scope="module")
-def complete_model():
-    return estimator().fit(COMPLETE.data)
-
-
 @pytest.fixture(scope="module", params=slow_after(4, VARIANTS), ids=str)
 def variant(request):
     """Return a model of the table with missing points."""
@@ -262,18 +257,6 @@ def test_the_fitted_table_has_its_coefficients_to_the_bit(variant, scale_frames)
             assert np.isfinite(value).all() == known, name
 
 
-def test_rows_do_not_depend_on_each_other(variant):
-    new = np.vstack([HOLED.data[:4], COMPLETE.data[:2], HOLED.data[40:42]])
-    new[2, 4:] = np.nan
-    together = variant.decompose(new)
-    backwards = variant.decompose(new[::-1])
-    for i in range(len(new)):
-        alone = variant.decompose(new[i : i + 1])
-        for one, whole, reverse in zip(alone, together, backwards, strict=True):
-            assert_allclose(one[0], whole[i], rtol=1e-8, atol=1e-9)
-            assert_allclose(one[0], reverse[-1 - i], rtol=1e-8, atol=1e-9)
-
-
 @pytest.mark.slow
 def test_a_stream_of_frames_keeps_its_memory(model):
     def stream(n_frames):
@@ -410,14 +393,6 @@ def test_noise_variance(seed, scale_frames, missing):
         centred = made.tracks - np.nanmean(made.tracks, axis=1, keepdims=True)
         variance = variance * np.mean(1 / np.nanmean(centred**2, axis=(1, 2)))
     assert_allclose(fitted.noise_variance_, variance, rtol=0.05)
-
-
-def test_frames_that_show_less_are_known_less_well():
-    tracks = COMPLETE.tracks.copy()
-    tracks[:30, ::2] = np.nan
-    fitted = estimator().fit(tracks.reshape(60, -1))
-    few, many = fitted.alpha_std_[:30], fitted.alpha_std_[30:]
-    assert np.all(np.median(few, axis=0) > 1.2 * np.median(many, axis=0))
 
 
 @pytest.mark.parametrize(("n_jobs", "piped"), [(None, True), (2, False)])

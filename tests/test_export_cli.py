@@ -96,13 +96,6 @@ def test_edges_are_pairs_of_names_or_numbers_of_points(export, tmp_path):
     assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
 
 
-def test_inputs_are_not_overwritten(folder, capsys):
-    model = folder / "model.txt"
-    model.write_bytes((folder / MODEL).read_bytes())
-    assert main(["export", str(model), "--output", str(model)]) == 1
-    assert "would be overwritten by the results" in capsys.readouterr().err
-
-
 def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys, rng):
     # Cameras that turn about the viewing direction see two directions of space.
     angle = rng.uniform(0, 2 * np.pi, 40)

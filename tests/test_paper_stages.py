@@ -1,21 +1,218 @@
-"""Block structure and its refinement: optimality, identities, degenerate blocks."""
+"""Stages of the paper: factorisation, samples of frames, blocks, the refinement."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, random_rotation, structured_motion
 
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._paper.pipeline import (
+    block_triplets,
     factorise,
     leading_blocks,
+    leading_triplets,
     lifted_blocks,
     lifted_moments,
     motion_products,
     recover_blocks,
     refine_alternating,
+    rigid_energy,
+    sample_frames,
     structure_energies,
 )
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
+
+
+def centred_matrix(seed, n_frames, n_points):
+    rng = np.random.default_rng(seed)
+    W = rng.exponential(size=(2 * n_frames, n_points))
+    W = W @ np.diag(rng.exponential(size=n_points))
+    return W - W.mean(axis=1, keepdims=True)
+
+
+def low_rank(seed, rank, n_frames=30, n_points=20):
+    """Return a centred matrix of a given rank with different singular values."""
+    rng = np.random.default_rng(seed)
+    shape = rng.exponential(size=(rank, n_points))
+    shape -= shape.mean(axis=1, keepdims=True)
+    return rng.normal(size=(2 * n_frames, rank)) @ shape
+
+
+def approximation(f):
+    return f.rigid_motion @ f.rigid_shape + f.motion @ f.signals
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("K", [1, 3])
+class TestIdentities:
+    def test_best_approximation_of_rank_3K_plus_3(self, size, K):
+        W = centred_matrix(0, *size)
+        U, S, Vt = np.linalg.svd(W, full_matrices=False)
+        rank = 3 * K + 3
+        best = (U[:, :rank] * S[:rank]) @ Vt[:rank]
+        assert_allclose(approximation(factorise(W, K)), best, atol=1e-12)
+
+    def test_signals_are_white_and_motion_orthogonal_and_ordered(self, size, K):
+        W = centred_matrix(0, *size)
+        f = factorise(W, K)
+        rows = np.vstack([f.rigid_shape, f.signals])
+        assert_allclose(rows.mean(axis=1), 0, atol=1e-13)
+        assert_allclose(rows @ rows.T / size[1], np.eye(3 * K + 3), atol=1e-13)
+        M = np.hstack([f.rigid_motion, f.motion])
+        gram = M.T @ M
+        norms = np.sqrt(np.diag(gram) * size[1])
+        assert_allclose(gram, np.diag(np.diag(gram)), atol=1e-12 * gram.max())
+        assert_allclose(norms, np.linalg.svd(W, compute_uv=False)[: 3 * K + 3])
+
+
+class TestMissingRank:
+    @pytest.mark.parametrize(
+        ("rank", "K"), [(1, 1), (3, 2), (4, 2), (7, 1), (8, 2), (12, 3)]
+    )
+    def test_only_directions_above_rounding_errors_are_used(self, rank, K):
+        W = low_rank(rank, rank)
+        f = factorise(W, K)
+        used = min(rank, 3 * K + 3)
+        n_signals = 3 * max(1, -(-(used - 3) // 3))
+        assert f.signals.shape == (n_signals, 20)
+        assert f.motion.shape == (60, n_signals)
+
+        # The motion of what is added is exactly zero, the signals stay white.
+        assert_array_equal(f.motion[:, max(used - 3, 0) :], 0)
+        assert np.all(np.linalg.norm(f.motion[:, : max(used - 3, 0)], axis=0) > 0)
+        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
+        assert_allclose(f.signals @ f.signals.T / 20, np.eye(n_signals), atol=1e-12)
+        assert_allclose(f.rigid_shape @ f.signals.T, 0, atol=1e-11)
+
+        expected = np.diag(np.repeat([1.0, 0.0], [min(rank, 3), max(3 - rank, 0)]))
+        assert_allclose(f.rigid_shape @ f.rigid_shape.T / 20, expected, atol=1e-12)
+        assert_array_equal(f.rigid_shape[rank:], 0)
+        if rank <= 3 * K + 3:
+            assert_allclose(approximation(f), W, atol=1e-12)
+
+
+class TestOrientations:
+    @pytest.mark.parametrize("unit", [1e-250, 1e250])
+    def test_opposite_rows_permutations_and_units(self, unit, rng):
+        rows = rng.normal(size=(6, 11))
+        signs = orientations(rows)
+        assert_array_equal(orientations(-rows), -signs)
+        assert_array_equal(orientations(unit * rows), signs)
+        assert_array_equal(orientations(rows[:, rng.permutation(11)]), signs)
+        assert_array_equal(orientations(signs[:, None] * rows), 1)
+
+    def test_sign_of_the_third_moment_or_of_the_extreme_entry(self):
+        rows = np.array([[2.0, -1.0, -1.0], [-2.0, 1.0, 1.0], [0.0, 0.0, 3.0]])
+        assert_array_equal(orientations(rows), [1, -1, 1])
+        assert_array_equal(orientations(np.zeros((2, 5))), 1)
+        # Third moments of rounding errors do not decide.
+        half = np.random.default_rng(0).normal(size=(50, 9))
+        rows = np.hstack([half, -half[:, ::-1]])
+        extreme = rows[np.arange(50), np.abs(rows).argmax(axis=1)]
+        assert_array_equal(orientations(rows), np.sign(extreme))
+
+
+LARGE = 30  # matrices with more rows and columns count as large
+
+
+class TestLargeBothWays:
+    @pytest.mark.parametrize("noise", [1e-2, 1e-6])
+    def test_the_leading_triplets_are_those_of_the_whole(self, noise):
+        W = low_rank(0, 8, 60, 90) + noise * centred_matrix(1, 60, 90)
+        whole, leading = leading_triplets(W, 9), leading_triplets(W, 9, LARGE)
+        factors = [factorise(W, 2, triplets=each) for each in (whole, leading)]
+        shapes = [each.rigid_shape for each in factors]
+        assert_allclose(shapes[1], shapes[0], atol=1e-6)
+        # Energies converge as the squares of the directions.
+        kept, got = np.sum(whole[0] ** 2), np.sum(leading[0] ** 2)
+        assert abs(got - kept) < 1e-6 * whole[2] + 1e-14 * kept
+        assert_allclose(leading[2], whole[2], rtol=1e-6, atol=1e-14 * kept)
+        assert_allclose(leading[0], whole[0], rtol=1e-3)
+
+    @pytest.mark.parametrize(
+        ("size", "block_frames"), [((60, 70), 7), ((40, 25), 1), ((60, 8), 60)]
+    )
+    def test_blocks_make_no_difference(self, size, block_frames):
+        W = low_rank(0, 8, *size) + 1e-2 * centred_matrix(1, *size)
+        frames = W.reshape(len(W) // 2, 2, -1)
+        values, vectors, rest = leading_triplets(W, 5, LARGE)
+        blocks = FrameBlocks.of_array(frames, block_frames)
+        found = block_triplets(blocks, W.shape, 5, LARGE)
+        assert_allclose(found[0], values, rtol=1e-7)
+        assert_allclose(found[2], rest, rtol=1e-6)
+        signs = np.sign(np.vecdot(found[1], vectors))
+        assert_allclose(found[1] * signs[:, None], vectors, atol=1e-3)
+
+
+FEW = {"small_table": 1000, "first": 40}
+
+
+def matrix(n_frames, n_points=20):
+    tracks = make_nonrigid_tracks(n_frames, n_points, 2, noise=0.02, random_state=0)
+    return measurements(tracks.data.reshape(n_frames, n_points, 2))
+
+
+def sample(W, block_frames=64, **options):
+    rows = FrameBlocks.of_array(W.reshape(len(W) // 2, 2, -1), block_frames)
+    shape = factorise(W, 2).rigid_shape
+    return sample_frames(rows, W.shape[1], shape, **{**FEW, **options})
+
+
+def test_samples_grow_to_half_of_the_frames():
+    for n_frames, sizes in ((40, []), (41, [40]), (321, [40, 160]), (700, [40, 160])):
+        W = matrix(n_frames)
+        of_first, parts = sample(W)
+        assert [len(part) for part in parts] == sizes
+        assert all((np.diff(part) > 0).all() for part in parts)
+        rows = W.reshape(n_frames, 2, -1)[parts[0]] if parts else W
+        assert_array_equal(of_first, rows.reshape(len(of_first), -1))
+    whole, parts = sample(W, small_table=150_000)
+    assert parts == []
+    assert_array_equal(whole, W)
+
+
+def test_frames_are_spread_from_the_most_to_the_least_rigid_one():
+    W = matrix(100)
+    factors = factorise(W, 2)
+    rest = W - factors.rigid_motion @ factors.rigid_shape
+    energy = np.sum(rest.reshape(100, -1) ** 2, axis=1)
+    found = rigid_energy(W.reshape(100, 2, -1), factors.rigid_shape)
+    assert_allclose(found, energy)
+    chosen = spread(np.argsort(energy), 21)
+    assert len(set(chosen)) == 21
+    assert (np.diff(energy[chosen]) > 0).all()
+    assert energy[chosen[0]] == energy.min()
+    assert energy[chosen[-1]] == energy.max()
+    assert_array_equal(sample(W)[1][0], np.sort(spread(np.argsort(energy), 40)))
+
+
+def test_representative_frames_are_spread_and_show_rare_points():
+    # Frames of known shares of x, in no order
+    order = np.random.default_rng(0).permutation(300)
+    rows = np.ones((300, 2, 4))
+    rows[order, 0] = np.linspace(0.1, 2.0, 300)[:, None]
+    blocks = FrameBlocks.of_array(rows, 64)
+    assert_array_equal(representative_frames(blocks, 300), np.arange(300))
+    found = representative_frames(blocks, 50)
+    assert_array_equal(found, np.sort(spread(order, 50)))
+    rows[:, :, 1:3] = np.nan
+    rows[order[::7], :, 1] = 1.0  # in 43 frames, and in 5 of those that are spread
+    rows[order[3:6], :, 2] = 1.0  # in three frames
+    # The order of the shares has changed little: compare by it.
+    halves = np.nansum(rows[:, 0] ** 2, axis=1) / np.nansum(rows**2, axis=(1, 2))
+    order = np.argsort(halves, kind="stable")
+    chosen = set(spread(order, 50).tolist())
+    for point, n in ((1, 10), (2, 3)):
+        seen = ~np.isnan(rows[order, 0, point])
+        assert sum(not np.isnan(rows[i, 0, point]) for i in chosen) < n
+        chosen |= set(spread(order[seen], n).tolist())
+    blocks = FrameBlocks.of_array(rows, 64)
+    assert_array_equal(representative_frames(blocks, 50), sorted(chosen))
+
 
 ALL_METHODS = pytest.mark.parametrize("method", BLOCK_RECOVERIES)
 
@@ -58,16 +255,6 @@ def published_irls(scene, k, n_frames, n_iter=50):
     return d.reshape(3, 3)
 
 
-def test_products_by_definition():
-    scene = structured_motion(0, noise=0.3)
-    cross, rigid, gram = motion_products(scene.rigid, scene.motion)
-    M_0 = scene.rigid.reshape(-1, 2, 3)
-    for i, M_i in enumerate(scene.motion.reshape(len(M_0), 2, -1)):
-        assert_allclose(cross[i], M_0[i].T @ M_i, atol=1e-13)
-        assert_allclose(rigid[i].reshape(3, 3), M_0[i].T @ M_0[i], atol=1e-13)
-    assert_allclose(gram, scene.motion.T @ scene.motion, atol=1e-12)
-
-
 @ALL_METHODS
 class TestAllMethods:
     def test_exact_data(self, method):
@@ -101,23 +288,16 @@ class TestAllMethods:
             *(("motion", np.s_[:, n:3]) for n in (1, 2)),  # moves in fewer directions
             *(("rigid", np.s_[:, n:]) for n in (1, 2)),  # is flat
             ("rigid", np.s_[:6]),  # is not seen, in the first frame among others
+            ("rigid", np.s_[:0]),  # has equal frames
         ],
     )
-    def test_parts_that_are_zero(self, method, part, zeros):
+    def test_parts_that_are_zero_and_equal_frames(self, method, part, zeros):
         scene = structured_motion(0, noise=0.3)
         getattr(scene, part)[zeros] = 0
-        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
+        parts = (np.tile(each, (3, 1)) for each in (scene.rigid, scene.motion))
+        D = recover_blocks(motion_products(*parts), method)
         assert np.isfinite(D).all()
         assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
-
-    def test_repeated_frames(self, method):
-        scene = structured_motion(0, n_frames=12, noise=0.3)
-        rigid, motion = np.tile(scene.rigid, (3, 1)), np.tile(scene.motion, (3, 1))
-        D = recover_blocks(motion_products(rigid, motion), method)
-        assert np.isfinite(D).all()
-        if method != "irls":  # which holds one of the three equal frames only
-            once = recover_blocks(motion_products(scene.rigid, scene.motion), method)
-            assert_allclose(direction(D), direction(once), atol=1e-10)
 
 
 class TestSingleMethods:
@@ -137,13 +317,6 @@ class TestSingleMethods:
         assert_allclose(np.linalg.norm(published, axis=(1, 2)), 1)
         assert_allclose(direction(D), direction(published), atol=1e-9)
 
-    def test_irls_depends_on_the_first_frame(self):
-        scene = structured_motion(0, noise=0.5)
-        rigid, motion = np.roll(scene.rigid, 2, axis=0), np.roll(scene.motion, 2, 0)
-        D = recover_blocks(motion_products(scene.rigid, scene.motion), "irls")
-        rolled = recover_blocks(motion_products(rigid, motion), "irls")
-        assert np.abs(direction(rolled) - direction(D)).max() > 1e-3
-
     def test_irls_where_the_first_frame_says_nothing(self):
         scene = structured_motion(0, noise=0.5)
         motion = scene.motion.copy()
@@ -151,13 +324,6 @@ class TestSingleMethods:
         products = motion_products(scene.rigid, motion)
         expected = recover_blocks(products, "generalized_eigen")
         assert_allclose(recover_blocks(products, "irls"), expected)
-
-    def test_generalized_eigen_stays_in_directions_that_move(self):
-        scene = structured_motion(0, n_blocks=1, noise=0.5)
-        R = random_rotation(3)
-        motion = (scene.motion * [1.0, 0.5, 0.0]) @ R
-        D = recover_blocks(motion_products(scene.rigid, motion), "generalized_eigen")[0]
-        assert_allclose(R[2] @ D, 0, atol=1e-12)
 
     @pytest.mark.parametrize("scale_frames", [True, False])
     def test_irls_explains_less_of_the_shark(self, load_data, scale_frames):
@@ -214,30 +380,6 @@ class TestRefinement:
             slopes = explained(scene, E + step) - explained(scene, E - step)
             assert_allclose(slopes / 2e-5, 0, atol=1e-6 * energy.max())
 
-    def test_best_of_the_starts_is_taken(self, scene):
-        starts = random_starts(0, 3, 6)
-        together = explained(scene, refined(scene, starts)[0])
-        alone = (refined(scene, starts[:, s : s + 1])[0] for s in range(6))
-        single = [explained(scene, E) for E in alone]
-        # Trial steps are few, so the best start may be missed, but not by much.
-        assert np.all(together >= 0.99 * np.max(single, axis=0))
-        assert np.all(together >= np.median(single, axis=0) * (1 - 1e-9))
-
-    def test_energies_rise_with_every_step(self, scene):
-        fits = [refined(scene, random_starts(3, 3, 1), n) for n in range(1, 15)]
-        energies = np.array([explained(scene, E) for E, *_ in fits])
-        assert np.all(np.diff(energies, axis=0) >= -1e-13 * energies[-1])
-        assert np.all(energies[-1] > energies[0])
-        assert fits[0][1:] == (1, False)
-
-    @pytest.mark.parametrize("tol", [1e-3, 1e-10])
-    def test_tolerance_is_kept(self, scene, tol):
-        best, n_best, _ = refined(scene, random_starts(3))
-        E, n_iter, converged = refined(scene, random_starts(3), tol=tol)
-        assert converged
-        assert n_iter <= n_best
-        assert np.all(explained(scene, E) >= explained(scene, best) * (1 - 5 * tol))
-
     def test_order_of_subspaces_units_and_starts(self, scene):
         starts = random_starts(0)
         expected = direction(refined(scene, starts)[0])
@@ -279,12 +421,6 @@ class TestRefinement:
         assert_allclose(E[0, :, n:], 0, atol=1e-9)
         assert_allclose(np.linalg.norm(E, axis=(1, 2)), 1)
 
-    def test_frames_that_do_not_see_the_rigid_object(self, scene):
-        scene.rigid[:8] = 0
-        part = scene._replace(rigid=scene.rigid[8:], motion=scene.motion[8:])
-        fits = [refined(each, random_starts(0))[0] for each in (scene, part)]
-        assert_allclose(direction(fits[0]), direction(fits[1]), atol=1e-6)
-
 
 class TestLiftedMotion:
     def lifted(self, rigid, motion):
@@ -296,38 +432,19 @@ class TestLiftedMotion:
             L.append(np.linalg.solve(A.T @ A + ridge * np.eye(3), A.T @ M))
         return np.array(L)
 
-    @pytest.fixture
-    def scene(self):
-        return structured_motion(0, noise=0.3)
-
-    @pytest.fixture
-    def moments(self, scene):
-        return lifted_moments(motion_products(scene.rigid, scene.motion))
-
-    subspaces = random_rotation(1, 9).reshape(3, 3, 9)
-
-    def test_moments_by_plain_loops(self, scene, moments):
+    def test_moments_blocks_and_energies_by_plain_loops(self):
+        scene = structured_motion(0, noise=0.3)
+        subspaces = random_rotation(1, 9).reshape(3, 3, 9)
         L = self.lifted(scene.rigid, scene.motion)
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         assert_allclose(moments, np.einsum("iam,ibn->abmn", L, L), atol=1e-12)
-
-    def test_blocks_are_moments_of_the_turned_lifted_motion(self, scene, moments):
-        L = self.lifted(scene.rigid, scene.motion)
-        got = lifted_blocks(moments, self.subspaces)
-        for k in range(3):
-            flat = (L @ self.subspaces[k].T).reshape(-1, 9)
-            assert_allclose(got[k], flat.T @ flat, atol=1e-12)
-
-    def test_leading_blocks_are_eigenvectors_by_decreasing_eigenvalue(self, moments):
-        E = leading_blocks(moments, self.subspaces, 3)
-        assert E.shape == (3, 3, 3, 3)
-        for k, matrix in enumerate(lifted_blocks(moments, self.subspaces)):
-            vectors = E[k].reshape(3, 9)
+        blocks = lifted_blocks(moments, subspaces)
+        E = leading_blocks(moments, subspaces, 3).reshape(3, 3, 9)
+        values = np.linalg.eigvalsh(blocks)[:, ::-1]
+        for k, vectors in enumerate(E):
+            flat = (L @ subspaces[k].T).reshape(-1, 9)
+            assert_allclose(blocks[k], flat.T @ flat, atol=1e-12)
             assert_allclose(vectors @ vectors.T, np.eye(3), atol=1e-12)
-            values = np.sort(np.linalg.eigvalsh(matrix))[::-1][:3]
-            assert_allclose(vectors @ matrix, values[:, None] * vectors, atol=1e-10)
-
-    def test_energies_are_the_largest_eigenvalues(self, moments):
-        E = leading_blocks(moments, self.subspaces, 1).reshape(3, 9)
-        blocks = lifted_blocks(moments, self.subspaces)
-        expected = np.einsum("ka,kab,kb->k", E, blocks, E)
-        assert_allclose(structure_energies(moments, self.subspaces), expected)
+            expected = values[k, :3, None] * vectors
+            assert_allclose(vectors @ blocks[k], expected, atol=1e-10)
+        assert_allclose(structure_energies(moments, subspaces), values[:, 0])
