@@ -108,6 +108,12 @@ def test_the_import_of_a_package_waits_for_nothing(name):
 
 
 @pytest.mark.subprocess
+def test_matplotlib_is_imported_only_to_draw():
+    loaded = loaded_by("import isa_nrsfm.plotting", EAGER_IMPORT="")
+    assert "matplotlib" not in loaded
+
+
+@pytest.mark.subprocess
 def test_folders_of_the_package_need_no_import_of_their_own():
     code = (
         "import isa_nrsfm\n"

@@ -11,14 +11,13 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import JOINT, QUICK
+from fit_runs import QUICK, begun, told_of_fit
 from landmark_files import BODYPARTS, TRACKS
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.datasets import make_body_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import (
     from_mediapipe,
@@ -40,52 +39,37 @@ def table_of(name, tracks, parts=BODYPARTS):
     return pd.DataFrame(tracks.reshape(len(tracks), -1), columns=names)
 
 
-COMMA, THOUSANDS = "decimal commas: ", "commas between thousands: "
-QUESTION = r"can be (.*) or (\d*), and no other number decides it"
-
-
-@pytest.mark.parametrize(
-    ("suffix", "sign", "numbers", "told"),
-    [
-        (".csv", ";", "4,25 912,5 7", COMMA),
-        (".csv", ";", "0,280 1,912", COMMA),
-        (".tsv", "\t", "4280,125 -,5", COMMA),
-        (".csv", ",", "4,2e2 1,5", COMMA),  # in quotation marks
-        (".csv", "|", "4,280 1,5", COMMA),
-        (".csv", ";", "4,280.5 912", THOUSANDS),
-        (".csv", ";", "4,280 912.5", THOUSANDS),
-        (".tsv", "\t", "-1,234,567 4,280", THOUSANDS),
-        (".csv", ";", "4,280 2,912 13", QUESTION),
-        (".csv", ";", "4,280,1 1,5", "like 1234.5"),
-        (".csv", ";", "4.5 1,5", "like 1234.5"),
-        (".csv", ";", "4.25 1e3", ""),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:(the cells|numbers have)")
-def test_commas_in_numbers(tmp_path, suffix, sign, numbers, told):
-    cells, title = np.resize(numbers.split(), (3, 16)), "note, or text"
-    table = table_of("{part}_{axis}", cells).assign(**{title: ["1,2", "3,4", "a, b"]})
-    table["p"], path = ["0,5", "27,5", "3"], tmp_path / f"a{suffix}"
+def comma_table(folder, suffix, sign, numbers):
+    """Write a table of numbers with commas, and of other columns: path, numbers."""
+    cells, path = np.resize(numbers.split(), (3, 16)), folder / f"a{suffix}"
+    others = {"note, or text": ["1,2", "3,4", "a, b"], "p": ["0,5", "27,5", "3"]}
+    table = table_of("{part}_{axis}", cells).assign(**others)
     table.to_csv(path, sep=sign, index=False)
-    if told in (QUESTION, "like 1234.5"):
-        error = refused(told, read_landmarks, path)
-        if told == QUESTION:  # as advised
-            numbers = re.search(told, str(error)).groups()
-            words = re.findall(r"pd.read_csv\(..., (\w+)=','\)", str(error))
-            for word, number in zip(words, numbers, strict=True):
-                again = pd.read_csv(path, sep=sign, **{word: ","})
-                again.to_csv(tmp_path / "new.csv", index=False)
-                found = landmark_table(read_table(tmp_path / "new.csv")).points
-                assert found.iloc[0, 0] == float(number)
-        return
+    return path, cells.ravel(), others
+
+
+def commas_in(folder, suffix, sign, numbers, by=""):
+    """Read a table in which commas stand for another sign: what is told."""
+    path, cells, others = comma_table(folder, suffix, sign, numbers)
     text, found = warnings_of(read_landmarks, path)
-    assert ("numbers have " in text) == bool(told)
-    assert told in text
-    assert list(found.frames[title]) == ["1,2", "3,4", "a, b"]
-    assert list(found.frames["p"]) == ["0,5", "27,5", "3"]
-    by = "." if told == COMMA else ""
-    expected = [float(each.replace(",", by)) for each in cells.ravel()]
+    for name, values in others.items():
+        assert list(found.frames[name]) == values
+    expected = [float(cell.replace(",", by)) for cell in cells]
     assert_array_equal(found.points.to_numpy().ravel(), expected)
+    return text
+
+
+@pytest.mark.filterwarnings("ignore:(the cells|numbers have)")
+def test_the_ways_to_decide_commas_are_right(tmp_path):
+    path, *_ = comma_table(tmp_path, ".csv", ";", "4,280 2,912 13")
+    told = r"can be (.*) or (\d*), and no other number decides it"
+    error = refused(told, read_landmarks, path)
+    words = re.findall(r"pd.read_csv\(..., (\w+)=','\)", str(error))
+    for word, number in zip(words, re.search(told, str(error)).groups(), strict=True):
+        again = pd.read_csv(path, sep=";", **{word: ","})
+        again.to_csv(tmp_path / "new.csv", index=False)
+        found = landmark_table(read_table(tmp_path / "new.csv")).points
+        assert found.iloc[0, 0] == float(number)
 
 
 def warnings_of(call, *args, **kwargs):
@@ -95,35 +79,26 @@ def warnings_of(call, *args, **kwargs):
     return " ".join(str(each.message) for each in caught), found
 
 
-@pytest.mark.parametrize(
-    ("name", "who"),
-    [
-        ("{part}_{who}_{axis}", "12"),  # SimBA
-        ("{who}.{part}.{axis}", ("inst0", "inst1")),  # sleap-io
-        ("net_{who}_{part}_{axis}", ("resident", "intruder")),  # levels of DeepLabCut
-        ("pt_{part}_{who}_{axis}", ("cam1", "cam2")),  # DLTdv
-        ("{part}_{axis}_{who}", "12"),
-        ("{who}{part} {axis}", "12"),
-    ],
-)
-def test_individuals_in_a_row_are_a_question(tmp_path, begins, fails, name, who):
+def individuals_asked(folder, name, who):
+    """Return what asks for individuals in one row; the options that it names work."""
     own = [name.replace("{who}", each) for each in who]
     tables = [table_of(each, POINTS + 300 * i) for i, each in enumerate(own)]
     scores = [f"{each.format(part=p, axis='p')}" for each in own for p in BODYPARTS]
-    path = tmp_path / "pair.csv"
+    path = folder / "pair.csv"
     pd.concat(tables, axis=1).assign(**dict.fromkeys(scores, 1.0)).to_csv(path)
-    told = str(refused("several individuals in one row", read_landmarks, path))
-    rows = read_landmarks(path, individuals=re.search("individuals='(.*?)'", told)[1])
+    asked = str(refused(None, read_landmarks, path))
+    rows = read_landmarks(path, individuals=re.search("individuals='(.*?)'", asked)[1])
     assert list(rows.frames["individual"]) == [*who] * N
     assert list(rows.frames["frame"]) == list(np.repeat(range(N), 2))
     for i in (0, 1):
         assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
     assert (rows.confidence == 1).all(axis=None)
-    told = fails("fit", path, *QUICK, "1", "-o", tmp_path / "b")
-    options = re.findall(r"use (--\w+ .*?)(?:\. |$)", told)
+    error = str(refused(None, told_of_fit, path, " ".join([*QUICK, "1"])))
+    options = re.findall(r"use (--\w+ .*?)(?:\. |$)", error)
     assert len(options) == 2
     for option in options:
-        begins(path, *shlex.split(option))
+        begun(path, *shlex.split(option))
+    return asked
 
 
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
@@ -162,7 +137,7 @@ def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
     table = table_of("{part}_{axis}", POINTS).assign(age=np.arange(N) % 7 + 0.5)
     path = tmp_path / "b.csv"
     table.assign(t=0.04 * np.arange(N)).to_csv(path, sep=";", decimal=decimal)
-    found = fits(path, "-k", 1, *JOINT, "--label", "age", "--time", "t").report
+    found = fits(path, *QUICK, 1, "--label", "age", "--time", "t").report
     assert found["labels"][0]["kind"] == "number"
 
 
@@ -198,11 +173,6 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
     assert ("make them NaN before coordinates are shifted" in text) == (code[0] < -1)
     tracks[hidden] = np.nan  # as advised
     assert "exactly" not in warnings_of(fit, tracks.reshape(N, -1))[0]
-
-
-def numbers_in(names):
-    """Return the numbers of frames in names of images."""
-    return list(image_numbers(pd.DataFrame({"image": names.split()})))
 
 
 def test_times_in_names_of_images_are_told(tmp_path, begins):
@@ -441,44 +411,18 @@ PLAIN = table_of("{part}_{axis}", POINTS).assign(
 )
 VIDEOS = PLAIN.assign(image=[f"v{i // 2}.png" for i in range(N)])
 SETS = PLAIN.join(table_of("{axis}_{part}", POINTS[:, :7] / 2, range(7)))
-NO_EDGES, DAYS = "--edges no_edges.csv", "--time-format %d.%m.%Y"
-SIZE = "--camera affine --image-size 640x480"
 
 
-@pytest.mark.parametrize(
-    ("table", "options", "told", "advised"),
-    [
-        (SETS, "", r"Choose with (.*?), such as (.*)", "{} {}"),
-        (VIDEOS, "--fps 25", "apart with (.*?),", "--fps 25 {} who"),
-        (VIDEOS, "--fps 25", "others out with (.*)", "--fps 25 {} who=bob"),
-        (PLAIN, "--time day", r"\((.*?)\) or", "--time day {}"),
-        (PLAIN, "--time day", r" or .* \((.*?)\)", "--time day {}"),
-        (PLAIN, "--label age", r"use --label COLUMN(.*)", "--label age{}"),
-        (PLAIN, "--group team", "rows out with (.*)", "--group team {} team=^$"),
-        (PLAIN, "--distance neck,hip", "such as (--unit .*)", "--distance neck,hip {}"),
-        (PLAIN, "--unit neck,hip", "needs (.*?),", "--unit neck,hip {} neck,hip"),
-        (
-            PLAIN,
-            "--time-format %d.%m.%Y",
-            "needs (.*)",
-            "--time-format %d.%m.%Y {} day",
-        ),
-        (PLAIN, "--points neck,eye", "or (without:).*", "--points {}neck"),
-        (PLAIN, NO_EDGES, "use (.*) to draw", "{}"),
-        (PLAIN, SIZE, "needs (.*?);", f"{SIZE} {{}}"),
-    ],
-)
-def test_options_that_messages_name_are_right(
-    tmp_path, monkeypatch, begins, fails, table, options, told, advised
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "no_edges.csv").write_text("\n")
+def option_named(folder, table, options, pattern, advised):
+    """Return the message about options; those that it names work."""
+    path, given = folder / "a.csv", options.replace("no_edges.csv", f"{folder}/no.csv")
+    (folder / "no.csv").write_text("\n")
     if "--image-size" in options:
         table = table.assign(**table.filter(regex="_[xy]$") / 1000)
-    table.to_csv("a.csv", index=False)
-    quick = [*QUICK, "1", "-o", "b"]
-    words = re.search(told, fails("fit", "a.csv", *quick, *options.split())).groups()
-    begins("a.csv", *shlex.split(advised.format(*words)))
+    table.to_csv(path, index=False)
+    error = str(refused(None, told_of_fit, path, f"{' '.join(QUICK)} 1 {given}"))
+    begun(path, *shlex.split(advised.format(*re.search(pattern, error).groups())))
+    return error
 
 
 def test_individuals_of_a_fit_are_named_to_transform(tmp_path, fits, fails, transforms):

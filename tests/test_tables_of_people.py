@@ -20,6 +20,7 @@ from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.cli._columns import asked_columns
 from isa_nrsfm.cli._options import build_parser
 from isa_nrsfm.cli._reading import read_frames
+from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table, open_table, read_landmarks, read_table
 from isa_nrsfm.skeletons import read_skeleton
@@ -127,6 +128,11 @@ def images_of(folder, columns, options):
     return np.round(
         25 * seconds(asked_in(folder, columns, "--fps", 25, *options).times), 9
     )
+
+
+def numbers_in(names):
+    """Return the numbers of frames in names of images."""
+    return list(image_numbers(pd.DataFrame({"image": names.split()})))
 
 
 LONG_NAMES = "123456789012345678901", "123456789012345678902"
