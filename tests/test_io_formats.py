@@ -122,18 +122,14 @@ def test_pyfeat_has_empty_cells_where_no_face_is(detector, tmp_path):
     assert np.isnan(tracks_of(sure)).all(axis=(1, 2)).sum() == 6
 
 
+def mesh(folder, tracks=MESH, **given):
+    return files.write_mesh(folder / "a.csv", tracks, **given)
+
+
 def test_shares_of_the_image_become_pixels(tmp_path):
-    path = files.write_mesh(tmp_path / "a.csv", MESH)
-    refused(r"fractions of the image's width.* give image_size=", read_landmarks, path)
-    landmarks = read_landmarks(path, image_size=files.IMAGE_SIZE)
+    landmarks = read_landmarks(mesh(tmp_path), image_size=files.IMAGE_SIZE)
     assert_allclose(tracks_of(landmarks), MESH)
     assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
-    few = files.write_mesh(tmp_path / "b.csv", TRACKS)
-    for size in (640, (640, 0), (640, 480, 3), ("a", "b"), (np.nan, 480)):
-        message = "image_size must be a width and a height"
-        refused(message, read_landmarks, few, "mediapipe", image_size=size)
-    pixels = files.write_mesh(tmp_path / "c.csv", MESH, shares=False)
-    refused("these are in pixels", read_landmarks, pixels, image_size=files.IMAGE_SIZE)
 
 
 def test_pts_files_are_read_in_the_order_of_names(tmp_path):
@@ -180,32 +176,18 @@ def test_openpose_has_a_row_for_each_person(tmp_path):
     assert list(read_landmarks(folder).frames["frame"]) == [0, 1, 2, 2, 3]
 
 
-def test_openpose_parts_are_chosen(tmp_path):
-    parts = {"pose": 25, "face": 70, "hand_left": 21}
-    parts = {part: points_of_openpose(n) for part, n in parts.items()}
-    person = files.openpose_person(**parts, hand_right=np.zeros((21, 3)))
-    folder = files.write_openpose(tmp_path / "json", [[person]])
-    several = r"json cannot .* pose, face, hand_left: choose one with part"
-    refused(several, read_landmarks, folder)
-    for part, values in parts.items():
-        found = read_landmarks(folder, part=part)
-        assert_array_equal(tracks_of(found)[0], values[:, :2])
-    assert found.skeleton is get_skeleton("hand-21")
-    for part, message in (
-        ("hand_right", "no points of hand_right, but of pose, face"),
-        ("feet", "part must be one of pose, face"),
-    ):
-        refused(message, read_landmarks, folder, part=part)
+PARTS = {"pose": 25, "face": 70, "hand_left": 21}
+PARTS = {part: points_of_openpose(n) for part, n in PARTS.items()}
 
 
-def test_wflw_keeps_boxes_and_attributes(tmp_path):
-    landmarks = read_landmarks(files.write_wflw(tmp_path / "list.txt", WFLW))
-    frames = landmarks.frames
-    assert list(frames["image"]) == [f"37--Soccer/37_Soccer_{i}.jpg" for i in range(4)]
-    assert list(frames.iloc[0, 1:5]) == [10, 20, 210, 220]
-    attributes = "pose expression illumination make_up occlusion blur"
-    assert list(frames.columns[5:]) == attributes.split()
-    assert list(frames.iloc[0, 5:]) == [0, 1, 0, 0, 1, 0]
+def parts(folder):
+    """Return a folder of one person with points of several parts."""
+    person = files.openpose_person(**PARTS, hand_right=np.zeros((21, 3)))
+    return files.write_openpose(folder / "json", [[person]])
+
+
+def wflw(folder):
+    return read_landmarks(files.write_wflw(folder / "list.txt", WFLW)).frames
 
 
 def pair_with_gaps():
@@ -258,7 +240,6 @@ def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
         h5 = files.write_deeplabcut(tmp_path / "a.h5", frame, how="fixed")
         found = read_landmarks(h5).frames
         pd.testing.assert_frame_equal(found, landmarks.frames, check_dtype=False)
-    refused("no confidences", read_landmarks, tmp_path / "a.csv", min_confidence=0.5)
 
 
 def test_h5_files_run_no_code(tmp_path):
@@ -465,33 +446,33 @@ def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
     assert_array_equal(found[..., ::-1], tracks_of(landmarks))
 
 
-class TestSkeletons:
-    def test_edges_of_sleap(self, tmp_path):
-        nodes = files.BODYPARTS
-        edges = [(nodes[0], nodes[2]), (nodes[1], nodes[2]), (nodes[2], nodes[3])]
-        for shape in (edges, list(zip(*edges, strict=True))):
-            given = {"names": ["a"], "edges": shape}
-            path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
-            found = read_landmarks(path).skeleton
-            assert found.edges.tolist() == [[0, 2], [1, 2], [2, 3]]
-            assert found.point_names == tuple(nodes)
+def test_edges_of_sleap(tmp_path):
+    nodes = files.BODYPARTS
+    edges = [(nodes[0], nodes[2]), (nodes[1], nodes[2]), (nodes[2], nodes[3])]
+    for shape in (edges, list(zip(*edges, strict=True))):
+        given = {"names": ["a"], "edges": shape}
+        path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
+        found = read_landmarks(path).skeleton
+        assert found.edges.tolist() == [[0, 2], [1, 2], [2, 3]]
+        assert found.point_names == tuple(nodes)
 
-    def test_what_the_readers_tell(self, tmp_path):
-        assert read_landmarks(WRITERS["sleap"](tmp_path)).skeleton is None
-        hand = [SimpleNamespace(x=0.1 * j, y=0.2) for j in range(21)]
-        results = [SimpleNamespace(hand_landmarks=[hand])]
-        assert from_mediapipe(results, (640, 480)).skeleton.name == "hand-21"
-        coco = get_skeleton("coco-17")
-        content = files.coco_annotations(files.scene(3, 17), names=coco.point_names)
-        path = files.write_json(tmp_path / "a.json", content)
-        assert read_landmarks(path).skeleton == coco
-        faces = files.scene(4, 68)
-        path = files.write_openface(tmp_path / "a.csv", faces)
-        assert read_landmarks(path).skeleton.name == "ibug-68"
-        names = [f"{a}_{j}" for j in range(68) for a in "xy"]
-        table = pd.DataFrame(faces.reshape(4, -1), columns=names)
-        table.to_csv(tmp_path / "b.csv", index=False)
-        assert read_landmarks(tmp_path / "b.csv", "table").skeleton is None
+
+def skeleton_in(path, *options):
+    """Return the name of the skeleton of a file, or None."""
+    return getattr(read_landmarks(path, *options).skeleton, "name", None)
+
+
+def coco(folder, names, n_frames=3):
+    tracks = files.scene(n_frames, len(names))
+    content = files.coco_annotations(tracks, names=names)
+    return files.write_json(folder / "a.json", content)
+
+
+FACES = files.scene(4, 68)
+WIDE = pd.DataFrame(
+    FACES.reshape(4, -1), columns=[f"{a}_{j}" for j in range(68) for a in "xy"]
+)
+THUMB = [SimpleNamespace(x=0.1 * j, y=0.2) for j in range(21)]
 
 
 def openface_text():

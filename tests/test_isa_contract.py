@@ -15,7 +15,6 @@ from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 from scenes import random_rotation, spherical_sources
-from scipy.optimize import approx_fprime
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.estimator_checks import (
@@ -26,7 +25,6 @@ from sklearn.utils.estimator_checks import (
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, isa as strategies
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
-from isa_nrsfm.isa._strategies import derivatives, log_density
 from isa_nrsfm.metrics import subspace_distance
 
 KINDS = [getattr(strategies, name) for name in strategies.__all__]
@@ -246,15 +244,6 @@ class TestEdges:
         assert counts == sorted(set(counts))
         assert counts[-1] <= 10
         assert lines[-1].endswith(f" starts, best {isa.log_likelihood_:.6g}")
-
-
-@pytest.mark.parametrize("energy", [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0, 1e4])
-def test_derivatives_of_the_density(energy):
-    u, step = np.array([energy]), 1e-6 * (energy + 0.1)
-    g, dg = derivatives(u)
-    assert_allclose(g, approx_fprime(u, lambda u: log_density(u)[0], step), rtol=1e-5)
-    slope = approx_fprime(u, lambda u: derivatives(u)[0][0], step)
-    assert_allclose(dg, slope, rtol=1e-5)
 
 
 # --- PooledFastICA: pooling by covariance and likelihood, criteria, recovery ---------

@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, spherical_sources
 from scipy.integrate import quad
 from scipy.linalg import polar
-from scipy.optimize import linear_sum_assignment, minimize_scalar
+from scipy.optimize import approx_fprime, linear_sum_assignment, minimize_scalar
 
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.isa import _shared_mixing
+from isa_nrsfm.isa import _shared_mixing, _strategies as strategies
 from isa_nrsfm.isa._shared_mixing import (
     LIGHT,
     TAILS,
@@ -96,6 +96,17 @@ def test_change_is_the_distance_of_projectors():
             difference = a.swapaxes(1, 2) @ a - b.swapaxes(1, 2) @ b
             expected.append(np.max(np.sum(difference**2, axis=(1, 2))) / 2 / size)
         assert_allclose(subspace_change(W, V, size), expected)
+
+
+@pytest.mark.parametrize("energy", [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0, 1e4])
+def test_derivatives_of_the_density(energy):
+    u, step = np.array([energy]), 1e-6 * (energy + 0.1)
+    g, dg = strategies.derivatives(u)
+    assert_allclose(
+        g, approx_fprime(u, lambda u: strategies.log_density(u)[0], step), rtol=1e-5
+    )
+    slope = approx_fprime(u, lambda u: strategies.derivatives(u)[0][0], step)
+    assert_allclose(dg, slope, rtol=1e-5)
 
 
 def sources(kinds, seed, n_samples, size):

@@ -19,6 +19,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._joint import problem as problem_module
 from isa_nrsfm._joint.fit import residual_deviations
 from isa_nrsfm._joint.problem import FactorisedTable, JointState
+from isa_nrsfm._joint.uncertainty import SIGNS
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
@@ -301,6 +302,13 @@ class TestRobustLoss:
         assert model.noise_variance_ == pytest.approx(few.noise_variance_, rel=0.02)
         assert_allclose(model.mean_shape_, few.mean_shape_, rtol=0, atol=0.02)
         assert_allclose(model.alpha_, model.transform(table), rtol=0, atol=1e-8)
+
+
+def test_halves_differ_like_independent_tables():
+    # All parts differ alike, but for their sum, and about as two tables of this size.
+    pairs = [a - b for i, a in enumerate(SIGNS) for b in SIGNS[:i]]
+    square = np.einsum("pi,pj->ij", pairs, pairs) / len(pairs)
+    assert_allclose(square, 2 * 8 / 7 * (np.eye(15) - 1 / 15), atol=1e-12)
 
 
 class TestDegenerate:
