@@ -11,7 +11,6 @@ from refusals import refusals_of, refused, warned
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._frames.pinhole import Pinhole
 from isa_nrsfm.export import frame_points, frame_poses
 from isa_nrsfm.io import load_model, save_model
 
@@ -76,44 +75,9 @@ def noisy():
     return table
 
 
-def virtual_scene():
-    """Return a scene with virtual images, and points in the axes of their cameras."""
-    s = scene()
-    s.pinhole = Pinhole(F, CENTRE)
-    s.rows = s.X.reshape(len(s.X), -1, 2).swapaxes(1, 2)
-    s.images, s.H = s.pinhole.virtual(s.rows), s.pinhole.turns(s.rows)
-    s.points = (s.S @ s.R.mT + s.T[:, None]) @ s.H.mT
-    return s
-
-
-def test_virtual_images_are_those_of_a_turned_camera():
-    s = virtual_scene()
-    images = F * s.points[..., :2] / s.points[..., 2:]
-    assert_allclose(s.images, images.swapaxes(1, 2))
-    assert_allclose(s.H @ s.H.mT, [np.eye(3)] * len(s.H), atol=1e-14)
-    assert_allclose(np.linalg.det(s.H), 1.0)
-
-
-def test_images_with_true_depths_are_weak_perspective():
-    s = virtual_scene()
-    R, place = s.H @ s.R, (s.H @ s.T[..., None])[..., 0]
-    scale = (F / place[:, 2])[:, None, None]
-    z = scale[..., 0] * (s.S @ R[:, 2, :, None])[..., 0]
-    flat = scale * (s.S @ R[:, :2].mT + place[:, None, :2])
-    straight = s.pinhole.straight(s.images, z)
-    assert_allclose(straight, flat.swapaxes(1, 2), rtol=0, atol=1e-9)
-    motion, translation = s.pinhole.real(
-        s.rows, scale * R[:, :2], scale[..., 0] * place[:, :2]
-    )
-    assert_allclose(s.pinhole.positions(motion, translation), s.T)
-    assert_allclose(motion, (F / s.T[:, 2])[:, None, None] * s.R[:, :2])
-    projected = s.pinhole.projected(s.S, motion, translation)
-    assert_allclose(projected.reshape(s.X.shape), s.X)
-
-
 @pytest.mark.parametrize("seed", slow_after(1, range(20)))
 def test_without_noise_the_fit_is_exact(seed):
-    s = scene(seed, yaw=40.0, distance=2.4 * (2.5 + 0.25 * seed))  # radii
+    s = scene(seed, 40, 40.0, 2.4 * (2.5 + 0.25 * seed))  # radii
     X, S, R = s.X, s.S, s.R
     model = fitted(X, tol=1e-3)
     assert frame_error(model.reconstruct(X), S) < 1e-4
@@ -230,7 +194,7 @@ def test_focal_lengths_of_frames(request, kind, tol):
 
 
 def test_tables_without_perspective_say_so():
-    s = scene(noise=0.005)
+    s = scene(n_frames=25, noise=0.005)
     X, S, R = s.X, s.S, s.R
     flat = 100 * (S @ R[:, :2].mT)
     flat += np.random.RandomState(1).uniform(-300, 300, (len(X), 1, 2)) + CENTRE
@@ -286,7 +250,7 @@ WEAK_LENS = {"camera": "weak_perspective", "focal_length": F}
 @pytest.fixture(scope="module")
 def far():
     """A table of distant objects at the sides of images, and its fit."""
-    table = scene(distance=60.0, noise=0.002, spread=0.4)
+    table = scene(n_frames=25, distance=60.0, noise=0.002, spread=0.4)
     table.model = fitted(table.X, **WEAK_LENS)
     return table
 

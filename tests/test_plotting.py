@@ -217,7 +217,7 @@ FLIPPED = np.tile([1.0, -1.0], 68)
 
 @pytest.fixture(scope="module")
 def faces():
-    return make_face_tracks(n_frames=80, n_components=2, noise=0.0, random_state=0)
+    return make_face_tracks(n_frames=40, n_components=2, noise=0.0, random_state=0)
 
 
 @pytest.fixture(scope="module")
@@ -555,11 +555,11 @@ def share_outside(matrix):
 
 
 def test_points_of_frames_are_the_numbers(faces, estimator):
-    show, rows = ReprojectionDisplay.from_estimator, [7, 3, 50]
+    show, rows = ReprojectionDisplay.from_estimator, [7, 3, 30]
     display = show(estimator, faces.data, frames=rows)
-    assert_array_equal(display.frames, [7, 3, 50])
+    assert_array_equal(display.frames, [7, 3, 30])
     table = estimator.reproject(faces.data).reshape(-1, 68, 2)
-    for i, row in enumerate([7, 3, 50]):
+    for i, row in enumerate([7, 3, 30]):
         seen, fitted = faces.tracks[row], table[row]
         assert_allclose(display.observed_[i].get_offsets(), seen)
         assert_allclose(display.reprojected_[i].get_offsets(), fitted)
@@ -575,7 +575,7 @@ def test_points_of_frames_are_the_numbers(faces, estimator):
     # Planar tables show the same.
     planar = faces.tracks.transpose(0, 2, 1).reshape(len(table), -1)
     other = clone(estimator).set_params(layout="planar").fit(planar)
-    other = ReprojectionDisplay.from_estimator(other, planar, frames=[7, 3, 50])
+    other = ReprojectionDisplay.from_estimator(other, planar, frames=[7, 3, 30])
     assert_array_equal(display.observed, other.observed)
     assert_allclose(display.reprojected, other.reprojected)
 
@@ -589,7 +589,7 @@ def test_random_frames(faces, estimator):
     assert_array_equal(one.frames, same.frames)
     assert set(one.frames) != set(other.frames)
     assert_array_equal(show(estimator, faces.data[:4]).frames, range(4))
-    for frames in ([80], [-1], 3, [], [0.5]):
+    for frames in ([40], [-1], 3, [], [0.5]):
         refused("frames must be", show, estimator, faces.data, frames=frames)
 
 
@@ -604,7 +604,7 @@ def test_random_rows_can_be_fitted(estimator, faces):
 
 
 def test_rows_of_dataframes_may_have_names(faces):
-    names = [f"photo{i}.jpg" for i in range(80)]
+    names = [f"photo{i}.jpg" for i in range(40)]
     X = pd.DataFrame(faces.data, columns=faces.feature_names, index=names)
     estimator = AffineNRSfM(2, refinement=None, random_state=0).fit(X)
     display = ReprojectionDisplay.from_estimator(estimator, X, frames=[5, 2])

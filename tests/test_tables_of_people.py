@@ -1,5 +1,6 @@
 """Tables as people write them: CONTRIBUTING lists each way and what happens."""
 
+import contextlib
 import gzip
 import json
 import re
@@ -79,45 +80,14 @@ def times_in(folder, cells):
     return [*np.round(seconds(found)[: len(cells)], 6)]
 
 
-def test_times_of_several_ways_of_writing_are_refused(asked):
-    cells = [f"{i}/03/2024" for i in range(8, N + 7)]
-    columns, time = {"t": [*cells, "tomorrow"]}, ["--time", "t"]
-    refused("1 of 24 are not .*row 23, 'tomorrow'", asked, columns, *time)
-    cells = [f"2024-02-01T12:00:{i}Z" for i in range(10, N + 9)]
-    columns = {"t": [*cells, "2024-02-01T13:00:00"]}
-    refused("23 of 24 .* zone, .* none .*row 23, '2024", asked, columns, *time)
-
-
-@pytest.mark.parametrize(
-    ("cell", "format", "step"),
-    [
-        ("{:02d}/02/2024", "%m/%d/%Y", 31 * DAY),
-        ("202402{:02d}", "%Y%m%d", DAY),
-        ("99:{:02d}", "%M:%S", 1),
-        ("0:{:02d}", "%H:%M", 60),
-    ],
-)
-def test_time_format_decides(asked, cell, format, step):
+def steps_of(folder, cell, *options):
+    """Return the times of twelve cells, in seconds from the first one."""
     cells = {"t": [cell.format(i) for i in range(1, 13)]}
-    found = asked(cells, "--time", "t", "--time-format", format).times
-    assert seconds(found)[1] == step
-    options = ["--time", "t", "--time-format", f"{format}x"]
-    refused(f"written as {format}x.*12 of 12", asked, cells, *options)
-    refused("--time-format needs --time", asked, cells, "--time-format", format)
+    return seconds(asked_in(folder, cells, *options).times)
 
 
-@pytest.mark.parametrize(
-    "times",
-    [
-        pd.date_range("2024-10-27", periods=N, freq="h", tz="Europe/Berlin"),
-        pd.to_timedelta(np.arange(N), unit="h"),
-    ],
-)
-def test_times_of_parquet_files_keep_their_type(asked, times):
-    found = asked({"t": times}, "--time", "t", suffix=".parquet").times
-    np.testing.assert_array_equal(seconds(found), 3600.0 * np.arange(N))
-
-
+DAYS = [f"{i}/03/2024" for i in range(8, N + 7)]
+ZONED = [f"2024-02-01T12:00:{i}Z" for i in range(10, N + 9)]
 ROWS = np.arange(N)
 FACES = {"face": np.where(ROWS % 2, "right", "left")}
 
@@ -135,28 +105,18 @@ def numbers_in(names):
     return list(image_numbers(pd.DataFrame({"image": names.split()})))
 
 
-LONG_NAMES = "123456789012345678901", "123456789012345678902"
-NAMES = [("007", "7"), ("1.1", "1.10"), ("1e5", "100000"), LONG_NAMES]
+def names_in(folder, *names):
+    """Return the classes and groups of a column with these names."""
+    options = "--label", "who:classes", "--group", "who"
+    found = asked_in(folder, {"who": np.resize(names, N)}, *options)
+    assert {*found.labels[0].values} == {*found.groups}
+    return sorted({*found.groups})
 
 
-@pytest.mark.parametrize("names", NAMES)
-def test_names_are_texts(asked, names):
-    cells = np.resize(names, N)
-    found = asked({"who": cells}, "--label", "who:classes", "--group", "who")
-    assert sorted(set(found.labels[0].values)) == sorted(names)
-    assert sorted(set(found.groups)) == sorted(names)
-    if "." not in names[0]:
-        found = asked({"who": cells}, "--label", "who")
-        assert sorted(set(found.labels[0].values)) == sorted(names)
-
-
-@pytest.mark.parametrize(
-    ("cells", "classes"),
-    [([10, 9, 8], ["8", "9", "10"]), (["round", "none"], ["none", "round"])],
-)
-def test_whole_numbers_and_none_are_classes_in_their_order(asked, cells, classes):
-    (label,) = asked({"age": np.resize(cells, N)}, "--label", "age").labels
-    assert [str(name) for name in label.cat.categories] == classes
+def classes_in(folder, *cells):
+    """Return the classes of a column, in their order."""
+    found = asked_in(folder, {"who": np.resize(cells, N)}, "--label", "who")
+    return [str(name) for name in found.labels[0].cat.categories]
 
 
 def test_labels_of_parquet_files_keep_their_type(asked):
@@ -167,32 +127,26 @@ def test_labels_of_parquet_files_keep_their_type(asked):
     found = asked(columns, *options, suffix=".parquet").labels
     assert [each.dtype for each in found] == ["category"] * 3
     assert set(found[0].values) == {"2024-02-01", "2024-02-02"}
-    for name, got in (("day", "'2024-02-01' in row 0"), ("mood", "'b' in row 1")):
-        message, option = f"{name}:number: .* numbers; got {got}", f"{name}:number"
-        refused(message, asked, columns, "--label", option, suffix=".parquet")
 
 
-@pytest.mark.parametrize(
-    ("word", "suffix"),
-    [
-        ("NA", ".parquet"),
-        *((word, ".csv") for word in ("NULL", "n/a", "", " ", "<NA>")),
-    ],
-)
-def test_words_for_missing_are_missing(asked, word, suffix):
+def labels_with(folder, word, *options, suffix=".csv"):
+    """Return labels of which row 4 has a word for missing."""
     columns = {
-        "mood": np.where(np.arange(N) % 3, "up", "down").astype(object),
-        "age": (20.5 + np.arange(N)).astype(str).astype(object),
+        "mood": np.where(ROWS % 3, "up", "down").astype(object),
+        "age": (20.5 + ROWS).astype(str).astype(object),
     }
     for cells in columns.values():
         cells[4] = word
-    options = ["--label", "mood", "--label", "age"]
-    mood, age = asked(columns, *options, suffix=suffix).labels
+    return asked_in(folder, columns, *options, suffix=suffix).labels
+
+
+def missing_in(folder, word, suffix=".csv"):
+    """Return the rows that lack a class and a number."""
+    labels = "--label", "mood", "--label", "age"
+    mood, age = labels_with(folder, word, *labels, suffix=suffix)
     assert set(mood.dropna()) == {"up", "down"}
     assert age.dtype == float
-    assert list(np.flatnonzero(mood.isna())) == list(np.flatnonzero(age.isna())) == [4]
-    message = r"--group: 1 of 24 frames have no 'mood' .*w 4"
-    refused(message, asked, columns, "--group", "mood", suffix=suffix)
+    return [list(np.flatnonzero(label.isna())) for label in (mood, age)]
 
 
 def test_texts_of_tables_are_no_mathematics():
@@ -430,24 +384,15 @@ LEVELS = WIDE.set_axis(
 )
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        WIDE.to_csv(index=False, sep=" "),
-        LEVELS.to_csv(),
-        LEVELS.to_csv(index=False),
-        LEVELS.to_csv(sep=";", decimal=","),
-    ],
-)
-def test_the_way_from_another_header_or_separator_is_right(tmp_path, monkeypatch, text):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.csv").write_text(text)
-    with warnings.catch_warnings(action="ignore"):  # of semicolons
-        scope = followed(read_table, "a.csv", pd=pd)
-    new = tmp_path / "new.csv"
+def read_as_advised(folder, text):
+    """Return the points of a table, after what an error advises in pandas."""
+    (path := folder / "a.csv").write_text(text)
+    new = folder / "new.csv"
+    with contextlib.chdir(folder), warnings.catch_warnings(action="ignore"):
+        scope = followed(read_table, path.name, pd=pd)  # also of semicolons
     if not new.exists():
         scope["table"].to_csv(new, index=False)
-    np.testing.assert_array_equal(read_landmarks(new).points, WIDE)
+    return read_landmarks(new).points.to_numpy()
 
 
 @pytest.mark.filterwarnings("ignore:the cells of")
