@@ -1,8 +1,5 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
-from dataclasses import dataclass, field
-from functools import partial
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +13,7 @@ from numpy.typing import NDArray
 from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
-from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, _line_search, refine_joint
+from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, refine_joint
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpack3
 
 DEVIATION = 0.03
@@ -76,21 +72,6 @@ def images(scene, result):
     frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
     points = motion @ frames
     return points - points.mean(axis=2, keepdims=True)
-
-
-class Counted(MarginalLikelihood):
-    """The objective, and how often it was computed."""
-
-    n_calls = 0
-
-    def __call__(self, *args):
-        self.n_calls += 1
-        return super().__call__(*args)
-
-
-def counted(scene):
-    """Return the objective of a scene that counts how often it is computed."""
-    return Counted(likelihood_of(scene.tracks, scene.weights, 0.0).frames, 0.0)
 
 
 KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
@@ -306,48 +287,6 @@ class TestLeastNoise:
         )
 
 
-@dataclass(frozen=True)
-class Parabola:
-    """An iterate on the line ``a t^2 / 2 - t``, whose noise has the floor 1/2."""
-
-    a: float
-    state: SimpleNamespace = field(
-        default_factory=lambda: SimpleNamespace(t=0.0, noise=1.0)
-    )
-    gradient = np.array([-1.0, 0.0])
-    cameras = SimpleNamespace(largest_length=lambda step: np.inf)
-
-    @property
-    def value(self):
-        return self.a * self.state.t**2 / 2 - self.state.t
-
-    def split(self, step):
-        return None, step[:1], step[1]
-
-    def moved(self, step):
-        return SimpleNamespace(t=step[0], noise=max(np.exp(step[1]), 0.5))
-
-
-def searched(a, direction):
-    return _line_search(Parabola(a), direction, partial(Parabola, a))
-
-
-class TestLineSearch:
-    @pytest.mark.parametrize(
-        ("a", "expected"),
-        [(1.0, 1.0), (1.99, 1.0), (2.0, 0.5), (4.0, 0.25), (40, 1 / 40)],
-    )
-    def test_takes_the_whole_step_or_the_minimum_of_the_parabola(self, a, expected):
-        reached, step = searched(a, np.array([1.0, 0.0]))
-        assert reached.state.t == pytest.approx(expected)
-        assert_allclose(step, [expected, 0.0])
-
-    def test_noise_changes_by_a_limited_factor_and_not_below_its_floor(self):
-        reached, step = searched(0.5, np.array([1.0, -3.0]))
-        assert reached.state.t == pytest.approx(0.5)
-        assert_allclose(step, [0.5, np.log(0.5)])
-
-
 class TestDegenerate:
     def test_basis_shapes_of_zero_stay_zero(self):
         # A saddle point of the objective: the search does not leave it by itself.
@@ -365,10 +304,7 @@ class TestDegenerate:
             start = start._replace(noise=np.nan)
         else:
             getattr(start, part)[3 if part == "motion" else (..., 3)] = np.inf
-        likelihood = counted(scene)
-        end = refine_joint(likelihood, start, AFFINE, max_iter=1000, tol=1e-3)
-        assert likelihood.n_calls < 100
-        assert not end.converged
+        assert not refined(scene, start).converged
 
     def test_point_that_no_frame_shows_stays_where_it_is(self):
         scene, start = scene_and_start(kind="weighted")

@@ -315,6 +315,7 @@ def test_face_priors_of_all_layouts(layout):
     assert_allclose(found, yaws, atol=4)
 
 
+@pytest.mark.slow
 def test_the_prior_of_real_photos_from_five_cameras(load_data):
     views, photos = load_data("muct_views"), load_data("muct_68")
     order = np.lexsort([photos[name] for name in ("camera", "lighting", "subjects")])
@@ -390,7 +391,7 @@ def test_mirrored_rows_are_named(ways, kind):
     assert fitted(X.reshape(30, -1), prior, **given).mirror_certainty_ == 1
 
 
-@pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+@pytest.mark.parametrize("camera", slow_after(1, ["affine", "weak_perspective"]))
 def test_mirrored_rows_are_named_without_a_prior(camera):
     X, _ = faces(degrees=30)
     mirrored = X * (-1, 1)
