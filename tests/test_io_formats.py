@@ -21,7 +21,7 @@ from isa_nrsfm.io import (
     from_movement,
     read_landmarks,
 )
-from isa_nrsfm.skeletons import get_skeleton
+from isa_nrsfm.skeletons import get_skeleton  # noqa: F401  in refusals.txt
 
 
 def tracks_of(landmarks):
@@ -79,47 +79,34 @@ def test_every_format_is_written_here_and_described():
         FORMATS["new"] = FORMATS["table"]
 
 
-def test_openface_keeps_what_it_says_of_frames(tmp_path):
-    success = np.array([1, 0, *[1] * 10])
-    confidence = np.linspace(0, 1, 12).round(2)
-    known = {"success": success, "confidence": confidence}
-    path = files.write_openface(tmp_path / "a.csv", TRACKS, **known)
+SUCCESS = np.array([1, 0, *[1] * 10])
+CONFIDENCE = np.linspace(0, 1, 12).round(2)
+
+
+def openface(folder, **options):
+    """Read a table of OpenFace with infinite numbers in the row that failed."""
+    known = {"success": SUCCESS, "confidence": CONFIDENCE}
+    path = files.write_openface(folder / "a.csv", TRACKS, **known)
     lines = path.read_text().splitlines()
     for number, text in ((TRACKS[1, 2, 0], "inf"), (TRACKS[1, 3, 0], "-nan(ind)")):
         assert f",{number}," in lines[2]
         lines[2] = lines[2].replace(f",{number},", f",{text},")
     path.write_text("\n".join(lines) + "\n")
-    landmarks = read_landmarks(path)
-    assert_array_equal(landmarks.failed, success == 0)
-    points = tracks_of(landmarks)
-    assert np.isnan(points[1]).all()
-    assert_array_equal(points[2:], TRACKS[2:])
-    frames = landmarks.frames
-    first = "frame face_id timestamp confidence success gaze_0_x"
-    assert list(frames)[:6] == first.split()
-    assert {"AU01_r", "pose_Rx", "p_0"} <= set(frames)
-    assert not {"X_0", "eye_lmk_x_0", "eye_lmk_X_0"} & set(frames)
-    assert list(frames["frame"]) == list(range(1, 13))
-    assert frames["frame"].dtype == frames["success"].dtype == np.int64
-    assert_array_equal(landmarks.confidence, np.tile(confidence[:, None], (1, 8)))
-    sure = read_landmarks(path, min_confidence=confidence[4])
-    lost = np.isnan(tracks_of(sure)).all(axis=(1, 2))
-    assert_array_equal(lost, confidence < confidence[4])
-    assert_array_equal(sure.failed, landmarks.failed)
+    return read_landmarks(path, **options)
 
 
-@pytest.mark.parametrize("detector", ["Detector", "MPDetector"])
-def test_pyfeat_has_empty_cells_where_no_face_is(detector, tmp_path):
-    tracks = TRACKS.copy()
-    tracks[3] = np.nan
-    path = files.write_pyfeat(tmp_path / "a.csv", tracks, detector=detector)
-    landmarks = read_landmarks(path)
-    assert_allclose(tracks_of(landmarks), tracks)
-    assert list(np.flatnonzero(landmarks.failed)) == [3]
-    assert list(landmarks.frames["input"]) == ["video, first.mp4"] * 12
-    assert "z_0" not in landmarks.frames
-    sure = read_landmarks(path, min_confidence=0.75)
-    assert np.isnan(tracks_of(sure)).all(axis=(1, 2)).sum() == 6
+# The third of twelve faces is not found.
+HIDDEN = np.where(np.arange(12)[:, None, None] == 3, np.nan, TRACKS)
+
+
+def pyfeat(folder, detector, **options):
+    path = files.write_pyfeat(folder / "a.csv", HIDDEN, detector=detector)
+    return read_landmarks(path, **options)
+
+
+def lost(landmarks):
+    """Return the rows that show no point."""
+    return list(np.flatnonzero(np.isnan(tracks_of(landmarks)).all(axis=(1, 2))))
 
 
 def mesh(folder, tracks=MESH, **given):
@@ -148,32 +135,23 @@ def points_of_openpose(n_points, confidence=0.5, seed=1):
     return np.c_[files.scene(1, n_points, seed)[0], np.full(n_points, confidence)]
 
 
-def test_openpose_has_a_row_for_each_person(tmp_path):
-    first, second = points_of_openpose(25), points_of_openpose(25, 0.25, seed=2)
-    first[3] = 0
-    unseen = files.openpose_person(pose=np.zeros((25, 3)))
-    people = [[first], [], [second, first], [second]]
-    people = [[files.openpose_person(pose=p) for p in persons] for persons in people]
-    people[3].insert(0, unseen)
-    folder = files.write_openpose(tmp_path / "json", people, first=9)
+FIRST, SECOND = points_of_openpose(25), points_of_openpose(25, 0.25, seed=2)
+FIRST[3] = 0
+PEOPLE = np.stack([FIRST, np.full((25, 3), np.nan), SECOND, FIRST, SECOND])
+
+
+def people(folder, photos=False):
+    """Read one person, nobody, two, and one beside another who is not visible."""
+    found = [[FIRST], [], [SECOND, FIRST], [np.zeros((25, 3)), SECOND]]
+    found = [[files.openpose_person(pose=p) for p in persons] for persons in found]
+    folder = files.write_openpose(folder / "json", found, first=9)
     (folder / "rendered.png").write_bytes(b"")
     (folder / "._video_000000000009_keypoints.json").write_text("not one")
-    landmarks = read_landmarks(folder)
-    rows = np.stack([first, np.full((25, 3), np.nan), second, first, second])
-    expected = np.where(rows[..., 2:] == 0, np.nan, rows)[..., :2]
-    assert_array_equal(tracks_of(landmarks), expected)
-    assert_array_equal(landmarks.confidence, rows[..., 2])
-    assert list(np.flatnonzero(landmarks.failed)) == [1]
-    frames = landmarks.frames
-    assert list(frames["frame"]) == [9, 10, 11, 11, 12]
-    assert frames["file"][0] == "video_000000000009_keypoints.json"
-    assert frames["person"].fillna(-1).tolist() == [0, -1, 0, 1, 1]
-    assert landmarks.skeleton is get_skeleton("body-25")
-    # Names of photos count in their order.
-    photos = sorted(folder.glob("video*.json"))
-    for photo, name in zip(photos, "abcd", strict=True):
-        photo.rename(folder / f"{name}_keypoints.json")
-    assert list(read_landmarks(folder).frames["frame"]) == [0, 1, 2, 2, 3]
+    if photos:  # their names count in their order
+        videos = sorted(folder.glob("video*.json"))
+        for video, name in zip(videos, "abcd", strict=True):
+            video.rename(folder / f"{name}_keypoints.json")
+    return read_landmarks(folder)
 
 
 PARTS = {"pose": 25, "face": 70, "hand_left": 21}
@@ -308,24 +286,14 @@ def test_points_without_a_confidence_are_kept(tmp_path):
     assert not landmarks.failed.any()
 
 
-def test_coco_has_a_row_for_each_person(tmp_path):
-    tracks = TRACKS.copy()
+def annotations(folder):
+    """Read persons of images in another order, and an image without anybody."""
+    tracks = HIDDEN.copy()
     tracks[1, 2] = np.nan
-    tracks[3] = np.nan
     content = files.coco_annotations(tracks, image=[7, 3, 3, 5] + [9] * 8)
     content["images"].append({"id": 11, "file_name": "empty.jpg"})
     content["annotations"].append({"id": 1, "image_id": 7, "category_id": 1})
-    landmarks = read_landmarks(files.write_json(tmp_path / "a.json", content))
-    frames = landmarks.frames
-    # In the order of the images 3, 5, 7 and 9, and last the image without anybody.
-    order = [1, 2, 3, 0, *range(4, 12)]
-    assert_array_equal(tracks_of(landmarks)[:-1], tracks[order])
-    assert list(frames["image_id"]) == [3, 3, 5, 7, *[9] * 8, 11]
-    assert list(frames["annotation_id"][:-1]) == [100 + i for i in order]
-    assert list(frames["file_name"][[0, 12]]) == ["000000000003.jpg", "empty.jpg"]
-    assert list(np.flatnonzero(landmarks.failed)) == [2, 12]
-    assert landmarks.confidence is None
-    assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
+    return read_landmarks(files.write_json(folder / "a.json", content))
 
 
 def test_coco_categories_are_not_mixed(tmp_path):
@@ -342,24 +310,18 @@ def test_coco_categories_are_not_mixed(tmp_path):
     assert_array_equal(tracks_of(people), TRACKS)
 
 
-def test_coco_results_have_confidences(tmp_path):
-    rows = np.dstack([TRACKS, np.linspace(0, 1, 96).reshape(12, 8)])
-    rows[0, 0] = 0
+SCORED = np.dstack([TRACKS, np.linspace(0, 1, 96).reshape(12, 8)])
+SCORED[0, 0] = 0
+
+
+def results(folder, category=1):
+    """Read results of which one has another category."""
     content = [
         {"image_id": f"{i}.jpg", "category_id": 1, "keypoints": row, "score": 0.5}
-        for i, row in enumerate(rows.reshape(12, -1).tolist())
+        for i, row in enumerate(SCORED.reshape(12, -1).tolist())
     ]
-    path = files.write_json(tmp_path / "a.json", content)
-    landmarks = read_landmarks(path)
-    expected = TRACKS.copy()
-    expected[0, 0] = np.nan
-    assert_array_equal(tracks_of(landmarks), expected)
-    assert_array_equal(landmarks.confidence, rows[..., 2])
-    assert list(landmarks.frames["image_id"])[:2] == ["0.jpg", "1.jpg"]
-    assert list(landmarks.points)[:2] == ["x_0", "y_0"]
-    content[3]["category_id"] = 2
-    files.write_json(path, content)
-    refused("more than one category_id: 1, 2", read_landmarks, path)
+    content[3]["category_id"] = category
+    return read_landmarks(files.write_json(folder / "a.json", content))
 
 
 def test_tables_keep_options_of_their_own(tmp_path):
@@ -384,21 +346,21 @@ def landmarker_result(part, faces, **extra):
     )
 
 
-@pytest.mark.parametrize("part", ["face_landmarks", "hand_landmarks", "pose_landmarks"])
-def test_mediapipe_results_become_pixels(part):
-    sizes = np.array([(640, 480), (1920, 1080), (100, 200)])
+SIZES = np.array([(640, 480), (1920, 1080), (100, 200)])
+
+
+def of_mediapipe(part):
+    """Return landmarks of two persons, of nobody, and of one."""
     shares = TRACKS[:3] / 500
     found = (shares[:2], 0.25), ([], 0.25), (shares[2:], 0.75)
     results = [landmarker_result(part, each, visibility=v) for each, v in found]
-    landmarks = from_mediapipe(iter(results), sizes)
-    assert_allclose(tracks_of(landmarks)[[0, 1, 3]], shares * sizes[[0, 0, 2], None])
+    landmarks = from_mediapipe(iter(results), SIZES)
+    pixels = shares * SIZES[[0, 0, 2], None]
+    assert_allclose(tracks_of(landmarks)[[0, 1, 3]], pixels)
     assert list(landmarks.failed) == [False, False, True, False]
     assert list(landmarks.frames["frame"]) == [0, 0, 1, 2]
     assert list(landmarks.frames["individual"].isna()) == [False, False, True, False]
-    if part == "pose_landmarks":
-        assert list(landmarks.confidence["0"].dropna()) == [0.25, 0.25, 0.75]
-    else:
-        assert landmarks.confidence is None
+    return landmarks
 
 
 class Variable:
