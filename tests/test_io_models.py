@@ -91,7 +91,7 @@ def fitted(tmp_path_factory):
             folder = tmp_path_factory.mktemp("frames")
             parameters["frames_folder"] = folder if kind is not str else str(folder)
         if "prior" in parameters:
-            faces = make_face_tracks(200, n_components=2, random_state=1)
+            faces = make_face_tracks(60, n_components=2, random_state=1)
             prior = AffineNRSfM(2, camera="weak_perspective", random_state=0)
             parameters["prior"] = prior.fit(faces.data[:, :28])
         with warnings.catch_warnings():

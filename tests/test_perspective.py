@@ -79,13 +79,13 @@ def noisy():
 def test_without_noise_the_fit_is_exact(seed):
     s = scene(seed, 40, 40.0, 2.4 * (2.5 + 0.25 * seed))  # radii
     X, S, R = s.X, s.S, s.R
-    model = fitted(X, tol=1e-3)
+    model = fitted(X, tol=5e-3)
     assert frame_error(model.reconstruct(X), S) < 1e-4
     turned = model.rotations_.mT @ R
     assert np.abs(turned - turned[0]).max() < 2e-3
 
 
-def test_frames(noisy):
+def test_frames(noisy, tmp_path):
     X, S, T, noise, model = noisy.X, noisy.S, noisy.T, noisy.noise, noisy.model
     assert frame_error(model.reconstruct(X), S) < 0.01
     assert_array_equal(model.transform(X), model.alpha_)
@@ -102,6 +102,11 @@ def test_frames(noisy):
     std = model.reconstruct(X, return_std=True)[1]
     assert 0.0 < std.min() < std.max() < 0.5
     assert model.diagnostics(X).outlier_share == 0.0
+    save_model(model, tmp_path / "model.npz")
+    loaded = load_model(tmp_path / "model.npz")
+    assert_array_equal(loaded.transform(X), model.alpha_)
+    assert_array_equal(loaded.positions_, model.positions_)
+    assert loaded.camera_ == "perspective"
 
 
 def test_rotation_covariance_and_smoothing(noisy):
@@ -335,15 +340,6 @@ def test_number_of_basis_shapes():
     )
     search = AffineNRSfMCV((1, 2), estimator=trial, cv=2).fit(X)
     assert search.n_components_ == 2
-
-
-def test_files(noisy, tmp_path):
-    X, model = noisy.X, noisy.model
-    save_model(model, tmp_path / "model.npz")
-    loaded = load_model(tmp_path / "model.npz")
-    assert_array_equal(loaded.transform(X), model.alpha_)
-    assert_array_equal(loaded.positions_, model.positions_)
-    assert loaded.camera_ == "perspective"
 
 
 test_refusals = refusals_of("perspective", globals())

@@ -157,7 +157,7 @@ def test_shapes_are_inside_limits_of_one_scale(rng):
     assert all(np.ptp(ax.get_xlim()) > 0 for ax in display.axes_.ravel())
 
 
-@pytest.mark.parametrize("n_shapes", [2, 10])
+@pytest.mark.parametrize("n_shapes", slow_after(1, [7, 2, 10]))
 def test_shapes_fit_on_a_page(n_shapes, rng):
     for aspect in (0.25, 3.0):
         mean = rng.uniform(size=(20, 3)) * [aspect, 1, aspect]

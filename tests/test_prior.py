@@ -276,7 +276,7 @@ def test_perspective_cameras(turned, focal_length):
 
 @pytest.mark.parametrize("certainty", slow_after(1, [0.5, 1.0]))
 def test_prior_and_perspective_decide_the_mirror_image(turned, certainty):
-    table, same = study(1, 20, 10, focal=4000), []
+    table, same = study(1, 16, 10, focal=4000), []
     for prior in (copy.copy(turned.model), turned.model.mirrored()):
         prior.mirror_certainty_ = certainty
         model = fitted(table.X, prior, focal_length=4000, **PERSPECTIVE)

@@ -4,7 +4,7 @@ import re
 import shlex
 import warnings
 from itertools import pairwise, product
-from string import ascii_lowercase
+from string import ascii_lowercase  # noqa: F401  in refusals.txt
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -261,22 +261,12 @@ def test_who_is_who_is_a_column_of_images_in_their_order(tmp_path, kind):
     assert_array_equal(found.points, FLAT)
 
 
-@pytest.mark.parametrize(
-    ("name", "wrap"),
-    [
-        ("pose_landmarks", lambda points: SimpleNamespace(landmark=points)),
-        ("multi_face_landmarks", lambda points: [SimpleNamespace(landmark=points)]),
-        ("left_hand_landmarks", lambda points: points),  # HolisticLandmarker
-        ("hand_landmarks", lambda points: [points]),
-    ],
-)
-@pytest.mark.parametrize("nobody", [None, []])
-def test_results_of_all_versions_of_mediapipe(name, wrap, nobody):
+def of_version(name, wrap, nobody=None):
+    """Return the points of a result of MediaPipe, which is followed by an empty one."""
     points = [SimpleNamespace(x=x, y=y, visibility=0.5) for x, y in TRACKS[0] / 500]
     results = [SimpleNamespace(**{name: each}) for each in (wrap(points), nobody)]
     results[0].handedness = [[SimpleNamespace(category_name="Left")]]
     found = from_mediapipe(results, (500, 500))
-    assert_allclose(found.points.iloc[0], FLAT[0])
     assert list(found.failed) == [False, True]
     if name == "hand_landmarks":
         assert list(found.frames["handedness"].fillna("")) == ["Left", ""]
@@ -285,6 +275,7 @@ def test_results_of_all_versions_of_mediapipe(name, wrap, nobody):
     assert re.search("part='(.*?)'", str(told))[1] in ("face", "hand", "pose")
     from_mediapipe(results, (500, 500), part="hand")
     refused("got part='body'", from_mediapipe, results, (5, 5), "body")
+    return found.points.iloc[0]
 
 
 @pytest.mark.parametrize("word", ["p", "Likelihood", "visibility"])
@@ -434,24 +425,19 @@ def test_individuals_of_a_fit_are_named_to_transform(tmp_path, fits, fails, tran
     assert len(transforms(model, path, *option)[0]) == 2 * N
 
 
-@pytest.mark.parametrize("box", ["x y w h", "bbox_x bbox_y bbox_w bbox_h"])
-@pytest.mark.parametrize("name", ["{part}_{axis}", "{part}{axis}"])
-def test_corners_of_boxes_are_no_points(box, name):
-    table = table_of(name, TRACKS).assign(**dict.fromkeys(box.split(), 5.0))
-    options = {}
-    if "_" not in name:
-        told = str(refused("give columns, such as", landmark_table, table))
-        options["columns"] = told.rpartition("such as ")[2].strip("'")
-    assert_array_equal(landmark_table(table, **options).points, FLAT)
+def points_as_advised(table):
+    """Return the points of a table, if need be with the columns that are advised."""
+    try:
+        return landmark_table(table).points.to_numpy()
+    except ValueError as error:
+        columns = str(error).rpartition("give columns, such as ")[2].strip("'")
+        return landmark_table(table, columns=columns).points.to_numpy()
 
 
-@pytest.mark.parametrize("name", ["{part}_{axis}", "{axis}_{part}", "{part}{axis}"])
-def test_points_w_and_h_are_no_sizes_of_boxes(name):
-    table, options = table_of(name, files.scene(2, 26), ascii_lowercase), {}
-    if not {*"_."} & {*name}:
-        told = str(refused("give columns, such as", landmark_table, table))
-        options["columns"] = told.rpartition("such as ")[2].strip("'")
-    assert_array_equal(landmark_table(table, **options).points, table)
+def boxed(name, box):
+    """Return a table of points and of boxes around them."""
+    return table_of(name, TRACKS).assign(**dict.fromkeys(box.split(), 5.0))
 
 
+LETTERS = files.scene(2, 26)  # also w and h
 test_refusals = refusals_of("tables_as_people_have_them", globals())
