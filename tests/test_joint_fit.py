@@ -175,19 +175,16 @@ class TestCameras:
         assert euclidean_error(model, tracks, frames) < 0.02
 
 
+ROBUST_TABLES = [("huber", 150, 40, 2, 0.15), ("cauchy", 300, 8, 1, 0.2)]
+ROBUST_TABLES.append(("huber", 150, 30, 5, 0.1))
+
+
 class TestNoiseVariance:
     # The median is less precise, and the fit bends towards the inner half, with
     # "cauchy" most of all.
     @pytest.mark.parametrize(
         ("loss", "n_frames", "n_points", "n_components", "largest"),
-        slow_after(
-            1,
-            [
-                ("huber", 150, 40, 2, 0.15),
-                ("cauchy", 300, 8, 1, 0.2),
-                ("huber", 150, 30, 5, 0.1),
-            ],
-        ),
+        slow_after(1, ROBUST_TABLES),
     )
     def test_with_a_robust_loss(self, loss, n_frames, n_points, n_components, largest):
         sizes = {"n_frames": n_frames, "n_points": n_points}

@@ -7,7 +7,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import QUICK
+from fit_runs import QUICK, begun, told_of_fit
 from landmark_files import BODYPARTS, TRACKS
 from numpy.testing import assert_array_equal
 from refusals import refusals_of, refused
@@ -173,19 +173,14 @@ def told_of_columns(folder, table):
     return ["Each column was scaled separately" in text for text in texts]
 
 
-@pytest.mark.parametrize(
-    ("further", "n"),
-    [
-        ([THIRD], 3),
-        ([SEEN], 3),
-        ([0 * SEEN], 3),
-        ([THIRD, SEEN], 4),
-        ([THIRD, 0 * SEEN], 4),
-    ],
-)
+FURTHER = [[THIRD], [SEEN], [0 * SEEN], [THIRD, SEEN], [THIRD, 0 * SEEN]]
+
+
+@pytest.mark.parametrize("further", FURTHER)
 @pytest.mark.parametrize("tracks", [FACES, PIXELS])
 @pytest.mark.filterwarnings("ignore:(in 1 of|68 of 136)")
-def test_points_of_three_or_four_numbers(tracks, further, n):
+def test_points_of_three_or_four_numbers(tracks, further):
+    n = 2 + len(further)
     X = np.concatenate([tracks, *further], axis=2)
     for layout, axes in (("interleaved", (0, 1, 2)), ("planar", (0, 2, 1))):
         fit = AffineNRSfM(1, layout=layout, refinement=None).fit
@@ -223,37 +218,24 @@ def test_points_that_stand_still(still):
 SCORES = np.linspace(0.02, 0.4, N * J).reshape(N, J)
 
 
-@pytest.mark.parametrize(
-    ("scores", "told"),
-    [
-        (SCORES, ""),  # of Detectron2
-        (0 * SCORES, ""),  # of MediaPipe's faces
-        (0 * SCORES + 0.5, ""),
-        (250 * SCORES, ""),
-        (1 - SCORES, ""),
-        (1 - 1.5 * SCORES, "--min-confidence 0.6"),
-        (1 - 2.4 * SCORES, "--weights confidence"),
-    ],
-)
-def test_confidences_of_other_scales(tmp_path, begins, fails, scores, told):
+def told_of_scores(folder, scores):
+    """Return what the command tells of confidences, which are used as they should."""
     scores, tracks = np.tile(scores, (2, 1)), make_face_tracks(24, random_state=1).data
     tracks = tracks.reshape(24, 68, 2)[:, ::9] * 100 + 300
     names = [f"{part}_score" for part in BODYPARTS]
     table = wide("{part}_{axis}", tracks).join(pd.DataFrame(scores, columns=names))
-    table.to_csv(path := tmp_path / "a.csv", index=False)
-    err = begins(path)
-    assert told in err if told else "confidence" not in err
+    table.to_csv(path := folder / "a.csv", index=False)
+    of_command = begun(path)
     if scores.min() == scores.max():
-        option = ["--weights", "confidence"]
-        assert "left out" not in fails(
-            "fit", path, *QUICK, "1", "-o", tmp_path, *option
-        )
+        options = " ".join([*QUICK, "1", "--weights", "confidence"])
+        assert "left out" not in str(refused(None, told_of_fit, path, options))
     told = read(path, min_confidence=0.6)[0]
     assert ("no point has" in told) == (0 < scores.max() < 0.6)
     assert ("no probabilities: a threshold" in told) == (scores.max() > 2)
     table[names] = np.where(scores >= np.median(scores), "True", "FALSE")
     table.to_csv(path, index=False)
     assert_array_equal(read_landmarks(path).confidence, table[names] == "True")
+    return of_command
 
 
 OBJECTS = [{"x": x, "y": y, "z": 0.5, "visibility": 0.9} for x, y in TRACKS[0].tolist()]
