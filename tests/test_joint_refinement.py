@@ -1,5 +1,6 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
-from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, refine_joint
+from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, _line_search, refine_joint
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpack3
 
 DEVIATION = 0.03
@@ -285,6 +286,38 @@ class TestLeastNoise:
             == result.state.noise
             > end.residual / likelihood.frames.totals[0]
         )
+
+
+def searched(a, direction):
+    """Search along the line ``a t^2 / 2 - t``, with noise whose floor is 1/2."""
+
+    def moved(step):
+        return SimpleNamespace(t=step[0], noise=max(np.exp(step[1]), 0.5))
+
+    def at(state):
+        return SimpleNamespace(
+            state=state,
+            value=a * state.t**2 / 2 - state.t,
+            gradient=np.array([-1.0, 0.0]),
+            cameras=SimpleNamespace(largest_length=lambda steps: np.inf),
+            split=lambda step: (None, step[:1], step[1]),
+            moved=moved,
+        )
+
+    reached, step = _line_search(at(moved(np.zeros(2))), np.array(direction), at)
+    return reached.state.t, step
+
+
+@pytest.mark.parametrize(
+    ("a", "expected"), [(1.0, 1.0), (1.99, 1.0), (2.0, 0.5), (4.0, 0.25), (40, 1 / 40)]
+)
+def test_whole_steps_or_the_minimum_of_the_parabola(a, expected):
+    assert_allclose(searched(a, [1.0, 0.0])[1], [expected, 0.0])
+
+
+def test_noise_changes_by_a_limited_factor_and_not_below_its_floor():
+    reached, step = searched(0.5, [1.0, -3.0])
+    assert_allclose([reached, *step], [0.5, 0.5, np.log(0.5)])
 
 
 class TestDegenerate:

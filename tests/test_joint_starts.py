@@ -201,18 +201,10 @@ class TestAffineStart:
             assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
 
-def random_frames(seed=0, n_frames=40, n_points=30, n_components=2):
-    """Return shapes, cameras and coefficients."""
-    rng = np.random.default_rng(seed)
-    shapes = rng.normal(size=(n_components + 1, 3, n_points))
-    shapes[1:] *= 0.3
-    motion = rng.normal(size=(n_frames, 2, 3))
-    return shapes, motion, rng.normal(size=(n_frames, n_components))
-
-
 @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
 def test_no_other_basis_is_likelier(penalty):
-    truth, motion, true_alpha = random_frames()
+    scene = random_model(0, 40, 30, 2)
+    truth, motion, true_alpha = scene.shapes, scene.motion, scene.alpha
     shapes = likely_basis(truth, motion, true_alpha, penalty)
     frames = truth[0] + np.tensordot(true_alpha, truth[1:], 1)
 
