@@ -243,25 +243,13 @@ class TestSubspaceDistance:
             assert_allclose(distance, expected)
 
 
-@pytest.fixture
-def pair(rng):
-    """True shapes, and others that resemble them."""
-    truth = rng.standard_normal((6, 15, 3)) + 4.0
-    return truth, truth + 0.3 * rng.standard_normal(truth.shape)
-
-
 def centred(shapes):
     return shapes - shapes.mean(axis=1, keepdims=True)
 
 
 class TestErrorsIn3D:
-    # A square in the plane, of standard deviations 1, 1, 0, and its corners moved along
-    # z, which no rotation undoes.
-    square = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
-    twist = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, -1], [0, 0, 1]])
-
-    def test_as_written_in_the_docstring(self, pair):
-        truth, shapes = map(centred, pair)
+    def test_as_written_in_the_docstring(self):
+        truth, shapes = centred(TRUTH), centred(SHAPES)
 
         def turned(S, X):
             return Rotation.align_vectors(S, X)[0].apply(X)
@@ -269,39 +257,26 @@ class TestErrorsIn3D:
         S, X = np.concatenate(truth), np.concatenate(shapes)
         distance = np.linalg.norm(S - turned(S, X), axis=1)
         expected = np.mean(distance) / np.mean([S.std(axis=0) for S in truth])
-        assert mean_shape_error_3d(*pair) == pytest.approx(expected, rel=1e-9)
+        assert mean_shape_error_3d(TRUTH, SHAPES) == pytest.approx(expected, rel=1e-9)
         errors = []
         for S, X in zip(truth, map(turned, truth, shapes), strict=True):
             rest = S - np.vdot(S, X) / np.vdot(X, X) * X
             errors.append(np.linalg.norm(rest) / np.linalg.norm(S))
-        found = mean_shape_error_3d(*pair, convention="frame")
+        found = mean_shape_error_3d(TRUTH, SHAPES, convention="frame")
         assert found == pytest.approx(np.mean(errors), rel=1e-9)
 
-    def test_camera_by_hand(self):
-        S = np.stack([self.square, self.square + self.twist])
-        X = S + 0.1 * self.twist
-        found = mean_shape_error_3d(S, X, convention="camera")
-        assert found == pytest.approx(np.mean([0.2 / np.sqrt(8), 0.2 / np.sqrt(12)]))
-        # One mirror image for all frames: the first frame alone would not choose it.
-        mirrored = mean_shape_error_3d(S, X * [1, 1, -1], convention="camera")
-        assert mirrored == pytest.approx(found)
-        scaled = mean_shape_error_3d(S, 5 * X, convention="camera", scale=True)
-        c = np.vdot(S, X) / np.vdot(X, X)
-        rest = np.linalg.norm(S - c * X, axis=(1, 2)) / np.sqrt([8, 12])
-        assert scaled == pytest.approx(rest.mean())
 
-
-class TestDegenerateShapes:
-    @pytest.mark.parametrize("nothing", [0.0, 0.1])
-    def test_shapes_of_one_point(self, pair, nothing):
-        truth, _ = pair
-        shapes = np.full_like(truth, nothing)
-        found = mean_shape_error_3d(truth, shapes, convention="frame")
-        assert found == pytest.approx(1)
-        distance = np.linalg.norm(centred(truth), axis=2).mean()
-        expected = distance / truth.std(axis=1).mean()
-        assert mean_shape_error_3d(truth, shapes) == pytest.approx(expected)
-        assert 1.3 < expected < 1.8
+# A square in the plane, of standard deviations 1, 1, 0, and its corners moved along z,
+# which no rotation undoes. One mirror image is for both frames: the first frame alone
+# would not choose it.
+SQUARE = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+TWIST = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, -1], [0, 0, 1]])
+TWO = np.stack([SQUARE, SQUARE + TWIST])
+TWISTED = TWO + 0.1 * TWIST
+# Their least squares scale, and the lengths of what it leaves
+SCALE = np.vdot(TWO, TWISTED) / np.vdot(TWISTED, TWISTED)
+LEFT = np.linalg.norm(TWO - SCALE * TWISTED, axis=(1, 2)) / np.sqrt([8, 12])
+by_camera = partial(mean_shape_error_3d, convention="camera")
 
 
 def test_of_a_published_estimate(load_data):

@@ -132,14 +132,6 @@ def test_other_columns_of_a_row_for_each_point():
     assert_array_equal(found, FLAT)
     with pytest.warns(match="row_per_point='frame,type[+]point'"):
         refused("more than one set", landmark_table, KAGGLE)
-    wrong = {"row_per_point": "image,landmark"}
-    refused(r"no \['image', 'landmark'\]", landmark_table, LONG, **wrong)
-    refused(
-        "several rows for the point '0'",
-        landmark_table,
-        PEOPLE,
-        row_per_point="frame,point",
-    )
 
 
 def test_a_fit_of_a_row_for_each_point(tmp_path, fits, transforms):

@@ -414,24 +414,26 @@ def test_notes_of_narrow_side_views_end_within_the_figure(rng):
         assert note.x1 <= display.figure_.bbox.x1
 
 
+MOODS = np.array(["b", "a", "c"])[np.arange(30) % 3]
+MISSING = np.where(np.arange(30)[:, None] == 3, np.nan, ALPHA)
+NAMED = pd.DataFrame(ALPHA, columns=["jaw $", 2])  # names are no mathematics
+
+
+def drawn_classes(**changed):
+    """Return the axes of coefficients of three classes."""
+    options = {"alpha": ALPHA, "y": MOODS, "label": "mood"} | changed
+    return CoefficientsDisplay(**options).plot().axes_
+
+
+def ticks(axes):
+    return [label.get_text() for label in axes.get_xticklabels()]
+
+
 def test_classes_have_boxes_of_their_frames():
-    y = np.array(["b", "a", "c"])[np.arange(30) % 3]
-    display = CoefficientsDisplay(alpha=ALPHA, y=y, label="mood").plot()
-    names = [text.get_text() for text in display.axes_[-1].get_xticklabels()]
-    assert names == ["a", "b", "c"]
-    for k, axes in enumerate(display.axes_):
+    for k, axes in enumerate(drawn_classes()):
         thick = [line for line in axes.lines if line.get_linewidth() == 1.4]
         medians = [line.get_ydata()[0] for line in thick]
-        assert_allclose(medians, [np.median(ALPHA[y == c, k]) for c in "abc"])
-    assert display.axes_[-1].get_xlabel() == "mood"
-    # Dataframes have names, which are no mathematics.
-    named = pd.DataFrame(ALPHA, columns=["jaw $", 2])
-    display = CoefficientsDisplay(alpha=named, y=pd.Series(y, name="$")).plot()
-    assert [axes.get_ylabel() for axes in display.axes_] == [r"jaw \$", "2"]
-    assert display.axes_[-1].get_xlabel() == r"\$"
-    missing = np.where(np.arange(30)[:, None] == 3, np.nan, ALPHA)
-    display = CoefficientsDisplay(alpha=missing, y=y).plot()
-    assert len(display.axes_[0].collections[0].get_offsets()) == 29
+        assert_allclose(medians, [np.median(ALPHA[MOODS == c, k]) for c in "abc"])
 
 
 def test_numbers_are_points():
@@ -478,8 +480,7 @@ def test_of_many_groups_the_largest_are_drawn_in_one_line():
     names = np.char.mod("%03d", groups)
     display = CoefficientsDisplay(alpha=alpha, y=names).plot(kind="classes")
     assert display.axes_[0].get_title("left").startswith("the 50 of 1000 classes")
-    labels = [text.get_text() for text in display.axes_[1].get_xticklabels()]
-    assert labels == [f"{number:03d}" for number in range(50)]
+    assert ticks(display.axes_[1]) == [f"{number:03d}" for number in range(50)]
 
 
 def test_coefficients_are_those_of_the_estimator(faces, estimator):
@@ -496,43 +497,34 @@ def covariance(n_components=2):
     return rows.T @ rows * np.outer(*2 * [np.repeat(np.arange(n_components) + 1, 3)])
 
 
-def test_colours_of_the_matrix_are_symmetric():
-    matrix = covariance()
-    display = ModeCovarianceDisplay(mode_covariance=matrix).plot()
-    assert_array_equal(display.im_.get_array(), matrix)
-    low, high = display.im_.get_clim()
-    assert low == -high
-    assert high == np.abs(matrix).max()
-    middle = display.im_.cmap(display.im_.norm([0.0]))[0, :3]
-    assert_allclose(middle, middle[0], atol=0.01)  # a grey
+def drawn_matrix(n_components):
+    """Return the matrix of some basis shapes."""
+    return ModeCovarianceDisplay(mode_covariance=covariance(n_components)).plot()
+
+
+# The boundaries of three blocks
+LINES = [[[c, -0.5], [c, 8.5]] for c in (2.5, 5.5)]
+LINES += [[[-0.5, c], [8.5, c]] for c in (2.5, 5.5)]
+SMALL = ModeCovarianceDisplay(mode_covariance=np.diag([1.0, 1, 1, 0.05, 1, 1]))
+
+
+def test_zero_is_grey():
+    image = drawn_matrix(2).im_
+    middle = image.cmap(image.norm([0.0]))[0, :3]
+    assert_allclose(middle, middle[0], atol=0.01)
     assert middle[0] > 0.95
-    small = ModeCovarianceDisplay(mode_covariance=np.diag([1.0, 1, 1, 0.05, 1, 1]))
-    assert small.plot().im_.norm(0.05) > 0.6  # not linear
 
 
-def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
+def test_the_matrix_is_that_of_the_estimator(estimator):
     display = ModeCovarianceDisplay.from_estimator(estimator)
     assert_array_equal(display.mode_covariance, estimator.mode_covariance_)
     share = f"{percent(display.off_block_share)} outside the diagonal blocks"
     assert display.ax_.get_title() == f"{share}\n(0 % if uncorrelated)"
-    display = ModeCovarianceDisplay(mode_covariance=covariance(3)).plot()
-    lines = [[[c, -0.5], [c, 8.5]] for c in (2.5, 5.5)]
-    lines += [[[-0.5, c], [8.5, c]] for c in (2.5, 5.5)]
-    assert_array_equal(display.boundaries_.get_segments(), lines)
-    for axis in (display.ax_.xaxis, display.ax_.yaxis):
-        assert_array_equal(axis.get_ticklocs(), [1, 4, 7])
-        assert [label.get_text() for label in axis.get_ticklabels()] == ["1", "2", "3"]
-    # The first row is at the top.
-    assert display.ax_.get_ylim() == (8.5, -0.5)
-    display = ModeCovarianceDisplay(mode_covariance=covariance(1)).plot()
-    assert display.boundaries_.get_segments() == []
-    assert display.colorbar_.mappable is display.im_
-    assert display.colorbar_.ax.get_ylabel() == "covariance"
 
 
 @pytest.mark.parametrize("n_components", [13, 99])
 def test_labels_of_the_matrix_do_not_touch(n_components):
-    display = ModeCovarianceDisplay(mode_covariance=covariance(n_components)).plot()
+    display = drawn_matrix(n_components)
     display.figure_.canvas.draw()
     for axis in (display.ax_.xaxis, display.ax_.yaxis):
         labels = [each for each in axis.get_ticklabels() if each.get_text()]
