@@ -114,6 +114,20 @@ def test_matplotlib_is_imported_only_to_draw():
 
 
 @pytest.mark.subprocess
+def test_the_estimator_brings_only_what_every_fit_needs():
+    codes = "import sklearn.decomposition", "from isa_nrsfm import AffineNRSfM"
+    before = loaded_by(codes[0])
+    options = {"EAGER_IMPORT": "", "PYTHONWARNINGS": "error"}
+    modules = loaded_by("\n".join(codes), **options) - before
+    packages = {module.partition(".")[0] for module in modules}
+    packages -= {*sys.stdlib_module_names, "isa_nrsfm"}
+    assert packages <= {"numpy", "scipy", "sklearn", "joblib", "threadpoolctl"}
+    parts = {f"isa_nrsfm.{part}" for part in ("baselines", "cli", "datasets", "io")}
+    parts |= {"isa_nrsfm.metrics", "isa_nrsfm.plotting"}
+    assert not modules & parts
+
+
+@pytest.mark.subprocess
 def test_folders_of_the_package_need_no_import_of_their_own():
     code = (
         "import isa_nrsfm\n"

@@ -263,11 +263,6 @@ class TestMethods:
         ]
         assert found[0] < 0.8 * found[1]
 
-    def test_dataframes_and_lists(self):
-        X, weights, _ = noisy()
-        found = fitted().transform(X, point_weight=pd.DataFrame(weights))
-        assert_array_equal(found, fitted().transform(X, point_weight=weights.tolist()))
-
 
 class TestRouting:
     """Metadata routing of scikit-learn."""

@@ -113,16 +113,12 @@ def test_hands_are_turned_upright_and_keep_the_side_that_is_seen():
     assert_allclose(back, upright * [-1, 1, -1], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "layout"),
-    [
-        ("ict_bu3dfe_like_68", "ibug-68"),
-        ("faces_wild_68_combined", "ibug-68"),
-        ("expressions_dlib_68", "ibug-68"),
-        ("muct_68", "xm2vts-68"),
-        ("hands_kazuhito_21", "hand-21"),
-    ],
-)
+REAL = dict.fromkeys(("ict_bu3dfe_like_68", "faces_wild_68_combined"), "ibug-68")
+REAL |= {"expressions_dlib_68": "ibug-68", "muct_68": "xm2vts-68"}
+REAL["hands_kazuhito_21"] = "hand-21"
+
+
+@pytest.mark.parametrize(("name", "layout"), REAL.items())
 def test_real_tables_are_recognised(load_data, name, layout):
     shape = mean_image(load_data, name)
     found = find_skeleton(len(shape), shape=shape)

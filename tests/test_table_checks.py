@@ -175,17 +175,12 @@ def test_pandas_na_is_missing(model, dtype):
     assert_array_equal(model.transform(frame), expected)
 
 
+KINDS_OF_FITS = [{"camera": name} for name in ("weak_perspective", "orthographic")]
+KINDS_OF_FITS += [{"loss": "cauchy"}, {"refinement": None, "scale_frames": False}]
+
+
 @pytest.mark.parametrize("size", slow_after(1, [2.0**-460, 2.0**460]))
-@pytest.mark.parametrize(
-    "params",
-    [
-        {"loss": "cauchy"},
-        {"camera": "weak_perspective"},
-        {"camera": "orthographic"},
-        {"refinement": None, "scale_frames": False},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("params", KINDS_OF_FITS, ids=str)
 def test_sizes_within_the_range_change_no_coefficient(params, size):
     """Powers of two: the numbers of the larger table are the same but for exponents."""
     with warnings.catch_warnings():
