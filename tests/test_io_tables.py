@@ -20,13 +20,9 @@ def random_frame():
     return frame
 
 
-@pytest.fixture
-def frame():
-    return random_frame()
-
-
 @pytest.mark.parametrize("suffix", [".csv", ".tsv", ".parquet", ".CSV"])
-def test_tables_survive_writing_and_reading(frame, tmp_path, suffix):
+def test_tables_survive_writing_and_reading(tmp_path, suffix):
+    frame = random_frame()
     frame.loc[2, ["x1", "y1"]] = np.nan
     path = tmp_path / f"table{suffix}"
     write_table(frame, path)
@@ -39,7 +35,8 @@ def cells(path):
     return read_table(path).to_dict("list")
 
 
-def test_landmarks_and_other_columns_are_separated(frame):
+def test_landmarks_and_other_columns_are_separated():
+    frame = random_frame()
     shuffled = frame[["y3", "id", *(name for name in NAMES if name != "y3")]]
     table = landmark_table(shuffled)
     assert isinstance(table, LandmarkTable)
@@ -55,7 +52,8 @@ def test_landmarks_and_other_columns_are_separated(frame):
     assert points.columns[0] == "x0"
 
 
-def test_zeros_are_missing_only_on_request_and_only_in_pairs(frame):
+def test_zeros_are_missing_only_on_request_and_only_in_pairs():
+    frame = random_frame()
     frame.loc[0, ["x1", "y1"]] = 0.0
     frame.loc[1, "x1"] = 0.0
     assert not landmark_table(frame).points.isna().any(axis=None)

@@ -273,15 +273,10 @@ def planted_signals():
     return signals, unmixing[groups.ravel()], unmixing.T @ C @ unmixing
 
 
-@pytest.fixture
-def planted():
-    return planted_signals()
-
-
 class TestCovariance:
-    def test_general_coordinates(self, planted):
+    def test_general_coordinates(self):
         # Signals and covariance change together.
-        signals, unmixing, C = planted
+        signals, unmixing, C = planted_signals()
         A = np.random.default_rng(1).normal(size=(9, 9))
         isa = PooledFastICA(n_init=2, random_state=0)
         isa.fit(signals @ A.T, covariance=A @ C @ A.T)
@@ -342,8 +337,8 @@ class TestComponents:
 
 
 class TestCriterion:
-    def test_candidates_are_subspaces_of_different_components(self, planted):
-        signals, _, C = planted
+    def test_candidates_are_subspaces_of_different_components(self):
+        signals, _, C = planted_signals()
         asked = []
 
         def criterion(candidates):
@@ -359,8 +354,8 @@ class TestCriterion:
         # A row that comes twice makes no candidate for a subspace.
         assert all((np.linalg.matrix_rank(each) == 3).all() for each in asked)
 
-    def test_no_opinion_leaves_the_first_run_as_pooled(self, planted):
-        signals, _, C = planted
+    def test_no_opinion_leaves_the_first_run_as_pooled(self):
+        signals, _, C = planted_signals()
         isa = PooledFastICA(n_init=2, random_state=0)
         isa.fit(signals, covariance=C, criterion=lambda c: np.zeros(len(c)))
         alone = PooledFastICA(n_init=1, random_state=0).fit(signals, covariance=C)
@@ -394,9 +389,9 @@ class TestCriterion:
                 swapped = isa.components_[order].reshape(3, 3, 9)
                 assert criterion(swapped).sum() <= value(isa) + 1e-10
 
-    def test_the_criterion_decides_over_the_covariance(self, planted):
+    def test_the_criterion_decides_over_the_covariance(self):
         # The covariance pools one way, the criterion asks for another.
-        signals, unmixing, C = planted
+        signals, unmixing, C = planted_signals()
         wanted = unmixing[[0, 3, 6, 1, 4, 7, 2, 5, 8]].reshape(3, 3, 9)
 
         def criterion(candidates):

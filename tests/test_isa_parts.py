@@ -292,6 +292,8 @@ class TestOptimality:
         Z = unit * sources(kinds, 0, 200, size)
         W = shared_mixing(Z)
         most = log_likelihood(W, Z)
+        found = _shared_mixing._fit_densities(W, Z)[0]
+        assert found == pytest.approx(most, rel=1e-7)
         for _ in range(10):
             step = 1e-3 * rng.normal(size=W.shape) @ W
             below, above = (most - log_likelihood(W + s * step, Z) for s in (-1, 1))

@@ -53,11 +53,6 @@ def similarity(of_truth, of_estimate, with_mean=False, **options):
     return basis_similarity(*bases, **means, **options)
 
 
-@pytest.fixture
-def scene():
-    return deforming()
-
-
 class TestInverseSNR:
     @pytest.mark.parametrize("scale_frames", [False, True])
     def test_invariances(self, rng, scale_frames):
@@ -101,7 +96,8 @@ class TestInverseSNR:
 
 
 class TestAffineShapeError:
-    def test_planar_and_zero_estimates(self, scene):
+    def test_planar_and_zero_estimates(self):
+        scene = deforming()
         flat = scene.shapes * (1, 1, 0)
         error = affine_shape_error(scene.shapes, flat)
         lost = np.linalg.norm(scene.shapes[..., 2], axis=1)
@@ -129,7 +125,8 @@ class TestBasisSimilarity:
     @pytest.mark.parametrize(
         ("with_mean", "modulo"), [(False, False), (True, False), (True, True)]
     )
-    def test_one_for_equivalent_bases(self, scene, affinity, with_mean, modulo):
+    def test_one_for_equivalent_bases(self, affinity, with_mean, modulo):
+        scene = deforming()
         factors = np.array([-2.0, 0.1, 5.0])[:, None, None]
         estimate = factors * scene.basis[[2, 0, 1]] @ affinity.T + [1.0, 2.0, 3.0]
         means = {}
@@ -159,7 +156,8 @@ class TestBasisSimilarity:
         free = basis_similarity(basis_true[:2], turned[::-1])
         assert np.sum(free**2) >= np.sum(np.cos(angles) ** 2)
 
-    def test_matching_is_the_best_of_all(self, scene, rng):
+    def test_matching_is_the_best_of_all(self, rng):
+        scene = deforming()
         estimate = rng.standard_normal(scene.basis.shape)
         means = {"mean_shape_true": scene.mean_shape, "mean_shape": scene.mean_shape}
         similarity = basis_similarity(scene.basis, estimate, **means)
@@ -193,7 +191,8 @@ class TestBasisSimilarity:
         assert_allclose(similarity, 1, atol=1e-9)
         assert_array_equal(np.array(order)[matching], np.arange(8))
 
-    def test_multiples_of_the_mean_shape(self, scene):
+    def test_multiples_of_the_mean_shape(self):
+        scene = deforming()
         mean, affinity = scene.mean_shape, AFFINITIES[1]
         multiples = np.array([0.1, -0.2, 0.05])[:, None, None]
         estimate = (scene.basis + multiples * mean) @ affinity
