@@ -5,7 +5,6 @@ import gzip
 import json
 import re
 import warnings
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -52,11 +51,6 @@ def asked_in(folder, columns, *options, suffix=".csv"):
     else:
         table.to_parquet(path, index=False)
     return asked_columns(*read_by_fit(path, *options))
-
-
-@pytest.fixture
-def asked(tmp_path):
-    return partial(asked_in, tmp_path)
 
 
 def seconds(times):
@@ -119,14 +113,8 @@ def classes_in(folder, *cells):
     return [str(name) for name in found.labels[0].cat.categories]
 
 
-def test_labels_of_parquet_files_keep_their_type(asked):
-    days = pd.to_datetime(["2024-02-01", "2024-02-02"] * (N // 2))
-    columns = {"day": days, "mood": ["1", "b"] * (N // 2)}
-    columns["ok"] = [True, False] * (N // 2)
-    options = ["--label", "day", "--label", "mood", "--label", "ok"]
-    found = asked(columns, *options, suffix=".parquet").labels
-    assert [each.dtype for each in found] == ["category"] * 3
-    assert set(found[0].values) == {"2024-02-01", "2024-02-02"}
+TYPED = {"day": pd.to_datetime(["2024-02-01", "2024-02-02"] * (N // 2))}
+TYPED |= {"mood": ["1", "b"] * (N // 2), "ok": [True, False] * (N // 2)}
 
 
 def labels_with(folder, word, *options, suffix=".csv"):
@@ -182,38 +170,33 @@ def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
         np.testing.assert_array_equal(open_table(tmp_path / kind)[:][:, 0], order)
 
 
-@pytest.fixture
-def tracks_read(tmp_path):
-    """Return a function that reads tracks as the command fit does, with warnings."""
-
-    def read(tracks, *options):
-        path = tmp_path / "table.csv"
-        values = tracks.reshape(len(tracks), -1)
-        pd.DataFrame(values, columns=POINTS).to_csv(path, index=False)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            _, frames = read_by_fit(path, *options)
-        return frames.points.to_numpy(), [str(each.message) for each in caught]
-
-    return read
+def tracks_read(folder, tracks, *options):
+    """Read tracks as the command fit does; return points and texts of warnings."""
+    table = pd.DataFrame(tracks.reshape(len(tracks), -1), columns=POINTS)
+    table.to_csv(path := folder / "table.csv", index=False)
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        _, frames = read_by_fit(path, *options)
+    return frames.points.to_numpy(), [str(each.message) for each in caught]
 
 
 @pytest.mark.parametrize(("code", "digits"), [(-1.0, 0), (999.0, 3), (0.0, 3)])
-def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
+def test_codes_of_missing_points_cause_a_warning(tmp_path, code, digits):
     tracks = landmarks(200).to_numpy().reshape(200, -1, 2)
     tracks = (500 + 40 * tracks).round(digits)
-    _, texts = tracks_read(tracks)
+    _, texts = tracks_read(tmp_path, tracks)
     assert texts == []
     hidden = np.random.default_rng(0).random(tracks.shape[:2]) < 0.1
     hidden[:, :8] = False  # these are seen in all rows
     tracks[hidden] = code
     n_rows, n_points = hidden.any(axis=1).sum(), hidden.sum()
-    points, (warning,) = tracks_read(tracks)
+    points, (warning,) = tracks_read(tmp_path, tracks)
     if not code:  # far from all other points, which are not
         told = f"{n_points:,} points at (0, 0), in {n_rows} rows, are missing: "
         assert warning.startswith(told)
         np.testing.assert_array_equal(np.isnan(points[:, ::2]), hidden)
-        assert len(tracks_read(tracks - [480, 0] * ~hidden[..., None])[1]) == 1
+        assert (
+            len(tracks_read(tmp_path, tracks - [480, 0] * ~hidden[..., None])[1]) == 1
+        )
         return
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
@@ -227,25 +210,27 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
         AffineNRSfM(1, refinement=None).fit,
         table,
     )
-    points, texts = tracks_read(tracks, f"--missing-value={number}")
+    points, texts = tracks_read(tmp_path, tracks, f"--missing-value={number}")
     assert texts == []
     expected = np.where(hidden[..., None], np.nan, tracks)
     np.testing.assert_array_equal(points.reshape(tracks.shape), expected)
 
 
-def test_pixels_of_a_face_that_hardly_moves_are_no_code(tracks_read):
+def test_pixels_of_a_face_that_hardly_moves_are_no_code(tmp_path):
     """Whole pixels repeat in many rows, also those with equal coordinates."""
     shape = np.stack([np.arange(300, 324, 2)] * 2, axis=1) + [[0, 0], [9, 0]] * 6
     noise = np.random.default_rng(0).normal(size=(600, 12, 2))
     tracks = np.round(shape + noise)
     assert (tracks[:, 0] == 300).all(axis=1).mean() > 0.1
-    assert tracks_read(tracks)[1] == []
+    assert tracks_read(tmp_path, tracks)[1] == []
 
 
-def test_several_codes_are_missing_together(tracks_read):
+def test_several_codes_are_missing_together(tmp_path):
     tracks = landmarks().to_numpy().reshape(N, -1, 2) + 50
     tracks[3, 2], tracks[4, 5], tracks[5, 1] = -1, 999, [-1, 3]
-    points, _ = tracks_read(tracks, "--missing-value", "-1", "--missing-value", "999")
+    points, _ = tracks_read(
+        tmp_path, tracks, "--missing-value", "-1", "--missing-value", "999"
+    )
     tracks[3, 2] = tracks[4, 5] = np.nan
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     table = pd.DataFrame([[-1, -1, -1, 4.0] * 4], columns=POINTS[:16])
