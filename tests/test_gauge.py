@@ -11,7 +11,7 @@ from scenes import random_cameras, random_rotation
 from isa_nrsfm._frames.camera_models import mean_view
 from isa_nrsfm._gauge import canonical_gauge, independent_gauge
 from isa_nrsfm._parameters.choices import INDEPENDENCE
-from isa_nrsfm.metrics import affine_shape_error, basis_similarity
+from isa_nrsfm.metrics import basis_similarity
 
 ALL = [*INDEPENDENCE, None]
 EACH = pytest.mark.parametrize("independence", ALL)
@@ -105,27 +105,6 @@ def assert_frontal(fit):
     assert np.trace(view[:, :2]) > 0
     assert np.linalg.det(view[:, :2]) > 0
     assert np.sum(fit.shapes[0, 2] ** 3) > 0
-
-
-@EACH
-class TestSameFit:
-    """What a fit says of the table and of the shapes is not changed."""
-
-    @pytest.mark.parametrize("n_components", [1, 3])
-    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(
-        self, independence, n_components
-    ):
-        fit = random_fit(n_components=n_components)
-        result, _ = canonical(fit, independence)
-        assert_allclose(result.images(), fit.images(), atol=1e-11)
-        frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
-        assert affine_shape_error(*frames) < 1e-10
-        # The affinity is that of the map.
-        space = independent_gauge(*fit, independence)[-1].space
-        scales = np.linalg.norm(space @ fit.frames(), axis=(1, 2))
-        scales /= np.linalg.norm(result.frames(), axis=(1, 2))
-        expected = scales[:, None, None] * result.frames()
-        assert_allclose(space @ fit.frames(), expected, atol=1e-11)
 
 
 class TestConditions:

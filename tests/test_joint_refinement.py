@@ -110,31 +110,6 @@ class TestOptimum:
         )
 
 
-@KINDS
-@pytest.mark.parametrize("penalty", [0.0, 10.0])
-def test_first_step_is_that_of_expectation_maximisation(kind, penalty):
-    """The step without memory, from a state that is near enough to take it whole."""
-    scene = random_scene(kind=kind)
-    start = disturbed(scene.truth, size=0.01)
-    likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
-    state = refined(scene, start, penalty=penalty, max_iter=1).state
-    passed = likelihood(*start)
-    half = start.noise / 2
-    shapes = start.shapes.reshape(-1, scene.tracks.shape[1]).T.copy()
-    gradient = passed.shape_gradient.reshape(shapes.T.shape).T
-    for j, g in enumerate(gradient):
-        N = passed.shape_curvature[j if kind == "weighted" else 0]
-        shapes[j] -= half * np.linalg.solve(N, g)
-    assert_allclose(state.shapes, shapes.T.reshape(start.shapes.shape), atol=1e-9)
-    for i, A in enumerate(np.moveaxis(unpack3(passed.motion_curvature), -1, 0)):
-        step = half * passed.motion_gradient[..., i] @ np.linalg.inv(A)
-        assert_allclose(state.motion[i], start.motion[i] - step)
-    # To first order the mean of the expected residual.
-    slope = passed.noise_gradient / likelihood.frames.totals[0]
-    assert abs(slope) < 1.5
-    assert state.noise == pytest.approx(start.noise * np.exp(-slope))
-
-
 class TestTolerance:
     @pytest.mark.parametrize("tol", [1.0, 1e-4])
     def test_is_of_two_steps_one_after_the_other_and_a_frame(self, tol):
