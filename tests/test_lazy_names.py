@@ -32,6 +32,7 @@ PACKAGES = [
 ]
 # Those that wait until a name is used; the other folders import what they hold.
 WAITING = ["isa_nrsfm", "isa_nrsfm.cli", "isa_nrsfm.export", "isa_nrsfm.io"]
+HELP = [["--version"], ["--help"], ["fit", "--help"], ["export", "--help"]]
 # All that is slow to import: NumPy is the least of it.
 SLOW = {"numpy", "scipy", "sklearn", "pandas", "joblib", "matplotlib"}
 
@@ -155,11 +156,7 @@ def test_what_is_not_installed_is_an_error_of_the_import():
 
 
 @pytest.mark.subprocess
-@pytest.mark.parametrize(
-    "arguments",
-    [["--version"], ["--help"], ["fit", "--help"], ["export", "--help"]],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("arguments", HELP, ids=" ".join)
 def test_help_waits_for_nothing(arguments):
     assert not loaded_by(command(*arguments), EAGER_IMPORT="") & SLOW
 

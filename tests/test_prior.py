@@ -260,9 +260,7 @@ def test_orthographic_cameras():
     assert np.sqrt(np.mean(model.reconstruct(table.X) ** 2)) == pytest.approx(size, 0.1)
 
 
-@pytest.mark.parametrize(
-    "focal_length", [800.0, pytest.param(None, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("focal_length", slow_after(1, [800.0, None]))
 def test_perspective_cameras(turned, focal_length):
     """The prior may be the mirror image of the objects."""
     table = study(1, 20, 4, change=0.04, focal=800)

@@ -24,12 +24,10 @@ def fitted(camera="affine", independence="shapes"):
     return AffineNRSfM(3, **params).fit(faces())
 
 
-@pytest.mark.parametrize(
-    ("camera", "independence"),
-    slow_after(
-        2, [("affine", "shapes"), ("affine", None), ("weak_perspective", "shapes")]
-    ),
-)
+FITS = [("affine", "shapes"), ("affine", None), ("weak_perspective", "shapes")]
+
+
+@pytest.mark.parametrize(("camera", "independence"), slow_after(2, FITS))
 def test_clear_coefficients_are_stable(camera, independence):
     model = fitted(camera, independence)
     assert model.stability_.shape == (3,)
