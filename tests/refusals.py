@@ -3,8 +3,8 @@
 A section of the table has the name of a test file, and for each call two lines: the
 call, in the names of that file, and an expression for the message of its ValueError,
 or of another error or a warning that is named before it, as in "OSError: is a pipe".
-Calls that are not refused have their result after "== ", or what their text matches
-after "~ ", and does not after "!~ ".
+Calls that are not refused have their result after "== ", up to rounding after "~= ", or
+what their text matches after "~ ", and does not after "!~ ".
 `written(name, content)` writes a file into `folder`. `tmp_path` stays empty. Commands
 are `begun`, `told`, `told_of_fit` and `usage`; `pd` and `isa_nrsfm` are imported.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from fit_runs import begun, told, told_of_fit, usage
-from numpy.testing import assert_equal
+from numpy.testing import assert_allclose, assert_equal
 
 import isa_nrsfm
 
@@ -24,12 +24,17 @@ TABLE = Path(__file__).with_suffix(".txt")
 GIVEN = {"isa_nrsfm": isa_nrsfm, "pd": pd}
 GIVEN |= {"begun": begun, "told": told, "told_of_fit": told_of_fit, "usage": usage}
 
-# Of results: their equality, and whether a text matches an expression
+# Of results: their equality, also up to rounding, and whether a text matches
 CHECKS = {
     "==": lambda found, rest, scope: assert_equal(found, eval(rest, scope)),
+    "~=": lambda found, rest, scope: assert_close(found, eval(rest, scope)),
     "~": lambda found, rest, _: assert_regex(rest, found, True),
     "!~": lambda found, rest, _: assert_regex(rest, found, False),
 }
+
+
+def assert_close(found, expected):
+    assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def assert_regex(pattern, text, expected):

@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._frames.point_sums import frame_tracks
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
+from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -172,3 +174,11 @@ def likelihood_of(tracks, weights, penalty, block_frames=2048):
     lengths = [len(block.weight) for block in blocks]
     frames = JointFrames(FrameBlocks.of_blocks(blocks, lengths))
     return MarginalLikelihood(frames, penalty)
+
+
+def shape_prior(scene):
+    """Return a prior whose shapes are near those of a scene, in other axes."""
+    rng, n = np.random.default_rng(2), len(scene.shapes)
+    gauge = FrameMap(np.eye(n) + 0.2 * rng.normal(size=(n, n)), np.eye(3))
+    shapes = scene.shapes + 0.1 * rng.normal(size=scene.shapes.shape)
+    return ShapePrior(shapes, gauge, True, 0.0, 0.3)

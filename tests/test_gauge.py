@@ -1,184 +1,17 @@
 """The canonical space, order, scale and sign, and the independent basis."""
 
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from scenes import random_rotation
-from scipy.spatial.transform import Rotation
+from scenes import random_cameras, random_rotation
 
 from isa_nrsfm._frames.camera_models import mean_view
-from isa_nrsfm._gauge import (
-    canonical_gauge,
-    canonical_rotation,
-    canonical_space,
-    euclidean_space,
-    independent_gauge,
-    reorder_blocks,
-)
+from isa_nrsfm._gauge import canonical_gauge, independent_gauge
 from isa_nrsfm._parameters.choices import INDEPENDENCE
-from isa_nrsfm.metrics import affine_shape_error, basis_similarity
-
-
-class Scene:
-    """A shape with a skewed depth, and cameras that see it from about one side."""
-
-    def __init__(self, seed=0, n_frames=30, spread=0.3, flat=0):
-        rng = np.random.default_rng(seed)
-        self.mean_shape = rng.exponential(size=(25, 3))
-        self.mean_shape[:, 3 - flat :] = 0
-        self.mean_shape -= self.mean_shape.mean(axis=0)
-        self.basis = rng.normal(size=(3, 25, 3))
-        self.basis -= self.basis.mean(axis=1, keepdims=True)
-        self.motion = np.eye(2, 3) + spread * rng.normal(size=(n_frames, 2, 3))
-        self.alpha = rng.exponential(size=(n_frames, 3)) * [1.0, 5.0, 0.2]
-        if flat:
-            self.motion[:, :, 3 - flat :] = 0
-
-    def canonical(self):
-        A = canonical_space(self.mean_shape, self.motion)
-        fit = self.mean_shape, self.basis, self.motion, self.alpha
-        mean_shape, basis, order, _ = canonical_gauge(*fit, A)
-        gauge = SimpleNamespace(mean_shape=mean_shape, basis=basis, order=order)
-        return gauge, self.motion @ np.linalg.inv(A)
-
-    def scattered(self):
-        """Give each frame a view of its own."""
-        rotations = [random_rotation(seed) for seed in range(len(self.motion))]
-        self.motion = np.array([R[:2] for R in rotations]) @ np.diag([1.0, 2.0, 3.0])
-        return self
-
-
-def coefficients(scene, gauge):
-    """Return alpha for the canonical basis, from the order and the scales."""
-    A = canonical_space(scene.mean_shape, scene.motion)
-    before = scene.basis[gauge.order] @ A.T
-    ratio = np.sum(gauge.basis * before, axis=(1, 2)) / np.sum(before**2, axis=(1, 2))
-    assert_allclose(gauge.basis, ratio[:, None, None] * before, atol=1e-10)
-    return scene.alpha[:, gauge.order] / ratio
-
-
-class TestSpace:
-    def test_rows_of_the_mean_camera_are_in_the_plane_of_x_and_y(self):
-        _, motion = Scene().canonical()
-        view = mean_view(motion)
-        assert_allclose(view[:, 2], 0, atol=1e-13)
-        # As near to the axes as can be: no rotation in the plane brings them nearer.
-        assert_allclose(view[0, 1], view[1, 0], atol=1e-13)
-        assert np.trace(view[:, :2]) > 0
-        assert np.linalg.det(view[:, :2]) > 0
-
-    def test_scattered_views_have_their_principal_axes(self):
-        gauge, motion = Scene(n_frames=300).scattered().canonical()
-        assert mean_view(motion) is None
-        B = gauge.mean_shape
-        assert_allclose(B.T @ B / len(B), np.eye(3), atol=1e-13)
-        second = np.einsum("irc,ird->cd", motion, motion)
-        assert_allclose(second, np.diag(np.diag(second)), atol=1e-10 * second.max())
-        assert np.all(np.diff(np.diag(second)) < 0)
-        assert np.all(np.sum(B**3, axis=0) > 0)
-
-    @pytest.mark.parametrize("scattered", [False, True])
-    @pytest.mark.parametrize("mirrored", [False, True])
-    def test_any_affinity_before_leads_to_the_same_space(self, scattered, mirrored):
-        scene = Scene(n_frames=300)
-        if scattered:
-            scene.scattered()
-        expected, expected_motion = scene.canonical()
-        A = np.random.default_rng(1).normal(size=(3, 3))
-        A[0] *= np.sign(np.linalg.det(A)) * (-1 if mirrored else 1)
-        scene.mean_shape, scene.basis = scene.mean_shape @ A.T, scene.basis @ A.T
-        scene.motion = scene.motion @ np.linalg.inv(A)
-        gauge, motion = scene.canonical()
-        assert_allclose(gauge.mean_shape, expected.mean_shape, atol=1e-10)
-        assert_allclose(gauge.basis, expected.basis, atol=1e-8)
-        assert_allclose(motion, expected_motion, atol=1e-10)
-
-    @pytest.mark.parametrize(("flat", "unit"), [(1, 1e-9), (2, 1e9)])
-    def test_flat_object(self, flat, unit):
-        scene = Scene(flat=flat)
-        R = random_rotation(4)
-        scene.mean_shape, scene.motion = unit * scene.mean_shape @ R, scene.motion @ R
-        gauge, motion = scene.canonical()
-        B = gauge.mean_shape
-        variances = np.sort(np.linalg.eigvalsh(B.T @ B / len(B)))[::-1]
-        assert_allclose(variances, [1.0] * (3 - flat) + [0.0] * flat, atol=1e-9)
-        images = scene.motion @ scene.mean_shape.T
-        assert_allclose(motion @ B.T, images, atol=1e-8 * unit)
-        assert np.isfinite(gauge.basis).all()
-
-    @pytest.mark.parametrize("flat", [1, 2])
-    def test_flat_directions_get_the_scale_of_the_widest(self, flat):
-        scene = Scene(flat=flat)
-        A = canonical_space(scene.mean_shape, scene.motion)
-        widths = np.linalg.svd(scene.mean_shape, compute_uv=False)[: 3 - flat]
-        expected = np.sort(np.append(widths, [widths[0]] * flat))[::-1] / 5
-        assert_allclose(1 / np.linalg.svd(A, compute_uv=False)[::-1], expected)
-
-
-class TestEuclideanSpace:
-    """With calibrated cameras space is turned, not stretched."""
-
-    def scene(self, spread=0.3):
-        rng = np.random.default_rng(0)
-        scene = Scene()
-        turns = Rotation.from_rotvec(spread * rng.normal(size=(30, 3))).as_matrix()
-        scene.motion = rng.uniform(0.5, 2.0, 30)[:, None, None] * turns[:, :2]
-        return scene
-
-    @pytest.mark.parametrize("size", [None, 1.0, 7.0])
-    def test_is_a_multiple_of_an_orthogonal_matrix(self, size):
-        scene = self.scene()
-        A = euclidean_space(scene.mean_shape, scene.motion, size)
-        if size is None:
-            size = 1 / np.sqrt(np.mean(scene.mean_shape**2))
-        assert_allclose(A @ A.T, size**2 * np.eye(3), atol=1e-12 * size**2)
-        expected = canonical_rotation(scene.mean_shape, scene.motion)
-        assert_allclose(A, size * expected, rtol=1e-12)
-
-    def test_mean_shape_of_zeros(self):
-        scene = self.scene()
-        A = euclidean_space(0 * scene.mean_shape, scene.motion, None)
-        assert_allclose(A @ A.T, np.eye(3), atol=1e-12)
-
-
-class TestBasis:
-    def test_coefficients_that_do_not_vary_have_unit_mean_square(self):
-        scene = Scene()
-        scene.alpha[:, 1] = -7.0
-        gauge, _ = scene.canonical()
-        alpha = coefficients(scene, gauge)
-        k = int(np.flatnonzero(gauge.order == 1)[0])
-        assert_allclose(alpha[:, k], 1)
-
-    @pytest.mark.parametrize(
-        ("part", "size"), [("alpha", 0.0), ("basis", 1e-15), ("basis", 1e-6)]
-    )
-    def test_basis_shape_that_hardly_moves(self, part, size):
-        scene = Scene()
-        values = scene.alpha.T if part == "alpha" else scene.basis
-        values[1] *= size
-        gauge, _ = scene.canonical()
-        assert gauge.order[2] == 1
-        assert np.isfinite(gauge.basis).all()
-        # Below rounding errors it is zero.
-        assert (np.abs(gauge.basis[2]).max() > 1e-7) == (size == 1e-6)
-        assert gauge.basis[2].any() == (size == 1e-6)
-
-
-def test_blocks_are_reordered():
-    matrix = np.arange(81.0).reshape(9, 9)
-    order = np.array([2, 0, 1])
-    got = reorder_blocks(matrix, order)
-    for a in range(3):
-        for b in range(3):
-            rows, columns = (np.arange(3) + 3 * order[each] for each in (a, b))
-            expected = matrix[np.ix_(rows, columns)]
-            assert_array_equal(got[3 * a : 3 * a + 3, 3 * b : 3 * b + 3], expected)
-
+from isa_nrsfm.metrics import basis_similarity
 
 ALL = [*INDEPENDENCE, None]
 EACH = pytest.mark.parametrize("independence", ALL)
@@ -198,14 +31,20 @@ class Fit(NamedTuple):
         return self.shapes[0] + np.tensordot(self.alpha, self.shapes[1:], 1)
 
 
-def random_fit(seed=0, n_frames=60, n_points=80, n_components=3):
-    """Return a fit with independent heavy-tailed basis shapes and coefficients."""
+def random_fit(seed=0, n_frames=60, n_points=80, n_components=3, scattered=False):
+    """
+    Return a fit with independent heavy-tailed basis shapes and coefficients.
+
+    Its cameras see the object from about one side, or scattered ones from all sides.
+    """
     rng = np.random.default_rng(seed)
     shapes = rng.normal(size=(n_components + 1, 3, n_points))
     shapes[1:] *= 0.3 * rng.normal(size=(n_components, 1, n_points))
     shapes -= shapes.mean(axis=2, keepdims=True)
     motion = rng.normal(size=(n_frames, 2, 3)) + 2 * np.eye(2, 3)
     alpha = rng.laplace(size=(n_frames, n_components)) / np.sqrt(2)
+    if scattered:
+        motion = random_cameras(rng, n_frames) @ np.diag([1.0, 2.0, 3.0])
     return Fit(shapes, motion, alpha)
 
 
@@ -230,11 +69,12 @@ def remixed(alpha, mixing):
     return c[..., 1:] / c[..., :1], c[..., 0]
 
 
-def regauged(fit, seed=1, shift=0.05):
+def regauged(fit, seed=1, shift=0.05, mirrored=False):
     """Return another fit that is as good: mixed, in a space that is sheared."""
     mixing = random_mixing(seed, len(fit.shapes), shift)
     rng = np.random.default_rng(seed)
     space = random_rotation(seed) + 0.3 * rng.normal(size=(3, 3))
+    space[0] *= np.sign(np.linalg.det(space)) * (-1 if mirrored else 1)
     alpha, scale = remixed(fit.alpha, mixing)
     motion = scale[:, None, None] * fit.motion @ np.linalg.inv(space)
     return Fit(space @ np.tensordot(mixing, fit.shapes, 1), motion, alpha)
@@ -257,31 +97,31 @@ def assert_same(got, expected, atol=1e-7):
         assert_allclose(one, other, atol=atol, err_msg=name)
 
 
-@EACH
-class TestSameFit:
-    """What a fit says of the table and of the shapes is not changed."""
-
-    @pytest.mark.parametrize("n_components", [1, 3])
-    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(
-        self, independence, n_components
-    ):
-        fit = random_fit(n_components=n_components)
-        result, _ = canonical(fit, independence)
-        assert_allclose(result.images(), fit.images(), atol=1e-11)
-        frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
-        assert affine_shape_error(*frames) < 1e-10
-        # The affinity is that of the map.
-        space = independent_gauge(*fit, independence)[-1].space
-        scales = np.linalg.norm(space @ fit.frames(), axis=(1, 2))
-        scales /= np.linalg.norm(result.frames(), axis=(1, 2))
-        expected = scales[:, None, None] * result.frames()
-        assert_allclose(space @ fit.frames(), expected, atol=1e-11)
+def assert_frontal(fit):
+    """Assert that the nearest orthonormal rows to the mean camera are x and y."""
+    view = mean_view(fit.motion)
+    assert_allclose(view[:, 2], 0, atol=1e-13)
+    assert_allclose(view[0, 1], view[1, 0], atol=1e-13)
+    assert np.trace(view[:, :2]) > 0
+    assert np.linalg.det(view[:, :2]) > 0
+    assert np.sum(fit.shapes[0, 2] ** 3) > 0
 
 
 class TestConditions:
     @EACH
-    def test_hold(self, independence):
-        result, _ = canonical(regauged(random_fit()), independence)
+    @pytest.mark.parametrize("scattered", [False, True])
+    def test_hold(self, independence, scattered):
+        fit = random_fit(n_frames=300 if scattered else 60, scattered=scattered)
+        result, _ = canonical(regauged(fit), independence)
+        if scattered:  # principal axes
+            assert mean_view(result.motion) is None
+            second = np.einsum("irc,ird->cd", result.motion, result.motion)
+            off = second - np.diag(np.diag(second))
+            assert_allclose(off, 0, atol=1e-10 * second.max())
+            assert np.all(np.diff(np.diag(second)) < 0)
+            assert np.all(np.sum(result.shapes[0] ** 3, axis=1) > 0)
+        else:
+            assert_frontal(result)
         mean_shape, basis = result.shapes[0], result.shapes[1:]
         n_points = mean_shape.shape[1]
         assert_allclose(result.shapes.mean(axis=2), 0, atol=1e-12)
@@ -330,11 +170,17 @@ def whitened(fit):
 
 
 @EACH
-@pytest.mark.parametrize("n_components", [1, 3])
-def test_gauge_of_the_fit_makes_no_difference(independence, n_components):
-    fit = random_fit(n_components=n_components, n_points=150)
+@pytest.mark.parametrize(
+    ("n_components", "scattered", "mirrored"),
+    [(1, False, False), (3, False, False), (3, True, False), (3, True, True)],
+)
+def test_gauge_of_the_fit_makes_no_difference(
+    independence, n_components, scattered, mirrored
+):
+    options = {"n_components": n_components, "n_points": 150, "scattered": scattered}
+    fit = random_fit(**options)
     expected, _ = canonical(fit, independence)
-    other = regauged(fit, shift=0.01)
+    other = regauged(fit, shift=0.01, mirrored=mirrored)
     assert_allclose(other.images(), fit.images(), atol=1e-10)
     assert_same(canonical(other, independence)[0], expected)
 
@@ -369,6 +215,7 @@ class TestCalibratedCameras:
         scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
         unit_gram = np.broadcast_to(np.eye(2), gram.shape)
         assert_allclose(gram / scale, unit_gram, atol=1e-10)
+        assert_frontal(result)
         if camera == "orthographic":
             assert_allclose(scale, 1 / size[0] ** 2, rtol=1e-10)
         if unit is None:
@@ -428,16 +275,56 @@ class TestDegenerate:
         assert_allclose(norms[3 - n_zero :], 0, atol=1e-9)
 
     @EACH
-    def test_flat_objects(self, independence):
+    @pytest.mark.parametrize(("flat", "unit"), [(1, 1e-9), (1, 1.0), (2, 1e9)])
+    def test_flat_objects(self, independence, flat, unit):
         fit = random_fit()
-        fit.shapes[:, 2] = 0.0
+        fit.shapes[:, 3 - flat :] = 0.0
+        fit = fit._replace(shapes=unit * fit.shapes)
         other = regauged(fit)
         result, deviation = canonical(other, independence)
         assert np.isfinite(deviation).all()
-        assert_allclose(result.images(), other.images(), atol=1e-10)
+        assert_allclose(result.images(), other.images(), atol=1e-10 * unit)
         assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
         along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
-        assert_allclose(along, 0, atol=1e-9)
+        if unit == 1.0:
+            assert_allclose(along, 0, atol=1e-9)
+        variances = np.linalg.eigvalsh(result.shapes[0] @ result.shapes[0].T / 80)
+        assert_allclose(variances, np.arange(3) >= flat, atol=1e-9)
+        # Directions that are exactly flat get the scale of the widest one.
+        mean_shape, _, frames = independent_gauge(*fit, independence)
+        space = frames.space
+        before = np.linalg.solve(space, mean_shape.T)
+        widths = np.linalg.svd(before, compute_uv=False) / np.sqrt(80)
+        widths[3 - flat :] = widths[0]
+        expected = np.sort(widths)[::-1]
+        assert_allclose(1 / np.linalg.svd(space, compute_uv=False)[::-1], expected)
+
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    def test_mean_shape_of_zeros(self, camera):
+        fit = random_fit()
+        fit.shapes[0] = 0.0
+        fit = fit if camera == "affine" else calibrated(fit, camera)
+        result, _ = canonical(fit, "shapes", camera)
+        assert_allclose(result.images(), fit.images(), atol=1e-10)
+
+    @pytest.mark.parametrize(
+        ("part", "size", "factor"),
+        [("alpha", 0.0, 0), ("basis", 1e-15, 0), ("basis", 1e-6, -7), (None, 1, -7)],
+    )
+    def test_factors_of_basis_shapes_that_hardly_move(self, part, size, factor):
+        """Below rounding errors they are zero, else of unit mean square."""
+        fit = random_fit()
+        fit.alpha[:, 1] = -7.0
+        if part == "alpha":
+            fit.alpha[:, 1] *= size
+        else:
+            fit.shapes[2] *= size
+        shapes = fit.shapes.transpose(0, 2, 1)
+        given = shapes[0], shapes[1:], fit.motion, fit.alpha, np.eye(3)
+        _, basis, order, factors = canonical_gauge(*given)
+        assert part is None or order[2] == 1
+        assert factors[order == 1] == pytest.approx(factor)
+        assert_allclose(basis, factors[:, None, None] * shapes[1:][order])
 
     @EACH
     @pytest.mark.parametrize("depth", [0.0, 0.02])

@@ -1,5 +1,7 @@
 """Parts of independent subspace analysis: steps, gains of swaps, shared mixing."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from layers import slow_after
@@ -7,10 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, spherical_sources
 from scipy.integrate import quad
 from scipy.linalg import polar
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import approx_fprime, linear_sum_assignment, minimize_scalar
 
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.isa import _shared_mixing
+from isa_nrsfm.isa import _shared_mixing, _strategies as strategies
 from isa_nrsfm.isa._shared_mixing import (
     LIGHT,
     TAILS,
@@ -94,6 +96,17 @@ def test_change_is_the_distance_of_projectors():
             difference = a.swapaxes(1, 2) @ a - b.swapaxes(1, 2) @ b
             expected.append(np.max(np.sum(difference**2, axis=(1, 2))) / 2 / size)
         assert_allclose(subspace_change(W, V, size), expected)
+
+
+@pytest.mark.parametrize("energy", [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0, 1e4])
+def test_derivatives_of_the_density(energy):
+    u, step = np.array([energy]), 1e-6 * (energy + 0.1)
+    g, dg = strategies.derivatives(u)
+    assert_allclose(
+        g, approx_fprime(u, lambda u: strategies.log_density(u)[0], step), rtol=1e-5
+    )
+    slope = approx_fprime(u, lambda u: strategies.derivatives(u)[0][0], step)
+    assert_allclose(dg, slope, rtol=1e-5)
 
 
 def sources(kinds, seed, n_samples, size):
@@ -236,15 +249,56 @@ def test_invariance_to_basis_order_of_samples_and_rotations(kinds, size, rng):
         assert_allclose(matched(expected, unmix(changed)), expected, atol=1e-7)
 
 
+@cache
+def log_integral(tail, size):
+    """Return the logarithm of the integral of a density over all vectors."""
+
+    def radial(r):
+        return r ** (size - 1) * np.exp(log_density(r * r, tail, size))
+
+    ends = (0, 5), (5, 50), (50, 400)
+    sphere = {1: 2.0, 3: 4 * np.pi}[size]
+    return np.log(sphere * sum(quad(radial, *each)[0] for each in ends))
+
+
+def log_density(u, tail, size):
+    """Return that of Student's t, or of light tails, at squared norms."""
+    F = -0.5 * u**2 / (size + 2)
+    if tail != LIGHT:
+        F = -0.5 * (tail + size) * np.log1p(u / tail)
+    return F - 0.5e-3 * u
+
+
+def log_likelihood(W, Z):
+    """Return the likelihood of signals, each with its likeliest density and scale."""
+    size, total = Z.shape[2], Z.shape[2] * np.linalg.slogdet(W)[1]
+    for y in np.tensordot(W, Z, 1):
+        u = np.sum(y**2, axis=1)
+
+        def cost(log_variance, tail, u=u):
+            F = log_density(u / np.exp(log_variance), tail, size).mean()
+            return log_integral(tail, size) + size / 2 * log_variance - F
+
+        total -= min(minimize_scalar(cost, args=(tail,)).fun for tail in TAILS)
+    return total
+
+
 class TestOptimality:
-    @pytest.mark.parametrize("size", [1, 3])
-    def test_no_mixing_near_by_is_likelier(self, size, rng):
-        Z = white(sources(["product", "uniform", "student", "laplace"], 0, 200, size))
+    @pytest.mark.parametrize(
+        ("size", "unit"), [(1, 1.0), (1, 30.0), (3, 1.0), (3, 0.1)]
+    )
+    def test_no_mixing_near_by_is_likelier(self, size, unit, rng):
+        kinds = ["product", "uniform", "student", "laplace"]
+        Z = unit * sources(kinds, 0, 200, size)
         W = shared_mixing(Z)
-        most = _shared_mixing._fit_densities(W, Z)[0]
-        for _ in range(50):
-            E = 1e-3 * rng.normal(size=W.shape)
-            assert _shared_mixing._fit_densities(W + E @ W, Z)[0] < most
+        most = log_likelihood(W, Z)
+        found = _shared_mixing._fit_densities(W, Z)[0]
+        assert found == pytest.approx(most, rel=1e-7)
+        for _ in range(10):
+            step = 1e-3 * rng.normal(size=W.shape) @ W
+            below, above = (most - log_likelihood(W + s * step, Z) for s in (-1, 1))
+            assert min(below, above) > 0
+            assert below == pytest.approx(above, rel=0.2)
 
     def test_derivatives_by_differences(self, rng):
         Y, tail = rng.normal(size=(3, 40, 3)), np.array([[2.0], [LIGHT], [8.0]])
@@ -275,59 +329,6 @@ class TestOptimality:
             gains.append(many - few)
         assert np.max(gains) > 1e-3
         assert np.mean(gains) > 0.0
-
-
-class TestDensities:
-    @pytest.mark.parametrize("tail", TAILS)
-    def test_slopes_by_differences(self, tail):
-        u, tail, h = np.linspace(0.1, 20.0, 50), np.array(tail), 1e-5
-        g, dg = _shared_mixing._slopes(u, tail, 3)
-        F = [_shared_mixing._log_density(u + s, tail, 3) for s in (h, -h)]
-        assert_allclose(g, (F[0] - F[1]) / (2 * h), rtol=1e-6)
-        G = [_shared_mixing._slopes(u + s, tail, 3)[0] for s in (h, -h)]
-        assert_allclose(dg, (G[0] - G[1]) / (2 * h), rtol=1e-5)
-
-    @pytest.mark.parametrize(
-        ("size", "sphere"), [(1, 2.0), (2, 2 * np.pi), (3, 4 * np.pi)]
-    )
-    @pytest.mark.parametrize("tail", TAILS)
-    def test_integral_by_quadrature(self, tail, size, sphere):
-        def radial(r):
-            given = np.array(r * r), np.array(tail), size
-            return r ** (size - 1) * np.exp(_shared_mixing._log_density(*given))
-
-        integral = sum(quad(radial, *ends)[0] for ends in ((0, 5), (5, 50), (50, 400)))
-        value = _shared_mixing._log_integral(tail, size)
-        assert_allclose(value, np.log(sphere * integral), atol=1e-8)
-
-    @pytest.mark.parametrize("size", [1, 3])
-    @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
-    def test_tail_and_scale_are_found(self, size, scale, rng):
-        shape = (1, 20_000, size)
-        chi_square = rng.chisquare(8, size=(1, 20_000, 1))
-        student = rng.normal(size=shape) / np.sqrt(chi_square / 8)
-        uniform = np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size=shape)
-        Z = scale * np.concatenate([student, uniform])
-        _, tails, variance, _ = _shared_mixing._fit_densities(np.eye(2), Z)
-        assert_array_equal(tails, [8.0, LIGHT])
-        assert_allclose(variance[0], scale**2, rtol=0.05)
-
-    def test_scale_is_the_likeliest_and_no_change_of_units(self):
-        Z = sources(["student", "uniform", "product"], 0, 300, 3)
-        total, tails, variance, of_signals = _shared_mixing._fit_densities(np.eye(3), Z)
-        assert total == pytest.approx(of_signals.sum())
-        for y, tail, v, value in zip(Z, tails, variance, of_signals, strict=True):
-            tail, u = np.array(tail), np.sum(y**2, axis=1)
-
-            def likelihood(v, tail=tail, u=u):
-                F = _shared_mixing._log_density(u / v, tail, 3).mean()
-                return F - _shared_mixing._log_integral(tail, 3) - 1.5 * np.log(v)
-
-            values = [likelihood(factor * v) for factor in (0.999, 1.0, 1.001)]
-            assert np.argmax(values) == 1
-            assert values[1] == pytest.approx(value)
-        units = np.diag([0.1, 1.0, 30.0])
-        assert _shared_mixing._fit_densities(units, Z)[0] == pytest.approx(total)
 
 
 class TestSteps:

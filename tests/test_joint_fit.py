@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from scenes import random_scene, with_gaps
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._joint import problem as problem_module
 from isa_nrsfm._joint.fit import residual_deviations
 from isa_nrsfm._joint.problem import FactorisedTable, JointState
+from isa_nrsfm._joint.uncertainty import SIGNS
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
@@ -36,9 +37,8 @@ CALIBRATED = pytest.mark.parametrize(
 KINDS = pytest.mark.parametrize(
     ("camera", "gaps"), slow_after(1, [*product(SEEN_BY, [True, False])])
 )
-# Errors of depths are tested in test_frame_fit.py.
-QuickNRSfM = with_limits(error_steps=3)
-# The first steps are made on few frames, as of large tables.
+# Errors of depths are tested in test_frame_fit.py. The first steps are made on few
+# frames, as of large tables.
 ONE_START = {"error_steps": 3, "few_frames": 0, "widths": (), "restarts": False}
 SampledNRSfM = with_limits(**ONE_START, small_table=1000, sample=40)
 
@@ -95,24 +95,12 @@ def fit_of(camera, gaps=False, deviation=DEVIATION):
     return Fit(tracks, truth, fitted(tracks, camera=camera))
 
 
-class TestStarts:
-    def test_make_no_difference_where_there_is_one_optimum(self):
-        tracks, truth = random_table(n_frames=40, n_points=30)
-        models = [
-            fitted(tracks, kind=QuickNRSfM, isa=isa)
-            for isa in (None, FastISA(n_init=1))
-        ]
-        ends = [model.objective_history_[-1] for model in models]
-        assert np.ptp(ends) < 0.05 * len(tracks)
-        for model in models:
-            assert error_of(model, tracks, truth) < 0.02
-
-    @may_not_converge
-    def test_steps_that_end_before_further_directions(self):
-        tracks, _ = random_table(n_frames=8, n_points=250)
-        model = fitted(tracks, max_iter=5)
-        assert model.basis_.shape == (2, 250, 3)
-        assert np.isfinite(model.basis_).all()
+@may_not_converge
+def test_steps_that_end_before_further_directions():
+    tracks, _ = random_table(n_frames=8, n_points=250)
+    model = fitted(tracks, max_iter=5)
+    assert model.basis_.shape == (2, 250, 3)
+    assert np.isfinite(model.basis_).all()
 
 
 def flying_bird(n_frames=50):
@@ -135,14 +123,12 @@ def flying_bird(n_frames=50):
     return images + 0.005 * rng.normal(size=images.shape), shapes
 
 
+@pytest.mark.slow
 def test_further_starts_tell_beating_wings_from_a_bird_that_rolls():
     tracks, shapes = flying_bird()
-    errors = [
-        euclidean_error(
-            fitted(tracks, kind=kind, camera="orthographic"), tracks, shapes
-        )
-        for kind in (with_limits(error_steps=3, few_frames=0, widths=()), AffineNRSfM)
-    ]
+    kinds = (with_limits(**ONE_START | {"restarts": each}) for each in (True, False))
+    models = (fitted(tracks, kind=kind, camera="orthographic") for kind in kinds)
+    errors = [euclidean_error(model, tracks, shapes) for model in models]
     assert errors[0] < 0.5 * errors[1]
 
 
@@ -189,19 +175,16 @@ class TestCameras:
         assert euclidean_error(model, tracks, frames) < 0.02
 
 
+ROBUST_TABLES = [("huber", 150, 40, 2, 0.15), ("cauchy", 300, 8, 1, 0.2)]
+ROBUST_TABLES.append(("huber", 150, 30, 5, 0.1))
+
+
 class TestNoiseVariance:
     # The median is less precise, and the fit bends towards the inner half, with
     # "cauchy" most of all.
     @pytest.mark.parametrize(
         ("loss", "n_frames", "n_points", "n_components", "largest"),
-        slow_after(
-            1,
-            [
-                ("huber", 150, 40, 2, 0.15),
-                ("cauchy", 300, 8, 1, 0.2),
-                ("huber", 150, 30, 5, 0.1),
-            ],
-        ),
+        slow_after(1, ROBUST_TABLES),
     )
     def test_with_a_robust_loss(self, loss, n_frames, n_points, n_components, largest):
         sizes = {"n_frames": n_frames, "n_points": n_points}
@@ -301,6 +284,13 @@ class TestRobustLoss:
         assert model.noise_variance_ == pytest.approx(few.noise_variance_, rel=0.02)
         assert_allclose(model.mean_shape_, few.mean_shape_, rtol=0, atol=0.02)
         assert_allclose(model.alpha_, model.transform(table), rtol=0, atol=1e-8)
+
+
+def test_halves_differ_like_independent_tables():
+    # All parts differ alike, but for their sum, and about as two tables of this size.
+    pairs = [a - b for i, a in enumerate(SIGNS) for b in SIGNS[:i]]
+    square = np.einsum("pi,pj->ij", pairs, pairs) / len(pairs)
+    assert_allclose(square, 2 * 8 / 7 * (np.eye(15) - 1 / 15), atol=1e-12)
 
 
 class TestDegenerate:

@@ -32,6 +32,7 @@ PACKAGES = [
 ]
 # Those that wait until a name is used; the other folders import what they hold.
 WAITING = ["isa_nrsfm", "isa_nrsfm.cli", "isa_nrsfm.export", "isa_nrsfm.io"]
+HELP = [["--version"], ["--help"], ["fit", "--help"], ["export", "--help"]]
 # All that is slow to import: NumPy is the least of it.
 SLOW = {"numpy", "scipy", "sklearn", "pandas", "joblib", "matplotlib"}
 
@@ -108,6 +109,26 @@ def test_the_import_of_a_package_waits_for_nothing(name):
 
 
 @pytest.mark.subprocess
+def test_matplotlib_is_imported_only_to_draw():
+    loaded = loaded_by("import isa_nrsfm.plotting", EAGER_IMPORT="")
+    assert "matplotlib" not in loaded
+
+
+@pytest.mark.subprocess
+def test_the_estimator_brings_only_what_every_fit_needs():
+    codes = "import sklearn.decomposition", "from isa_nrsfm import AffineNRSfM"
+    before = loaded_by(codes[0])
+    options = {"EAGER_IMPORT": "", "PYTHONWARNINGS": "error"}
+    modules = loaded_by("\n".join(codes), **options) - before
+    packages = {module.partition(".")[0] for module in modules}
+    packages -= {*sys.stdlib_module_names, "isa_nrsfm"}
+    assert packages <= {"numpy", "scipy", "sklearn", "joblib", "threadpoolctl"}
+    parts = {f"isa_nrsfm.{part}" for part in ("baselines", "cli", "datasets", "io")}
+    parts |= {"isa_nrsfm.metrics", "isa_nrsfm.plotting"}
+    assert not modules & parts
+
+
+@pytest.mark.subprocess
 def test_folders_of_the_package_need_no_import_of_their_own():
     code = (
         "import isa_nrsfm\n"
@@ -135,11 +156,7 @@ def test_what_is_not_installed_is_an_error_of_the_import():
 
 
 @pytest.mark.subprocess
-@pytest.mark.parametrize(
-    "arguments",
-    [["--version"], ["--help"], ["fit", "--help"], ["export", "--help"]],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("arguments", HELP, ids=" ".join)
 def test_help_waits_for_nothing(arguments):
     assert not loaded_by(command(*arguments), EAGER_IMPORT="") & SLOW
 

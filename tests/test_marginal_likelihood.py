@@ -5,7 +5,7 @@ import pytest
 import scenes
 from frame_parts import Regression
 from numpy.testing import assert_allclose
-from scenes import likelihood_of
+from scenes import likelihood_of, shape_prior
 
 NOISE = 0.05
 PENALTY = 7.0
@@ -14,9 +14,10 @@ PENALTY = 7.0
 class Scene(scenes.Scene):
     """A table, and shapes and cameras that are near it, but not at the optimum."""
 
-    def at(self, penalty=0.0, noise=NOISE, **options):
+    def at(self, penalty=0.0, noise=NOISE, prior=None, **options):
         """Return the objective and its derivatives, frames first."""
         likelihood = likelihood_of(self.tracks, self.weights, penalty, **options)
+        likelihood = likelihood._replace(prior=prior)
         terms = likelihood(self.shapes, self.motion, noise)
         gradient = terms.motion_gradient.transpose(2, 0, 1)
         return terms._replace(motion_gradient=gradient)
@@ -125,17 +126,20 @@ class TestValue:
 
 class TestGradient:
     @PENALTIES
-    @pytest.mark.parametrize("name", ["shapes", "motion"])
+    @pytest.mark.parametrize("name", ["shapes", "motion", "shapes near a prior"])
     def test_against_differences(self, scene, penalty, name):
+        prior = shape_prior(scene) if "prior" in name else None
+        name = name.partition(" ")[0]
         field = {"shapes": "shape_gradient", "motion": "motion_gradient"}[name]
-        gradient = getattr(scene.at(penalty), field)
+        gradient = getattr(scene.at(penalty, prior=prior), field)
         rng = np.random.default_rng(1)
         for _ in range(5):
             change = rng.normal(size=gradient.shape)
             step = 1e-5
             moved = (getattr(scene, name) + s * step * change for s in (1, -1))
             above, below = (scene._replace(**{name: value}) for value in moved)
-            slope = (above.at(penalty).value - below.at(penalty).value) / (2 * step)
+            values = (each.at(penalty, prior=prior).value for each in (above, below))
+            slope = np.subtract(*values) / (2 * step)
             assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
 
     @PENALTIES

@@ -51,12 +51,10 @@ def test_missing_points_are_farther_away(side, kind):
         assert_allclose(np.linalg.det(model.rotations_), 1.0)
 
 
-@pytest.mark.parametrize(
-    ("make", "share"),
-    slow_after(
-        1, [(make_face_tracks, 0.6), (make_hand_tracks, 0.2), (make_body_tracks, 0.3)]
-    ),
-)
+SHARES = [(make_face_tracks, 0.6), (make_hand_tracks, 0.2), (make_body_tracks, 0.3)]
+
+
+@pytest.mark.parametrize(("make", "share"), slow_after(1, SHARES))
 def test_points_missing_at_random_change_nothing(make, share):
     convention, model = fits(make(60, missing=share, random_state=1).data)
     assert np.isnan(model.mirror_certainty_)

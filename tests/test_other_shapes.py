@@ -1,6 +1,5 @@
 """Tables as programs write them that are not two columns for each point of one body."""
 
-import json
 import re
 import warnings
 
@@ -8,7 +7,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import QUICK
+from fit_runs import QUICK, begun, told_of_fit
 from landmark_files import BODYPARTS, TRACKS
 from numpy.testing import assert_array_equal
 from refusals import refusals_of, refused
@@ -64,115 +63,6 @@ def moved(**names):
 TWICE = "the points are probably there more than once"
 SHOWN = np.arange(N * J).reshape(N, J) % 5 > 0
 GAPS = np.where(SHOWN, 1, np.nan).repeat(2, axis=1)
-# A table, and what is read: the points, or a part of a message.
-TABLES = {
-    "R": (LONG.rename(columns={"frame": "Image", "point": "Landmark"}), FLAT),
-    "TrackMate": (
-        LONG.set_axis(["FRAME", "SPOT", "POSITION_X", "POSITION_Y"], axis=1).assign(
-            ID=range(N * J)
-        ),
-        FLAT,
-    ),
-    "MediaPipe": (NAMED.assign(z=0.1, visibility=0.9, width=640, height=480), FLAT),
-    "Kaggle, a part": (KAGGLE[KAGGLE.type == "pose"], FLAT),
-    "ImageJ": (LONG.rename(columns={"x": "X [px]", "y": "Y [px]"}), FLAT),
-    "times": (LONG.assign(time=FRAMES / 25, score=np.linspace(0, 1, N * J)), FLAT),
-    "videos": (LONG.assign(video=FRAMES // 6, frame=FRAMES % 6), FLAT),
-    "floats are no points": (
-        LONG.drop(columns="frame").assign(
-            POSITION_T=FRAMES / 25 + 0.01, ID=range(N * J)
-        ),
-        "row_per_point",
-    ),
-    "ImageJ, multi-point": (
-        LONG[["x", "y"]].assign(**{" ": range(1, N * J + 1), "Slice": FRAMES + 1}),
-        FLAT,
-    ),
-    "hidden points": (NAMED.assign(occluded=np.arange(N * J) % 2), FLAT),
-    "VIA": (
-        LONG[["frame", "point"]].assign(
-            shape=[
-                f'{{"name":"point","cx":{x},"cy":{y}}}'
-                for x, y in LONG[["x", "y"]].values
-            ]
-        ),
-        FLAT,
-    ),
-    "people": (PEOPLE, FLAT.repeat(2, axis=0)),
-    "people without numbers": (PEOPLE.drop(columns="person"), FLAT.repeat(2, axis=0)),
-    "order": (LONG.drop(columns="point"), FLAT),
-    "frames in order": (LONG.drop(columns="frame"), FLAT),
-    "movement": (
-        tidy(coords="space", value="position", bodyparts="keypoints").assign(
-            individuals="mouse", confidence=0.5
-        ),
-        FLAT,
-    ),
-    "DeepLabCut stacked": (tidy().assign(scorer="net"), FLAT),
-    "tidyr": (wide().assign(frame=range(N)).melt("frame", var_name="name"), FLAT),
-    "pixels and millimetres": (BESIDE, "'px_x,px_y' or 'mm_x,mm_y'"),
-    "gaze": (LONG[["x", "y"]].assign(frame=range(N * J)), "row_per_point"),
-    "trials of gaze": (LONG[["x", "y"]].assign(trial=FRAMES), "row_per_point"),
-    "lists": (cells("[{}, {}]".format), FLAT),
-    "numbers above tuples": (cells("({}, {})".format, map(str, range(J))), FLAT),
-    "json": (cells(lambda x, y: json.dumps({"x": x, "y": y})), FLAT),
-    "x, y, z": (cells("({}, {}, -0.1)".format), FLAT),
-    "numpy 2": (cells("[np.float64({}), np.float64({}), 0.9]".format), FLAT),
-    "numbers as keys": (faces(lambda f: str(dict(enumerate(f.tolist())))), FLAT),
-    "objects": (
-        faces(lambda f: str([f"P(x={x}, y={y}, z=1.5, name=None)" for x, y in f])),
-        FLAT,
-    ),
-    "gaps": (cells("({}, {})".format).where(SHOWN, ""), FLAT * GAPS),
-    "None": (cells("({}, {})".format).where(SHOWN, "(None, None)"), FLAT * GAPS),
-    "shortened": (
-        faces(lambda f: f"[[{f[0, 0]} 1.5]\n ...\n [2.5 1.5]]"),
-        "leaves out",
-    ),
-    "AffectNet": (faces(lambda face: ";".join(map(str, face.ravel()))), FLAT),
-    "lists of lists": (faces(lambda face: str(face.tolist())), FLAT),
-    "numpy": (faces(str), FLAT),
-    "lists of x": (
-        pd.DataFrame(
-            {a: map(str, TRACKS[..., k].tolist()) for k, a in enumerate("xy")}
-        ),
-        FLAT,
-    ),
-    "lengths": (faces(lambda f: str(f[: 7 + int(f[0, 0]) % 2].tolist())), "'points'"),
-    "world": (wide().join(wide("{part}_world_{axis}", TRACKS / 9)), TWICE),
-    "before": (wide().join(wide("world_{part}_{axis}", TRACKS / 9)), TWICE),
-    "units": (wide("{part}_px_{axis}").join(wide("{part}_mm_{axis}")), TWICE),
-    "derivatives": (
-        wide().join(wide("{part}_vel_{axis}")).join(wide("{part}_acc_{axis}")),
-        TWICE,
-    ),
-    "camel": (wide().join(wide("{part}Filtered_{axis}")), TWICE),
-    "numbered": (
-        wide("{axis}_{part}", parts=range(J)).join(
-            wide("world_{axis}_{part}", parts=range(J))
-        ),
-        TWICE,
-    ),
-    "after": (wide("{axis}_{part}").join(wide("{axis}_{part}_raw")), TWICE),
-    "velocities": (
-        moved(gyro_x=1, gyro_y=2)
-        .join(wide("{part}_smooth_{axis}"))
-        .join(wide("{part}_velocity_{axis}")),
-        TWICE,
-    ),
-    "cameras": (
-        wide("{part}_leftcam_{axis}").join(wide("{part}_rightcam_{axis}")),
-        "views of several cameras",
-    ),
-    "force plate": (moved(force_x=1, force_y=2, COP_x=1, COP_y=2), FLAT),
-    "gyroscope": (moved(gyro_x=1, gyro_y=2, gyro_z=3), FLAT),
-    "gaze angles": (moved(gaze_angle_x=1, gaze_angle_y=2), FLAT),
-    "head": (moved(head_rotation_x=1, head_rotation_y=2), FLAT),
-    "box": (moved(bbox_center_x=1, bbox_center_y=2), FLAT),
-    "cursor": (moved(mouse_x=1, mouse_y=2, cursor_x=3, cursor_y=1), FLAT),
-    "centroid": (moved(centroid_x=1, centroid_y=2), FLAT),
-    "targets": (wide("target_{part}_{axis}"), FLAT),
-}
 
 
 def read(path, **options):
@@ -185,32 +75,47 @@ def read(path, **options):
     return " ".join([*(str(each.message) for each in caught), error]), found
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-@pytest.mark.parametrize("name", TABLES)
-def test_tables_of_other_shapes(tmp_path, name, suffix):
-    (table, expected), path = TABLES[name], tmp_path / f"a{suffix}"
-    if suffix == ".csv":
-        table.to_csv(path, index=False)
-    else:
-        table.to_parquet(path, index=False)
-    told, found = read(path)
-    if isinstance(expected, str):
-        assert expected in told
+def both_kinds(folder, table):
+    """Yield a table read from text and from parquet: path, what is told, landmarks."""
+    table.to_csv(text := folder / "a.csv", index=False)
+    table.to_parquet(typed := folder / "a.parquet", index=False)
+    yield from ((path, *read(path)) for path in (text, typed))
+
+
+def advice_on(folder, table):
+    """Return what is told of a table; columns to choose are right."""
+    for path, told, _ in both_kinds(folder, table):
         advised = re.findall(r"'([^' ]*,[-+][^']*)'", told)
-        assert bool(advised) == (expected == TWICE)
+        assert bool(advised) == (TWICE in told)
         for columns in advised:
             assert len(read_landmarks(path, columns=columns).point_names) == J
-        return
-    assert_array_equal(found.points, expected)
-    assert bool(told) == (name != "targets")
-    if option := re.search("row_per_point='(.*?)'", told):  # the same, as it says
-        again = read(path, row_per_point=option[1])[1]
-        pd.testing.assert_frame_equal(again.points, found.points)
-        pd.testing.assert_frame_equal(again.frames, found.frames)
-    if left := re.search("the columns (.*) are no points", told):
-        every = re.search("columns='(.*)'", told)[1]
-        more = len(read_landmarks(path, columns=every).point_names) - J
-        assert 2 * more == len([n for n in left[1].split(", ") if n[-1] != "z"])
+    return told
+
+
+def quietly_read(folder, table):
+    """Return points that are read without any advice."""
+    (_, told, found), (_, typed, same) = both_kinds(folder, table)
+    assert told == typed == ""
+    assert_array_equal(found.points, same.points)
+    return found.points.to_numpy()
+
+
+def points_in(folder, table):
+    """Return the points of a table; the options that are told give the same."""
+    first = None
+    for path, told, found in both_kinds(folder, table):
+        assert told
+        first = found.points if first is None else first
+        assert_array_equal(found.points, first)
+        if option := re.search("row_per_point='(.*?)'", told):
+            again = read(path, row_per_point=option[1])[1]
+            pd.testing.assert_frame_equal(again.points, found.points)
+            pd.testing.assert_frame_equal(again.frames, found.frames)
+        if left := re.search("the columns (.*) are no points", told):
+            every = re.search("columns='(.*)'", told)[1]
+            more = len(read_landmarks(path, columns=every).point_names) - J
+            assert 2 * more == len([n for n in left[1].split(", ") if n[-1] != "z"])
+    return first.to_numpy()
 
 
 def test_other_columns_of_a_row_for_each_point():
@@ -227,14 +132,6 @@ def test_other_columns_of_a_row_for_each_point():
     assert_array_equal(found, FLAT)
     with pytest.warns(match="row_per_point='frame,type[+]point'"):
         refused("more than one set", landmark_table, KAGGLE)
-    wrong = {"row_per_point": "image,landmark"}
-    refused(r"no \['image', 'landmark'\]", landmark_table, LONG, **wrong)
-    refused(
-        "several rows for the point '0'",
-        landmark_table,
-        PEOPLE,
-        row_per_point="frame,point",
-    )
 
 
 def test_a_fit_of_a_row_for_each_point(tmp_path, fits, transforms):
@@ -268,19 +165,14 @@ def told_of_columns(folder, table):
     return ["Each column was scaled separately" in text for text in texts]
 
 
-@pytest.mark.parametrize(
-    ("further", "n"),
-    [
-        ([THIRD], 3),
-        ([SEEN], 3),
-        ([0 * SEEN], 3),
-        ([THIRD, SEEN], 4),
-        ([THIRD, 0 * SEEN], 4),
-    ],
-)
+FURTHER = [[THIRD], [SEEN], [0 * SEEN], [THIRD, SEEN], [THIRD, 0 * SEEN]]
+
+
+@pytest.mark.parametrize("further", FURTHER)
 @pytest.mark.parametrize("tracks", [FACES, PIXELS])
 @pytest.mark.filterwarnings("ignore:(in 1 of|68 of 136)")
-def test_points_of_three_or_four_numbers(tracks, further, n):
+def test_points_of_three_or_four_numbers(tracks, further):
+    n = 2 + len(further)
     X = np.concatenate([tracks, *further], axis=2)
     for layout, axes in (("interleaved", (0, 1, 2)), ("planar", (0, 2, 1))):
         fit = AffineNRSfM(1, layout=layout, refinement=None).fit
@@ -318,37 +210,24 @@ def test_points_that_stand_still(still):
 SCORES = np.linspace(0.02, 0.4, N * J).reshape(N, J)
 
 
-@pytest.mark.parametrize(
-    ("scores", "told"),
-    [
-        (SCORES, ""),  # of Detectron2
-        (0 * SCORES, ""),  # of MediaPipe's faces
-        (0 * SCORES + 0.5, ""),
-        (250 * SCORES, ""),
-        (1 - SCORES, ""),
-        (1 - 1.5 * SCORES, "--min-confidence 0.6"),
-        (1 - 2.4 * SCORES, "--weights confidence"),
-    ],
-)
-def test_confidences_of_other_scales(tmp_path, begins, fails, scores, told):
+def told_of_scores(folder, scores):
+    """Return what the command tells of confidences, which are used as they should."""
     scores, tracks = np.tile(scores, (2, 1)), make_face_tracks(24, random_state=1).data
     tracks = tracks.reshape(24, 68, 2)[:, ::9] * 100 + 300
     names = [f"{part}_score" for part in BODYPARTS]
     table = wide("{part}_{axis}", tracks).join(pd.DataFrame(scores, columns=names))
-    table.to_csv(path := tmp_path / "a.csv", index=False)
-    err = begins(path)
-    assert told in err if told else "confidence" not in err
+    table.to_csv(path := folder / "a.csv", index=False)
+    of_command = begun(path)
     if scores.min() == scores.max():
-        option = ["--weights", "confidence"]
-        assert "left out" not in fails(
-            "fit", path, *QUICK, "1", "-o", tmp_path, *option
-        )
+        options = " ".join([*QUICK, "1", "--weights", "confidence"])
+        assert "left out" not in str(refused(None, told_of_fit, path, options))
     told = read(path, min_confidence=0.6)[0]
     assert ("no point has" in told) == (0 < scores.max() < 0.6)
     assert ("no probabilities: a threshold" in told) == (scores.max() > 2)
     table[names] = np.where(scores >= np.median(scores), "True", "FALSE")
     table.to_csv(path, index=False)
     assert_array_equal(read_landmarks(path).confidence, table[names] == "True")
+    return of_command
 
 
 OBJECTS = [{"x": x, "y": y, "z": 0.5, "visibility": 0.9} for x, y in TRACKS[0].tolist()]

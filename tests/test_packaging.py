@@ -23,13 +23,6 @@ DATA = "py.typed cli/options.toml cli/report.html datasets/face_model.csv"
 DATA += " datasets/face_prior.npz export/viewer.html export/viewer.js io/formats.toml"
 DATA += " skeletons/layouts.toml"
 DATA = {f"isa_nrsfm/{name}" for name in DATA.split()}
-FOUND_AT_IMPORT = """
-import sys, sklearn.decomposition
-before = set(sys.modules)
-from isa_nrsfm import AffineNRSfM
-print(*(set(sys.modules) - before))
-"""
-OWN_PARTS = ("baselines", "cli", "datasets", "io", "metrics", "plotting")
 FIT_OF_AN_ARRAY = """
 import sys
 
@@ -74,18 +67,6 @@ def built(kind, folder, monkeypatch):
 
     monkeypatch.chdir(ROOT)
     return folder / getattr(build, f"build_{kind}")(str(folder))
-
-
-@pytest.mark.subprocess
-def test_estimator_brings_only_what_every_fit_needs():
-    command = [sys.executable, "-W", "error", "-c", FOUND_AT_IMPORT]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    modules = set(done.stdout.split())
-    packages = {module.partition(".")[0] for module in modules}
-    packages -= {*sys.stdlib_module_names, "isa_nrsfm"}
-    assert packages <= {"numpy", "scipy", "sklearn", "joblib", "threadpoolctl"}
-    assert "isa_nrsfm" in modules
-    assert not modules & {f"isa_nrsfm.{part}" for part in OWN_PARTS}
 
 
 @pytest.mark.subprocess

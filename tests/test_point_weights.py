@@ -15,7 +15,7 @@ from layers import slow_after, start_may_not_converge
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from refusals import refusals_of, refused, warned
+from refusals import refusals_of, warned
 from scenes import waving_scene
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
@@ -245,9 +245,6 @@ class TestMethods:
                 call(X, point_weight=weights), call(holed), strict=True
             ):
                 assert_array_equal(found, expected)
-        decomposed = model.decompose(X, point_weight=weights)
-        message = "point_weight needs the table; give it to decompose"
-        refused(message, model.reconstruct, decomposed, point_weight=weights)
 
     @pytest.mark.slow
     def test_smoothed_coefficients_are_those_of_weighted_frames(self, rng):
@@ -265,11 +262,6 @@ class TestMethods:
             for options in ({"point_weight": weights}, {})
         ]
         assert found[0] < 0.8 * found[1]
-
-    def test_dataframes_and_lists(self):
-        X, weights, _ = noisy()
-        found = fitted().transform(X, point_weight=pd.DataFrame(weights))
-        assert_array_equal(found, fitted().transform(X, point_weight=weights.tolist()))
 
 
 class TestRouting:
@@ -305,66 +297,56 @@ class TestRouting:
         assert search.cv_results_["split0_test_score"][1] == expected
 
 
-class TestRefusals:
-    @pytest.mark.parametrize(
-        ("value", "message"),
-        [
-            (-0.5, "between 0 and 1e.30, because .* got -0.5 in row 2, point 3"),
-            (1e101, "got 1e.101 in row 2"),
-            (np.nan, "point_weight contains NaN"),
-            (np.inf, "point_weight contains infinity"),
-        ],
-    )
-    @pytest.mark.parametrize("method", ["fit", "transform", "decompose", "score"])
-    def test_values(self, method, value, message):
-        weights = noisy().weights.copy()
-        weights[2, 3] = value
-        model = estimator() if method == "fit" else fitted()
-        refused(message, getattr(model, method), noisy().X, point_weight=weights)
+def with_weight(value, method="fit"):
+    """Call a method with a weight of this value in row 2, point 3."""
+    weights = noisy().weights.copy()
+    weights[2, 3] = value
+    model = estimator() if method == "fit" else fitted()
+    return getattr(model, method)(noisy().X, point_weight=weights)
 
-    @pytest.mark.parametrize("shape", [(60, 40), (59, 20), (1, 20)])
-    def test_shape(self, shape):
-        message = r"a column for each point, the shape \(60, 20\); got "
-        refused(message, estimator().fit, noisy().X, point_weight=np.ones(shape))
-        refused(message, fitted().transform, noisy().X, point_weight=np.ones(shape))
 
-    def test_tables_that_are_not_in_memory(self, tmp_path):
-        np.save(tmp_path / "table.npy", noisy().X)
-        mapped = np.load(tmp_path / "table.npy", mmap_mode="r")
-        with pytest.raises(ValueError, match=r"table in memory.* Give"):
-            estimator().fit(mapped, point_weight=noisy().weights)
-        (tmp_path / "parts").mkdir()
-        for name, part in zip("ab", np.split(noisy().X, 2), strict=True):
-            np.save(tmp_path / "parts" / f"{name}.npy", part)
-        stored = open_table(tmp_path / "parts")
-        with pytest.raises(ValueError, match="needs a table in memory"):
-            fitted().transform(stored, point_weight=noisy().weights)
+def few_weights(least):
+    """Return weights whose sum is a little below the least number of each frame."""
+    return noisy().weights * (0.99 * least * N_FRAMES / noisy().weights.sum())
 
-    @pytest.mark.parametrize(("camera", "least"), [("affine", 5), ("orthographic", 4)])
-    def test_fewer_observations_than_unknowns(self, camera, least):
-        weights = noisy().weights * (0.99 * least * N_FRAMES / noisy().weights.sum())
-        message = f"fewer than the {least} that .* Multiply point_weight by a number"
-        refused(message, estimator(camera=camera).fit, noisy().X, point_weight=weights)
+
+def mapped(folder):
+    np.save(folder / "table.npy", noisy().X)
+    return np.load(folder / "table.npy", mmap_mode="r")
+
+
+def in_files(folder):
+    for name, part in zip("ab", np.split(noisy().X, 2), strict=True):
+        np.save(folder / f"{name}.npy", part)
+    return open_table(folder)
+
+
+def written_table(folder, **further):
+    """Return a file of points without confidences."""
+    names = [f"{axis}_{j}" for j in range(N_POINTS) for axis in "xy"]
+    table = pd.DataFrame(noisy().X, columns=names).assign(**further)
+    table.to_csv(path := folder / "table.csv", index=False)
+    return path
+
+
+def keypoints(folder):
+    """Return a file of keypoints with their confidences."""
+    X, weights, _ = noisy()
+    points = np.dstack([100 * X.reshape(N_FRAMES, -1, 2) + 300, weights])
+    points[4, 3, 2] = 0.0
+    rows = [
+        {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
+        for i, row in enumerate(points)
+    ]
+    (path := folder / "results.json").write_text(json.dumps(rows))
+    return path
 
 
 class TestCommandLine:
     QUICK = ("-k", "2", *JOINT)
 
-    @pytest.fixture
-    def results(self, tmp_path):
-        """Return a file of keypoints with their confidences."""
-        X, weights, _ = noisy()
-        points = np.dstack([100 * X.reshape(N_FRAMES, -1, 2) + 300, weights])
-        points[4, 3, 2] = 0.0
-        path = tmp_path / "results.json"
-        rows = [
-            {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
-            for i, row in enumerate(points)
-        ]
-        path.write_text(json.dumps(rows))
-        return path
-
-    def test_all_results_of_some_points_are_weighted(self, results, tmp_path, succeeds):
+    def test_all_results_of_some_points_are_weighted(self, tmp_path, succeeds):
+        results = keypoints(tmp_path)
         options = ["--weights", "confidence"]
         options += ["--points", "without:3,7", "--fps", 25, "--std"]
         succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
@@ -390,20 +372,7 @@ class TestCommandLine:
         again = pd.read_csv(new)[["alpha_1", "alpha_2"]]
         assert_allclose(again, model.alpha_, atol=1e-6)
 
-    def test_refusals(self, results, tmp_path, fails):
-        options = ["--weights", "confidence", "-o", tmp_path / "out", "--no-figures"]
-        message = fails("fit", results, *options, "-k", "1-2")
-        assert "--weights needs one number of basis shapes" in message
-        table = tmp_path / "table.csv"
-        names = [f"{axis}_{j}" for j in range(N_POINTS) for axis in "xy"]
-        pd.DataFrame(noisy().X, columns=names).to_csv(table, index=False)
-        message = fails("fit", table, *options, "-k", "2")
-        assert "has no confidences of all points. Their columns need" in message
-        frame = pd.DataFrame(noisy().X, columns=names)
-        scores = {f"c_{j}": "good" if j == 3 else 1.0 for j in range(N_POINTS)}
-        frame.assign(**scores).to_csv(table, index=False)
-        message = fails("fit", table, *options, "-k", "2")
-        assert "column 'c_3' should hold numbers, but in row 0" in message
 
-
+SCORES = {f"c_{j}": "good" if j == 3 else 1.0 for j in range(N_POINTS)}
+WEIGHTED = "--weights confidence --no-figures -k"
 test_refusals = refusals_of("point_weights", globals())

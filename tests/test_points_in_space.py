@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from layers import slow_after, with_limits
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 from scipy.io import netcdf_file
@@ -15,7 +16,7 @@ from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid
 from isa_nrsfm.export import frame_points, write_points
 
 MAKE = {
-    "faces": lambda **k: make_face_tracks(80, n_components=3, noise=0.02, **k),
+    "faces": lambda **k: make_face_tracks(50, n_components=3, noise=0.02, **k),
     "bodies": lambda **k: make_body_tracks(150, noise=0.02, **k),
     "clouds": lambda **k: make_nonrigid_tracks(150, 30, 2, noise=0.02, **k),
     "near": lambda **k: make_face_tracks(
@@ -156,6 +157,7 @@ def test_depths_that_are_not_determined(face, tmp_path):
 TABLE = make_face_tracks(40, n_components=1, random_state=0, noise=0.01).data
 
 
+@made_once
 def plain_model(**params):
     return AffineNRSfM(1, random_state=0, **params).fit(TABLE)
 

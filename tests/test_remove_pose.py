@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose
 from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.analysis._diagnostics import pose_share
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.io import load_model, save_model
@@ -84,8 +83,6 @@ def test_new_frames_lose_what_the_fit_has_found(model):
     found = model.transform(new)
     assert_allclose(found, fit.alpha - part.T, atol=1e-8)
     assert_allclose(found[7:8], model.transform(new[7:8]), atol=1e-9)
-    assert pose_share(fit.motion, fit.alpha).max() > 0.5
-    assert pose_share(fit.motion, found).max() < 0.3
     new[3] = np.nan
     assert np.isnan(model.transform(new)[3]).all()
 

@@ -19,7 +19,6 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
-from isa_nrsfm._selection import results_of, selected
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0).data
@@ -169,28 +168,21 @@ def test_metadata_without_routing_are_refused(fitted, method):
         getattr(fitted, method)(X, weight=PERSON)
 
 
-def test_fewest_basis_shapes_within_one_standard_error():
-    # Means -0.03, -0.011, -0.010; the standard error of the best is 0.0015.
-    scores = np.array([[-0.03, -0.03], [-0.011, -0.011], [-0.0115, -0.0085]])
-    assert selected(scores, "best") == 2
-    assert selected(scores, "one_standard_error") == 1
-    scores[1] -= 0.0006
-    assert selected(scores, "one_standard_error") == 2
-    # A score that is not known is never chosen.
-    scores[0] = np.nan
-    assert selected(scores, "one_standard_error") == 2
-
-
-def test_fewest_basis_shapes_are_fitted():
-    scores = {1: -0.030, 2: -0.011, 3: -0.010}
+def searched(select="best", **scores):
+    """Return a search with these scores of two parts, by the number of basis shapes."""
+    first = X[0, 0]
 
     def scorer(estimator, X, y=None):
-        return scores[len(estimator.basis_)] + 0.0015 * np.sign(X[0, 0] - first)
+        part = int(np.any(X[:, 0] == first))
+        return np.broadcast_to(scores[f"K{len(estimator.basis_)}"], 2)[part]
 
-    first = np.median(X[[0, 30], 0])
-    options = {"cv": 2, "scoring": scorer, "select": "one_standard_error"}
-    search = AffineNRSfMCV((1, 2, 3), estimator=quick(tol=1.0), **options).fit(X)
-    assert search.n_components_ == len(search.best_estimator_.basis_) == 2
+    estimator = inner(refinement=None, isa=FastISA(n_init=1))
+    options = {"cv": 2, "scoring": scorer, "select": select}
+    return AffineNRSfMCV((1, 2, 3), estimator=estimator, **options).fit(X)
+
+
+# The standard error of the best is 0.0015.
+BEST = (-0.0115, -0.0085)
 
 
 def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
@@ -223,16 +215,6 @@ def test_held_out_rows_are_not_fitted_without_joint_refinement():
     search = AffineNRSfMCV((1,), estimator=estimator, cv=2).fit(table)
     ours = [search.cv_results_[f"split{i}_test_score"][0] for i in range(2)]
     assert_allclose(ours, cross_val_score(estimator, table, cv=2), rtol=1e-9)
-
-
-NAMES = "fit_time score_time test_score path_time".split()
-
-
-def test_the_best_mean_score_ranks_first_and_unknown_ones_last():
-    means = [-0.5, np.nan, -0.2, -0.5, -0.9]
-    parts = [dict.fromkeys(NAMES, np.full(2, mean)) for mean in means]
-    results = results_of(range(1, 6), parts)
-    assert_array_equal(results["rank_test_score"], [2, 5, 1, 2, 4])
 
 
 test_refusals = refusals_of("selection", globals())

@@ -238,24 +238,15 @@ def test_memory_maps_are_taken_as_arrays_where_that_is_needed(tmp_path):
     assert_array_equal(got.basis_, expected.basis_)
 
 
-class TestOpenTable:
-    @pytest.mark.parametrize("kind", ["npy", "parquet"])
-    def test_slices_are_rows(self, tmp_path, kind):
-        X = table(0.1)
-        blocks = stored(X, tmp_path, kind, n_files=4)
-        assert blocks.shape == X.shape
-        assert len(blocks) == len(X)
-        for rows in (slice(0, 10), slice(30, 130), slice(140, 400), slice(5, 5)):
-            assert_array_equal(blocks[rows], X[rows])
-        refused("slice without steps", blocks.__getitem__, 3, error=TypeError)
+def slices_of(folder, kind, *slices):
+    """Return rows of a table in four files."""
+    blocks = stored(table(0.1), folder, kind, n_files=4)
+    assert len(blocks) == blocks.shape[0] == 150
+    return [blocks[rows] for rows in slices]
 
-    def test_one_array_is_mapped(self, tmp_path):
-        np.save(tmp_path / "table.npy", table())
-        assert isinstance(open_table(tmp_path / "table.npy"), np.memmap)
 
-    def test_single_precision_parquet(self, tmp_path):
-        blocks = stored(table().astype(np.float32), tmp_path, "parquet")
-        assert blocks.dtype == blocks[:3].dtype == np.float32
+SLICES = slice(0, 10), slice(30, 130), slice(140, 400), slice(5, 5)
+SINGLE = table().astype(np.float32)
 
 
 def spoilt(place, value):

@@ -97,44 +97,25 @@ def test_numbers_of_frames_for_calibrated_cameras(n_points, n_components, rng):
     refused(f"needs at least {n_frames} frames", model.fit, table_of(tracks))
 
 
-class TestNames:
-    @both_layouts
-    def test_names_that_do_not_contradict(self, layout):
-        for axes in ("ab", "xy"):
-            pairs = [[f"{axis}{j}" for axis in axes] for j in range(30)]
-            names = np.array(pairs).T if layout == "planar" else np.array(pairs)
-            X = pd.DataFrame(table_of(FACES, layout), columns=names.ravel())
-            assert fit(X, layout=layout).n_features_in_ == 60
+def names_of(layout, axes):
+    """Return the table of both layouts under names with these letters of the axes."""
+    pairs = [[f"{axis}{j}" for axis in axes] for j in range(30)]
+    names = np.array(pairs).T if layout == "planar" else np.array(pairs)
+    return pd.DataFrame(table_of(FACES, layout), columns=names.ravel())
+
+
+# The object has size 1 and may be far away from the corner of the image.
+FAR = 300.0 * np.array([1.0, 0.0])
+# Long tables are sampled evenly.
+LONG = np.tile(FACES, (100, 1, 1))
+HALF = make_face_tracks(60, missing=0.3, random_state=0).data
 
 
 class TestOtherLayout:
-    @pytest.mark.parametrize("scale_frames", [True, False])
-    @both_layouts
-    def test_is_warned_of(self, layout, scale_frames):
-        (other,) = set(LAYOUTS) - {layout}
-        message = rf"layout='{other}' explains the table much better than "
-        message += rf"layout='{layout}': what one basis shape leaves has 0\.\d+ times"
-        X = table_of(FACES, other)
-        warned(message, fit, X, layout=layout, scale_frames=scale_frames)
-
-    # The object has size 1 and may be far away from the corner of the image.
-    @pytest.mark.parametrize("scale_frames", [True, False])
-    @both_layouts
-    @pytest.mark.parametrize(("unit", "offset"), [(1e-9, 0), (1, 300.0)])
-    def test_the_right_layout_is_quiet(self, layout, scale_frames, unit, offset):
-        X = table_of(unit * (FACES + np.array([offset, 0.0])), layout)
-        fit(X, layout=layout, scale_frames=scale_frames)
-
     @pytest.mark.filterwarnings("ignore:in 60 of 60 rows points have only one")
-    @pytest.mark.parametrize("kind", ["long", "missing"])
-    def test_long_tables_and_those_with_missing_points(self, kind):
-        # Long ones are sampled evenly.
-        if kind == "long":
-            X = table_of(np.tile(FACES, (100, 1, 1)))
-        else:
-            X = make_face_tracks(60, missing=0.3, random_state=0).data
-        fit(X)
-        warned("layout='interleaved' explains", fit, X, layout="planar")
+    def test_of_missing_points(self):
+        fit(HALF)
+        warned("layout='interleaved' explains", fit, HALF, layout="planar")
 
     def test_tables_that_both_layouts_explain(self, rng):
         fit(table_of(rng.normal(size=(20, 3)) @ rng.normal(size=(20, 3, 2))))
@@ -194,17 +175,12 @@ def test_pandas_na_is_missing(model, dtype):
     assert_array_equal(model.transform(frame), expected)
 
 
+KINDS_OF_FITS = [{"camera": name} for name in ("weak_perspective", "orthographic")]
+KINDS_OF_FITS += [{"loss": "cauchy"}, {"refinement": None, "scale_frames": False}]
+
+
 @pytest.mark.parametrize("size", slow_after(1, [2.0**-460, 2.0**460]))
-@pytest.mark.parametrize(
-    "params",
-    [
-        {"loss": "cauchy"},
-        {"camera": "weak_perspective"},
-        {"camera": "orthographic"},
-        {"refinement": None, "scale_frames": False},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("params", KINDS_OF_FITS, ids=str)
 def test_sizes_within_the_range_change_no_coefficient(params, size):
     """Powers of two: the numbers of the larger table are the same but for exponents."""
     with warnings.catch_warnings():

@@ -1,10 +1,10 @@
 """Tables as people write them: CONTRIBUTING lists each way and what happens."""
 
+import contextlib
 import gzip
 import json
 import re
 import warnings
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -20,6 +20,7 @@ from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.cli._columns import asked_columns
 from isa_nrsfm.cli._options import build_parser
 from isa_nrsfm.cli._reading import read_frames
+from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table, open_table, read_landmarks, read_table
 from isa_nrsfm.skeletons import read_skeleton
@@ -52,11 +53,6 @@ def asked_in(folder, columns, *options, suffix=".csv"):
     return asked_columns(*read_by_fit(path, *options))
 
 
-@pytest.fixture
-def asked(tmp_path):
-    return partial(asked_in, tmp_path)
-
-
 def seconds(times):
     times = np.asarray(times)
     if times.dtype.kind == "M":
@@ -78,45 +74,14 @@ def times_in(folder, cells):
     return [*np.round(seconds(found)[: len(cells)], 6)]
 
 
-def test_times_of_several_ways_of_writing_are_refused(asked):
-    cells = [f"{i}/03/2024" for i in range(8, N + 7)]
-    columns, time = {"t": [*cells, "tomorrow"]}, ["--time", "t"]
-    refused("1 of 24 are not .*row 23, 'tomorrow'", asked, columns, *time)
-    cells = [f"2024-02-01T12:00:{i}Z" for i in range(10, N + 9)]
-    columns = {"t": [*cells, "2024-02-01T13:00:00"]}
-    refused("23 of 24 .* zone, .* none .*row 23, '2024", asked, columns, *time)
-
-
-@pytest.mark.parametrize(
-    ("cell", "format", "step"),
-    [
-        ("{:02d}/02/2024", "%m/%d/%Y", 31 * DAY),
-        ("202402{:02d}", "%Y%m%d", DAY),
-        ("99:{:02d}", "%M:%S", 1),
-        ("0:{:02d}", "%H:%M", 60),
-    ],
-)
-def test_time_format_decides(asked, cell, format, step):
+def steps_of(folder, cell, *options):
+    """Return the times of twelve cells, in seconds from the first one."""
     cells = {"t": [cell.format(i) for i in range(1, 13)]}
-    found = asked(cells, "--time", "t", "--time-format", format).times
-    assert seconds(found)[1] == step
-    options = ["--time", "t", "--time-format", f"{format}x"]
-    refused(f"written as {format}x.*12 of 12", asked, cells, *options)
-    refused("--time-format needs --time", asked, cells, "--time-format", format)
+    return seconds(asked_in(folder, cells, *options).times)
 
 
-@pytest.mark.parametrize(
-    "times",
-    [
-        pd.date_range("2024-10-27", periods=N, freq="h", tz="Europe/Berlin"),
-        pd.to_timedelta(np.arange(N), unit="h"),
-    ],
-)
-def test_times_of_parquet_files_keep_their_type(asked, times):
-    found = asked({"t": times}, "--time", "t", suffix=".parquet").times
-    np.testing.assert_array_equal(seconds(found), 3600.0 * np.arange(N))
-
-
+DAYS = [f"{i}/03/2024" for i in range(8, N + 7)]
+ZONED = [f"2024-02-01T12:00:{i}Z" for i in range(10, N + 9)]
 ROWS = np.arange(N)
 FACES = {"face": np.where(ROWS % 2, "right", "left")}
 
@@ -129,64 +94,47 @@ def images_of(folder, columns, options):
     )
 
 
-LONG_NAMES = "123456789012345678901", "123456789012345678902"
-NAMES = [("007", "7"), ("1.1", "1.10"), ("1e5", "100000"), LONG_NAMES]
+def numbers_in(names):
+    """Return the numbers of frames in names of images."""
+    return list(image_numbers(pd.DataFrame({"image": names.split()})))
 
 
-@pytest.mark.parametrize("names", NAMES)
-def test_names_are_texts(asked, names):
-    cells = np.resize(names, N)
-    found = asked({"who": cells}, "--label", "who:classes", "--group", "who")
-    assert sorted(set(found.labels[0].values)) == sorted(names)
-    assert sorted(set(found.groups)) == sorted(names)
-    if "." not in names[0]:
-        found = asked({"who": cells}, "--label", "who")
-        assert sorted(set(found.labels[0].values)) == sorted(names)
+def names_in(folder, *names):
+    """Return the classes and groups of a column with these names."""
+    options = "--label", "who:classes", "--group", "who"
+    found = asked_in(folder, {"who": np.resize(names, N)}, *options)
+    assert {*found.labels[0].values} == {*found.groups}
+    return sorted({*found.groups})
 
 
-@pytest.mark.parametrize(
-    ("cells", "classes"),
-    [([10, 9, 8], ["8", "9", "10"]), (["round", "none"], ["none", "round"])],
-)
-def test_whole_numbers_and_none_are_classes_in_their_order(asked, cells, classes):
-    (label,) = asked({"age": np.resize(cells, N)}, "--label", "age").labels
-    assert [str(name) for name in label.cat.categories] == classes
+def classes_in(folder, *cells):
+    """Return the classes of a column, in their order."""
+    found = asked_in(folder, {"who": np.resize(cells, N)}, "--label", "who")
+    return [str(name) for name in found.labels[0].cat.categories]
 
 
-def test_labels_of_parquet_files_keep_their_type(asked):
-    days = pd.to_datetime(["2024-02-01", "2024-02-02"] * (N // 2))
-    columns = {"day": days, "mood": ["1", "b"] * (N // 2)}
-    columns["ok"] = [True, False] * (N // 2)
-    options = ["--label", "day", "--label", "mood", "--label", "ok"]
-    found = asked(columns, *options, suffix=".parquet").labels
-    assert [each.dtype for each in found] == ["category"] * 3
-    assert set(found[0].values) == {"2024-02-01", "2024-02-02"}
-    for name, got in (("day", "'2024-02-01' in row 0"), ("mood", "'b' in row 1")):
-        message, option = f"{name}:number: .* numbers; got {got}", f"{name}:number"
-        refused(message, asked, columns, "--label", option, suffix=".parquet")
+TYPED = {"day": pd.to_datetime(["2024-02-01", "2024-02-02"] * (N // 2))}
+TYPED |= {"mood": ["1", "b"] * (N // 2), "ok": [True, False] * (N // 2)}
 
 
-@pytest.mark.parametrize(
-    ("word", "suffix"),
-    [
-        ("NA", ".parquet"),
-        *((word, ".csv") for word in ("NULL", "n/a", "", " ", "<NA>")),
-    ],
-)
-def test_words_for_missing_are_missing(asked, word, suffix):
+def labels_with(folder, word, *options, suffix=".csv"):
+    """Return labels of which row 4 has a word for missing."""
     columns = {
-        "mood": np.where(np.arange(N) % 3, "up", "down").astype(object),
-        "age": (20.5 + np.arange(N)).astype(str).astype(object),
+        "mood": np.where(ROWS % 3, "up", "down").astype(object),
+        "age": (20.5 + ROWS).astype(str).astype(object),
     }
     for cells in columns.values():
         cells[4] = word
-    options = ["--label", "mood", "--label", "age"]
-    mood, age = asked(columns, *options, suffix=suffix).labels
+    return asked_in(folder, columns, *options, suffix=suffix).labels
+
+
+def missing_in(folder, word, suffix=".csv"):
+    """Return the rows that lack a class and a number."""
+    labels = "--label", "mood", "--label", "age"
+    mood, age = labels_with(folder, word, *labels, suffix=suffix)
     assert set(mood.dropna()) == {"up", "down"}
     assert age.dtype == float
-    assert list(np.flatnonzero(mood.isna())) == list(np.flatnonzero(age.isna())) == [4]
-    message = r"--group: 1 of 24 frames have no 'mood' .*w 4"
-    refused(message, asked, columns, "--group", "mood", suffix=suffix)
+    return [list(np.flatnonzero(label.isna())) for label in (mood, age)]
 
 
 def test_texts_of_tables_are_no_mathematics():
@@ -222,38 +170,33 @@ def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
         np.testing.assert_array_equal(open_table(tmp_path / kind)[:][:, 0], order)
 
 
-@pytest.fixture
-def tracks_read(tmp_path):
-    """Return a function that reads tracks as the command fit does, with warnings."""
-
-    def read(tracks, *options):
-        path = tmp_path / "table.csv"
-        values = tracks.reshape(len(tracks), -1)
-        pd.DataFrame(values, columns=POINTS).to_csv(path, index=False)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            _, frames = read_by_fit(path, *options)
-        return frames.points.to_numpy(), [str(each.message) for each in caught]
-
-    return read
+def tracks_read(folder, tracks, *options):
+    """Read tracks as the command fit does; return points and texts of warnings."""
+    table = pd.DataFrame(tracks.reshape(len(tracks), -1), columns=POINTS)
+    table.to_csv(path := folder / "table.csv", index=False)
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        _, frames = read_by_fit(path, *options)
+    return frames.points.to_numpy(), [str(each.message) for each in caught]
 
 
 @pytest.mark.parametrize(("code", "digits"), [(-1.0, 0), (999.0, 3), (0.0, 3)])
-def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
+def test_codes_of_missing_points_cause_a_warning(tmp_path, code, digits):
     tracks = landmarks(200).to_numpy().reshape(200, -1, 2)
     tracks = (500 + 40 * tracks).round(digits)
-    _, texts = tracks_read(tracks)
+    _, texts = tracks_read(tmp_path, tracks)
     assert texts == []
     hidden = np.random.default_rng(0).random(tracks.shape[:2]) < 0.1
     hidden[:, :8] = False  # these are seen in all rows
     tracks[hidden] = code
     n_rows, n_points = hidden.any(axis=1).sum(), hidden.sum()
-    points, (warning,) = tracks_read(tracks)
+    points, (warning,) = tracks_read(tmp_path, tracks)
     if not code:  # far from all other points, which are not
         told = f"{n_points:,} points at (0, 0), in {n_rows} rows, are missing: "
         assert warning.startswith(told)
         np.testing.assert_array_equal(np.isnan(points[:, ::2]), hidden)
-        assert len(tracks_read(tracks - [480, 0] * ~hidden[..., None])[1]) == 1
+        assert (
+            len(tracks_read(tmp_path, tracks - [480, 0] * ~hidden[..., None])[1]) == 1
+        )
         return
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
@@ -267,25 +210,27 @@ def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
         AffineNRSfM(1, refinement=None).fit,
         table,
     )
-    points, texts = tracks_read(tracks, f"--missing-value={number}")
+    points, texts = tracks_read(tmp_path, tracks, f"--missing-value={number}")
     assert texts == []
     expected = np.where(hidden[..., None], np.nan, tracks)
     np.testing.assert_array_equal(points.reshape(tracks.shape), expected)
 
 
-def test_pixels_of_a_face_that_hardly_moves_are_no_code(tracks_read):
+def test_pixels_of_a_face_that_hardly_moves_are_no_code(tmp_path):
     """Whole pixels repeat in many rows, also those with equal coordinates."""
     shape = np.stack([np.arange(300, 324, 2)] * 2, axis=1) + [[0, 0], [9, 0]] * 6
     noise = np.random.default_rng(0).normal(size=(600, 12, 2))
     tracks = np.round(shape + noise)
     assert (tracks[:, 0] == 300).all(axis=1).mean() > 0.1
-    assert tracks_read(tracks)[1] == []
+    assert tracks_read(tmp_path, tracks)[1] == []
 
 
-def test_several_codes_are_missing_together(tracks_read):
+def test_several_codes_are_missing_together(tmp_path):
     tracks = landmarks().to_numpy().reshape(N, -1, 2) + 50
     tracks[3, 2], tracks[4, 5], tracks[5, 1] = -1, 999, [-1, 3]
-    points, _ = tracks_read(tracks, "--missing-value", "-1", "--missing-value", "999")
+    points, _ = tracks_read(
+        tmp_path, tracks, "--missing-value", "-1", "--missing-value", "999"
+    )
     tracks[3, 2] = tracks[4, 5] = np.nan
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     table = pd.DataFrame([[-1, -1, -1, 4.0] * 4], columns=POINTS[:16])
@@ -320,41 +265,27 @@ def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-def of_estimators(test):
-    quick = {"n_components": 1, "isa": FastISA(n_init=1), "random_state": 0}
-    all_of_them = [AffineNRSfM(**quick, refinement=None), PseudoInverseNRSfM(1)]
-    names = [type(each).__name__ for each in all_of_them]
-    return pytest.mark.parametrize("estimator", all_of_them, ids=names)(test)
-
-
-@of_estimators
-@pytest.mark.parametrize(
-    ("further", "number", "first"),
-    [
-        ({"frame": ROWS, "person": 1}, "2 of the 26", "frame"),
-        ({"frame": ROWS, "person": "Ann"}, "2 of the 26", "frame"),
-        ({"day": pd.date_range("2024", periods=N)}, "1 of the 25", "day"),
-        ({f"likelihood{j}": 1.0 for j in range(12)}, "12 of the 36", "likelihood0"),
-        ({f"z{j}": 1.0 for j in range(12)}, "12 of the 36", "z0"),
-    ],
-)
-def test_whole_tables_are_no_tables_of_points(estimator, further, number, first):
+def named_as_others(estimator, **further):
+    """Return what is told of a table with columns that are no points."""
     table = pd.concat([pd.DataFrame(further, index=ROWS), landmarks()], axis=1)
-    message = f"{number} .*'{first}'.* Give only the columns of points: "
-    message += ".*landmark_table"
-    refused(message, estimator.fit, table)
+    told = str(refused(".*landmark_table", estimator.fit, table))
     columns = [tuple(f"DLC {name}".split()) for name in table]
     levels = table.set_axis(pd.MultiIndex.from_tuples(columns), axis=1)
-    refused(message.replace(first, f"DLC_{first}"), estimator.fit, levels)
-    refused(message, estimator.fit(landmarks().to_numpy()).transform, table)
-    unnamed = landmarks().set_axis([f"c{j}" for j in range(24)], axis=1)
-    texts = unnamed.assign(c24="Ann", c25="Bob")
-    refused("X has texts: .*'Ann'.*landmark_table", estimator.fit, texts)
-    message = r"the points of LandmarkTable: X\.points"
-    refused(message, estimator.fit, landmark_table(landmarks()), error=TypeError)
+    first = next(iter(further))
+    refused(f"DLC_{first}'.* Give only the columns of points: ", estimator.fit, levels)
+    refused(re.escape(told), estimator.fit(landmarks().to_numpy()).transform, table)
+    return told
 
 
-@of_estimators
+LIKELIHOODS = {f"likelihood{j}": 1.0 for j in range(12)}
+DEPTHS = {f"z{j}": 1.0 for j in range(12)}
+TEXTS = landmarks().set_axis([f"c{j}" for j in range(24)], axis=1)
+TEXTS = TEXTS.assign(c24="Ann", c25="Bob")
+QUICKLY = {"n_components": 1, "isa": FastISA(n_init=1), "random_state": 0}
+PAPER, BASELINE = AffineNRSfM(**QUICKLY, refinement=None), PseudoInverseNRSfM(1)
+
+
+@pytest.mark.parametrize("estimator", [PAPER, BASELINE])
 @pytest.mark.parametrize("layout", ["interleaved", "planar"])
 def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
     tracks = landmarks().to_numpy().reshape(N, 12, 2)
@@ -424,24 +355,15 @@ LEVELS = WIDE.set_axis(
 )
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        WIDE.to_csv(index=False, sep=" "),
-        LEVELS.to_csv(),
-        LEVELS.to_csv(index=False),
-        LEVELS.to_csv(sep=";", decimal=","),
-    ],
-)
-def test_the_way_from_another_header_or_separator_is_right(tmp_path, monkeypatch, text):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.csv").write_text(text)
-    with warnings.catch_warnings(action="ignore"):  # of semicolons
-        scope = followed(read_table, "a.csv", pd=pd)
-    new = tmp_path / "new.csv"
+def read_as_advised(folder, text):
+    """Return the points of a table, after what an error advises in pandas."""
+    (path := folder / "a.csv").write_text(text)
+    new = folder / "new.csv"
+    with contextlib.chdir(folder), warnings.catch_warnings(action="ignore"):
+        scope = followed(read_table, path.name, pd=pd)  # also of semicolons
     if not new.exists():
         scope["table"].to_csv(new, index=False)
-    np.testing.assert_array_equal(read_landmarks(new).points, WIDE)
+    return read_landmarks(new).points.to_numpy()
 
 
 @pytest.mark.filterwarnings("ignore:the cells of")

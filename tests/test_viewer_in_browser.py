@@ -54,6 +54,12 @@ def page(tmp_path_factory):
     return path.as_uri()
 
 
+def opened(browser, folder, model, **options):
+    """Write the page of a model, and open it."""
+    write_viewer(model, path := folder / "viewer.html", **options)
+    browser.open(path.as_uri())
+
+
 def test_sliders_move_the_points(browser, page):
     browser.open(page)
     before = browser.array("viewer.points()")
@@ -227,14 +233,11 @@ def test_pages_fit_the_width_of_the_window(browser, page, width, mobile):
 
 
 def test_one_basis_shape_and_no_face(browser, tmp_path):
-    path = tmp_path / "viewer.html"
-    write_viewer(blob_model(), path, n_frames=0, edges=[[0, 1], [1, 2]])
-    browser.open(path.as_uri())
+    opened(browser, tmp_path, blob_model(), n_frames=0, edges=[[0, 1], [1, 2]])
     browser.run(DRAWN)
     assert browser.complaints() == []
     assert browser.run("document.getElementById('frames').hidden")
-    write_viewer(blob_model(), path, camera=None)
-    browser.open(path.as_uri())
+    opened(browser, tmp_path, blob_model(), camera=None)
     browser.click("play")
     browser.wait("viewer.state().frame >= 1")
     assert browser.complaints() == []
@@ -242,9 +245,8 @@ def test_one_basis_shape_and_no_face(browser, tmp_path):
 
 
 def test_error_bars_are_along_the_viewing_direction(browser, tmp_path):
-    path, deviations = tmp_path / "viewer.html", np.linspace(0.0, 1.0, 68)
-    write_viewer(calibrated_model(), path, depth_std=deviations, n_frames=10)
-    browser.open(path.as_uri())
+    given = {"depth_std": (deviations := np.linspace(0.0, 1.0, 68)), "n_frames": 10}
+    opened(browser, tmp_path, calibrated_model(), **given)
     assert browser.run("viewer.state().frame") == 0
     assert not browser.run("document.getElementById('barred').hidden")
     for frame in (0, 7):
@@ -265,8 +267,7 @@ def test_error_bars_are_along_the_viewing_direction(browser, tmp_path):
         assert np.corrcoef(lengths[1], deviations)[0, 1] > 0.99
     browser.run(DRAWN)
     assert browser.complaints() == []
-    write_viewer(calibrated_model(), path, n_frames=10)
-    browser.open(path.as_uri())
+    opened(browser, tmp_path, calibrated_model(), n_frames=10)
     assert browser.run("document.getElementById('barred').hidden")
 
 
@@ -290,11 +291,9 @@ INK = """
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_left_and_right_have_colours_of_their_own(browser, tmp_path, scheme):
-    path = tmp_path / "viewer.html"
-    write_viewer(face_model(), path)
     media = [{"name": "prefers-color-scheme", "value": scheme}]
     browser.call("Emulation.setEmulatedMedia", features=media)
-    browser.open(path.as_uri())
+    opened(browser, tmp_path, face_model())
     browser.run(DRAWN)
     found = browser.run(INK)
     browser.call("Emulation.setEmulatedMedia", features=[])
@@ -304,10 +303,8 @@ def test_left_and_right_have_colours_of_their_own(browser, tmp_path, scheme):
 
 
 def test_videos_play_at_true_speed(browser, tmp_path):
-    path = tmp_path / "video.html"
     seconds = np.arange(N_FRAMES) * 0.05
-    write_viewer(face_model(), path, times=seconds, n_frames=N_FRAMES)
-    browser.open(path.as_uri())
+    opened(browser, tmp_path, face_model(), times=seconds, n_frames=N_FRAMES)
     assert browser.run("document.getElementById('pace').value") == "true"
     begun = browser.run("performance.now()")
     browser.click("play")
