@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone
 from sklearn.utils.validation import validate_data
 
+from isa_nrsfm import _parameters as choices
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
     HasMethods,
@@ -27,14 +28,11 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._fitted_model import MOST_ROWS, unexplained_share
+from isa_nrsfm._fitted_model import MOST_ROWS, fitted_prior, unexplained_share
 from isa_nrsfm._joint import consensus
-from isa_nrsfm._linalg.small_matrices import centred, procrustes
-from isa_nrsfm._other_tables import fitted_prior
-from isa_nrsfm._parameters import choices
+from isa_nrsfm._linalg import centred, procrustes
 from isa_nrsfm._selection import ChosenMixin, StartedNRSfM
-from isa_nrsfm._tables.blocks import spread
-from isa_nrsfm._tables.sources import refuse_stored
+from isa_nrsfm._tables.blocks import refuse_stored, spread
 from isa_nrsfm.analysis._advice import (
     COMPARE,
     OTHER_CAMERAS,

@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
-from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._compat.scikit_learn import FitProgress, NoProgress, one_blas_thread
+from isa_nrsfm._fitted_model import TableModel, prior_start
 from isa_nrsfm._frames.camera_models import (
     compose,
     line_of_sight,
@@ -35,19 +34,19 @@ from isa_nrsfm._frames.camera_models import (
     reference_camera,
     reprojection_error,
 )
+from isa_nrsfm._frames.gauge import (
+    image_energies,
+    independent_gauge,
+    mode_covariance,
+    reorder_blocks,
+    rigid_gauge,
+)
 from isa_nrsfm._frames.models import (
     MIRROR,
     Decomposition,
     FrameMap,
     FrameModel,
     spread_starts,
-)
-from isa_nrsfm._gauge import (
-    image_energies,
-    independent_gauge,
-    mode_covariance,
-    reorder_blocks,
-    rigid_gauge,
 )
 from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
@@ -67,21 +66,24 @@ from isa_nrsfm._joint.uncertainty import (
     shape_information,
     shown_frames,
 )
-from isa_nrsfm._other_tables import prior_start
-from isa_nrsfm._paper.pipeline import (
+from isa_nrsfm._parameters import JOINT_REFINEMENTS
+from isa_nrsfm._prepare.completion import complete_rows
+from isa_nrsfm._prepare.robust import gross_outliers
+from isa_nrsfm._prepare.scaling import (
+    ScaledTable,
+    largest_n_components,
+    most_components,
+    rows_without,
+)
+from isa_nrsfm._tables.blocks import spread
+from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm.isa._pipeline import (
     Factorisation,
     block_triplets,
     factorise,
     run_paper_pipeline,
     sample_frames,
 )
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._prepare.checks import largest_n_components, most_components
-from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.robust import gross_outliers
-from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
-from isa_nrsfm._tables.blocks import spread
-from isa_nrsfm._tables.tracks import of_all_rows
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"

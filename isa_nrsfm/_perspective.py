@@ -1,8 +1,9 @@
 """The fit of perspective images: repeated fits of weak-perspective ones.
 
-`_frames.pinhole` has the equations. Each repeat corrects the images for the depths of
-the fit before, and starts from its shapes, until depths and fit agree. Weak-perspective
-images determine depths up to their sign, so both mirror images are continued.
+`_frames.camera_models` has the equations. Each repeat corrects the images for the
+depths of the fit before, and starts from its shapes, until depths and fit agree.
+Weak-perspective images determine depths up to their sign, so both mirror images are
+continued.
 
 Let E be the mean squared distance of points from their images, in sizes of frames. As a
 function of g = 1/f it is least for the focal length f. g = 0 is the weak-perspective
@@ -20,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, stdtr
 
-from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import FitProgress, NoProgress
 from isa_nrsfm._fit import (
     PERSPECTIVE_STAGE,
     TableFit,
@@ -31,8 +32,8 @@ from isa_nrsfm._fit import (
     supported_components,
 )
 from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.camera_models import Pinhole, common, pinhole_of
 from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._frames.pinhole import Pinhole, common, pinhole_of
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, neighbours
 from isa_nrsfm._prepare.robust import robust_square
@@ -322,9 +323,7 @@ def minimum(fits: dict[float, PerspectiveFit]) -> tuple[float, float]:
 
 
 def fit_perspective(
-    table: PerspectiveTable,
-    n_components: int | None,
-    given: Any,
+    table: PerspectiveTable, n_components: int | None, given: Any
 ) -> TableFit:
     """Fit perspective images as `fit_table` fits weak-perspective ones.
 

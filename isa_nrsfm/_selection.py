@@ -23,13 +23,13 @@ from sklearn.utils import indexable
 from sklearn.utils.metadata_routing import UNUSED, MetadataRouter, process_routing
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
     N_JOBS,
     CoefficientsMixin,
     HasMethods,
     Interval,
+    NoProgress,
     StrOptions,
     fit_context,
     taken_rows,
@@ -37,10 +37,9 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._joint.settings import JOINT_TOL
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import JOINT_REFINEMENTS, named
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.sources import refuse_stored
+from isa_nrsfm._tables.blocks import refuse_stored
 
 # For held-out errors of 100 % and more.
 NO_SHAPE = (
@@ -111,10 +110,6 @@ class ChosenMixin(CoefficientsMixin, TransformerMixin, MetaEstimatorMixin):
             The table.
         """
         return self._fitted().inverse_transform(alpha, motion, translation)
-
-    def __sklearn_is_fitted__(self) -> bool:
-        """Return whether a fit has ended."""
-        return hasattr(self, "best_estimator_")
 
     def _fitted(self) -> AffineNRSfM:
         """Return the fit of all frames, or raise if there is none."""

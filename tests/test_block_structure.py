@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, random_rotation, structured_motion
 
-from isa_nrsfm._paper.pipeline import (
+from isa_nrsfm._parameters import BLOCK_RECOVERIES
+from isa_nrsfm.isa._pipeline import (
     factorise,
     leading_blocks,
     lifted_blocks,
@@ -15,7 +16,6 @@ from isa_nrsfm._paper.pipeline import (
     refine_alternating,
     structure_energies,
 )
-from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
 ALL_METHODS = pytest.mark.parametrize("method", BLOCK_RECOVERIES)
 

@@ -13,7 +13,7 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rotated,
 )
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
     COLUMNS,
     ROWS,
     frames_first,

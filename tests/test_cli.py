@@ -20,7 +20,7 @@ from refusals import refusals_of, refused
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, FastISA, __version__
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import named
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model

@@ -5,16 +5,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames
 
-from isa_nrsfm._linalg.small_matrices import orientations
-from isa_nrsfm._paper.pipeline import (
+from isa_nrsfm._linalg import orientations
+from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.isa._pipeline import (
     block_triplets,
     factorise,
     leading_triplets,
     rigid_energy,
     sample_frames,
 )
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
-from isa_nrsfm.datasets import make_nonrigid_tracks
 
 SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
 

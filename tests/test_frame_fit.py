@@ -34,7 +34,7 @@ from isa_nrsfm._joint.uncertainty import (
     neighbours,
     shape_information,
 )
-from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._parameters import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks

@@ -38,7 +38,7 @@ from isa_nrsfm._frames.search import (
     calibrated_starts,
     scale_of,
 )
-from isa_nrsfm._linalg.small_matrices import LANES, frames_first, frames_last, unpacked
+from isa_nrsfm._linalg import LANES, frames_first, frames_last, unpacked
 from isa_nrsfm._tables.blocks import block_slices
 
 AS_USERS = ["few_frames", "widths"]

@@ -11,7 +11,7 @@ from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import mean_view
-from isa_nrsfm._gauge import (
+from isa_nrsfm._frames.gauge import (
     canonical_gauge,
     canonical_rotation,
     canonical_space,
@@ -19,7 +19,7 @@ from isa_nrsfm._gauge import (
     independent_gauge,
     reorder_blocks,
 )
-from isa_nrsfm._parameters.choices import INDEPENDENCE
+from isa_nrsfm._parameters import INDEPENDENCE
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 

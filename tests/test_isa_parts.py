@@ -9,14 +9,14 @@ from scipy.integrate import quad
 from scipy.linalg import polar
 from scipy.optimize import linear_sum_assignment
 
-from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.isa import _shared_mixing
-from isa_nrsfm.isa._shared_mixing import (
+from isa_nrsfm._frames import gauge
+from isa_nrsfm._frames.gauge import (
     LIGHT,
     TAILS,
     independent_coefficients,
     shared_mixing,
 )
+from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.isa._strategies import (
     fixed_point_step,
     iterate,
@@ -152,7 +152,7 @@ def cosines(truth, recovered):
 
 def white(signals):
     """Return white signals."""
-    whitening, _ = _shared_mixing._whitening(signals.reshape(len(signals), -1))
+    whitening, _ = gauge._whitening(signals.reshape(len(signals), -1))
     return np.tensordot(whitening, signals, 1)
 
 
@@ -241,10 +241,10 @@ class TestOptimality:
     def test_no_mixing_near_by_is_likelier(self, size, rng):
         Z = white(sources(["product", "uniform", "student", "laplace"], 0, 200, size))
         W = shared_mixing(Z)
-        most = _shared_mixing._fit_densities(W, Z)[0]
+        most = gauge._fit_densities(W, Z)[0]
         for _ in range(50):
             E = 1e-3 * rng.normal(size=W.shape)
-            assert _shared_mixing._fit_densities(W + E @ W, Z)[0] < most
+            assert gauge._fit_densities(W + E @ W, Z)[0] < most
 
     def test_derivatives_by_differences(self, rng):
         Y, tail = rng.normal(size=(3, 40, 3)), np.array([[2.0], [LIGHT], [8.0]])
@@ -252,11 +252,11 @@ class TestOptimality:
         def likelihood(E):
             W = np.eye(3) + E
             u = np.sum(np.tensordot(W, Y, 1) ** 2, axis=2)
-            F = _shared_mixing._log_density(u, tail, 3).mean(axis=1).sum()
+            F = gauge._log_density(u, tail, 3).mean(axis=1).sum()
             return F + 3 * np.linalg.slogdet(W)[1]
 
-        slopes = _shared_mixing._slopes(np.sum(Y**2, axis=2), tail, 3)
-        gradient, blocks = _shared_mixing._relative_derivatives(Y, *slopes)
+        slopes = gauge._slopes(np.sum(Y**2, axis=2), tail, 3)
+        gradient, blocks = gauge._relative_derivatives(Y, *slopes)
         h = 1e-4
         for _ in range(5):
             E = rng.normal(size=(3, 3))
@@ -271,7 +271,7 @@ class TestOptimality:
         for seed in range(4):
             Z = white(sources(["gaussian"] * 5, seed, 68, 3))
             mixings = (shared_mixing(Z, n_starts=n) for n in (1, 8))
-            few, many = (_shared_mixing._fit_densities(W, Z)[0] for W in mixings)
+            few, many = (gauge._fit_densities(W, Z)[0] for W in mixings)
             gains.append(many - few)
         assert np.max(gains) > 1e-3
         assert np.mean(gains) > 0.0
@@ -281,10 +281,10 @@ class TestDensities:
     @pytest.mark.parametrize("tail", TAILS)
     def test_slopes_by_differences(self, tail):
         u, tail, h = np.linspace(0.1, 20.0, 50), np.array(tail), 1e-5
-        g, dg = _shared_mixing._slopes(u, tail, 3)
-        F = [_shared_mixing._log_density(u + s, tail, 3) for s in (h, -h)]
+        g, dg = gauge._slopes(u, tail, 3)
+        F = [gauge._log_density(u + s, tail, 3) for s in (h, -h)]
         assert_allclose(g, (F[0] - F[1]) / (2 * h), rtol=1e-6)
-        G = [_shared_mixing._slopes(u + s, tail, 3)[0] for s in (h, -h)]
+        G = [gauge._slopes(u + s, tail, 3)[0] for s in (h, -h)]
         assert_allclose(dg, (G[0] - G[1]) / (2 * h), rtol=1e-5)
 
     @pytest.mark.parametrize(
@@ -294,10 +294,10 @@ class TestDensities:
     def test_integral_by_quadrature(self, tail, size, sphere):
         def radial(r):
             given = np.array(r * r), np.array(tail), size
-            return r ** (size - 1) * np.exp(_shared_mixing._log_density(*given))
+            return r ** (size - 1) * np.exp(gauge._log_density(*given))
 
         integral = sum(quad(radial, *ends)[0] for ends in ((0, 5), (5, 50), (50, 400)))
-        value = _shared_mixing._log_integral(tail, size)
+        value = gauge._log_integral(tail, size)
         assert_allclose(value, np.log(sphere * integral), atol=1e-8)
 
     @pytest.mark.parametrize("size", [1, 3])
@@ -308,34 +308,34 @@ class TestDensities:
         student = rng.normal(size=shape) / np.sqrt(chi_square / 8)
         uniform = np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size=shape)
         Z = scale * np.concatenate([student, uniform])
-        _, tails, variance, _ = _shared_mixing._fit_densities(np.eye(2), Z)
+        _, tails, variance, _ = gauge._fit_densities(np.eye(2), Z)
         assert_array_equal(tails, [8.0, LIGHT])
         assert_allclose(variance[0], scale**2, rtol=0.05)
 
     def test_scale_is_the_likeliest_and_no_change_of_units(self):
         Z = sources(["student", "uniform", "product"], 0, 300, 3)
-        total, tails, variance, of_signals = _shared_mixing._fit_densities(np.eye(3), Z)
+        total, tails, variance, of_signals = gauge._fit_densities(np.eye(3), Z)
         assert total == pytest.approx(of_signals.sum())
         for y, tail, v, value in zip(Z, tails, variance, of_signals, strict=True):
             tail, u = np.array(tail), np.sum(y**2, axis=1)
 
             def likelihood(v, tail=tail, u=u):
-                F = _shared_mixing._log_density(u / v, tail, 3).mean()
-                return F - _shared_mixing._log_integral(tail, 3) - 1.5 * np.log(v)
+                F = gauge._log_density(u / v, tail, 3).mean()
+                return F - gauge._log_integral(tail, 3) - 1.5 * np.log(v)
 
             values = [likelihood(factor * v) for factor in (0.999, 1.0, 1.001)]
             assert np.argmax(values) == 1
             assert values[1] == pytest.approx(value)
         units = np.diag([0.1, 1.0, 30.0])
-        assert _shared_mixing._fit_densities(units, Z)[0] == pytest.approx(total)
+        assert gauge._fit_densities(units, Z)[0] == pytest.approx(total)
 
 
 class TestSteps:
     def test_few_samples_are_spread_from_the_smallest_to_the_largest(self, rng):
         few = rng.normal(size=(2, 3000, 3))
-        assert _shared_mixing._few_samples(few) is few
+        assert gauge._few_samples(few) is few
         many = rng.normal(size=(2, 6000, 3))
-        chosen = _shared_mixing._few_samples(many)
+        chosen = gauge._few_samples(many)
         assert chosen.shape == (2, 1500, 3)
         sizes = [np.sort(np.sum(Z**2, axis=(0, 2))) for Z in (chosen, many)]
         place = np.searchsorted(sizes[1], sizes[0])
@@ -347,17 +347,17 @@ class TestSteps:
         n, size, shift = 5, 3, 0.5
         root, gradient = rng.normal(size=(n, n, n)), rng.normal(size=(n, n))
         blocks = -(root @ root.transpose(0, 2, 1)) - 4.0 * np.eye(n)
-        E = _shared_mixing._ascent(gradient, blocks, shift, size)
+        E = gauge._ascent(gradient, blocks, shift, size)
         slope = np.einsum("kab,kb->ka", blocks, E) - size * E.T - shift * E
         assert_allclose(gradient + slope, 0, atol=1e-4 * np.linalg.norm(gradient))
         # Weaker blocks than the coupling, and blocks without a maximum at all
         for factor in (0.25, -1.0):
             weak = -factor * 4.0 * np.tile(np.eye(n), (n, 1, 1))
-            assert _shared_mixing._ascent(gradient, weak, shift, size) is None
+            assert gauge._ascent(gradient, weak, shift, size) is None
         # A direction that the diagonals of the blocks do not show
         one = np.ones((n, n))
         blocks = np.tile(10.0 * one - 16.0 * np.eye(n), (n, 1, 1))
-        assert _shared_mixing._ascent(one, blocks, 0.0, size) is None
+        assert gauge._ascent(one, blocks, 0.0, size) is None
 
 
 class TestDegenerate:

@@ -10,7 +10,7 @@ from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._frames.pinhole import Pinhole
+from isa_nrsfm._frames.camera_models import Pinhole
 from isa_nrsfm._perspective import WEAK
 from isa_nrsfm.export import frame_points, frame_poses
 from isa_nrsfm.io import load_model, save_model

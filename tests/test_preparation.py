@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._parameters import LOSSES
 from isa_nrsfm._prepare import robust
 from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._prepare.robust import (

@@ -12,7 +12,7 @@ from isa_nrsfm._frames.point_sums import (
     frame_tracks,
     whitened,
 )
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
     COLUMNS,
     LANES,
     ROWS,

@@ -29,8 +29,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.cached import cached_property
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._compat.lazy import cached_property
+from isa_nrsfm._linalg import (
     COLUMNS,
     DIAGONAL,
     ROWS,

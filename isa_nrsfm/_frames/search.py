@@ -45,8 +45,8 @@ from isa_nrsfm._frames.point_sums import (
     whitened,
     with_one,
 )
-from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
+    OF_STEPS,
     frames_first,
     frames_last,
     invert_positive,

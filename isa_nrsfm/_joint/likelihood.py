@@ -36,7 +36,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.cached import cached_property
+from isa_nrsfm._compat.lazy import cached_property
 from isa_nrsfm._frames.point_sums import (
     FrameTracks,
     ShapeProducts,
@@ -47,7 +47,7 @@ from isa_nrsfm._frames.point_sums import (
     joined_frames,
 )
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
     centred,
     diagonal_of,
     energies,

@@ -53,7 +53,7 @@ from isa_nrsfm._joint.problem import JointProblem, JointState, Widths, refine_jo
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import other_depths, steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
-from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._linalg import centred
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
+    OF_DISTANCES,
     centred,
     frames_first,
     invert_positive,

@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 from scipy.special import softmax
 from scipy.stats import norm, rankdata
 
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
+from isa_nrsfm._linalg import OF_DIFFERENCES
 
 # Why a label cannot be tested.
 ONE_EVENT = (

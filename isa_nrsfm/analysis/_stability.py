@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.camera_models import pose_effect, pose_part
+from isa_nrsfm._frames.gauge import independent_gauge
 from isa_nrsfm._frames.models import FrameMap
-from isa_nrsfm._gauge import independent_gauge
 from isa_nrsfm._joint.uncertainty import HalfTables
 
 # Least correlation of what counts as the same coefficient, as for the congruence of

@@ -20,23 +20,22 @@ from sklearn.base import (
 )
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import (
     Interval,
     StrOptions,
     fit_context,
+    one_blas_thread,
     with_numpy_defaults,
 )
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, project
+from isa_nrsfm._frames.gauge import canonical_rotation
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.search import FrameSearch
-from isa_nrsfm._gauge import canonical_rotation
 from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._linalg.small_matrices import orientations
-from isa_nrsfm._prepare.checks import validated_table
-from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.sources import open_table
+from isa_nrsfm._linalg import orientations
+from isa_nrsfm._prepare.scaling import scaled_table, validated_table
+from isa_nrsfm._tables.blocks import open_table
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,

@@ -9,12 +9,11 @@ from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import Interval
-from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._paper.pipeline import leading_triplets
+from isa_nrsfm._linalg import OF_RANKS, polar
 from isa_nrsfm._tables.tracks import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.calibration import orthonormal_cameras
+from isa_nrsfm.isa._pipeline import leading_triplets
 
 
 def orthographic_cameras(W: NDArray, rank: int) -> NDArray:

@@ -14,18 +14,18 @@ from joblib import parallel_config
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
-from isa_nrsfm._compat import pandas as pd, whole_files
+from isa_nrsfm._compat import files, pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
-from isa_nrsfm._other_tables import hold_open
-from isa_nrsfm._parameters.choices import (
+from isa_nrsfm._fitted_model import hold_open
+from isa_nrsfm._parameters import (
     CALIBRATED_CAMERAS,
     FACE_PRIORS as LAYOUTS,
     JOINT_REFINEMENTS,
+    check_requirements,
 )
-from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
@@ -108,13 +108,13 @@ def fit_table(
         inputs.append(args.table)
     else:
         results[Path(args.table).name] = ""
-    with whole_files.folder_for_writing(folder):
+    with files.folder_for_writing(folder):
         targets = [folder / name for name in (*results, *figures, _outputs.REPORT)]
         earlier = _outputs.entry_of_report(folder, "sha256")
         own_files = {*earlier, _outputs.REPORT} if earlier else ()
         _outputs.check_outputs(args, inputs, targets, own_files)
         for target in targets:
-            whole_files.check_replaceable(target)
+            files.check_replaceable(target)
         old = _outputs.entry_of_report(folder, "files")
         removed = {*figures, *(name for name in old if name.endswith(".png"))}
         used = {args.group, args.time, frames.images.name}
@@ -125,7 +125,7 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
-        with whole_files.files_together(folder, removed=removed) as new:
+        with files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
@@ -161,7 +161,7 @@ def fit_table(
         if not figures:
             return report, estimator
         # A figure that fails, or takes long, costs no results: they are in place.
-        with whole_files.files_together(folder) as new:
+        with files.files_together(folder) as new:
             if _outputs.digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "

@@ -13,8 +13,8 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.whole_files import files_together
+from isa_nrsfm._compat.files import files_together
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._fitted_model import frames_of, points_in_space
 from isa_nrsfm.analysis._advice import depth_advice, facts_of

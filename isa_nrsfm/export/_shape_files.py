@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.files import reading, whole_file
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._compat.stored_arrays import write_arrays
-from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
-from isa_nrsfm._linalg.small_matrices import procrustes
+from isa_nrsfm._linalg import procrustes
 from isa_nrsfm.export import _upright
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.plotting._views import Origin

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.files import reading
 from isa_nrsfm._compat.texts import as_utf8, first_items
 from isa_nrsfm.io._keypoints import (
     entries_as_rows,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import named
 from isa_nrsfm.skeletons._column_names import (
     individuals_in,
     parse_coordinate,

@@ -24,16 +24,16 @@ from sklearn.utils import check_array, check_random_state, gen_batches
 from sklearn.utils.parallel import Parallel, delayed
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
     N_JOBS,
     Interval,
     fit_context,
+    one_blas_thread,
     with_numpy_defaults,
 )
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._linalg import OF_DIFFERENCES, OF_PRODUCTS
+from isa_nrsfm._tables.blocks import unmasked
 
 
 @with_numpy_defaults

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import CHECKS, unmasked
+from isa_nrsfm._tables.blocks import CHECKS, FrameBlocks, unmasked
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,

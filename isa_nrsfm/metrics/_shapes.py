@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment, minimize
 
-from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._linalg import OF_STEPS
+from isa_nrsfm._tables.blocks import unmasked
 
 
 def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm.analysis._frame_columns import checked_column, kind_of
 from isa_nrsfm.plotting import _axes
 from isa_nrsfm.skeletons._column_names import checked_names

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm.plotting._axes import flat_axes, percent
 from isa_nrsfm.skeletons._column_names import checked_names
 
