@@ -331,21 +331,9 @@ def _energies(
     rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
 ) -> tuple[float, float]:
     """Return the energies of the residuals of a block, and of its centred frames."""
-    middle = rows.mean(axis=2, keepdims=True, dtype=np.float64)
-    if np.isnan(middle).any():
-        middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
-    signal = _sum_of_squares(rows - middle)
-    model = stacked_motion(motion, alpha) @ shapes.reshape(-1, shapes.shape[2])
-    rest = model.reshape(rows.shape)
-    rest += position[:, :, None]
-    rest -= rows
-    return _sum_of_squares(rest), signal
-
-
-def _sum_of_squares(values: NDArray) -> float:
-    """Return the sum of the squares of all values that are not NaN."""
-    total = float(np.vdot(values, values))
-    return float(np.nansum(values**2)) if np.isnan(total) else total
+    noise = np.nansum(distances(rows, shapes, motion, position, alpha) ** 2)
+    middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
+    return float(noise), float(np.nansum((rows - middle) ** 2))
 
 
 def distances(
