@@ -28,7 +28,14 @@ from isa_nrsfm._compat.scikit_learn import (
     with_numpy_defaults,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
-from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
+from isa_nrsfm._fit import (
+    STEPWISE,
+    PerspectiveTable,
+    fit_perspective,
+    fit_table,
+    stages_of,
+    supported_components,
+)
 from isa_nrsfm._fitted_model import (
     TableModel,
     checked_prior,
@@ -49,7 +56,6 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
 from isa_nrsfm._prepare.coordinates import warn_of_rows
 from isa_nrsfm._prepare.scaling import (
     check_camera,
@@ -61,17 +67,19 @@ from isa_nrsfm._prepare.scaling import (
     validated_table,
     weighted_rows,
 )
-from isa_nrsfm._tables.blocks import (
+from isa_nrsfm._tables import (
     CHECKS,
+    LAYOUTS,
     FrameBlocks,
+    Layout,
     StoredTable,
     column_sample,
     is_on_dask,
     is_read_later,
     open_table,
+    tracks_to_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.analysis._advice import warn_after_fit
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers

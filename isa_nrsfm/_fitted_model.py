@@ -31,12 +31,14 @@ from isa_nrsfm._linalg import padded
 from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
 from isa_nrsfm._prepare.scaling import FEWEST_COMPARED, ScaledTable
-from isa_nrsfm._tables.blocks import FrameBlocks, is_read_later, spread
-from isa_nrsfm._tables.tracks import (
+from isa_nrsfm._tables import (
+    FrameBlocks,
     Layout,
     centred_frames,
+    is_read_later,
     of_all_rows,
     seen_points,
+    spread,
     tracks_to_table,
     weighted_sizes,
 )

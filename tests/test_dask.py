@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import FastISA
-from isa_nrsfm._tables.blocks import DaskBlocks
+from isa_nrsfm._tables import DaskBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 array = pytest.importorskip("dask.array")

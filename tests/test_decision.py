@@ -13,8 +13,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AutoNRSfM
-from isa_nrsfm._decision import FIRST, first_settings
 from isa_nrsfm._prepare.coordinates import still_points
+from isa_nrsfm._selection import FIRST, first_settings
 from isa_nrsfm.analysis._advice import COMPARE
 from isa_nrsfm.analysis._frame_columns import runs_between_gaps
 from isa_nrsfm.datasets import (

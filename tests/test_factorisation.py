@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames
 
 from isa_nrsfm._linalg import orientations
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
+from isa_nrsfm._tables import FrameBlocks, representative_frames, spread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.isa._pipeline import (
     block_triplets,

@@ -27,7 +27,6 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import spread_starts
-from isa_nrsfm._frames.point_sums import coefficient_posterior, frame_sums, frame_tracks
 from isa_nrsfm._frames.search import (
     LARGE_RISE,
     MAX_STEPS,
@@ -36,10 +35,13 @@ from isa_nrsfm._frames.search import (
     State,
     _rise,
     calibrated_starts,
+    coefficient_posterior,
+    frame_sums,
+    frame_tracks,
     scale_of,
 )
 from isa_nrsfm._linalg import LANES, frames_first, frames_last, unpacked
-from isa_nrsfm._tables.blocks import block_slices
+from isa_nrsfm._tables import block_slices
 
 AS_USERS = ["few_frames", "widths"]
 NOISE = 0.02

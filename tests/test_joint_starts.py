@@ -38,7 +38,7 @@ from isa_nrsfm._joint.whole import (
     whole_distribution,
 )
 from isa_nrsfm._linalg import centred
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.isa._pipeline import Factorisation, factorise
 

@@ -10,8 +10,8 @@ from refusals import refusals_of
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._fit import WEAK
 from isa_nrsfm._frames.camera_models import Pinhole
-from isa_nrsfm._perspective import WEAK
 from isa_nrsfm.export import frame_points, frame_poses
 from isa_nrsfm.io import load_model, save_model
 

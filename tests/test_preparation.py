@@ -20,8 +20,7 @@ from isa_nrsfm._prepare.robust import (
     robustly_centred,
     spatial_median,
 )
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import centred_frames
+from isa_nrsfm._tables import FrameBlocks, centred_frames
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 N_FRAMES = 23

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.point_sums import (
+from isa_nrsfm._frames.search import (
     ShapeProducts,
     determines_camera,
     frame_sums,

@@ -52,8 +52,7 @@ from isa_nrsfm._linalg import (
     unpacked,
 )
 from isa_nrsfm._prepare.robust import spatial_median
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import centred_frames
+from isa_nrsfm._tables import FrameBlocks, centred_frames
 
 # Largest rotation of a camera in one step, in radians, and largest change of the
 # logarithm of its scale.

@@ -39,7 +39,7 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.models import Decomposition, FrameMap
 from isa_nrsfm._linalg import OF_DIFFERENCES, OF_RANKS, OF_STEPS, orientations, polar
-from isa_nrsfm._tables.blocks import spread
+from isa_nrsfm._tables import spread
 from isa_nrsfm.isa._strategies import orthogonalise
 
 

@@ -29,7 +29,7 @@ from isa_nrsfm._prepare.robust import (
     lower_medians,
     robust_sizes,
 )
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables import seen_points
 
 # Depths are not determined above this error, relative to their root mean square:
 # docs/depth.md, "Undetermined depth".

@@ -68,8 +68,7 @@ from isa_nrsfm._linalg import (
     unpacked,
 )
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm._tables.tracks import FEWEST_POINTS
+from isa_nrsfm._tables import FEWEST_POINTS, FrameBlocks, spread
 
 # Frames and points of a group
 Indices = tuple[NDArray, NDArray]

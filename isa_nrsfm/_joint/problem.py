@@ -19,8 +19,7 @@ from scipy.special import expit
 
 from isa_nrsfm._compat.lazy import cached_property
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, line_of_sight
-from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
-from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._frames.search import FrameSearch, FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.settings import FitSettings

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
-from isa_nrsfm._tables.tracks import Layout
+from isa_nrsfm._tables import Layout
 from isa_nrsfm.isa._pipeline import DENSE
 
 # Default tolerances. JOINT_TOL: decrease of the objective of the joint refinement per

@@ -30,7 +30,7 @@ from isa_nrsfm._joint.problem import (
     JointState,
 )
 from isa_nrsfm._linalg import OF_PRODUCTS, frames_last
-from isa_nrsfm._tables.blocks import spread
+from isa_nrsfm._tables import spread
 from isa_nrsfm.calibration._metric_upgrade import best_metric
 from isa_nrsfm.calibration._orthonormal_cameras import (
     orthonormal_mixture,

@@ -20,8 +20,7 @@ from isa_nrsfm._linalg import (
     pair_indices,
     unpacked,
 )
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 
 # Tuning constants c of the losses, in standard deviations of a coordinate. With these,
 # the estimate of a location in the plane has 95 percent of the efficiency of least

@@ -16,19 +16,22 @@ from isa_nrsfm._linalg import OF_DIFFERENCES
 from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
-from isa_nrsfm._tables.blocks import CHECKS, FrameBlocks, checked_range, unmasked
-from isa_nrsfm._tables.tracks import (
+from isa_nrsfm._tables import (
+    CHECKS,
     FEWEST_POINTS,
     LAYOUTS,
+    FrameBlocks,
     FrameReport,
     Layout,
     centred_frames,
     check_frames,
+    checked_range,
     describe_point,
     seen_points,
     table_to_rows,
     tracks_to_table,
     two_of,
+    unmasked,
     warn_of_half_points,
     weighted_sizes,
     without_half_points,

@@ -18,7 +18,7 @@ from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._joint.uncertainty import HalfTables
 from isa_nrsfm._linalg import OF_RANKS, polar
 from isa_nrsfm._parameters import named
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.analysis import _advice
 from isa_nrsfm.analysis._advice import camera_meaning
 from isa_nrsfm.analysis._stability import stability, stability_words

@@ -35,11 +35,11 @@ from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg import orientations
 from isa_nrsfm._prepare.scaling import scaled_table, validated_table
-from isa_nrsfm._tables.blocks import open_table
-from isa_nrsfm._tables.tracks import (
+from isa_nrsfm._tables import (
     LAYOUTS,
     Layout,
     centred_frames,
+    open_table,
     refuse_one_place,
     table_to_rows,
     tracks_to_table,

@@ -23,7 +23,7 @@ from sklearn.utils import check_random_state, gen_batches
 
 from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg import OF_RANKS, polar
-from isa_nrsfm._tables.tracks import Layout
+from isa_nrsfm._tables import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.calibration._metric import (
     LARGEST_STRETCH,

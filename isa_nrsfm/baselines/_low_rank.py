@@ -10,7 +10,7 @@ from sklearn.exceptions import ConvergenceWarning
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg import OF_RANKS, polar
-from isa_nrsfm._tables.tracks import Layout
+from isa_nrsfm._tables import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.calibration import orthonormal_cameras
 from isa_nrsfm.isa._pipeline import leading_triplets

@@ -18,7 +18,6 @@ from isa_nrsfm._compat import files, pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
 from isa_nrsfm._fitted_model import hold_open
 from isa_nrsfm._parameters import (
     CALIBRATED_CAMERAS,
@@ -27,7 +26,7 @@ from isa_nrsfm._parameters import (
     check_requirements,
 )
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
-from isa_nrsfm._selection import standard_errors
+from isa_nrsfm._selection import FIRST, Trial, decided, first_settings, standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _outputs, _reading, _report
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes

@@ -16,7 +16,7 @@ from isa_nrsfm._compat.files import errors_of, reading
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters import FACE_PRIORS, SKELETON_NAMES
 from isa_nrsfm._prepare.coordinates import UNSURE, CoordinateWarning, warn_of_places
-from isa_nrsfm._tables.tracks import (
+from isa_nrsfm._tables import (
     FEWEST_POINTS,
     FrameReport,
     centred_frames,

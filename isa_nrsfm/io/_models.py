@@ -32,8 +32,7 @@ from isa_nrsfm._frames.models import (
     FrameModel,
 )
 from isa_nrsfm._parameters import LOSSES
-from isa_nrsfm._tables.blocks import SMALLEST
-from isa_nrsfm._tables.tracks import LAYOUTS
+from isa_nrsfm._tables import LAYOUTS, SMALLEST
 
 FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
 HEADER = "header"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.files import reading
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import by_number, first_items
-from isa_nrsfm._tables.blocks import StoredTable, read_rows
+from isa_nrsfm._tables import StoredTable, read_rows
 
 SUFFIXES = (".npy", ".parquet")
 PARQUET = "a parquet file"

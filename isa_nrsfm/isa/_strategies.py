@@ -33,7 +33,7 @@ from isa_nrsfm._compat.scikit_learn import (
     with_numpy_defaults,
 )
 from isa_nrsfm._linalg import OF_DIFFERENCES, OF_PRODUCTS
-from isa_nrsfm._tables.blocks import unmasked
+from isa_nrsfm._tables import unmasked
 
 
 @with_numpy_defaults

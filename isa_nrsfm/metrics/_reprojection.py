@@ -4,13 +4,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
-from isa_nrsfm._tables.blocks import CHECKS, FrameBlocks, unmasked
-from isa_nrsfm._tables.tracks import (
+from isa_nrsfm._tables import (
+    CHECKS,
     LAYOUTS,
+    FrameBlocks,
     Layout,
     centred_frames,
     seen_points,
     table_to_tracks,
+    unmasked,
     without_half_points,
 )
 from isa_nrsfm.metrics._shapes import check_same_shape

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment, minimize
 
 from isa_nrsfm._linalg import OF_STEPS
-from isa_nrsfm._tables.blocks import unmasked
+from isa_nrsfm._tables import unmasked
 
 
 def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:

@@ -11,8 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
-from isa_nrsfm._tables.blocks import unmasked
-from isa_nrsfm._tables.tracks import FEWEST_POINTS, table_to_tracks, tracks_to_table
+from isa_nrsfm._tables import FEWEST_POINTS, table_to_tracks, tracks_to_table, unmasked
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import _axes
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
