@@ -2,7 +2,6 @@
 
 import copy
 import os
-import warnings
 from functools import partial
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -28,14 +27,7 @@ from isa_nrsfm._compat.scikit_learn import (
     with_numpy_defaults,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
-from isa_nrsfm._fit import (
-    STEPWISE,
-    PerspectiveTable,
-    fit_perspective,
-    fit_table,
-    stages_of,
-    supported_components,
-)
+from isa_nrsfm._fit import STEPWISE, Images, fit_images, stages_of
 from isa_nrsfm._fitted_model import (
     TableModel,
     checked_prior,
@@ -50,7 +42,6 @@ from isa_nrsfm._frames.camera_models import (
     compose,
     focal_shares,
     full_rotations,
-    pinhole_of,
     pose_effect,
     zoomed_table,
 )
@@ -62,7 +53,6 @@ from isa_nrsfm._prepare.scaling import (
     check_frames_kept,
     check_table,
     checked,
-    scaled_table,
     undetermined,
     validated_table,
     weighted_rows,
@@ -594,23 +584,10 @@ default="affine"
         )
         prior, n_components = settings.prior, self.n_components
         n_components = n_components if prior is None else prior.n_components
-        auto, f, point = n_components == "auto", self.focal_length, self.principal_point
-        if self.camera == "perspective":
-            images = PerspectiveTable(source, weights, isa, settings, point, progress)
-            fit = fit_perspective(images, None if auto else n_components, f)
-        else:
-            if auto and self.camera == "affine":
-                with warnings.catch_warnings(action="ignore"):  # the fit warns again
-                    table = scaled_table(source, weights, 1, settings)
-                n_components = supported_components(table, isa, settings, progress)
-            number = 1 if n_components == "auto" else n_components
-            table = scaled_table(source, weights, number, settings)
-            fit = fit_table(table, number, isa, settings, progress)
-        model, frames, converged, fitted = fit
-        if point is not None and model.pinhole is None:
-            f = np.array(np.inf if f is None else f, dtype=float)[()]
-            model = model._replace(axes=pinhole_of(f, point))
-            fitted |= {"focal_length_": f, "focal_length_std_": 0.0}
+        images = Images(source, weights, isa, settings, self.principal_point, progress)
+        model, frames, converged, fitted, *_ = fit_images(
+            images, n_components, self.focal_length, self.camera == "perspective"
+        )
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "

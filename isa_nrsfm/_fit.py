@@ -110,8 +110,93 @@ PERSPECTIVE_STAGE = "perspective"
 # Stages that report steps.
 STEPWISE = JOINT_STAGE, CONSENSUS_STAGE, PERSPECTIVE_STAGE
 
-# Model, frames, convergence and other attributes of a fit
-TableFit = tuple[TableModel, Decomposition, bool, dict[str, Any]]
+# Effects of these constants: docs/benchmarks/README.md, "Thresholds".
+# Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
+# tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
+SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
+# Factor of the tolerance of all fits but the last one, and of SETTLED for focal lengths
+# that are only compared.
+ROUGH, COMPARED = 4.0, 5.0
+# A mirror image is given up if E is larger than this multiple of the other one's.
+WORSE = 1.3
+# Focal lengths of the weak-perspective fit and of the first perspective one, in largest
+# distances from the principal point, and how much longer the next one is if that fails.
+ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
+# Factors of the steps of the search for the minimum, from the best fit up and down; its
+# error, as a share of 1/f; and the largest number of fits.
+STEPS, NEAR, MOST_FITS = (1.5, 1.1), 0.01, 16
+
+# Why perspective is not taken.
+UNSTEADY = (
+    "the fit of perspective has not settled: depths and fit do not agree. The focal "
+    "length may be wrong, or the objects may turn too little"
+)
+NOT_BETTER = (
+    "perspective predicts held-out points no better than weak perspective. The focal "
+    "length or the principal point may be wrong, or the objects too far away"
+)
+NO_PERSPECTIVE = (
+    "no perspective was found: the focal length is very long, or there are too few "
+    "basis shapes to estimate it. If it is known, give focal_length"
+)
+WEAK = "The fit is that of weak-perspective cameras"
+
+
+class TableFit(NamedTuple):
+    """
+    A fit: model of new tables, frames of all rows, convergence, other attributes.
+
+    Of perspective images with a known focal length they are those of weak-perspective
+    images in virtual cameras. changes: shares by which repeats have changed the depths.
+    energies (J,): contributions of the points to E.
+    """
+
+    model: TableModel
+    frames: Decomposition
+    converged: bool
+    attributes: dict[str, Any]
+    changes: tuple[float, ...] = ()
+    energies: NDArray = np.zeros(0)
+
+    @property
+    def energy(self) -> float:
+        """Mean squared distance E of the points from their images."""
+        return float(self.energies.sum())
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """The perspective camera."""
+        assert self.model.pinhole is not None
+        return self.model.pinhole
+
+    def depths(self, part: slice) -> NDArray:
+        """Return depths (n, J) of the points of some frames."""
+        return self.model.depths(self.frames.motion[part], self.frames.alpha[part])
+
+    def change(self, other: "TableFit", parts: list[slice]) -> float:
+        """Return the distance of depths from others, relative to these.
+
+        It is negative if the mirror image is nearer.
+        """
+        pairs = (np.nan_to_num([fit.depths(p) for fit in (self, other)]) for p in parts)
+        products = sum(np.einsum("aij,bij->ab", pair, pair) for pair in pairs)
+        (own, common), (_, others) = np.asarray(products)
+        square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
+        return float(np.copysign(np.sqrt(square), common))
+
+    def ends(self, tol: float, best: float) -> bool:
+        """Return whether further repeats would not help: for the best E of others."""
+        n_repeats, change = len(self.changes), self.changes[-1]
+        most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
+        most = 2 if self.energy > WORSE * best else most
+        return change < tol or n_repeats >= most
+
+    def mirrored(self) -> "TableFit":
+        """Return the mirror image in depth."""
+        attributes = self.attributes | self.model.mirrored_attributes(self.attributes)
+        frames = self.frames._replace(motion=self.frames.motion * MIRROR)
+        model = attributes.pop("_model")
+        return self._replace(model=model, frames=frames, attributes=attributes)
 
 
 def stages_of(estimator: Any) -> list[str]:
@@ -139,8 +224,8 @@ def fit_table(
 ) -> TableFit:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
-    Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
-    without visible points; convergence; and the other attributes of `AffineNRSfM`.
+    Frames are NaN for rows without visible points. The attributes are the others of
+    `AffineNRSfM`.
     """
     wanted, first = n_components, settings
     # Calibrated cameras: the fit does not depend on the number of coefficients.
@@ -169,35 +254,31 @@ def fit_table(
         isa, shapes = None, given.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
-        fitted, frames, converged, attributes = _joint_fit(
-            factorised, shapes, given, settings, wanted, progress
-        )
+        fit = _joint_fit(factorised, shapes, given, settings, wanted, progress)
         # Down-weighted outliers, for example, look like basis shapes at first.
-        supported = max(n_reliable(attributes["reliability_"]), 1)
+        supported = max(n_reliable(fit.attributes["reliability_"]), 1)
         falls = settings.free and not settings.all_directions
         if falls and supported < n_components:
             progress("gauge and coefficients")
             first = first._replace(known=None)
             return fit_table(table, supported, isa, first, NoProgress())
     else:
-        fitted, frames, attributes = _paper_frames(
-            table, factorised.factors, shapes, covariance, settings
-        )
-        attributes["n_iter_"] = n_iter
+        fit = _paper_fit(table, factorised.factors, shapes, covariance, settings)
+        fit.attributes["n_iter_"] = n_iter
+        fit = fit._replace(converged=converged)
     # The mirror image in depth
     probability = settings.mirror_certainty
     if settings.hidden_points and not table.complete and settings.prior is None:
-        probability = fitted.mirror_certainty(table.rows, frames)
+        probability = fit.model.mirror_certainty(table.rows, fit.frames)
         if probability < 0.5:
-            probability = 1.0 - probability
-            fitted, frames, attributes = mirror_image(fitted, frames, attributes)
+            probability, fit = 1.0 - probability, fit.mirrored()
     # 6. Measures of the fit
-    attributes |= _measures(table, factorised, fitted, frames, settings)
+    attributes = fit.attributes | _measures(factorised, fit, settings.camera)
     progress("gauge and coefficients")
-    rows = (of_all_rows(part.astype(table.dtype), table.shown) for part in frames)
+    rows = (of_all_rows(part.astype(table.dtype), table.shown) for part in fit.frames)
     sizes = of_all_rows(table.sizes, table.shown)
     attributes |= {"mirror_certainty_": probability, "isa_": isa, "_frame_sizes": sizes}
-    return fitted, Decomposition(*rows), converged, attributes
+    return fit._replace(frames=Decomposition(*rows), attributes=attributes)
 
 
 def _joint_fit(
@@ -265,14 +346,13 @@ def _joint_fit(
         widths = None if widths is None else widths.padded(n_more)
     fits = fitted_frames(model, tracks, table.rows)
     del tracks  # as much memory as the table
-    fitted, frames, measures = _joint_frames(
-        table, model, fits, settings, n_components, widths
-    )
+    result = _joint_frames(table, model, fits, settings, n_components, widths)
     if fit.prior is not None:
         attributes["prior_std_"] = np.array([fit.prior.distance, 0.0])
     if errors and calibrated:
-        attributes["depth_uncertainty_"] = fitted.frames.certainty.total
-    return fitted, frames, fit.converged, attributes | measures
+        attributes["depth_uncertainty_"] = result.model.frames.certainty.total
+    attributes |= result.attributes
+    return result._replace(converged=fit.converged, attributes=attributes)
 
 
 @one_blas_thread
@@ -365,34 +445,29 @@ def _started(
     return JointState(shapes, motion, noise)
 
 
-def _paper_frames(
+def _paper_fit(
     table: ScaledTable,
     factors: Factorisation,
     shapes: NDArray,
     covariance: NDArray,
     s: FitSettings,
-) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return model, frames and attributes of the paper's pipeline in its gauge."""
+) -> TableFit:
+    """Return the fit of the paper's pipeline in its gauge."""
     if s.camera != "affine":
         scaled = s.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
 
-    def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
-        frames = FrameModel.rigid(mean_shape, basis, s.camera)
-        K = len(basis)
-        return TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
-
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
-    def frames_for(mean_shape: NDArray, basis: NDArray) -> Any:
-        decompose = partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
-        return table.source.joined(decompose)
+    def fitted(mean_shape: NDArray, basis: NDArray) -> tuple[TableModel, Decomposition]:
+        frames, K = FrameModel.rigid(mean_shape, basis, s.camera), len(basis)
+        model = TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
+        return model, table.source.joined(partial(model.decompose, dtype=np.float64))
 
-    mean_shape, basis, order, frames = rigid_gauge(
-        shapes[0].T, shapes[1:].mT, table.sizes, frames_for, s.camera, table.dtype
+    model, frames, order = rigid_gauge(
+        shapes[0].T, shapes[1:].mT, table.sizes, fitted, s.camera, table.dtype
     )
-    covariance = reorder_blocks(covariance, order)
-    attributes = {"mode_covariance_": (table.unit or 1.0) ** 2 * covariance}
-    return fitted(mean_shape, basis), frames, attributes
+    covariance = (table.unit or 1.0) ** 2 * reorder_blocks(covariance, order)
+    return TableFit(model, frames, True, {"mode_covariance_": covariance})
 
 
 def _joint_frames(
@@ -402,8 +477,8 @@ def _joint_frames(
     s: FitSettings,
     n_components: int,
     widths: Widths | None,
-) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return model, frames and attributes of fits in the independent gauge.
+) -> TableFit:
+    """Return fits in the independent gauge.
 
     n_components: number of coefficients that are reported. widths: of a fit of all
     directions.
@@ -468,17 +543,14 @@ def _joint_frames(
     }
     frames = frames._replace(translation=frames.translation + table.translation)
     fitted = TableModel(model, mean_shape, basis, n_components, s.layout, table.unit)
-    return fitted, frames, attributes
+    return TableFit(fitted, frames, True, attributes)
 
 
 def _measures(
-    table: ScaledTable,
-    factorised: FactorisedTable,
-    model: TableModel,
-    frames: Decomposition,
-    settings: FitSettings,
+    factorised: FactorisedTable, fit: TableFit, camera: str
 ) -> dict[str, Any]:
     """Return the attributes that describe any fit, by name."""
+    table, (model, frames, *_) = factorised.scaled, fit
     mean_shape, basis, K = model.mean_shape, model.basis, model.n_components
     values = factorised.singular_values
     cameras = frames.motion / table.sizes[:, None, None]
@@ -486,7 +558,7 @@ def _measures(
     position = (frames.translation - table.translation) / table.sizes[:, None]
     shapes = np.concatenate([mean_shape[None], basis]).mT
     error = reprojection_error(table.rows, shapes, cameras, position, frames.alpha)
-    reference = mean_camera(frames, table.sizes, settings.camera)
+    reference = mean_camera(frames, table.sizes, camera)
     return {
         "mean_shape_": mean_shape,
         "basis_": basis[:K],
@@ -507,109 +579,8 @@ def mean_camera(frames: Decomposition, sizes: NDArray, camera: str) -> dict[str,
     return {"reference_motion_": reference, "reference_translation_": centre}
 
 
-def mirror_image(
-    model: TableModel, frames: Decomposition, attributes: dict[str, Any]
-) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return the mirror image in depth of a fit."""
-    attributes = attributes | model.mirrored_attributes(attributes)
-    frames = frames._replace(motion=frames.motion * MIRROR)
-    return attributes.pop("_model"), frames, attributes
-
-
-# Effects of these constants: docs/benchmarks/README.md, "Thresholds".
-# Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
-# tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
-SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
-# Factor of the tolerance of all fits but the last one, and of SETTLED for focal lengths
-# that are only compared.
-ROUGH, COMPARED = 4.0, 5.0
-# A mirror image is given up if E is larger than this multiple of the other one's.
-WORSE = 1.3
-# Focal lengths of the weak-perspective fit and of the first perspective one, in largest
-# distances from the principal point, and how much longer the next one is if that fails.
-ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
-# Factors of the steps of the search for the minimum, from the best fit up and down; its
-# error, as a share of 1/f; and the largest number of fits.
-STEPS, NEAR, MOST_FITS = (1.5, 1.1), 0.01, 16
-
-# Why perspective is not taken.
-UNSTEADY = (
-    "the fit of perspective has not settled: depths and fit do not agree. The focal "
-    "length may be wrong, or the objects may turn too little"
-)
-NOT_BETTER = (
-    "perspective predicts held-out points no better than weak perspective. The focal "
-    "length or the principal point may be wrong, or the objects too far away"
-)
-NO_PERSPECTIVE = (
-    "no perspective was found: the focal length is very long, or there are too few "
-    "basis shapes to estimate it. If it is known, give focal_length"
-)
-WEAK = "The fit is that of weak-perspective cameras"
-
-
-class PerspectiveFit(NamedTuple):
-    """
-    A fit with a known focal length, of weak-perspective images in virtual cameras.
-
-    model: with the perspective camera. frames, converged, attributes: as `fit_table`
-    returns them. changes: shares by which repeats have changed the depths. energies
-    (J,): contributions of the points to E.
-    """
-
-    model: TableModel
-    frames: Decomposition
-    converged: bool
-    attributes: dict[str, Any]
-    changes: tuple[float, ...] = ()
-    energies: NDArray = np.zeros(0)
-
-    @property
-    def energy(self) -> float:
-        """Mean squared distance E of the points from their images."""
-        return float(self.energies.sum())
-
-    @property
-    def pinhole(self) -> Pinhole:
-        """The perspective camera."""
-        assert self.model.pinhole is not None
-        return self.model.pinhole
-
-    @property
-    def n_components(self) -> int:
-        """Number of basis shapes."""
-        return self.model.n_components
-
-    def depths(self, part: slice) -> NDArray:
-        """Return depths (n, J) of the points of some frames."""
-        return self.model.depths(self.frames.motion[part], self.frames.alpha[part])
-
-    def change(self, other: "PerspectiveFit", parts: list[slice]) -> float:
-        """Return the distance of depths from others, relative to these.
-
-        It is negative if the mirror image is nearer.
-        """
-        pairs = (np.nan_to_num([fit.depths(p) for fit in (self, other)]) for p in parts)
-        products = sum(np.einsum("aij,bij->ab", pair, pair) for pair in pairs)
-        (own, common), (_, others) = np.asarray(products)
-        square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
-        return float(np.copysign(np.sqrt(square), common))
-
-    def ends(self, tol: float, best: float) -> bool:
-        """Return whether further repeats would not help: for the best E of others."""
-        n_repeats, change = len(self.changes), self.changes[-1]
-        most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
-        most = 2 if self.energy > WORSE * best else most
-        return change < tol or n_repeats >= most
-
-    def mirrored(self) -> "PerspectiveFit":
-        """Return the mirror image in depth."""
-        image = mirror_image(self.model, self.frames, self.attributes)
-        return self._replace(model=image[0], frames=image[1], attributes=image[2])
-
-
-class PerspectiveTable(NamedTuple):
-    """A table of perspective images, and what all its fits have in common."""
+class Images(NamedTuple):
+    """A table of images, and what all its fits have in common."""
 
     source: FrameBlocks
     weights: NDArray | None
@@ -624,28 +595,32 @@ class PerspectiveTable(NamedTuple):
         return pinhole_of(focal_length, self.principal_point, robust, near)
 
     def straight(
-        self, pinhole: Pinhole | None, n_components: int, fit: PerspectiveFit | None
+        self,
+        n_components: int = 1,
+        pinhole: Pinhole | None = None,
+        fit: TableFit | None = None,
     ) -> ScaledTable:
         """Return weak-perspective images, for the depths of a fit, or equal ones.
 
         Without a camera they are those of the table.
         """
-        model = None if fit is None else fit.model
+        rows, model = self.source, None if fit is None else fit.model
         known = () if fit is None else (fit.frames.motion, fit.frames.alpha)
-        function = partial(_straight, pinhole=pinhole, model=model)
-        rows = self.source.derive(function, *known)
+        if pinhole is not None:
+            straight = partial(_straight, pinhole=pinhole, model=model)
+            rows = rows.derive(straight, *known)
         return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
         self,
         pinhole: Pinhole | None,
         n_components: int | None,
-        before: PerspectiveFit | None = None,
+        before: TableFit | None = None,
         *,
         last: bool = False,
         progress: FitProgress | NoProgress | None = None,
         **changes: Any,
-    ) -> PerspectiveFit:
+    ) -> TableFit:
         """Return the fit of images that are corrected for the depths of another fit.
 
         It has the mirror image with those depths. None stands for as many basis shapes
@@ -668,13 +643,13 @@ class PerspectiveTable(NamedTuple):
                 settings = settings._replace(start=before.model, placed=before.frames)
         settings = settings._replace(**{"free": n_components is None} | changes)
         if n_components is None:
-            table = self.straight(pinhole, 1, before)
+            table = self.straight(1, pinhole, before)
             n_components = supported_components(table, isa, settings, quiet)
-            if before is not None and n_components == before.n_components:
+            if before is not None and n_components == before.model.n_components:
                 return before
-        table = self.straight(pinhole, n_components, before)
+        table = self.straight(n_components, pinhole, before)
         args = table, n_components, isa, settings, progress or quiet
-        fit = PerspectiveFit(*fit_table(*args))
+        fit = fit_table(*args)
         fit = fit._replace(model=fit.model._replace(pinhole=pinhole))
         if before is not None:
             change = fit.change(before, self.source.slices)
@@ -689,16 +664,16 @@ class PerspectiveTable(NamedTuple):
         self,
         pinhole: Pinhole,
         n_components: int,
-        *fits: PerspectiveFit,
+        *fits: TableFit,
         tol: float = SETTLED,
-    ) -> list[PerspectiveFit]:
+    ) -> list[TableFit]:
         """Repeat fits until depths and fits agree; return them, the best first.
 
         A fit also ends if it is clearly worse than the best one.
         """
         tol *= self.settings.tol / JOINT_TOL
         running = [fit._replace(changes=()) for fit in fits]
-        ended: list[PerspectiveFit] = []
+        ended: list[TableFit] = []
         while running:
             self.progress.step()
             running = [self.fit(pinhole, n_components, fit) for fit in running]
@@ -707,10 +682,10 @@ class PerspectiveTable(NamedTuple):
             running = [fit for fit in running if not fit.ends(tol, best)]
         return sorted(ended, key=lambda fit: fit.energy)
 
-    def images(self, first: PerspectiveFit, f: float) -> dict[float, PerspectiveFit]:
+    def images(self, first: TableFit, f: float) -> dict[float, TableFit]:
         """Return the fits for 1/f and -1/f from a first fit."""
         images, pinhole = (first, first.mirrored()), self.pinhole(f)
-        better, worse = self.settled(pinhole, first.n_components, *images)
+        better, worse = self.settled(pinhole, first.model.n_components, *images)
         if self.log_odds(better, worse) < 0:
             better, worse = worse, better
         return {1.0 / f: better, -1.0 / f: worse}
@@ -721,7 +696,7 @@ class PerspectiveTable(NamedTuple):
         ours, theirs = (m.held_out_error(self.source, *known) for m in (model, weak))
         return ours < theirs
 
-    def log_odds(self, fit: PerspectiveFit, image: PerspectiveFit) -> float:
+    def log_odds(self, fit: TableFit, image: TableFit) -> float:
         """Return the log odds of a fit against its mirror image.
 
         The evidence is a test of E over groups of points, and the prior, if any.
@@ -736,24 +711,24 @@ class PerspectiveTable(NamedTuple):
         sign = np.sign(np.vdot(fit.model.mean_shape[:, 2], prior[:, 2]))
         return odds + float(sign * logit(self.settings.mirror_certainty))
 
-    def started(self, model: TableModel, n_components: Any) -> PerspectiveFit:
+    def started(self, model: TableModel, n_components: Any) -> TableFit:
         """Return the fit from the model of a similar table, with its focal length."""
         frames = self.source.joined(model.in_virtual_cameras)
-        fit = PerspectiveFit(model, frames, True, {"isa_": None})
+        fit = TableFit(model, frames, True, {"isa_": None})
         return self.settled(fit.pinhole, n_components, fit)[0]
 
-    def near(self, fits: dict[float, PerspectiveFit], place: float) -> PerspectiveFit:
+    def near(self, fits: dict[float, TableFit], place: float) -> TableFit:
         """Return the fit for g, from that with the nearest one."""
         fit = fits[min((g for g in fits if g > 0), key=lambda g: abs(g - place))]
         rough, pinhole = COMPARED * SETTLED, self.pinhole(1.0 / place)
-        return self.settled(pinhole, fit.n_components, fit, tol=rough)[0]
+        return self.settled(pinhole, fit.model.n_components, fit, tol=rough)[0]
 
-    def searched(self, n_components: int | None) -> dict[float, PerspectiveFit]:
+    def searched(self, n_components: int | None) -> dict[float, TableFit]:
         """Return fits around the minimum of E; 0 is the weak-perspective fit."""
         f = FIRST * max(self.source.map(self._reach))
         virtual = self.pinhole(f, near=False)
         first = self.fit(virtual, n_components, progress=self.progress)
-        far = self.fit(self.pinhole(ENDLESS * f, near=False), first.n_components)
+        far = self.fit(self.pinhole(ENDLESS * f, near=False), first.model.n_components)
         fits = {0.0: far, **self.images(first, f)}
         if far.energy < fits[1.0 / f].energy:  # a long focal length, or none
             fits |= self.images(far, LONGER * f)
@@ -773,12 +748,37 @@ class PerspectiveTable(NamedTuple):
         return float(max(largest, *np.abs(centre[:, 0])))
 
 
-def best_of(fits: dict[float, PerspectiveFit]) -> float:
+def fit_images(
+    table: Images, n_components: Any, given: Any, perspective: bool
+) -> TableFit:
+    """Fit images as `fit_table` fits a scaled table, with a given focal length, if any.
+
+    "auto" stands for as many coefficients as the table determines.
+    """
+    auto, point = n_components == "auto", table.principal_point
+    args = table.isa, table.settings, table.progress
+    if perspective:
+        fit = fit_perspective(table, None if auto else n_components, given)
+    else:
+        if auto and table.settings.camera == "affine":
+            with warnings.catch_warnings(action="ignore"):  # the fit warns again
+                scaled = table.straight()
+            n_components = supported_components(scaled, *args)
+        number = 1 if n_components == "auto" else n_components
+        fit = fit_table(table.straight(n_components=number), number, *args)
+    if point is not None and fit.model.pinhole is None:
+        f = np.array(np.inf if given is None else given, dtype=float)[()]
+        fit = fit._replace(model=fit.model._replace(axes=pinhole_of(f, point)))
+        fit.attributes.update(focal_length_=f, focal_length_std_=0.0)
+    return fit
+
+
+def best_of(fits: dict[float, TableFit]) -> float:
     """Return the g of the fit with the least E."""
     return min(fits, key=lambda g: fits[g].energy)
 
 
-def minimum(fits: dict[float, PerspectiveFit]) -> tuple[float, float]:
+def minimum(fits: dict[float, TableFit]) -> tuple[float, float]:
     """Return the minimum of a parabola through the three best fits, its deviation."""
     g = sorted(fits, key=lambda g: fits[g].energy)[:3]
     energies = np.array([fits[place].energies for place in g])
@@ -798,9 +798,7 @@ def minimum(fits: dict[float, PerspectiveFit]) -> tuple[float, float]:
     return every, float(parts.std() * np.sqrt(n_free * n_free / (n_free - 2)))
 
 
-def fit_perspective(
-    table: PerspectiveTable, n_components: int | None, given: Any
-) -> TableFit:
+def fit_perspective(table: Images, n_components: int | None, given: Any) -> TableFit:
     """Fit perspective images as `fit_table` fits weak-perspective ones.
 
     `n_components` and the given focal length are estimated if they are None; the table
@@ -810,7 +808,7 @@ def fit_perspective(
     that fit may be known, as "weak".
     """
     settings, errors = table.settings, table.settings.errors
-    fits: dict[float, PerspectiveFit] = {}
+    fits: dict[float, TableFit] = {}
     deviation, why, prior = 0.0, "", settings.prior
     # Like all fits with calibrated cameras, it does not depend on the number reported.
     number = None if settings.all_directions else n_components
@@ -838,11 +836,11 @@ def fit_perspective(
                 why = NO_PERSPECTIVE
         if number is None and not why:
             best = table.fit(best.pinhole, None, best)
-            best = table.settled(best.pinhole, best.n_components, best)[0]
+            best = table.settled(best.pinhole, best.model.n_components, best)[0]
     # The last fits, with warnings and errors of depths
     last = partial(table.fit, last=True)
     if not why:
-        n_last = n_components or best.n_components
+        n_last = n_components or best.model.n_components
         fit = last(best.pinhole, n_last, best)
         if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
             fit = last(best.pinhole, n_last, fit)
@@ -854,9 +852,8 @@ def fit_perspective(
     table.progress(PERSPECTIVE_STAGE)
     if why:
         warn_caller(f"{why}. {WEAK}")
-        return plain()[:4]
-    model, _, converged, attributes, *_ = fit
-    f = best.pinhole.focal_length
+        return plain()
+    model, attributes, f = fit.model, fit.attributes, best.pinhole.focal_length
     if errors and model.frames.joint:
         certainty = model.frames.certainty
         error = focal_error(fits, 1.0 / f, deviation, table.source.slices)
@@ -882,11 +879,11 @@ def fit_perspective(
         "focal_length_std_": deviation * f**2 if known or not deviation else np.inf,
     }
     frames = Decomposition(*(part.astype(dtype) for part in frames))
-    return model, frames, converged, attributes
+    return fit._replace(model=model, frames=frames)
 
 
 def focal_error(
-    fits: dict[float, PerspectiveFit], g: float, deviation: float, parts: list[slice]
+    fits: dict[float, TableFit], g: float, deviation: float, parts: list[slice]
 ) -> float:
     """Return the relative error of the depths due to that of the focal length.
 
@@ -902,14 +899,12 @@ def focal_error(
 
 
 def _straight(
-    rows: NDArray, *frames: NDArray, pinhole: Pinhole | None, model: TableModel | None
+    rows: NDArray, *frames: NDArray, pinhole: Pinhole, model: TableModel | None
 ) -> NDArray:
     """Return weak-perspective images (n, 2, J) of rows, for the depths of a model.
 
     Frames are cameras and coefficients. Without a model depths are equal.
     """
-    if pinhole is None:
-        return rows
     images = pinhole.virtual(rows)
     return images if model is None else pinhole.straight(images, model.depths(*frames))
 

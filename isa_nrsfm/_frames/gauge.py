@@ -120,16 +120,16 @@ def rigid_gauge(
     mean_shape: NDArray,
     basis: NDArray,
     sizes: NDArray,
-    fitted: Callable[[NDArray, NDArray], Decomposition],
+    fitted: Callable[[NDArray, NDArray], tuple[Any, Decomposition]],
     camera: str,
     dtype: Any,
-) -> tuple[NDArray, NDArray, NDArray, Decomposition]:
-    """Return mean shape, basis, its order, and frames of the paper's pipeline.
+) -> tuple[Any, Decomposition, NDArray]:
+    """Return model and frames of the paper's pipeline, and the order of the basis.
 
     The gauge is that of a fit to visible points, not to completed frames. `fitted`
-    returns the fit for a mean shape (J, 3) and a basis (K, J, 3), rounded to a dtype.
+    returns both for a mean shape (J, 3) and a basis (K, J, 3), rounded to a dtype.
     """
-    order, frames = np.arange(len(basis)), fitted(mean_shape, basis)
+    order, (model, frames) = np.arange(len(basis)), fitted(mean_shape, basis)
     # One scaling is enough, unless frames have fewer points than coefficients need.
     for _ in range(50):
         motion = frames.motion / sizes[:, None, None]
@@ -143,13 +143,13 @@ def rigid_gauge(
         )
         order = order[new_order]
         mean_shape, basis = mean_shape.astype(dtype), basis.astype(dtype)
-        frames = fitted(mean_shape, basis)
+        model, frames = fitted(mean_shape, basis)
         # Coefficients scale with the basis shapes. If a frame does not determine its
         # coefficients, their solution of minimum norm changes.
         off = coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
         if np.abs(off).max(initial=0.0) <= 1e-6:
             break
-    return mean_shape, basis, order, frames
+    return model, frames, order
 
 
 def coefficient_sizes(alpha: NDArray) -> NDArray:
