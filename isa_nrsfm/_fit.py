@@ -533,13 +533,12 @@ def _joint_frames(
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
+    modes = mode_covariance(cameras, frames.alpha[:, :n_components])
+    reliability = reliabilities(alpha, covariance, sum(moments), sum(noises))
     attributes |= {
-        "mode_covariance_": square
-        * mode_covariance(cameras, frames.alpha[:, :n_components]),
+        "mode_covariance_": square * modes,
         "noise_variance_": square * noise,
-        "reliability_": reliabilities(alpha, covariance, sum(moments), sum(noises))[
-            :n_components
-        ],
+        "reliability_": reliability[:n_components],
     }
     frames = frames._replace(translation=frames.translation + table.translation)
     fitted = TableModel(model, mean_shape, basis, n_components, s.layout, table.unit)
@@ -854,7 +853,7 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         warn_caller(f"{why}. {WEAK}")
         return plain()
     model, attributes, f = fit.model, fit.attributes, best.pinhole.focal_length
-    if errors and model.frames.joint:
+    if errors:
         certainty = model.frames.certainty
         error = focal_error(fits, 1.0 / f, deviation, table.source.slices)
         total = float(np.hypot(certainty.total, error))

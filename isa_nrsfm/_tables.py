@@ -31,7 +31,6 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
-from isa_nrsfm._linalg import energies
 
 # Columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
 Layout = Literal["interleaved", "planar"]
@@ -346,18 +345,15 @@ class FrameBlocks:
         if self.cached:
             array = self.joined(getitem, frames)
             return self.of_array(array, length, self.n_threads)
-        chosen = self.derive(getitem, frames)
-        counts = [np.count_nonzero(frames[part]) for part in self.slices]
-        before = np.cumsum([0, *counts])
+        chosen, ends = np.flatnonzero(frames), np.cumsum(self.lengths)
 
         def rows(part: slice) -> NDArray:
-            ends = [part.start, part.stop - 1]
-            first, last = np.searchsorted(before, ends, side="right") - 1
-            blocks = [chosen.read(number) for number in range(first, last + 1)]
-            start = part.start - before[first]
-            return np.concatenate(blocks)[start : start + part.stop - part.start]
+            wanted = chosen[part]
+            first, last = np.searchsorted(ends, wanted[[0, -1]], side="right")
+            blocks = [self.read(number) for number in range(first, last + 1)]
+            return np.concatenate(blocks)[wanted - self.slices[first].start]
 
-        return self.read_later(rows, int(before[-1]), length, self.n_threads)
+        return self.read_later(rows, len(chosen), length, self.n_threads)
 
     @one_blas_thread
     def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
@@ -516,9 +512,7 @@ def _share_of_x(rows: NDArray) -> NDArray:
 
     NaN counts as zero.
     """
-    if np.isnan(rows.sum()):
-        rows = np.where(np.isnan(rows), 0.0, rows)
-    x, y = map(energies, rows.swapaxes(0, 1))
+    x, y = np.nansum(np.square(rows, dtype=np.float64), axis=2).T
     energy = x + y
     return np.divide(x, energy, where=energy > 0, out=np.zeros_like(energy))
 

@@ -199,13 +199,6 @@ def affine_cameras(products: FrameSums, c: NDArray) -> NDArray:
     return np.einsum("rbi,bai->rai", Y, inverse3(A))
 
 
-def seen_changes(cross: NDArray, T: NDArray, M: NDArray) -> NDArray:
-    """Return ``F_k = M T_k - P_k^T`` (K, 2, 3, n) of the basis shapes."""
-    F = np.einsum("rbi,kbai->krai", M, unpack3(T[1:]))
-    F -= cross[1:].swapaxes(1, 2)
-    return F
-
-
 def frame_tracks(rows: NDArray, weights: NDArray | None = None) -> FrameTracks:
     """Return rows (I, 2, J) with the frame index last, each frame centred.
 
@@ -923,8 +916,11 @@ def _rise(
 def _changes(
     products: FrameSums, M: NDArray, posterior: CoefficientPosterior
 ) -> NDArray:
-    """Return ``F_k`` (K, 2, 3, n) for cameras M (2, 3, n)."""
-    return seen_changes(products.cross, products.gram.products(posterior.c), M)
+    """Return ``F_k`` (K, 2, 3, n) of the basis shapes for cameras M (2, 3, n)."""
+    changes = unpack3(products.gram.products(posterior.c)[1:])
+    F = np.einsum("rbi,kbai->krai", M, changes)
+    F -= products.cross[1:].swapaxes(1, 2)
+    return F
 
 
 def _value(problem: FrameProblem, posterior: CoefficientPosterior) -> NDArray:
