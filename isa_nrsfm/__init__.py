@@ -20,10 +20,12 @@ if TYPE_CHECKING:
         plotting as plotting,
         skeletons as skeletons,
     )
-    from isa_nrsfm._decision import AutoNRSfM as AutoNRSfM
     from isa_nrsfm._estimator import AffineNRSfM as AffineNRSfM
     from isa_nrsfm._frames.models import Decomposition as Decomposition
-    from isa_nrsfm._selection import AffineNRSfMCV as AffineNRSfMCV
+    from isa_nrsfm._selection import (
+        AffineNRSfMCV as AffineNRSfMCV,
+        AutoNRSfM as AutoNRSfM,
+    )
     from isa_nrsfm.analysis import (
         WithinGroups as WithinGroups,
         association as association,

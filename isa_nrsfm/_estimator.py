@@ -2,7 +2,6 @@
 
 import copy
 import os
-import warnings
 from functools import partial
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -14,55 +13,63 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_scalar
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress, NoProgress
+from isa_nrsfm import _parameters as choices
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
     N_JOBS,
+    CallbackSupportMixin,
+    FitProgress,
     HasMethods,
     Interval,
+    NoProgress,
     StrOptions,
     fit_context,
     with_numpy_defaults,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
-from isa_nrsfm._fit import STEPWISE, fit_table, stages_of, supported_components
-from isa_nrsfm._fitted_model import TableModel, removed_part, sees_perspective
-from isa_nrsfm._frames import camera_models
-from isa_nrsfm._frames.camera_models import CAMERAS, compose, full_rotations
-from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
-from isa_nrsfm._frames.pinhole import focal_shares, pinhole_of, zoomed_table
-from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
-from isa_nrsfm._other_tables import (
+from isa_nrsfm._fit import STEPWISE, Images, fit_images, stages_of
+from isa_nrsfm._fitted_model import (
+    TableModel,
     checked_prior,
     fitted_prior,
     of_fits,
+    removed_part,
+    sees_perspective,
     warn_if_foreign,
 )
-from isa_nrsfm._parameters import choices
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._parameters.naming import check_requirements
-from isa_nrsfm._perspective import PerspectiveTable, fit_perspective
-from isa_nrsfm._prepare.checks import (
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    compose,
+    focal_shares,
+    full_rotations,
+    pose_effect,
+    zoomed_table,
+)
+from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
+from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
+from isa_nrsfm._prepare.coordinates import warn_of_rows
+from isa_nrsfm._prepare.scaling import (
     check_camera,
     check_frames_kept,
     check_table,
     checked,
     undetermined,
     validated_table,
+    weighted_rows,
 )
-from isa_nrsfm._prepare.coordinates import warn_of_rows
-from isa_nrsfm._prepare.scaling import scaled_table, weighted_rows
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import (
+from isa_nrsfm._tables import (
     CHECKS,
+    LAYOUTS,
+    FrameBlocks,
+    Layout,
     StoredTable,
     column_sample,
     is_on_dask,
     is_read_later,
     open_table,
+    tracks_to_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.analysis._advice import warn_after_fit
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
@@ -577,23 +584,10 @@ default="affine"
         )
         prior, n_components = settings.prior, self.n_components
         n_components = n_components if prior is None else prior.n_components
-        auto, f, point = n_components == "auto", self.focal_length, self.principal_point
-        if self.camera == "perspective":
-            images = PerspectiveTable(source, weights, isa, settings, point, progress)
-            fit = fit_perspective(images, None if auto else n_components, f)
-        else:
-            if auto and self.camera == "affine":
-                with warnings.catch_warnings(action="ignore"):  # the fit warns again
-                    table = scaled_table(source, weights, 1, settings)
-                n_components = supported_components(table, isa, settings, progress)
-            number = 1 if n_components == "auto" else n_components
-            table = scaled_table(source, weights, number, settings)
-            fit = fit_table(table, number, isa, settings, progress)
-        model, frames, converged, fitted = fit
-        if point is not None and model.pinhole is None:
-            f = np.array(np.inf if f is None else f, dtype=float)[()]
-            model = model._replace(axes=pinhole_of(f, point))
-            fitted |= {"focal_length_": f, "focal_length_std_": 0.0}
+        images = Images(source, weights, isa, settings, self.principal_point, progress)
+        model, frames, converged, fitted, *_ = fit_images(
+            images, n_components, self.focal_length, self.camera == "perspective"
+        )
         if not converged:
             warn_caller(
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
@@ -610,7 +604,7 @@ default="affine"
         }
         reported = leading(frames, model.n_components)
         if self.remove_pose:
-            self.pose_effect_ = camera_models.pose_effect(frames.motion, reported.alpha)
+            self.pose_effect_ = pose_effect(frames.motion, reported.alpha)
             left = reported.alpha - removed_part(self, frames.motion)
             reported = reported._replace(alpha=left)
         if self.keep_frames:
@@ -631,9 +625,9 @@ default="affine"
         self, X: Any, point_weight: Any = None
     ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
         """Return the checked table of a fit, its weights and settings; set names."""
-        joint = self.refinement in JOINT_REFINEMENTS
+        joint = self.refinement in choices.JOINT_REFINEMENTS
         params = self.get_params(deep=False)
-        check_requirements(params | {"point_weight": point_weight})
+        choices.check_requirements(params | {"point_weight": point_weight})
         if not joint:
             if is_on_dask(X) or isinstance(X, StoredTable):
                 raise ValueError(
@@ -647,6 +641,10 @@ default="affine"
         params |= checked_prior(self, source.empty.shape[2])
         if self.tol is None:
             params["tol"] = JOINT_TOL if joint else PAPER_TOL
+        if self.camera == "orthographic":  # one scale
+            params["scale_frames"] = False
+        elif self.camera == "perspective":  # fits of images without perspective
+            params["camera"] = "weak_perspective"
         settings = FitSettings(
             **{name: params[name] for name in FitSettings._fields if name in params},
             names=getattr(self, "feature_names_in_", None),
@@ -655,10 +653,6 @@ default="affine"
             limits=self._limits,
             **(self._continued or {}),
         )
-        if self.camera == "orthographic":  # one scale
-            settings = settings._replace(scale_frames=False)
-        elif self.camera == "perspective":  # fits of images without perspective
-            settings = settings._replace(camera="weak_perspective")
         return source, weights[0] if weights else None, settings
 
     def _focal_shares(self, table: FrameBlocks) -> tuple[NDArray, ...]:
@@ -679,10 +673,6 @@ default="affine"
         plain = super(AffineNRSfM, plain).__sklearn_clone__()
         plain.prior = copy.copy(self.prior)  # for `set_params`
         return plain
-
-    def __sklearn_is_fitted__(self) -> bool:
-        """Return whether a fit has ended."""
-        return hasattr(self, "_model")
 
     if not TYPE_CHECKING:  # mypy would accept any name
 
@@ -1160,7 +1150,7 @@ default="affine"
             layout, frames = self._model.layout, self._model.frames
             known = "joint" if frames.joint else None
             given = {"point_weight": point_weight, "refinement": known}
-            check_requirements(given | {"loss": frames.loss})
+            choices.check_requirements(given | {"loss": frames.loss})
         if is_read_later(X):
             check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)

@@ -14,26 +14,49 @@
 
 Stages 1, 5 and 6 use all frames, the other stages those of the sample. No function here
 has an estimator: `AffineNRSfM.fit` sets the attributes that `fit_table` returns.
+
+The fit of perspective images repeats fits of weak-perspective ones, with the equations
+of `_frames.camera_models`. Each repeat corrects the images for the depths of the fit
+before, and starts from its shapes, until depths and fit agree. Weak-perspective images
+determine depths up to their sign, so both mirror images are continued.
+
+Let E be the mean squared distance of points from their images, in sizes of frames. As a
+function of g = 1/f it is least for the focal length f. g = 0 is the weak-perspective
+fit, and -g the mirror image of the fit for g. For an unknown f, steps up and down lead
+to the best fit: f is the minimum of the parabola through the best three. Without one of
+several groups of points it moves, which gives its deviation (jackknife).
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit, stdtr
 from sklearn.base import clone
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
-from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import FitProgress, NoProgress, one_blas_thread
+from isa_nrsfm._fitted_model import TableModel, prior_start
 from isa_nrsfm._frames.camera_models import (
+    Pinhole,
+    common,
     compose,
     line_of_sight,
     nearest_calibrated,
+    pinhole_of,
     reference_camera,
     reprojection_error,
+)
+from isa_nrsfm._frames.gauge import (
+    image_energies,
+    independent_gauge,
+    mode_covariance,
+    reorder_blocks,
+    rigid_gauge,
 )
 from isa_nrsfm._frames.models import (
     MIRROR,
@@ -42,46 +65,44 @@ from isa_nrsfm._frames.models import (
     FrameModel,
     spread_starts,
 )
-from isa_nrsfm._gauge import (
-    image_energies,
-    independent_gauge,
-    mode_covariance,
-    reorder_blocks,
-    rigid_gauge,
-)
 from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
-from isa_nrsfm._joint.settings import FitSettings
+from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, lifted_shapes, rigid_start
 from isa_nrsfm._joint.uncertainty import (
+    N_GROUPS,
     FrameFits,
     depth_certainty,
     fitted_frames,
     frame_certainty,
     half_tables,
     n_reliable,
+    neighbours,
     reliabilities,
     shape_information,
     shown_frames,
 )
-from isa_nrsfm._other_tables import prior_start
-from isa_nrsfm._paper.pipeline import (
+from isa_nrsfm._parameters import JOINT_REFINEMENTS
+from isa_nrsfm._prepare.completion import complete_rows
+from isa_nrsfm._prepare.robust import gross_outliers, robust_square
+from isa_nrsfm._prepare.scaling import (
+    ScaledTable,
+    largest_n_components,
+    most_components,
+    rows_without,
+    scaled_table,
+)
+from isa_nrsfm._tables import FrameBlocks, of_all_rows, spread
+from isa_nrsfm.isa._pipeline import (
     Factorisation,
     block_triplets,
     factorise,
     run_paper_pipeline,
     sample_frames,
 )
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._prepare.checks import largest_n_components, most_components
-from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.robust import gross_outliers
-from isa_nrsfm._prepare.scaling import ScaledTable, rows_without
-from isa_nrsfm._tables.blocks import spread
-from isa_nrsfm._tables.tracks import of_all_rows
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
@@ -89,8 +110,93 @@ PERSPECTIVE_STAGE = "perspective"
 # Stages that report steps.
 STEPWISE = JOINT_STAGE, CONSENSUS_STAGE, PERSPECTIVE_STAGE
 
-# Model, frames, convergence and other attributes of a fit
-TableFit = tuple[TableModel, Decomposition, bool, dict[str, Any]]
+# Effects of these constants: docs/benchmarks/README.md, "Thresholds".
+# Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
+# tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
+SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
+# Factor of the tolerance of all fits but the last one, and of SETTLED for focal lengths
+# that are only compared.
+ROUGH, COMPARED = 4.0, 5.0
+# A mirror image is given up if E is larger than this multiple of the other one's.
+WORSE = 1.3
+# Focal lengths of the weak-perspective fit and of the first perspective one, in largest
+# distances from the principal point, and how much longer the next one is if that fails.
+ENDLESS, FIRST, LONGER = 1e7, 2.0, 8.0
+# Factors of the steps of the search for the minimum, from the best fit up and down; its
+# error, as a share of 1/f; and the largest number of fits.
+STEPS, NEAR, MOST_FITS = (1.5, 1.1), 0.01, 16
+
+# Why perspective is not taken.
+UNSTEADY = (
+    "the fit of perspective has not settled: depths and fit do not agree. The focal "
+    "length may be wrong, or the objects may turn too little"
+)
+NOT_BETTER = (
+    "perspective predicts held-out points no better than weak perspective. The focal "
+    "length or the principal point may be wrong, or the objects too far away"
+)
+NO_PERSPECTIVE = (
+    "no perspective was found: the focal length is very long, or there are too few "
+    "basis shapes to estimate it. If it is known, give focal_length"
+)
+WEAK = "The fit is that of weak-perspective cameras"
+
+
+class TableFit(NamedTuple):
+    """
+    A fit: model of new tables, frames of all rows, convergence, other attributes.
+
+    Of perspective images with a known focal length they are those of weak-perspective
+    images in virtual cameras. changes: shares by which repeats have changed the depths.
+    energies (J,): contributions of the points to E.
+    """
+
+    model: TableModel
+    frames: Decomposition
+    converged: bool
+    attributes: dict[str, Any]
+    changes: tuple[float, ...] = ()
+    energies: NDArray = np.zeros(0)
+
+    @property
+    def energy(self) -> float:
+        """Mean squared distance E of the points from their images."""
+        return float(self.energies.sum())
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """The perspective camera."""
+        assert self.model.pinhole is not None
+        return self.model.pinhole
+
+    def depths(self, part: slice) -> NDArray:
+        """Return depths (n, J) of the points of some frames."""
+        return self.model.depths(self.frames.motion[part], self.frames.alpha[part])
+
+    def change(self, other: "TableFit", parts: list[slice]) -> float:
+        """Return the distance of depths from others, relative to these.
+
+        It is negative if the mirror image is nearer.
+        """
+        pairs = (np.nan_to_num([fit.depths(p) for fit in (self, other)]) for p in parts)
+        products = sum(np.einsum("aij,bij->ab", pair, pair) for pair in pairs)
+        (own, common), (_, others) = np.asarray(products)
+        square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
+        return float(np.copysign(np.sqrt(square), common))
+
+    def ends(self, tol: float, best: float) -> bool:
+        """Return whether further repeats would not help: for the best E of others."""
+        n_repeats, change = len(self.changes), self.changes[-1]
+        most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
+        most = 2 if self.energy > WORSE * best else most
+        return change < tol or n_repeats >= most
+
+    def mirrored(self) -> "TableFit":
+        """Return the mirror image in depth."""
+        attributes = self.attributes | self.model.mirrored_attributes(self.attributes)
+        frames = self.frames._replace(motion=self.frames.motion * MIRROR)
+        model = attributes.pop("_model")
+        return self._replace(model=model, frames=frames, attributes=attributes)
 
 
 def stages_of(estimator: Any) -> list[str]:
@@ -118,8 +224,8 @@ def fit_table(
 ) -> TableFit:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
-    Returns the model of new tables; cameras and coefficients of all rows, NaN for rows
-    without visible points; convergence; and the other attributes of `AffineNRSfM`.
+    Frames are NaN for rows without visible points. The attributes are the others of
+    `AffineNRSfM`.
     """
     wanted, first = n_components, settings
     # Calibrated cameras: the fit does not depend on the number of coefficients.
@@ -148,35 +254,31 @@ def fit_table(
         isa, shapes = None, given.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
-        fitted, frames, converged, attributes = _joint_fit(
-            factorised, shapes, given, settings, wanted, progress
-        )
+        fit = _joint_fit(factorised, shapes, given, settings, wanted, progress)
         # Down-weighted outliers, for example, look like basis shapes at first.
-        supported = max(n_reliable(attributes["reliability_"]), 1)
+        supported = max(n_reliable(fit.attributes["reliability_"]), 1)
         falls = settings.free and not settings.all_directions
         if falls and supported < n_components:
             progress("gauge and coefficients")
             first = first._replace(known=None)
             return fit_table(table, supported, isa, first, NoProgress())
     else:
-        fitted, frames, attributes = _paper_frames(
-            table, factorised.factors, shapes, covariance, settings
-        )
-        attributes["n_iter_"] = n_iter
+        fit = _paper_fit(table, factorised.factors, shapes, covariance, settings)
+        fit.attributes["n_iter_"] = n_iter
+        fit = fit._replace(converged=converged)
     # The mirror image in depth
     probability = settings.mirror_certainty
     if settings.hidden_points and not table.complete and settings.prior is None:
-        probability = fitted.mirror_certainty(table.rows, frames)
+        probability = fit.model.mirror_certainty(table.rows, fit.frames)
         if probability < 0.5:
-            probability = 1.0 - probability
-            fitted, frames, attributes = mirror_image(fitted, frames, attributes)
+            probability, fit = 1.0 - probability, fit.mirrored()
     # 6. Measures of the fit
-    attributes |= _measures(table, factorised, fitted, frames, settings)
+    attributes = fit.attributes | _measures(factorised, fit, settings.camera)
     progress("gauge and coefficients")
-    rows = (of_all_rows(part.astype(table.dtype), table.shown) for part in frames)
+    rows = (of_all_rows(part.astype(table.dtype), table.shown) for part in fit.frames)
     sizes = of_all_rows(table.sizes, table.shown)
     attributes |= {"mirror_certainty_": probability, "isa_": isa, "_frame_sizes": sizes}
-    return fitted, Decomposition(*rows), converged, attributes
+    return fit._replace(frames=Decomposition(*rows), attributes=attributes)
 
 
 def _joint_fit(
@@ -244,14 +346,13 @@ def _joint_fit(
         widths = None if widths is None else widths.padded(n_more)
     fits = fitted_frames(model, tracks, table.rows)
     del tracks  # as much memory as the table
-    fitted, frames, measures = _joint_frames(
-        table, model, fits, settings, n_components, widths
-    )
+    result = _joint_frames(table, model, fits, settings, n_components, widths)
     if fit.prior is not None:
         attributes["prior_std_"] = np.array([fit.prior.distance, 0.0])
     if errors and calibrated:
-        attributes["depth_uncertainty_"] = fitted.frames.certainty.total
-    return fitted, frames, fit.converged, attributes | measures
+        attributes["depth_uncertainty_"] = result.model.frames.certainty.total
+    attributes |= result.attributes
+    return result._replace(converged=fit.converged, attributes=attributes)
 
 
 @one_blas_thread
@@ -344,34 +445,29 @@ def _started(
     return JointState(shapes, motion, noise)
 
 
-def _paper_frames(
+def _paper_fit(
     table: ScaledTable,
     factors: Factorisation,
     shapes: NDArray,
     covariance: NDArray,
     s: FitSettings,
-) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return model, frames and attributes of the paper's pipeline in its gauge."""
+) -> TableFit:
+    """Return the fit of the paper's pipeline in its gauge."""
     if s.camera != "affine":
         scaled = s.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
 
-    def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
-        frames = FrameModel.rigid(mean_shape, basis, s.camera)
-        K = len(basis)
-        return TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
-
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
-    def frames_for(mean_shape: NDArray, basis: NDArray) -> Any:
-        decompose = partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
-        return table.source.joined(decompose)
+    def fitted(mean_shape: NDArray, basis: NDArray) -> tuple[TableModel, Decomposition]:
+        frames, K = FrameModel.rigid(mean_shape, basis, s.camera), len(basis)
+        model = TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
+        return model, table.source.joined(partial(model.decompose, dtype=np.float64))
 
-    mean_shape, basis, order, frames = rigid_gauge(
-        shapes[0].T, shapes[1:].mT, table.sizes, frames_for, s.camera, table.dtype
+    model, frames, order = rigid_gauge(
+        shapes[0].T, shapes[1:].mT, table.sizes, fitted, s.camera, table.dtype
     )
-    covariance = reorder_blocks(covariance, order)
-    attributes = {"mode_covariance_": (table.unit or 1.0) ** 2 * covariance}
-    return fitted(mean_shape, basis), frames, attributes
+    covariance = (table.unit or 1.0) ** 2 * reorder_blocks(covariance, order)
+    return TableFit(model, frames, True, {"mode_covariance_": covariance})
 
 
 def _joint_frames(
@@ -381,8 +477,8 @@ def _joint_frames(
     s: FitSettings,
     n_components: int,
     widths: Widths | None,
-) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return model, frames and attributes of fits in the independent gauge.
+) -> TableFit:
+    """Return fits in the independent gauge.
 
     n_components: number of coefficients that are reported. widths: of a fit of all
     directions.
@@ -437,27 +533,23 @@ def _joint_frames(
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
+    modes = mode_covariance(cameras, frames.alpha[:, :n_components])
+    reliability = reliabilities(alpha, covariance, sum(moments), sum(noises))
     attributes |= {
-        "mode_covariance_": square
-        * mode_covariance(cameras, frames.alpha[:, :n_components]),
+        "mode_covariance_": square * modes,
         "noise_variance_": square * noise,
-        "reliability_": reliabilities(alpha, covariance, sum(moments), sum(noises))[
-            :n_components
-        ],
+        "reliability_": reliability[:n_components],
     }
     frames = frames._replace(translation=frames.translation + table.translation)
     fitted = TableModel(model, mean_shape, basis, n_components, s.layout, table.unit)
-    return fitted, frames, attributes
+    return TableFit(fitted, frames, True, attributes)
 
 
 def _measures(
-    table: ScaledTable,
-    factorised: FactorisedTable,
-    model: TableModel,
-    frames: Decomposition,
-    settings: FitSettings,
+    factorised: FactorisedTable, fit: TableFit, camera: str
 ) -> dict[str, Any]:
     """Return the attributes that describe any fit, by name."""
+    table, (model, frames, *_) = factorised.scaled, fit
     mean_shape, basis, K = model.mean_shape, model.basis, model.n_components
     values = factorised.singular_values
     cameras = frames.motion / table.sizes[:, None, None]
@@ -465,7 +557,7 @@ def _measures(
     position = (frames.translation - table.translation) / table.sizes[:, None]
     shapes = np.concatenate([mean_shape[None], basis]).mT
     error = reprojection_error(table.rows, shapes, cameras, position, frames.alpha)
-    reference = mean_camera(frames, table.sizes, settings.camera)
+    reference = mean_camera(frames, table.sizes, camera)
     return {
         "mean_shape_": mean_shape,
         "basis_": basis[:K],
@@ -486,10 +578,339 @@ def mean_camera(frames: Decomposition, sizes: NDArray, camera: str) -> dict[str,
     return {"reference_motion_": reference, "reference_translation_": centre}
 
 
-def mirror_image(
-    model: TableModel, frames: Decomposition, attributes: dict[str, Any]
-) -> tuple[TableModel, Decomposition, dict[str, Any]]:
-    """Return the mirror image in depth of a fit."""
-    attributes = attributes | model.mirrored_attributes(attributes)
-    frames = frames._replace(motion=frames.motion * MIRROR)
-    return attributes.pop("_model"), frames, attributes
+class Images(NamedTuple):
+    """A table of images, and what all its fits have in common."""
+
+    source: FrameBlocks
+    weights: NDArray | None
+    isa: Any
+    settings: FitSettings
+    principal_point: Any
+    progress: FitProgress | NoProgress
+
+    def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
+        """Return the camera with a focal length."""
+        robust = self.settings.loss != "linear"
+        return pinhole_of(focal_length, self.principal_point, robust, near)
+
+    def straight(
+        self,
+        n_components: int = 1,
+        pinhole: Pinhole | None = None,
+        fit: TableFit | None = None,
+    ) -> ScaledTable:
+        """Return weak-perspective images, for the depths of a fit, or equal ones.
+
+        Without a camera they are those of the table.
+        """
+        rows, model = self.source, None if fit is None else fit.model
+        known = () if fit is None else (fit.frames.motion, fit.frames.alpha)
+        if pinhole is not None:
+            straight = partial(_straight, pinhole=pinhole, model=model)
+            rows = rows.derive(straight, *known)
+        return scaled_table(rows, self.weights, n_components, self.settings)
+
+    def fit(
+        self,
+        pinhole: Pinhole | None,
+        n_components: int | None,
+        before: TableFit | None = None,
+        *,
+        last: bool = False,
+        progress: FitProgress | NoProgress | None = None,
+        **changes: Any,
+    ) -> TableFit:
+        """Return the fit of images that are corrected for the depths of another fit.
+
+        It has the mirror image with those depths. None stands for as many basis shapes
+        as are relevant. Fits before the last one are joint fits with principal axes and
+        a larger tolerance, from the other fit and its cameras. `changes` are those of
+        the settings.
+        """
+        isa, quiet = self.isa, NoProgress()
+        settings = self.settings._replace(start=None, known=None)
+        if not last:
+            settings = settings._replace(
+                independence=None,
+                tol=ROUGH * settings.tol,
+                whole=False,  # all directions of a shape would explain the perspective
+                refinement="joint",
+                remove_pose=False,
+                errors=False,
+            )
+            if before is not None:
+                settings = settings._replace(start=before.model, placed=before.frames)
+        settings = settings._replace(**{"free": n_components is None} | changes)
+        if n_components is None:
+            table = self.straight(1, pinhole, before)
+            n_components = supported_components(table, isa, settings, quiet)
+            if before is not None and n_components == before.model.n_components:
+                return before
+        table = self.straight(n_components, pinhole, before)
+        args = table, n_components, isa, settings, progress or quiet
+        fit = fit_table(*args)
+        fit = fit._replace(model=fit.model._replace(pinhole=pinhole))
+        if before is not None:
+            change = fit.change(before, self.source.slices)
+            fit = fit.mirrored() if change < 0 else fit
+            fit.attributes["isa_"] = fit.attributes["isa_"] or before.attributes["isa_"]
+            fit = fit._replace(changes=(*before.changes, abs(change)))
+        squares = self.source.map(partial(_squares, model=fit.model), *fit.frames)
+        square, counts = np.sum(list(squares), axis=0)
+        return fit._replace(energies=square / counts.sum())
+
+    def settled(
+        self,
+        pinhole: Pinhole,
+        n_components: int,
+        *fits: TableFit,
+        tol: float = SETTLED,
+    ) -> list[TableFit]:
+        """Repeat fits until depths and fits agree; return them, the best first.
+
+        A fit also ends if it is clearly worse than the best one.
+        """
+        tol *= self.settings.tol / JOINT_TOL
+        running = [fit._replace(changes=()) for fit in fits]
+        ended: list[TableFit] = []
+        while running:
+            self.progress.step()
+            running = [self.fit(pinhole, n_components, fit) for fit in running]
+            best = min(fit.energy for fit in [*running, *ended])
+            ended += [fit for fit in running if fit.ends(tol, best)]
+            running = [fit for fit in running if not fit.ends(tol, best)]
+        return sorted(ended, key=lambda fit: fit.energy)
+
+    def images(self, first: TableFit, f: float) -> dict[float, TableFit]:
+        """Return the fits for 1/f and -1/f from a first fit."""
+        images, pinhole = (first, first.mirrored()), self.pinhole(f)
+        better, worse = self.settled(pinhole, first.model.n_components, *images)
+        if self.log_odds(better, worse) < 0:
+            better, worse = worse, better
+        return {1.0 / f: better, -1.0 / f: worse}
+
+    def preferred(self, model: TableModel, weak: TableModel) -> bool:
+        """Return whether held-out points prefer a model to weak perspective."""
+        known = () if self.weights is None else (self.weights,)
+        ours, theirs = (m.held_out_error(self.source, *known) for m in (model, weak))
+        return ours < theirs
+
+    def log_odds(self, fit: TableFit, image: TableFit) -> float:
+        """Return the log odds of a fit against its mirror image.
+
+        The evidence is a test of E over groups of points, and the prior, if any.
+        """
+        gain = image.energies - fit.energies
+        gain = np.bincount(neighbours(fit.model.mean_shape.T), gain)
+        t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
+        odds = float(logit(stdtr(len(gain) - 1, t)))
+        if np.isnan(self.settings.mirror_certainty):
+            return odds
+        prior = self.settings.prior.mean_shape
+        sign = np.sign(np.vdot(fit.model.mean_shape[:, 2], prior[:, 2]))
+        return odds + float(sign * logit(self.settings.mirror_certainty))
+
+    def started(self, model: TableModel, n_components: Any) -> TableFit:
+        """Return the fit from the model of a similar table, with its focal length."""
+        frames = self.source.joined(model.in_virtual_cameras)
+        fit = TableFit(model, frames, True, {"isa_": None})
+        return self.settled(fit.pinhole, n_components, fit)[0]
+
+    def near(self, fits: dict[float, TableFit], place: float) -> TableFit:
+        """Return the fit for g, from that with the nearest one."""
+        fit = fits[min((g for g in fits if g > 0), key=lambda g: abs(g - place))]
+        rough, pinhole = COMPARED * SETTLED, self.pinhole(1.0 / place)
+        return self.settled(pinhole, fit.model.n_components, fit, tol=rough)[0]
+
+    def searched(self, n_components: int | None) -> dict[float, TableFit]:
+        """Return fits around the minimum of E; 0 is the weak-perspective fit."""
+        f = FIRST * max(self.source.map(self._reach))
+        virtual = self.pinhole(f, near=False)
+        first = self.fit(virtual, n_components, progress=self.progress)
+        far = self.fit(self.pinhole(ENDLESS * f, near=False), first.model.n_components)
+        fits = {0.0: far, **self.images(first, f)}
+        if far.energy < fits[1.0 / f].energy:  # a long focal length, or none
+            fits |= self.images(far, LONGER * f)
+        for step in STEPS:
+            while len(fits) < MOST_FITS and (lowest := best_of(fits)) > 0:
+                places = lowest * step, lowest / step
+                new = [p for p in places if min(abs(g / p - 1) for g in fits) > NEAR]
+                if not new:
+                    break
+                fits[new[0]] = self.near(fits, new[0])
+        return fits
+
+    def _reach(self, rows: NDArray) -> float:
+        """Return the largest coordinate of points and image, from its middle."""
+        centre = self.pinhole(1.0).centre
+        largest = np.fmax.reduce(np.abs(rows - centre), axis=None, initial=0.0)
+        return float(max(largest, *np.abs(centre[:, 0])))
+
+
+def fit_images(
+    table: Images, n_components: Any, given: Any, perspective: bool
+) -> TableFit:
+    """Fit images as `fit_table` fits a scaled table, with a given focal length, if any.
+
+    "auto" stands for as many coefficients as the table determines.
+    """
+    auto, point = n_components == "auto", table.principal_point
+    args = table.isa, table.settings, table.progress
+    if perspective:
+        fit = fit_perspective(table, None if auto else n_components, given)
+    else:
+        if auto and table.settings.camera == "affine":
+            with warnings.catch_warnings(action="ignore"):  # the fit warns again
+                scaled = table.straight()
+            n_components = supported_components(scaled, *args)
+        number = 1 if n_components == "auto" else n_components
+        fit = fit_table(table.straight(n_components=number), number, *args)
+    if point is not None and fit.model.pinhole is None:
+        f = np.array(np.inf if given is None else given, dtype=float)[()]
+        fit = fit._replace(model=fit.model._replace(axes=pinhole_of(f, point)))
+        fit.attributes.update(focal_length_=f, focal_length_std_=0.0)
+    return fit
+
+
+def best_of(fits: dict[float, TableFit]) -> float:
+    """Return the g of the fit with the least E."""
+    return min(fits, key=lambda g: fits[g].energy)
+
+
+def minimum(fits: dict[float, TableFit]) -> tuple[float, float]:
+    """Return the minimum of a parabola through the three best fits, its deviation."""
+    g = sorted(fits, key=lambda g: fits[g].energy)[:3]
+    energies = np.array([fits[place].energies for place in g])
+    groups = neighbours(fits[g[0]].model.mean_shape.T)
+
+    def vertex(kept: NDArray) -> float:
+        """Return the minimum for some of the points, or infinity if there is none."""
+        square, slope, _ = np.polyfit(g, energies[:, kept].sum(axis=1), 2)
+        return float(-0.5 * slope / square) if square > 0 else np.inf
+
+    every = vertex(groups >= 0)
+    parts = np.array([vertex(groups != group) for group in range(N_GROUPS)])
+    if not np.isfinite(parts).all():
+        return every, np.inf
+    # Few groups: the error has a t distribution, whose deviation is larger.
+    n_free = N_GROUPS - 1
+    return every, float(parts.std() * np.sqrt(n_free * n_free / (n_free - 2)))
+
+
+def fit_perspective(table: Images, n_components: int | None, given: Any) -> TableFit:
+    """Fit perspective images as `fit_table` fits weak-perspective ones.
+
+    `n_components` and the given focal length are estimated if they are None; the table
+    has the mean of several. A fit from the model of a similar table has that of it.
+    If perspective is not found, its fit does not settle, or held-out points do not
+    prefer it, the fit is that of weak-perspective cameras, with a warning. The model of
+    that fit may be known, as "weak".
+    """
+    settings, errors = table.settings, table.settings.errors
+    fits: dict[float, TableFit] = {}
+    deviation, why, prior = 0.0, "", settings.prior
+    # Like all fits with calibrated cameras, it does not depend on the number reported.
+    number = None if settings.all_directions else n_components
+    with warnings.catch_warnings(action="ignore"):  # the last fit warns
+        if settings.start is not None:
+            best = table.started(settings.start, n_components)
+        elif given is not None:
+            f = common(given)
+            virtual = table.pinhole(f, near=False)
+            first = table.fit(virtual, number, progress=table.progress)
+            fits = {0.0: first, **table.images(first, f)}
+            best = fits[1.0 / f]
+            if best.changes[-1] > UNSETTLED and prior is None:
+                why = UNSTEADY
+            elif errors:  # neighbours tell how far a focal length contradicts the table
+                places = 0.8 / f, 1.25 / f
+                fits |= {place: table.near(fits, place) for place in places}
+        else:
+            fits, number = table.searched(n_components), n_components
+            place, deviation = minimum(fits)
+            deviation = float(np.hypot(deviation, 0.5 * NEAR * place))  # of the search
+            if best_of(fits) > 0 and place > 2.0 * deviation:
+                best = table.near(fits, place)
+            else:
+                why = NO_PERSPECTIVE
+        if number is None and not why:
+            best = table.fit(best.pinhole, None, best)
+            best = table.settled(best.pinhole, best.model.n_components, best)[0]
+    # The last fits, with warnings and errors of depths
+    last = partial(table.fit, last=True)
+    if not why:
+        n_last = n_components or best.model.n_components
+        fit = last(best.pinhole, n_last, best)
+        if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
+            fit = last(best.pinhole, n_last, fit)
+    plain = partial(last, None, n_components or 1, free=n_components is None)
+    if not why and settings.start is None:
+        with warnings.catch_warnings(action="ignore"):
+            weak = (settings.known or {}).get("weak") or plain(errors=False).model
+        why = "" if table.preferred(fit.model, weak) else NOT_BETTER
+    table.progress(PERSPECTIVE_STAGE)
+    if why:
+        warn_caller(f"{why}. {WEAK}")
+        return plain()
+    model, attributes, f = fit.model, fit.attributes, best.pinhole.focal_length
+    if errors:
+        certainty = model.frames.certainty
+        error = focal_error(fits, 1.0 / f, deviation, table.source.slices)
+        total = float(np.hypot(certainty.total, error))
+        certainty = certainty._replace(total=total)
+        model = model._replace(frames=replace(model.frames, certainty=certainty))
+        least = min(abs(g) for g in fits if g < 0)
+        probability = float(expit(table.log_odds(fits[least], fits[-least])))
+        attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
+    # Frames as new tables have them
+    weights = () if table.weights is None else (table.weights,)
+    decompose = partial(model.decompose, dtype=np.float64)
+    frames: Decomposition = table.source.joined(decompose, *weights)
+    dtype = table.source.empty.dtype
+    sizes, known = attributes["_frame_sizes"], model.frames.certainty.determined
+    shown = np.isfinite(sizes)
+    seen = Decomposition(*(values[shown] for values in frames))
+    view = mean_camera(seen, sizes[shown], "perspective")
+    attributes |= {name: value.astype(dtype) for name, value in view.items()}
+    attributes |= {
+        "isa_": best.attributes["isa_"],
+        "focal_length_": f if given is None else np.array(given, dtype=float)[()],
+        "focal_length_std_": deviation * f**2 if known or not deviation else np.inf,
+    }
+    frames = Decomposition(*(part.astype(dtype) for part in frames))
+    return fit._replace(model=model, frames=frames)
+
+
+def focal_error(
+    fits: dict[float, TableFit], g: float, deviation: float, parts: list[slice]
+) -> float:
+    """Return the relative error of the depths due to that of the focal length.
+
+    The error of 1/f is its deviation. For a given f it is the distance of the minimum
+    of E, as far as the deviation of the minimum does not explain it.
+    """
+    if not deviation:
+        place, other = minimum(fits)
+        deviation = np.sqrt(np.fmax((place - g) ** 2 - other**2, 0.0))
+    first, second = sorted((o for o in fits if o >= 0), key=lambda o: abs(o - g))[:2]
+    change = abs(fits[first].change(fits[second], parts))
+    return float(change * deviation / abs(second - first))
+
+
+def _straight(
+    rows: NDArray, *frames: NDArray, pinhole: Pinhole, model: TableModel | None
+) -> NDArray:
+    """Return weak-perspective images (n, 2, J) of rows, for the depths of a model.
+
+    Frames are cameras and coefficients. Without a model depths are equal.
+    """
+    images = pinhole.virtual(rows)
+    return images if model is None else pinhole.straight(images, model.depths(*frames))
+
+
+def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
+    """Return sums (J,) of squared distances, in sizes of frames, and counts."""
+    square = model.distances(rows, *model.in_table_cameras(rows, *fit)[:3]) ** 2
+    if model.frames.loss != "linear":
+        square = robust_square(square, model.frames.noise_variance)
+    return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.models import FrameMap
-from isa_nrsfm._frames.point_sums import frame_tracks
+from isa_nrsfm._frames.search import frame_tracks
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 

@@ -17,7 +17,7 @@ from refusals import refused
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 # Python does not interrupt between the last call of a block and the release of a lock.

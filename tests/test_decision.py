@@ -14,8 +14,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AutoNRSfM
-from isa_nrsfm._decision import FIRST, first_settings  # noqa: F401  in refusals.txt
 from isa_nrsfm._prepare.coordinates import still_points  # noqa: F401
+from isa_nrsfm._selection import FIRST, first_settings  # noqa: F401  in refusals.txt
 from isa_nrsfm.analysis._advice import COMPARE
 from isa_nrsfm.analysis._frame_columns import runs_between_gaps  # noqa: F401
 from isa_nrsfm.datasets import (

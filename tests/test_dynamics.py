@@ -16,7 +16,7 @@ from scipy.special import logit
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.models import FrameMap, LinearisedFrames
-from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
+from isa_nrsfm._linalg import frames_first, frames_last
 from isa_nrsfm.analysis._smoothing import (
     Dynamics,
     estimated_dynamics,

@@ -34,9 +34,9 @@ from isa_nrsfm._joint.uncertainty import (
     neighbours,
     shape_information,
 )
-from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._parameters import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses, write_viewer
 from isa_nrsfm.io import load_model, save_model

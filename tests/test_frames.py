@@ -33,7 +33,6 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
 )
 from isa_nrsfm._frames.models import spread_starts  # noqa: F401  in refusals.txt
-from isa_nrsfm._frames.point_sums import coefficient_posterior, frame_sums, frame_tracks
 from isa_nrsfm._frames.search import (
     LARGE_RISE,
     REVERSED,
@@ -41,15 +40,18 @@ from isa_nrsfm._frames.search import (
     State,
     _rise,
     calibrated_starts,
+    coefficient_posterior,
+    frame_sums,
+    frame_tracks,
 )
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
     COLUMNS,
     ROWS,
     frames_first,
     frames_last,
     unpacked,
 )
-from isa_nrsfm._tables.blocks import block_slices  # noqa: F401  in refusals.txt
+from isa_nrsfm._tables import block_slices  # noqa: F401  in refusals.txt
 
 AS_USERS = ["few_frames", "widths"]
 NOISE = 0.02

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scenes import random_cameras, random_rotation
 
 from isa_nrsfm._frames.camera_models import mean_view
-from isa_nrsfm._gauge import canonical_gauge, independent_gauge
-from isa_nrsfm._parameters.choices import INDEPENDENCE
+from isa_nrsfm._frames.gauge import canonical_gauge, independent_gauge
+from isa_nrsfm._parameters import INDEPENDENCE
 from isa_nrsfm.metrics import basis_similarity
 
 ALL = [*INDEPENDENCE, None]

@@ -11,14 +11,14 @@ from scipy.integrate import quad
 from scipy.linalg import polar
 from scipy.optimize import approx_fprime, linear_sum_assignment, minimize_scalar
 
-from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.isa import _shared_mixing, _strategies as strategies
-from isa_nrsfm.isa._shared_mixing import (
+from isa_nrsfm._frames.gauge import (
     LIGHT,
     TAILS,
     independent_coefficients,
     shared_mixing,
 )
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.isa import _shared_mixing, _strategies as strategies
 from isa_nrsfm.isa._strategies import (
     fixed_point_step,
     iterate,

@@ -20,7 +20,7 @@ from isa_nrsfm._joint import problem as problem_module
 from isa_nrsfm._joint.fit import residual_deviations
 from isa_nrsfm._joint.problem import FactorisedTable, JointState
 from isa_nrsfm._joint.uncertainty import SIGNS
-from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._parameters import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 

@@ -15,7 +15,7 @@ from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
 from isa_nrsfm._joint.problem import NOISE_FLOOR, JointState, _line_search, refine_joint
-from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpack3
+from isa_nrsfm._linalg import frames_first, frames_last, unpack3
 
 DEVIATION = 0.03
 AFFINE = CAMERAS["affine"]

@@ -37,10 +37,10 @@ from isa_nrsfm._joint.whole import (
     n_directions,
     whole_distribution,
 )
-from isa_nrsfm._linalg.small_matrices import centred
-from isa_nrsfm._paper.pipeline import Factorisation, factorise
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._linalg import centred
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.isa._pipeline import Factorisation, factorise
 
 N_POINTS = 40
 BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
 
 KINDS = {

@@ -5,8 +5,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, random_rotation, structured_motion
 
-from isa_nrsfm._linalg.small_matrices import orientations
-from isa_nrsfm._paper.pipeline import (
+from isa_nrsfm._linalg import orientations
+from isa_nrsfm._parameters import BLOCK_RECOVERIES
+from isa_nrsfm._tables import FrameBlocks, representative_frames, spread
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.isa._pipeline import (
     block_triplets,
     factorise,
     leading_blocks,
@@ -20,9 +23,6 @@ from isa_nrsfm._paper.pipeline import (
     sample_frames,
     structure_energies,
 )
-from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
-from isa_nrsfm.datasets import make_nonrigid_tracks
 
 SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
 

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._parameters import LOSSES
 from isa_nrsfm._prepare import robust
 from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._prepare.robust import (
@@ -20,8 +20,7 @@ from isa_nrsfm._prepare.robust import (
     robustly_centred,
     spatial_median,
 )
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.tracks import centred_frames
+from isa_nrsfm._tables import FrameBlocks, centred_frames
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 N_FRAMES = 23

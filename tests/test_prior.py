@@ -21,13 +21,12 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, AutoNRSfM
-from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._fitted_model import TableModel, hold_open, prior_start
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint.fit import widened
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import JointProblem
-from isa_nrsfm._other_tables import hold_open, prior_start
-from isa_nrsfm._parameters.choices import FACE_PRIORS
+from isa_nrsfm._parameters import FACE_PRIORS
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm.datasets import load_face_prior
 from isa_nrsfm.io import load_model, save_model

@@ -3,7 +3,7 @@
 import pytest
 from refusals import refused
 
-from isa_nrsfm._parameters.naming import REQUIREMENTS, check_requirements, named
+from isa_nrsfm._parameters import REQUIREMENTS, check_requirements, named
 
 WRONG = {"refinement": "alternating", "camera": "affine", "loss": "cauchy"}
 # Values of settings of which any needs another, and their option with its value.

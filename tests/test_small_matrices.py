@@ -5,14 +5,14 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.point_sums import (
+from isa_nrsfm._frames.search import (
     ShapeProducts,
     determines_camera,
     frame_sums,
     frame_tracks,
     whitened,
 )
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
     COLUMNS,
     LANES,
     ROWS,

@@ -1,6 +1,7 @@
-"""Public names that are imported when they are first used (SPEC 1).
+"""What is loaded or computed when it is first used: names, libraries, properties.
 
-An ``__init__.py`` imports them under `TYPE_CHECKING`, which `lazy_names` reads.
+Public names are imported when they are first used (SPEC 1). An ``__init__.py`` imports
+them under `TYPE_CHECKING`, which `lazy_names` reads.
 """
 
 import ast
@@ -8,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 # Environment variable of SPEC 1 that turns lazy imports off.
 EAGER = "EAGER_IMPORT"
@@ -53,3 +54,39 @@ def lazy_names(
         for name in modules:
             imported(name)
     return imported, listed, [name for name in modules if modules[name] != package]
+
+
+def import_optional(name: str, *, extra: str) -> Any:
+    """Import a module; the error names the extra of the package that installs it."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        raise ImportError(
+            f"{package} is needed here and is not installed: "
+            f'pip install "isa-nrsfm[{extra}]"'
+        ) from error
+
+
+if TYPE_CHECKING:
+    from functools import cached_property as cached_property
+else:
+
+    class cached_property:
+        """`functools.cached_property` without the lock that it has in Python 3.11.
+
+        A process that is forked while another Python thread holds it waits forever.
+        """
+
+        def __init__(self, function: Any) -> None:
+            self.function, self.__doc__ = function, function.__doc__
+
+        def __set_name__(self, owner: type, name: str) -> None:
+            """Remember the name of the property."""
+            self.name = name
+
+        def __get__(self, held: Any, owner: type | None = None) -> Any:
+            """Return the value, which then stands in the object."""
+            if held is None:
+                return self
+            return held.__dict__.setdefault(self.name, self.function(held))

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 
 
 def __getattr__(name: str) -> Any:

@@ -1,11 +1,20 @@
-"""The private names of scikit-learn that are used. All supported versions have them."""
+"""The private names of scikit-learn that are used: parameters, threads, progress.
+
+All supported versions have them, but for callbacks: these are new and experimental in
+scikit-learn 1.9.
+"""
 
 import copy
 import inspect
-from collections.abc import Callable
+import os
+import time
+from collections.abc import Callable, Sequence
 from functools import wraps
 from numbers import Integral
-from typing import Any, TypeVar
+from operator import attrgetter
+from threading import RLock, get_ident
+from typing import Any, ClassVar, Self, TypeVar, cast
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,3 +117,183 @@ class CoefficientsMixin(ClassNamePrefixFeaturesOutMixin):
         n_components = len(super().get_feature_names_out(input_features))
         names = [f"alpha_{k + 1}" for k in range(n_components)]
         return np.array(names, dtype=object)
+
+
+class OneBlasThread:
+    """Limit BLAS to one thread inside of a block.
+
+    Threads of BLAS mostly wait for each other if matrices are small. Functions take 2
+    to 12 times as long with them while another program runs. Blocks of frames run in
+    parallel instead.
+
+    Most BLAS libraries have one number of threads for the whole process. So the last
+    Python thread that leaves restores it. With OpenMP each Python thread has its own.
+
+    The users are held by weak references: an interrupt while a block is entered or left
+    does not leave a user behind. A process that is forked meanwhile has no other Python
+    threads, and none of their blocks.
+    """
+
+    _lock = RLock()
+    _users: ClassVar["WeakSet[OneBlasThread]"] = WeakSet()
+    # Numbers of threads before the first user; empty if they are restored.
+    _of_process: ClassVar[list[int]] = []
+
+    def __enter__(self) -> None:
+        """Remember the number of threads, and set it to one."""
+        pools = _pools()
+        with self._lock:
+            # From Python 3.12 on, a tracer that stops a comprehension keeps the lock.
+            self._before = list(map(attrgetter("num_threads"), pools))
+            self._thread = get_ident()
+            if not self._of_process:
+                self._of_process[:] = self._before
+            self._users.add(self)
+            for pool in pools:
+                _set_threads(pool, 1)
+
+    def __exit__(self, *error: object) -> None:
+        """Restore the number of threads, if no Python thread is inside any more."""
+        pools = _pools()
+        with self._lock:
+            self._users.discard(self)
+            last = not len(self._users)
+            numbers = zip(pools, self._before, self._of_process, strict=True)
+            for pool, own, first in numbers:
+                if getattr(pool, "threading_layer", None) == "openmp":
+                    _set_threads(pool, own)
+                elif last:
+                    _set_threads(pool, first)
+            if last:
+                self._of_process.clear()
+
+    @classmethod
+    def _forked(cls) -> None:
+        """Leave the blocks of other Python threads in a forked process."""
+        for user in [user for user in cls._users if user._thread != get_ident()]:
+            user.__exit__()
+        cls._lock.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=OneBlasThread._lock.acquire,
+        after_in_parent=OneBlasThread._lock.release,
+        after_in_child=OneBlasThread._forked,
+    )
+
+
+def one_blas_thread(function: Function) -> Function:
+    """Return a function that runs with one BLAS thread."""
+
+    @wraps(function)
+    def limited(*args: Any, **kwargs: Any) -> Any:
+        with OneBlasThread():
+            return function(*args, **kwargs)
+
+    return cast(Function, limited)
+
+
+def _pools() -> list[Any]:
+    """Return the controllers of the loaded BLAS libraries."""
+    return threadpool_controller().select(user_api="blas").lib_controllers
+
+
+def _set_threads(pool: Any, number: int) -> None:
+    """Set the number of threads of a library, whichever Python thread set it last."""
+    # From threadpoolctl 3.8 on, other Python threads are ignored.
+    clear = getattr(pool, "clear_controlling_thread", lambda force: None)
+    clear(force=True)
+    pool.set_num_threads(number)
+    clear(force=True)
+
+
+try:
+    from sklearn.callback import CallbackSupportMixin as CallbackSupportMixin
+except ImportError:
+
+    class CallbackSupportMixin:  # type: ignore[no-redef]
+        """Estimators without callbacks."""
+
+        def _init_callback_context(self, **_: Any) -> "_NoContext":
+            """Return the context of a fit."""
+            return _NoContext()
+
+
+class _NoContext:
+    """Callback context for versions of scikit-learn without callbacks."""
+
+    def _itself(self, **_: Any) -> Self:
+        """Return this context."""
+        return self
+
+    subcontext = call_on_fit_task_begin = call_on_fit_task_end = _itself
+
+
+class FitProgress:
+    """Reports the stages of a fit, and the steps of the stages `stepwise`.
+
+    Callbacks get tasks for the fit, its stages and their steps. `verbose` prints a line
+    after each stage; above one it overwrites the current step.
+    """
+
+    def __init__(
+        self, estimator: Any, stages: list[str], *, stepwise: Sequence[str], **data: Any
+    ):
+        self.about = {"estimator": estimator, **data}
+        self.left = list(stages)
+        self.stepwise = stepwise
+        self.fit = estimator._init_callback_context(max_subtasks=len(self.left))
+        self.fit.call_on_fit_task_begin(**self.about)
+        self._begin()
+
+    def __call__(self, stage: str) -> None:
+        """End a stage, and begin the next one."""
+        self._print(1, f"{stage}: {time.perf_counter() - self.since:.2f} s")
+        self._end_step()
+        self.stage.call_on_fit_task_end(**self.about)
+        self.left.remove(stage)
+        if self.left:
+            self._begin()
+
+    def step(self) -> None:
+        """End the last step of the stage, and begin the next one."""
+        self._end_step()
+        self.n_steps += 1
+        self._print(2, f"{self.left[0]}, step {self.n_steps}", end="\r")
+        self.last_step = self.stage.subcontext(task_name="step")
+        self.last_step.call_on_fit_task_begin(**self.about)
+
+    def end(self) -> None:
+        """End the fit: the estimator is fitted."""
+        self.fit.call_on_fit_task_end(**self.about, reconstruction_attributes={})
+
+    def _begin(self) -> None:
+        """Begin the next stage."""
+        name, self.n_steps, self.last_step = self.left[0], 0, None
+        self._print(2, name, end="\r")
+        self.since = time.perf_counter()
+        n_steps = None if name in self.stepwise else 0
+        self.stage: Any = self.fit.subcontext(task_name=name, max_subtasks=n_steps)
+        self.stage.call_on_fit_task_begin(**self.about)
+
+    def _end_step(self) -> None:
+        """End the last step, if there is one."""
+        if self.last_step is not None:
+            self.last_step.call_on_fit_task_end(**self.about)
+
+    def _print(self, least: int, text: str, end: str = "\n") -> None:
+        """Print a text if the estimator is at least that verbose."""
+        estimator = self.about["estimator"]
+        if estimator.verbose >= least:
+            print(f"[{type(estimator).__name__}] {text}", end=end, flush=True)
+
+
+class NoProgress:
+    """Reports nothing."""
+
+    def __call__(self, stage: str) -> None:
+        """End a stage."""
+
+    def step(self) -> None:
+        """Begin a step."""

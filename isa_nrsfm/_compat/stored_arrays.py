@@ -15,7 +15,7 @@ from zipfile import ZIP_STORED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.whole_files import folder_for_writing, whole_file
+from isa_nrsfm._compat.files import folder_for_writing, whole_file
 
 Keep = Callable[[Mapping[str, NDArray]], dict[str, NDArray]]
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.cached import cached_property
+from isa_nrsfm._compat.lazy import cached_property
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     compose,
@@ -22,15 +22,14 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS
-from isa_nrsfm._linalg.small_matrices import centred, frames_last, lengths
+from isa_nrsfm._linalg import OF_PRODUCTS, centred, frames_last, lengths
 from isa_nrsfm._prepare.robust import (
     MEDIAN_DISTANCE,
     frame_weights,
     lower_medians,
     robust_sizes,
 )
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables import seen_points
 
 # Depths are not determined above this error, relative to their root mean square:
 # docs/depth.md, "Undetermined depth".

@@ -38,10 +38,9 @@ from isa_nrsfm._joint.problem import JointProblem, JointState, Widths
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.uncertainty import N_GROUPS, inlying_rows, neighbours
 from isa_nrsfm._joint.whole import LEAST_NOISE, determined
-from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._linalg import centred
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm._tables.tracks import FEWEST_POINTS
+from isa_nrsfm._tables import FEWEST_POINTS, FrameBlocks, spread
 
 # Largest numbers of frames and directions, and steps: docs/benchmarks/README.md,
 # "Thresholds".

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from sklearn.utils.parallel import Parallel, delayed
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     AffineCameras,
@@ -54,9 +54,9 @@ from isa_nrsfm._joint.problem import JointFit, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import lifted_shapes, likely_basis
 from isa_nrsfm._joint.uncertainty import depth_certainty, inlying_rows
-from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
     COLUMNS,
+    OF_DISTANCES,
     ROWS,
     centred,
     frames_first,
@@ -68,8 +68,7 @@ from isa_nrsfm._linalg.small_matrices import (
     unpacked,
 )
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
-from isa_nrsfm._tables.tracks import FEWEST_POINTS
+from isa_nrsfm._tables import FEWEST_POINTS, FrameBlocks, spread
 
 # Frames and points of a group
 Indices = tuple[NDArray, NDArray]

@@ -57,11 +57,9 @@ from isa_nrsfm._joint.whole import (
     rival_depths,
     whole_distribution,
 )
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import centred, lengths
+from isa_nrsfm._linalg import OF_DIFFERENCES, OF_DISTANCES, centred, lengths
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 
 # Numbers of basis shapes of the fits that are compared, first that of the noise ratio:
 # docs/benchmarks/README.md, "Thresholds".

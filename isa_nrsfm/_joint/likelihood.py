@@ -36,8 +36,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.cached import cached_property
-from isa_nrsfm._frames.point_sums import (
+from isa_nrsfm._compat.lazy import cached_property
+from isa_nrsfm._frames.search import (
     FrameTracks,
     ShapeProducts,
     camera_gram,
@@ -47,7 +47,7 @@ from isa_nrsfm._frames.point_sums import (
     joined_frames,
 )
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
     centred,
     diagonal_of,
     energies,
@@ -56,8 +56,7 @@ from isa_nrsfm._linalg.small_matrices import (
     unpack3,
     unpacked,
 )
-from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables import BLOCK_FRAMES, FrameBlocks, seen_points
 
 # Without the penalty, frontal photos of faces give needle-like shapes. If one extent is
 # five times both others, it is as large as that of a ratio of the arithmetic to the

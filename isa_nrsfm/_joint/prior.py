@@ -36,8 +36,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import stacked_motion
 from isa_nrsfm._frames.models import FrameMap, FrameModel
-from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._linalg import OF_DISTANCES, centred
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Width of the first fit, in sizes of frames.

@@ -17,17 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from isa_nrsfm._compat.cached import cached_property
+from isa_nrsfm._compat.lazy import cached_property
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, line_of_sight
-from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
-from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._frames.search import FrameSearch, FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
-from isa_nrsfm._linalg.small_matrices import centred, frames_first, frames_last
-from isa_nrsfm._paper.pipeline import Factorisation
+from isa_nrsfm._linalg import (
+    OF_DIFFERENCES,
+    OF_SUMS,
+    centred,
+    frames_first,
+    frames_last,
+)
 from isa_nrsfm._prepare.scaling import ScaledTable
+from isa_nrsfm.isa._pipeline import Factorisation
 
 # Lower bound of the noise variance, as a share of the mean square of the tracks. It
 # keeps the objective finite for tables without noise.

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._paper.pipeline import DENSE
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._tables.tracks import Layout
+from isa_nrsfm._parameters import JOINT_REFINEMENTS
+from isa_nrsfm._tables import Layout
+from isa_nrsfm.isa._pipeline import DENSE
 
 # Default tolerances. JOINT_TOL: decrease of the objective of the joint refinement per
 # frame. PAPER_TOL: gain of the paper's refinement, as a share of the explained energy.

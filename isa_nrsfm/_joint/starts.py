@@ -29,15 +29,14 @@ from isa_nrsfm._joint.problem import (
     JointProblem,
     JointState,
 )
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS
-from isa_nrsfm._linalg.small_matrices import frames_last
-from isa_nrsfm._paper.pipeline import Factorisation, rigid_energy
-from isa_nrsfm._tables.blocks import spread
+from isa_nrsfm._linalg import OF_PRODUCTS, frames_last
+from isa_nrsfm._tables import spread
 from isa_nrsfm.calibration._metric_upgrade import best_metric
 from isa_nrsfm.calibration._orthonormal_cameras import (
     orthonormal_mixture,
     principal_columns,
 )
+from isa_nrsfm.isa._pipeline import Factorisation, rigid_energy
 
 # Largest number of steps of a start with fixed cameras.
 FIXED_STEPS = 6

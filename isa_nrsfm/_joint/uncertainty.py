@@ -55,11 +55,16 @@ from isa_nrsfm._joint.problem import JointProblem, JointState, Widths, refine_jo
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import other_depths, steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
-from isa_nrsfm._linalg.small_matrices import centred
+from isa_nrsfm._linalg import centred
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames, spread
-from isa_nrsfm._tables.tracks import FEWEST_POINTS, seen_points
+from isa_nrsfm._tables import (
+    FEWEST_POINTS,
+    FrameBlocks,
+    representative_frames,
+    seen_points,
+    spread,
+)
 
 # With a robust loss, points with residuals above this threshold, in standard deviations
 # of a coordinate, are left out: docs/benchmarks/README.md, "Thresholds".

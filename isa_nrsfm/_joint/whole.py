@@ -34,8 +34,7 @@ from isa_nrsfm._joint.problem import (
     regular,
 )
 from isa_nrsfm._joint.starts import camera_moments
-from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import frames_last, unpacked
+from isa_nrsfm._linalg import OF_DISTANCES, frames_last, unpacked
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Largest number of directions: of small complete tables, and of others, where each

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
-from isa_nrsfm._linalg.small_matrices import centred, unpacked
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
+from isa_nrsfm._linalg import OF_DIFFERENCES, OF_STEPS, centred, unpacked
+from isa_nrsfm._tables import FrameBlocks, representative_frames
 
 # Low-rank model of the rows of a measurement matrix: B (rank, n_points), rows centred,
 # and the noise variance of a coordinate

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._parameters.naming import named
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._parameters import named
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # All of these: docs/benchmarks/README.md, "Thresholds".

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._linalg.small_matrices import (
+from isa_nrsfm._linalg import (
+    OF_DISTANCES,
     centred,
     frames_first,
     invert_positive,
@@ -20,8 +20,7 @@ from isa_nrsfm._linalg.small_matrices import (
     pair_indices,
     unpacked,
 )
-from isa_nrsfm._tables.blocks import FrameBlocks, representative_frames
-from isa_nrsfm._tables.tracks import seen_points
+from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 
 # Tuning constants c of the losses, in standard deviations of a coordinate. With these,
 # the estimate of a location in the plane has 95 percent of the efficiency of least

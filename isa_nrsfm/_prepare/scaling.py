@@ -1,29 +1,396 @@
 """A table made ready for the fit: checked, each frame centred and of size one."""
 
+import contextlib
+from collections.abc import Hashable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import check_array
+from sklearn.utils.validation import validate_data
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._parameters.naming import named
-from isa_nrsfm._prepare.checks import check_arrangement, check_points, check_size
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
+from isa_nrsfm._linalg import OF_DIFFERENCES
+from isa_nrsfm._parameters import named
+from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import unmasked
-from isa_nrsfm._tables.tracks import (
+from isa_nrsfm._tables import (
+    CHECKS,
+    FEWEST_POINTS,
+    LAYOUTS,
+    FrameBlocks,
     FrameReport,
+    Layout,
     centred_frames,
     check_frames,
+    checked_range,
+    describe_point,
     seen_points,
+    table_to_rows,
+    tracks_to_table,
+    two_of,
+    unmasked,
     warn_of_half_points,
     weighted_sizes,
     without_half_points,
 )
-from isa_nrsfm.skeletons._column_names import names_layout
+from isa_nrsfm.skeletons._column_names import names_layout, parse_coordinate
+
+# With fewer frames or points than this the layouts are not compared.
+FEWEST_COMPARED = 10
+ONLY_POINTS = (
+    "Give only the columns of points: isa_nrsfm.io.landmark_table(X).points has them"
+)
+
+
+def check_table(X: Any, layout: Layout) -> None:
+    """Raise if X is no table of two dimensions, or has columns that are no points.
+
+    Names of several levels, as DeepLabCut has them, are read as one.
+    """
+    shape: tuple[int, ...] = getattr(X, "shape", ())
+    if not shape and hasattr(X, "points"):
+        raise TypeError(
+            f"X must be a table; give the points of {type(X).__name__}: X.points"
+        )
+    if isinstance(X, list | tuple):
+        shape = np.shape(X)
+    if len(shape) > 2:
+        order = ".swapaxes(1, 2)" * ((layout == "planar") != (shape[-1] > 5))
+        two = "" if 2 in shape[1:] else "[..., :2]" if shape[-1] < 6 else "[:, :2]"
+        way = f": give np.asarray(X){two}{order}.reshape(len(X), -1)"
+        raise ValueError(
+            "X must be a table with one row per frame and two columns per point; got "
+            f"the shape {shape}{way * (len(shape) == 3 and 1 < min(shape[1:]) < 6)}"
+        )
+    names = getattr(X, "columns", None)
+    if names is not None:
+        names = ["_".join(map(str, n)) if isinstance(n, tuple) else n for n in names]
+        check_names(names, layout)
+
+
+def validated_table(estimator: Any, X: Any, layout: Layout, reset: bool) -> NDArray:
+    """Return a table as an array of numbers, checked by scikit-learn and by name."""
+    check_table(X, layout)
+    minimum = dict.fromkeys(("ensure_min_samples", "ensure_min_features"), 1 + reset)
+    try:
+        X = validate_data(estimator, unmasked(X), reset=reset, **minimum, **CHECKS)
+    except ValueError as error:
+        if "could not convert" in str(error):
+            raise ValueError(f"X has texts: {error}. {ONLY_POINTS}") from error
+        raise
+    return checked_range(np.asarray(X))
+
+
+def check_names(names: Sequence[Hashable], layout: Layout) -> None:
+    """Raise an error if column names contradict the layout or are not of points."""
+    said = names_layout(names)
+    if said in (None, layout):
+        return
+    others = [
+        str(name)
+        for name in names
+        if (coordinate := parse_coordinate(name)) is None or coordinate[0] > 1
+    ]
+    if others:
+        raise ValueError(
+            f"{len(others)} of the {len(names)} columns are not named as the x or "
+            f"y of a point (first: {others[0]!r}). {ONLY_POINTS}"
+        )
+    examples = ", ".join(map(str, names[:4]))
+    order = (
+        "neither interleaved nor planar; isa_nrsfm.io.landmark_table(X).points has "
+        "them interleaved"
+        if said == "other"
+        else said
+    )
+    raise ValueError(
+        f"layout={layout!r} contradicts the column names ({examples}, ...), "
+        f"whose order is {order}"
+    )
+
+
+def largest_n_components(n_points: int, camera: str | None = None) -> int:
+    """Return the largest K that n_points points allow.
+
+    The factorisation needs 3K + 3 directions in centred points. The joint fit with
+    calibrated cameras needs it for a start only, with fewer basis shapes. A frame has
+    2J - 2 centred coordinates, at most four unknowns of its camera and K coefficients;
+    one coordinate has to be left for the noise. `camera` is None without a joint fit.
+    """
+    largest = (n_points - 1) // 3 - 1
+    calibrated = camera not in (None, "affine")
+    return 2 * n_points - 7 if calibrated and largest > 0 else largest
+
+
+def smallest_n_frames(n_components: int, n_points: int) -> int:
+    """Return the least number of frames that determines the shapes."""
+    K = n_components
+    # However many the points, W = M B leaves an invertible matrix between its factors:
+    # 9 (K + 1)^2 unknowns, less the (K + 1)^2 + 8 of the gauge. A frame has 6 (K + 1)
+    # entries of M, but 6 numbers of its camera and K coefficients: 5K equations. So
+    # 5K I >= 8 (K + 1)^2 - 8 = 8K (K + 2), rounded up.
+    smallest = -(-8 * (K + 2) // 5)
+    if K <= largest_n_components(n_points):
+        return smallest
+    # Calibrated cameras: 3 (K + 1) (J - 1) unknowns of the shapes, less the K (K + 1) +
+    # 3 of mixing, shift and rotation; a frame has 2J - 6 - K equations.
+    unknowns = 3 * (K + 1) * (n_points - 1) - K * (K + 1) - 3
+    return max(smallest, -(-unknowns // (2 * n_points - 6 - K)))
+
+
+def most_components(n_frames: int, n_points: int, camera: str | None = None) -> int:
+    """Return the largest K that a table of this size determines, zero if none."""
+    largest = largest_n_components(n_points, camera)
+    possible = [
+        k for k in range(1, largest + 1) if n_frames >= smallest_n_frames(k, n_points)
+    ]
+    return max(possible, default=0)
+
+
+def check_size(
+    n_frames: int, n_points: int, n_components: int, camera: str | None = None
+) -> None:
+    """Refuse a table that is too small for the number of basis shapes."""
+    largest = largest_n_components(n_points, camera)
+    if n_components > largest:
+        possible = f"at least 7 points are needed for {named('n_components', 1)}"
+        if largest > 0:
+            possible = (
+                f"with {n_points} points the largest possible {named('n_components')} "
+                f"is {largest}"
+            )
+        if largest > 0 and camera == "affine":
+            most = largest_n_components(n_points, "weak_perspective")
+            possible += (
+                f" with affine cameras, and {most} with calibrated ones "
+                f"({named('camera', 'weak_perspective')})"
+            )
+        of_affine = camera in (None, "affine")
+        needed = 3 * n_components + 4 if of_affine else max(n_components // 2 + 4, 7)
+        raise ValueError(
+            f"{named('n_components', n_components)} needs at least {needed} points, "
+            f"the table has {n_points}; {possible}"
+        )
+    smallest = smallest_n_frames(n_components, n_points)
+    if n_frames < smallest:
+        possible = ""
+        if most := most_components(n_frames, n_points, camera):
+            possible = f"; the largest possible {named('n_components')} is {most}"
+        raise ValueError(
+            f"{named('n_components', n_components)} needs at least {smallest} frames "
+            f"(rows), the table has n_samples={n_frames}{possible}"
+        )
+
+
+def check_points(
+    visible: NDArray,
+    n_points: int,
+    n_components: int,
+    layout: Layout = "interleaved",
+    names: NDArray | None = None,
+) -> None:
+    """Refuse tables whose visible points do not determine the shapes.
+
+    `visible` (I, J) is packed, eight points in a byte. The numbers of equations and
+    unknowns are compared, a necessary condition. A point has 3 (K + 1) unknowns, and
+    two equations per frame that shows it. A frame of n points has 2 n equations, and 8
+    + K unknowns of its own.
+    """
+    if (visible == np.packbits(np.ones(n_points, dtype=bool))).all():
+        return
+    patterns, counts = np.unique(visible, axis=0, return_counts=True)
+    seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)
+    n_frames, n_shapes = counts @ seen, n_components + 1
+    minimum = -(-3 * n_shapes // 2)
+    few = n_frames < minimum
+    if few.any():
+        point = int(few.argmax())
+        raise ValueError(
+            f"{named('n_components', n_components)} needs every point in at least "
+            f"{minimum} frames; fewer show {few.sum()} of {n_points} points (first: "
+            f"{describe_point(point, layout, names)}, in {n_frames[point]} of "
+            f"{counts.sum()} frames). Leave out these points, or take fewer basis "
+            "shapes"
+        )
+    equations = counts @ np.maximum(2 * seen.sum(axis=1) - 8 - n_components, 0)
+    unknowns = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
+    if equations < unknowns:
+        raise ValueError(
+            f"too few points are visible for {named('n_components', n_components)}: "
+            f"they determine {equations} numbers of the shapes, which have {unknowns}. "
+            "Take fewer basis shapes, or leave out points that are rarely visible"
+        )
+    # Points seen together take the least number of their frames, until none changes.
+    before, group = np.array(-1), np.arange(n_points)
+    while (group != before).any():
+        minimum = np.where(seen, group, n_points).min(axis=1, keepdims=True)
+        before, group = group, np.where(seen, minimum, n_points).min(axis=0)
+    if (n_groups := len(np.unique(group))) > 1:
+        raise ValueError(
+            f"the points fall into {n_groups} groups that no frame shows "
+            "together, so that they cannot be joined to one object (first: "
+            f"{describe_point(int(group.argmax()), layout, names)} is never visible "
+            f"with {describe_point(0, layout, names)} and its group). Add frames that "
+            "show points of both, or fit each group separately"
+        )
+
+
+def check_arrangement(
+    rows: FrameBlocks, n_points: int, layout: Layout, scale_frames: bool, named: bool
+) -> None:
+    """Warn if an object with one basis shape fits the other layout much better.
+
+    Raise if it fits points of three or four numbers, unless columns are named. Compares
+    mean squares, not shares of the total energy. The wrong order mixes x and y, and a
+    rigid object explains the energy of their offset. Without a basis shape, legs that
+    walk, seen from two sides, fit the wrong layout better.
+    """
+    if min(rows.n_frames, n_points) < FEWEST_COMPARED:
+        return
+    # Some frames, evenly spread
+    enough = max(min(1000, 1_000_000 // n_points), 100)
+    given = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
+    X = tracks_to_table(given.transpose(0, 2, 1), layout)
+    other = next(name for name in LAYOUTS if name != layout)
+    swapped = table_to_rows(X, other)
+    rigid = _noise_ratio(given, swapped, scale_frames, 3)
+    for n in [] if named else [3, 4]:
+        if X.shape[1] % n == 0:
+            parts = X.reshape(len(X), n, -1)
+            if layout == "interleaved":
+                parts = X.reshape(len(X), -1, n).transpose(0, 2, 1)
+            certain = 0.1 if n == 3 else _visibility(parts)
+            ratio = _noise_ratio(given, parts[:, :2], scale_frames, 3)
+            # docs/benchmarks/README.md, "Thresholds"
+            if certain > 0.5 or (certain > 0.05 and ratio < min(0.65, rigid)):
+                raise ValueError(
+                    f"X seems to have {n} numbers for each point (x, y, z, or a "
+                    f"visibility); x and y are needed. Give {two_of(n, layout)}"
+                )
+    # On real tables the right layout leaves 0.05 to 0.61 of the energy of the wrong
+    # one, and the wrong one at least 0.72 of that of the right one.
+    with_basis = _noise_ratio(given, swapped, scale_frames, 6)
+    if with_basis < 0.65:
+        warn_caller(
+            f"layout={other!r} explains the table much better than layout={layout!r}: "
+            f"what one basis shape leaves has {with_basis:.2g} times the energy"
+        )
+
+
+def _visibility(parts: NDArray) -> float:
+    """Return how certainly the fourth of four numbers (I, 4, J) are visibilities.
+
+    They are from 0 to 1, some above 0.5: the share of the others that are not. 1 if
+    all are equal.
+    """
+    others, fourth = parts[:, :3], parts[:, 3]
+    if not (np.isnan(fourth) | ((fourth >= 0) & (fourth <= 1))).all():
+        return 0.0
+    smallest, largest = np.nanmin(fourth), np.nanmax(fourth)
+    if smallest < largest < 0.5:  # y of points in a row
+        return 0.0
+    return 1.0 if smallest == largest else float(np.mean((others < 0) | (others > 1)))
+
+
+def _noise_ratio(
+    given: NDArray, other: NDArray, scale_frames: bool, rank: int
+) -> float:
+    """Return the noise of other rows over that of given ones; inf for small tables."""
+    both = [given, without_half_points(other)[0]]
+    # Points that few frames show are left out first, then frames that show few points
+    # in one of the orders.
+    both = [r[:, :, seen_points(r).sum(axis=0) >= FEWEST_POINTS] for r in both]
+    n_seen = np.min([seen_points(r).sum(axis=1) for r in both], axis=0)
+    both = [r[n_seen >= FEWEST_POINTS] for r in both]
+    if min(min(len(r), r.shape[2]) for r in both) < FEWEST_COMPARED:
+        return np.inf
+    # Low rank explains any table with hardly more numbers than it has unknowns.
+    for r in both:
+        unknowns = rank * (2 * len(r) + r.shape[2] - rank)
+        if 2 * seen_points(r).sum() < 1.5 * unknowns:
+            return np.inf
+    centred, reports = zip(*map(centred_frames, both), strict=True)
+    # The size of a frame is the smaller of both orders, that of the right one.
+    sizes = np.min([report.size for report in reports], axis=0)
+    if not scale_frames:
+        squares = [np.mean(report.size**2) for report in reports]
+        sizes = np.full_like(sizes, np.sqrt(min(squares)))
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    noise, swapped = (_residual(part / sizes[:, None, None], rank) for part in centred)
+    return swapped / noise if noise > OF_DIFFERENCES else np.inf
+
+
+def _residual(rows: NDArray, rank: int) -> float:
+    """Return the noise variance of centred rows (I, 2, J) beyond some rank."""
+    if np.isfinite(rows).all():
+        W = rows.reshape(-1, rows.shape[2])
+        energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
+        remaining = 1.0 - rank / (W.shape[1] - 1)  # of the dimensions
+        return max(float(energy[:-rank].sum()), 0.0) / W.size / remaining
+    return completion_model(rows, rank=rank)[1]
+
+
+def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
+    """Return values as a finite array of the first of the allowed shapes, or raise."""
+    array = check_array(
+        unmasked(values),
+        dtype=[np.float64, np.float32],
+        input_name=name,
+        ensure_2d=False,
+        allow_nd=True,
+    )
+    if array.shape not in allowed:
+        expected = " or ".join(map(str, allowed))
+        raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
+    return np.broadcast_to(array, allowed[0])
+
+
+def check_camera(model: Any) -> None:
+    """Refuse a focal length without an axis, or perspective cameras without one."""
+    camera, centre, f = model.camera, model.principal_point, model.focal_length
+    if camera != "perspective" and (f is None) != (centre is None):
+        raise ValueError(
+            "focal_length and principal_point belong together: give both or none; got "
+            f"focal_length={f!r}, principal_point={centre!r}"
+        )
+    if centre is None and camera != "perspective":
+        return
+    numbers = np.asarray(centre, dtype=float)
+    if numbers.shape != (2,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"camera={camera!r} needs principal_point=(x, y), the point of the image "
+            "on the axis of the camera. If nothing else is known, give half of the "
+            "image's width and height in pixels, such as (640, 360); normalised "
+            "coordinates have focal_length=1, principal_point=(0, 0); got "
+            f"principal_point={centre!r}"
+        )
+
+
+@contextlib.contextmanager
+def undetermined(camera: str) -> Iterator[None]:
+    """Raise an error of tables that determine no shapes in place of those of LAPACK."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            f"the table does not determine shapes with {named('camera', camera)}: its "
+            "frames differ too little, or their points are on few lines. Add frames "
+            f"that show the object from other sides, or set {named('camera', 'affine')}"
+        ) from error
+
+
+def check_frames_kept(estimator: Any, what: str) -> None:
+    """Raise an error if the frames of the fit are needed and were not kept."""
+    if not hasattr(estimator, "motion_"):
+        raise ValueError(
+            f"{what} needs the cameras and coefficients of the fitted table, which "
+            "were not kept. Fit again with keep_frames=True. The face prior has no "
+            "frames: fit a table with it"
+        )
+
 
 # Largest weight of a point: sums of weighted squares stay far from overflow.
 LARGEST_WEIGHT = 1e30

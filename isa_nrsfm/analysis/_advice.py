@@ -12,7 +12,7 @@ from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
 from isa_nrsfm._joint.uncertainty import n_reliable
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points

@@ -44,7 +44,7 @@ from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import aligned
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
+from isa_nrsfm._linalg import OF_DIFFERENCES
 from isa_nrsfm.analysis import _frame_columns
 
 # Why a label cannot be tested.

@@ -15,19 +15,17 @@ from scipy.optimize import linear_sum_assignment
 from sklearn.base import TransformerMixin
 from sklearn.utils import estimator_html_repr
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._compat.cached import cached_property
-from isa_nrsfm._compat.scikit_learn import CoefficientsMixin
+from isa_nrsfm._compat.lazy import cached_property
+from isa_nrsfm._compat.scikit_learn import CoefficientsMixin, one_blas_thread
 from isa_nrsfm._compat.texts import aligned, first_items, percent
 from isa_nrsfm._fitted_model import removed_part
 from isa_nrsfm._frames.camera_models import pose_effect, pose_part
+from isa_nrsfm._frames.gauge import independent_gauge
 from isa_nrsfm._frames.models import FrameMap
-from isa_nrsfm._gauge import independent_gauge
 from isa_nrsfm._joint.uncertainty import HalfTables
-from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._parameters.naming import named
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._linalg import OF_RANKS, polar
+from isa_nrsfm._parameters import named
+from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.analysis import _advice
 from isa_nrsfm.analysis._advice import camera_meaning
 from isa_nrsfm.skeletons import Skeleton

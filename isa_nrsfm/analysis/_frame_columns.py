@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sklearn.utils import check_array, column_or_1d
 from sklearn.utils.multiclass import type_of_target
 
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import named
 
 Kind = Literal["classes", "number"]
 # Names and meanings of the statistics of labels, by their kind.

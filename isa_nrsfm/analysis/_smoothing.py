@@ -40,10 +40,10 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.models import Decomposition, FrameMap, LinearisedFrames
-from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
+from isa_nrsfm._linalg import frames_first, frames_last
 from isa_nrsfm.analysis._frame_columns import checked_times, group_numbers, sequences_of
 
 # Least logarithm of the evidence for dynamics over that for none: a Bayes factor of 20,

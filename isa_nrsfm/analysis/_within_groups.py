@@ -13,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import fit_context
-from isa_nrsfm._tables.sources import CHECKS
+from isa_nrsfm._tables import CHECKS
 from isa_nrsfm.analysis._association import between_shares, indicators
 from isa_nrsfm.analysis._frame_columns import checked_column, group_names, group_numbers
 

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from sklearn.utils import check_random_state, gen_batches
 
 from isa_nrsfm._compat.scikit_learn import Interval
-from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._tables.tracks import Layout
+from isa_nrsfm._linalg import OF_RANKS, polar
+from isa_nrsfm._tables import Layout
 from isa_nrsfm.baselines._low_rank import ShapeSequenceNRSfM
 from isa_nrsfm.calibration._metric import (
     LARGEST_STRETCH,

@@ -18,22 +18,19 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat import scikit_learn
-from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._frames.camera_models import CAMERAS, compose, project
+from isa_nrsfm._frames.gauge import canonical_rotation
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.search import FrameSearch
-from isa_nrsfm._gauge import canonical_rotation
 from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import orientations, polar
-from isa_nrsfm._paper.pipeline import leading_triplets
-from isa_nrsfm._prepare.checks import validated_table
-from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables import tracks
-from isa_nrsfm._tables.sources import open_table
+from isa_nrsfm._linalg import OF_RANKS, orientations, polar
+from isa_nrsfm._prepare.scaling import scaled_table, validated_table
+from isa_nrsfm._tables import open_table, tracks
 from isa_nrsfm.calibration import orthonormal_cameras
+from isa_nrsfm.isa._pipeline import leading_triplets
 
 
 @scikit_learn.with_numpy_defaults

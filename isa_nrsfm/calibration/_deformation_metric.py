@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
-from isa_nrsfm._linalg.small_matrices import procrustes
-from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm._linalg import OF_DIFFERENCES, procrustes
+from isa_nrsfm._tables import of_all_rows
 from isa_nrsfm.calibration._metric import MetricFit, refine_metric
 from isa_nrsfm.calibration._metric_upgrade import (
     fit_metric,

@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import gen_batches
 
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
-from isa_nrsfm._parameters.choices import CalibratedCamera
-from isa_nrsfm._tables.blocks import BLOCK_FRAMES
+from isa_nrsfm._linalg import OF_PRODUCTS, OF_RANKS, OF_STEPS
+from isa_nrsfm._parameters import CalibratedCamera
+from isa_nrsfm._tables import BLOCK_FRAMES
 
 # Bound on the ratio of stretches of space by a root Q of the metric G. It is exceeded
 # if the cameras hardly determine the depth, which noise can then stretch without limit:

@@ -9,9 +9,9 @@ from scipy import linalg
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS
-from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS, CalibratedCamera
-from isa_nrsfm._tables.tracks import of_all_rows
+from isa_nrsfm._linalg import OF_PRODUCTS, OF_RANKS
+from isa_nrsfm._parameters import CALIBRATED_CAMERAS, CalibratedCamera
+from isa_nrsfm._tables import of_all_rows
 from isa_nrsfm.calibration import _metric
 
 # Above this condition number the cameras hardly determine the metric. It is that of

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from sklearn.utils import check_array
 
-from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
+from isa_nrsfm._linalg import OF_RANKS, OF_STEPS
 from isa_nrsfm.calibration._metric import levenberg_marquardt, normal_equations
 
 # Number of columns that are added at a time: a basis shape has three.

@@ -9,9 +9,9 @@ import numpy as np
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import errors_of
+from isa_nrsfm._compat.files import errors_of
 from isa_nrsfm._fitted_model import removed_part
-from isa_nrsfm._parameters.naming import check_requirements
+from isa_nrsfm._parameters import check_requirements
 from isa_nrsfm.cli import _reading, _report
 from isa_nrsfm.cli._options import EXPORTS, NONE, flag_of
 from isa_nrsfm.io._tables import table_suffix

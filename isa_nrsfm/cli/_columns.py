@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, analysis
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import errors_of
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._compat.files import errors_of
+from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
 from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import DEFAULTS

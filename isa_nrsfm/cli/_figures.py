@@ -11,8 +11,8 @@ import numpy as np
 from isa_nrsfm import plotting
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm._compat.files import write_whole
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._reading import Frames

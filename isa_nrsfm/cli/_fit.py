@@ -17,18 +17,17 @@ from sklearn.model_selection import GroupKFold
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
 from isa_nrsfm._compat import pandas as pd, whole_files
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._decision import FIRST, Trial, decided, first_settings
-from isa_nrsfm._other_tables import hold_open
-from isa_nrsfm._parameters.choices import (
+from isa_nrsfm._fitted_model import hold_open
+from isa_nrsfm._parameters import (
     CALIBRATED_CAMERAS,
     FACE_PRIORS as LAYOUTS,
     JOINT_REFINEMENTS,
+    check_requirements,
 )
-from isa_nrsfm._parameters.naming import check_requirements
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
-from isa_nrsfm._selection import standard_errors
+from isa_nrsfm._selection import FIRST, Trial, decided, first_settings, standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.cli import _reading, _report
 from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any, TextIO
 
 from isa_nrsfm._compat.texts import printable
-from isa_nrsfm._parameters.naming import WRITTEN, in_python
+from isa_nrsfm._parameters import WRITTEN, in_python
 from isa_nrsfm.cli._options import NONE, PROGRAM, build_parser, flag_of
 
 

@@ -12,9 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from isa_nrsfm import __version__
+from isa_nrsfm import __version__, _parameters as choices
 from isa_nrsfm._compat.texts import printable
-from isa_nrsfm._parameters import choices
 from isa_nrsfm.io._formats import FORMATS, TABLE
 
 PROGRAM = "isa-nrsfm"

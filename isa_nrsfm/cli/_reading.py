@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, skeletons
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import errors_of, reading
+from isa_nrsfm._compat.files import errors_of, reading
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._parameters.choices import FACE_PRIORS, SKELETON_NAMES
+from isa_nrsfm._parameters import FACE_PRIORS, SKELETON_NAMES
 from isa_nrsfm._prepare.coordinates import UNSURE, CoordinateWarning, warn_of_places
-from isa_nrsfm._tables.tracks import (
+from isa_nrsfm._tables import (
     FEWEST_POINTS,
     FrameReport,
     centred_frames,

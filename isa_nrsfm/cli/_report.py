@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.files import write_whole
 from isa_nrsfm._compat.texts import as_utf8, escape, first_items, percent
-from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._advice import FIT, camera_meaning, verdict
 from isa_nrsfm.analysis._diagnostics import Diagnostics

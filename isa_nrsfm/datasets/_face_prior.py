@@ -10,7 +10,7 @@ from sklearn.utils import check_scalar
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import DepthCertainty, FrameMap, FrameModel
-from isa_nrsfm._parameters.choices import FACE_PRIORS
+from isa_nrsfm._parameters import FACE_PRIORS
 
 
 def load_face_prior(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import checked_parameters
-from isa_nrsfm._tables.tracks import table_to_tracks
+from isa_nrsfm._tables import table_to_tracks
 from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, fetch_file
 
 URL = (

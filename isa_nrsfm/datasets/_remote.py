@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 
 DataHome = str | os.PathLike[str] | None
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
-from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
+from isa_nrsfm._tables import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.skeletons import get_skeleton
 
 FlatCamera = Literal["weak_perspective", "affine", "orthographic"]

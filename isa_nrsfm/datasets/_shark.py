@@ -16,7 +16,7 @@ from scipy.io import loadmat
 from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import checked_parameters
-from isa_nrsfm._tables.tracks import tracks_to_table
+from isa_nrsfm._tables import tracks_to_table
 from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, fetch_file
 
 URL = (

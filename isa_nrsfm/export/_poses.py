@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.export import _upright

@@ -14,14 +14,13 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.files import files_together, reading, whole_file
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._compat.stored_arrays import write_arrays
-from isa_nrsfm._compat.whole_files import files_together, whole_file
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._fitted_model import frames_of, points_in_space
-from isa_nrsfm._linalg.small_matrices import procrustes
+from isa_nrsfm._linalg import procrustes
 from isa_nrsfm.analysis._advice import depth_advice, facts_of
 from isa_nrsfm.export import _upright
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of

@@ -16,7 +16,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm._frames.camera_models import compose, full_rotations
-from isa_nrsfm._prepare.checks import check_frames_kept
+from isa_nrsfm._prepare.scaling import check_frames_kept
 from isa_nrsfm.analysis._advice import depth_advice, facts_of
 from isa_nrsfm.calibration import (
     DeformationMetric,

@@ -17,8 +17,8 @@ from scipy.spatial import Delaunay, QhullError
 from sklearn.utils import check_array
 
 from isa_nrsfm import __version__
+from isa_nrsfm._compat.files import write_whole
 from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
-from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
 from isa_nrsfm.export import _upright

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.files import reading
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.stored_arrays import array_in, read_arrays
 from isa_nrsfm.io._keypoints import floats_of
 from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import first_items
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.coordinates import are_shares
 from isa_nrsfm.io._keypoints import entries_as_rows, json_kind, read_json
 from isa_nrsfm.io._landmark_columns import (

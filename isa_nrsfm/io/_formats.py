@@ -14,9 +14,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
+from isa_nrsfm._compat.files import errors_of, reading, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import named
 
 if TYPE_CHECKING:
     from isa_nrsfm.io._landmarks import Landmarks

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import errors_of, reading, refuse_special
+from isa_nrsfm._compat.files import errors_of, reading, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items, frame_numbers
-from isa_nrsfm._parameters.choices import OPENPOSE_PARTS, WHOLE_PARTS
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import OPENPOSE_PARTS, WHOLE_PARTS, named
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes, stacked
 from isa_nrsfm.io._tables import first_lines, header_names, parse_table
 

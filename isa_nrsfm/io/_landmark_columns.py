@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
-from isa_nrsfm._parameters.naming import named
+from isa_nrsfm._parameters import named
 from isa_nrsfm.skeletons._column_names import (
     WORDS,
     individuals_in,

@@ -21,18 +21,14 @@ from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm import __version__, isa
-from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.files import reading, whole_file
 from isa_nrsfm._compat.stored_arrays import read_arrays, write_arrays
-from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
-from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._fitted_model import TableModel, fitted_prior
+from isa_nrsfm._frames.camera_models import CAMERAS, Pinhole
 from isa_nrsfm._frames.models import DepthCertainty, FrameMap, FrameModel
-from isa_nrsfm._frames.pinhole import Pinhole
-from isa_nrsfm._other_tables import fitted_prior
-from isa_nrsfm._parameters.choices import LOSSES
-from isa_nrsfm._tables.sources import SMALLEST
-from isa_nrsfm._tables.tracks import LAYOUTS
+from isa_nrsfm._parameters import LOSSES
+from isa_nrsfm._tables import LAYOUTS, SMALLEST
 
 FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
 HEADER = "header"

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.files import reading
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import by_number, first_items
-from isa_nrsfm._tables.blocks import read_rows
-from isa_nrsfm._tables.sources import StoredTable
+from isa_nrsfm._tables import StoredTable, read_rows
 
 SUFFIXES = (".npy", ".parquet")
 PARQUET = "a parquet file"

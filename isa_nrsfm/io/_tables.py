@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.files import reading, whole_file
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME
-from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm.io._landmark_columns import (
     confidence_columns,
     find_landmark_columns,

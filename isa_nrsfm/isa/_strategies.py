@@ -25,11 +25,10 @@ from sklearn.utils.parallel import Parallel, delayed
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat import scikit_learn
-from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_PRODUCTS
-from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
+from isa_nrsfm._linalg import OF_DIFFERENCES, OF_PRODUCTS, polar
+from isa_nrsfm._tables import unmasked
 
 
 @scikit_learn.with_numpy_defaults

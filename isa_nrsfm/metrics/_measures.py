@@ -14,10 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment, minimize
 from sklearn.utils import check_array
 
-from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm._tables import tracks
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.sources import CHECKS, unmasked
+from isa_nrsfm._linalg import OF_STEPS
+from isa_nrsfm._tables import CHECKS, FrameBlocks, tracks, unmasked
 
 
 def inverse_snr(

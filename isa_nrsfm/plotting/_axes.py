@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 
 # Vermilion, blue and black of the palette of Okabe and Ito, which people with any kind
 # of colour vision can distinguish; grey for comparison.

@@ -9,10 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
-from isa_nrsfm._tables.sources import unmasked
-from isa_nrsfm._tables.tracks import FEWEST_POINTS, table_to_tracks, tracks_to_table
+from isa_nrsfm._tables import FEWEST_POINTS, table_to_tracks, tracks_to_table, unmasked
 from isa_nrsfm.analysis._frame_columns import checked_column, kind_of
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import _axes

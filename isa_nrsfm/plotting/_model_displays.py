@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm.plotting import _axes, _views
 from isa_nrsfm.plotting._axes import flat_axes, percent
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout

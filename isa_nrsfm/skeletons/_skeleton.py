@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.files import reading
+from isa_nrsfm._compat.lazy import import_optional
 
 Kind = Literal["face", "hand", "body", "whole body", "other"]
 KINDS: tuple[Kind, ...] = ("face", "hand", "body", "whole body", "other")

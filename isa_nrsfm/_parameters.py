@@ -1,10 +1,43 @@
-"""Parameters in messages, as the user writes them; what settings need of others."""
+"""Parameters: their values, their names in messages, and what they need of others.
+
+The help of the command line must not wait for NumPy or scikit-learn.
+"""
 
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, Literal, get_args
 
-from isa_nrsfm._parameters.choices import CAMERA_NAMES, JOINT_REFINEMENTS, LOSSES
+BlockRecovery = Literal["generalized_eigen", "irls"]
+Refinement = Literal["joint", "consensus", "alternating"]
+CalibratedCamera = Literal["weak_perspective", "orthographic"]
+Camera = Literal["affine", CalibratedCamera, "perspective"]
+Independence = Literal["shapes", "coefficients"]
+Loss = Literal["linear", "huber", "cauchy"]
+Axes = Literal["object", "camera"]
+
+BLOCK_RECOVERIES: tuple[BlockRecovery, ...] = get_args(BlockRecovery)
+REFINEMENTS: tuple[Refinement, ...] = get_args(Refinement)
+# Refinements that begin with the joint fit.
+JOINT_REFINEMENTS = ("joint", "consensus")
+CALIBRATED_CAMERAS: tuple[CalibratedCamera, ...] = get_args(CalibratedCamera)
+CAMERA_NAMES: tuple[Camera, ...] = get_args(Camera)
+INDEPENDENCE: tuple[Independence, ...] = get_args(Independence)
+LOSSES: tuple[Loss, ...] = get_args(Loss)
+AXES: tuple[Axes, ...] = get_args(Axes)
+# Sets of points in the files of OpenPose.
+OPENPOSE_PARTS = ("pose", "face", "hand_left", "hand_right")
+# Parts of whole bodies in the files of COCO and MMPose.
+WHOLE_PARTS = ("body", "feet", "face", "left_hand", "right_hand", "all")
+# The layouts in `isa_nrsfm.skeletons.SKELETONS`, in that order.
+SKELETON_NAMES = tuple(
+    "ibug-68 ibug-51 xm2vts-68 xm2vts-53 muct-76 muct-61 wflw-98 wflw-65 "
+    "mediapipe-face-468 mediapipe-face-478 hand-21 coco-17 h36m-17 body-25 "
+    "mediapipe-pose-33 coco-wholebody-133".split()
+)
+# Layouts with a face prior, and their points in its file.
+FACE_PRIORS = {"ibug-68": range(68), "ibug-51": range(17, 68)}
+FACE_PRIORS |= {"xm2vts-68": range(68, 136), "xm2vts-53": range(83, 136)}
+FACE_PRIORS |= {"muct-76": range(68, 144), "muct-61": range(83, 144)}
 
 
 def in_python(name: str, *values: Any) -> str:
@@ -20,7 +53,7 @@ def named(name: str, *values: Any) -> str:
     """
     Return a parameter, and its values if there are any, as the user writes it.
 
-    >>> from isa_nrsfm._parameters.naming import named
+    >>> from isa_nrsfm._parameters import named
     >>> named("columns"), named("camera", "affine")
     ('columns', "camera='affine'")
     """

@@ -37,9 +37,8 @@ from scipy.linalg import eigh, null_space
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import has_fit_parameter
 
-from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.small_matrices import energies, orientations, polar
-from isa_nrsfm._tables.blocks import FrameBlocks, spread
+from isa_nrsfm._linalg import OF_RANKS, energies, orientations, polar
+from isa_nrsfm._tables import FrameBlocks, spread
 
 # Larger matrices, with more rows and more columns, are not factorised as a whole.
 DENSE = 1500

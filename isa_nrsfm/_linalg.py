@@ -18,7 +18,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv, dpotri
 
-from isa_nrsfm._linalg.rounding import OF_STEPS
+# Limits of rounding errors, in double precision. Each is relative to the numbers that a
+# result was computed from. It exceeds the unit roundoff 1.1e-16 by the observed loss of
+# its kind of operations. None is critical: if all are halved, or doubled, ``python -m
+# benchmarks.accuracy tables`` prints the same digits.
+
+# Sums of squares, and numbers compared with them: a few units of the last place.
+OF_SUMS = 1e-15
+# Products and decompositions of matrices.
+OF_PRODUCTS = 1e-14
+# Results of several such steps, as Schur complements and normalised differences.
+OF_STEPS = 1e-13
+# Remainders of large numbers that cancel.
+OF_DIFFERENCES = 1e-12
+# Singular values and eigenvalues of directions beyond the rank of a matrix, relative to
+# the largest.
+OF_RANKS = 1e-10
+# Square roots of such remainders, such as distances.
+OF_DISTANCES = 1e-9
 
 # Row and column of the packed entries of a 3x3 matrix, the way back, and the diagonal.
 ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)

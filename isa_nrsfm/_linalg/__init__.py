@@ -1,1 +1,0 @@
-"""Small matrices and vectors, many at a time."""

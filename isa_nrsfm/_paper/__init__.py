@@ -1,1 +1,0 @@
-"""The pipeline of Brandt, Ackermann and Grasshof (2018)."""

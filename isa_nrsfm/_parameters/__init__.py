@@ -1,1 +1,0 @@
-"""Permitted values of the parameters of the public classes."""

@@ -1,1 +1,0 @@
-"""Input tables: layouts, columns, blocks of frames."""
