@@ -79,7 +79,7 @@ def noisy():
 def test_without_noise_the_fit_is_exact(seed):
     s = scene(seed, 40, 40.0, 2.4 * (2.5 + 0.25 * seed))  # radii
     X, S, R = s.X, s.S, s.R
-    model = fitted(X, tol=5e-3)
+    model = fitted(X, tol=1e-3)
     assert frame_error(model.reconstruct(X), S) < 1e-4
     turned = model.rotations_.mT @ R
     assert np.abs(turned - turned[0]).max() < 2e-3
