@@ -11,6 +11,7 @@ from scipy.integrate import quad
 from scipy.linalg import polar
 from scipy.optimize import approx_fprime, linear_sum_assignment, minimize_scalar
 
+from isa_nrsfm._frames import gauge
 from isa_nrsfm._frames.gauge import (
     LIGHT,
     TAILS,
@@ -18,7 +19,7 @@ from isa_nrsfm._frames.gauge import (
     shared_mixing,
 )
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.isa import _shared_mixing, _strategies as strategies
+from isa_nrsfm.isa import _strategies as strategies
 from isa_nrsfm.isa._strategies import (
     fixed_point_step,
     iterate,
@@ -165,7 +166,7 @@ def cosines(truth, recovered):
 
 def white(signals):
     """Return white signals."""
-    whitening, _ = _shared_mixing._whitening(signals.reshape(len(signals), -1))
+    whitening, _ = gauge._whitening(signals.reshape(len(signals), -1))
     return np.tensordot(whitening, signals, 1)
 
 
@@ -292,7 +293,7 @@ class TestOptimality:
         Z = unit * sources(kinds, 0, 200, size)
         W = shared_mixing(Z)
         most = log_likelihood(W, Z)
-        found = _shared_mixing._fit_densities(W, Z)[0]
+        found = gauge._fit_densities(W, Z)[0]
         assert found == pytest.approx(most, rel=1e-7)
         for _ in range(10):
             step = 1e-3 * rng.normal(size=W.shape) @ W
@@ -306,11 +307,11 @@ class TestOptimality:
         def likelihood(E):
             W = np.eye(3) + E
             u = np.sum(np.tensordot(W, Y, 1) ** 2, axis=2)
-            F = _shared_mixing._log_density(u, tail, 3).mean(axis=1).sum()
+            F = gauge._log_density(u, tail, 3).mean(axis=1).sum()
             return F + 3 * np.linalg.slogdet(W)[1]
 
-        slopes = _shared_mixing._slopes(np.sum(Y**2, axis=2), tail, 3)
-        gradient, blocks = _shared_mixing._relative_derivatives(Y, *slopes)
+        slopes = gauge._slopes(np.sum(Y**2, axis=2), tail, 3)
+        gradient, blocks = gauge._relative_derivatives(Y, *slopes)
         h = 1e-4
         for _ in range(5):
             E = rng.normal(size=(3, 3))
@@ -325,7 +326,7 @@ class TestOptimality:
         for seed in range(4):
             Z = white(sources(["gaussian"] * 5, seed, 68, 3))
             mixings = (shared_mixing(Z, n_starts=n) for n in (1, 8))
-            few, many = (_shared_mixing._fit_densities(W, Z)[0] for W in mixings)
+            few, many = (gauge._fit_densities(W, Z)[0] for W in mixings)
             gains.append(many - few)
         assert np.max(gains) > 1e-3
         assert np.mean(gains) > 0.0
@@ -334,9 +335,9 @@ class TestOptimality:
 class TestSteps:
     def test_few_samples_are_spread_from_the_smallest_to_the_largest(self, rng):
         few = rng.normal(size=(2, 3000, 3))
-        assert _shared_mixing._few_samples(few) is few
+        assert gauge._few_samples(few) is few
         many = rng.normal(size=(2, 6000, 3))
-        chosen = _shared_mixing._few_samples(many)
+        chosen = gauge._few_samples(many)
         assert chosen.shape == (2, 1500, 3)
         sizes = [np.sort(np.sum(Z**2, axis=(0, 2))) for Z in (chosen, many)]
         place = np.searchsorted(sizes[1], sizes[0])
@@ -348,17 +349,17 @@ class TestSteps:
         n, size, shift = 5, 3, 0.5
         root, gradient = rng.normal(size=(n, n, n)), rng.normal(size=(n, n))
         blocks = -(root @ root.transpose(0, 2, 1)) - 4.0 * np.eye(n)
-        E = _shared_mixing._ascent(gradient, blocks, shift, size)
+        E = gauge._ascent(gradient, blocks, shift, size)
         slope = np.einsum("kab,kb->ka", blocks, E) - size * E.T - shift * E
         assert_allclose(gradient + slope, 0, atol=1e-4 * np.linalg.norm(gradient))
         # Weaker blocks than the coupling, and blocks without a maximum at all
         for factor in (0.25, -1.0):
             weak = -factor * 4.0 * np.tile(np.eye(n), (n, 1, 1))
-            assert _shared_mixing._ascent(gradient, weak, shift, size) is None
+            assert gauge._ascent(gradient, weak, shift, size) is None
         # A direction that the diagonals of the blocks do not show
         one = np.ones((n, n))
         blocks = np.tile(10.0 * one - 16.0 * np.eye(n), (n, 1, 1))
-        assert _shared_mixing._ascent(one, blocks, 0.0, size) is None
+        assert gauge._ascent(one, blocks, 0.0, size) is None
 
 
 class TestDegenerate:

@@ -17,6 +17,7 @@ from sklearn import base
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm import _tables
 from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
@@ -28,7 +29,6 @@ from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg import OF_RANKS, orientations, polar
 from isa_nrsfm._prepare.scaling import scaled_table, validated_table
-from isa_nrsfm._tables import open_table, tracks
 from isa_nrsfm.calibration import orthonormal_cameras
 from isa_nrsfm.isa._pipeline import leading_triplets
 
@@ -59,7 +59,7 @@ class ShapeSequenceNRSfM(
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [scikit_learn.Interval(Integral, 1, None, closed="left")],
-        "layout": [scikit_learn.StrOptions(set(tracks.LAYOUTS))],
+        "layout": [scikit_learn.StrOptions(set(_tables.LAYOUTS))],
         "scale_frames": ["boolean"],
         "ordered": ["boolean"],
     }
@@ -68,7 +68,7 @@ class ShapeSequenceNRSfM(
         self,
         n_components: int = 3,
         *,
-        layout: tracks.Layout = "interleaved",
+        layout: _tables.Layout = "interleaved",
         scale_frames: bool = False,
         ordered: bool = False,
     ):
@@ -118,7 +118,7 @@ class ShapeSequenceNRSfM(
             names=getattr(self, "feature_names_in_", None),
             scale_frames=self.scale_frames,
         )
-        rows = open_table(X, self.layout)
+        rows = _tables.open_table(X, self.layout)
         table = scaled_table(rows, None, self.n_components, settings)
         W = table.rows.whole().reshape(2 * len(X), -1).astype(np.float64)
 
@@ -230,7 +230,9 @@ class ShapeSequenceNRSfM(
         """
         motion, translation, alpha, _ = self.decompose(X)
         shapes = compose(self.mean_shape_, self.basis_, alpha)
-        return tracks.tracks_to_table(project(shapes, motion, translation), self.layout)
+        return _tables.tracks_to_table(
+            project(shapes, motion, translation), self.layout
+        )
 
     def __sklearn_tags__(self) -> Any:
         """Return the estimator's tags."""
@@ -252,11 +254,11 @@ class ShapeSequenceNRSfM(
 
     def _decompose(self, X: NDArray) -> Decomposition:
         """Return camera and coefficients of each frame of a valid table."""
-        rows = tracks.table_to_rows(X, self.layout).astype(np.float64)
+        rows = _tables.table_to_rows(X, self.layout).astype(np.float64)
         sizes = np.full(len(rows), self._unit)
         if self.scale_frames:
-            _, report = tracks.centred_frames(rows)
-            tracks.refuse_one_place(report, rows.shape[2])
+            _, report = _tables.centred_frames(rows)
+            _tables.refuse_one_place(report, rows.shape[2])
             sizes = report.size
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
         shapes = shapes.transpose(0, 2, 1).astype(float)
@@ -558,7 +560,7 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         self,
         n_components: int = 3,
         *,
-        layout: tracks.Layout = "interleaved",
+        layout: _tables.Layout = "interleaved",
         scale_frames: bool = False,
         ordered: bool = False,
         max_iter: int = 10_000,

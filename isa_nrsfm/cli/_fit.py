@@ -15,7 +15,7 @@ from joblib import parallel_config
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
-from isa_nrsfm._compat import pandas as pd, whole_files
+from isa_nrsfm._compat import files, pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import first_items
@@ -112,13 +112,13 @@ def fit_table(
     inputs += [args.table] * (table is None)
     if table is not None:
         results[Path(args.table).name] = ""
-    with whole_files.folder_for_writing(folder):
+    with files.folder_for_writing(folder):
         targets = [folder / name for name in (*results, *figures, _report.REPORT)]
         earlier = _report.entry_of_report(folder, "sha256")
         own_files = {*earlier, _report.REPORT} if earlier else ()
         _report.check_outputs(args, inputs, targets, own_files)
         for target in targets:
-            whole_files.check_replaceable(target)
+            files.check_replaceable(target)
         old = _report.entry_of_report(folder, "files")
         removed = {*figures, *(name for name in old if name.endswith(".png"))}
         used = {args.group, args.time, frames.images.name}
@@ -129,7 +129,7 @@ def fit_table(
         show_stage("answers")
         answers, columns, smooth = column_results(args, estimator, frames)
         show_stage("tables")
-        with whole_files.files_together(folder, removed=removed) as new:
+        with files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
@@ -163,7 +163,7 @@ def fit_table(
         if not figures:
             return report, estimator
         # A figure that fails, or takes long, costs no results: they are in place.
-        with whole_files.files_together(folder) as new:
+        with files.files_together(folder) as new:
             if _report.digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "

@@ -151,9 +151,14 @@ POSITIONAL = ("table", "model")
 SHORT = {"output": ["-o"], "n_components": ["-k"]}
 # The commands with their options, and the help of each option by its name and value.
 _DATA = tomllib.loads(Path(__file__).with_name("options.toml").read_text("utf-8"))
-_LISTS = {name: each for name, each in vars(choices).items() if name.isupper()}
-_LISTS["FORMATS"] = [name for name in FORMATS if name != TABLE]
-_WORDS = {name: ", ".join(map(str, values)) for name, values in _LISTS.items()}
+_LISTS = {
+    "FORMATS": [name for name in FORMATS if name != TABLE],
+    "OPENPOSE_PARTS": choices.OPENPOSE_PARTS,
+    "WHOLE_PARTS": choices.WHOLE_PARTS,
+    "SKELETON_NAMES": choices.SKELETON_NAMES,
+    "FACE_PRIORS": choices.FACE_PRIORS,
+}
+_WORDS = {name: ", ".join(values) for name, values in _LISTS.items()}
 HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
 # What export writes: suffixes of the files, and options.
 EXPORTS = _DATA["exports"]

@@ -14,15 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment, minimize
 from sklearn.utils import check_array
 
+from isa_nrsfm import _tables
 from isa_nrsfm._linalg import OF_STEPS
-from isa_nrsfm._tables import CHECKS, FrameBlocks, tracks, unmasked
+from isa_nrsfm._tables import CHECKS, FrameBlocks, unmasked
 
 
 def inverse_snr(
     X: ArrayLike,
     X_hat: ArrayLike,
     *,
-    layout: tracks.Layout = "interleaved",
+    layout: _tables.Layout = "interleaved",
     scale_frames: bool = False,
 ) -> float:
     r"""
@@ -67,8 +68,8 @@ def inverse_snr(
     >>> inverse_snr(X, X_hat)
     0.125
     """
-    if layout not in tracks.LAYOUTS:
-        raise ValueError(f"layout must be one of {tracks.LAYOUTS}; got {layout!r}")
+    if layout not in _tables.LAYOUTS:
+        raise ValueError(f"layout must be one of {_tables.LAYOUTS}; got {layout!r}")
     energy, error, seen = frame_energies(X, X_hat, layout)
     if scale_frames:
         used = seen.any(axis=1)
@@ -90,17 +91,17 @@ def inverse_snr(
 
 
 def frame_energies(
-    X: ArrayLike, X_hat: ArrayLike, layout: tracks.Layout
+    X: ArrayLike, X_hat: ArrayLike, layout: _tables.Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
     checks = CHECKS | {"dtype": np.float64}
     truth = check_array(unmasked(X), input_name="X", **checks)
     fitted = check_array(unmasked(X_hat), input_name="X_hat", **checks)
     check_same_shape("X", truth, "X_hat", fitted)
-    both = (tracks.table_to_tracks(table, layout).mT for table in (truth, fitted))
-    truth, fitted = (tracks.without_half_points(rows)[0] for rows in both)
-    seen = tracks.seen_points(truth)
-    lost = seen & ~tracks.seen_points(fitted)
+    both = (_tables.table_to_tracks(table, layout).mT for table in (truth, fitted))
+    truth, fitted = (_tables.without_half_points(rows)[0] for rows in both)
+    seen = _tables.seen_points(truth)
+    lost = seen & ~_tables.seen_points(fitted)
     if lost.any():
         rows = np.flatnonzero(lost.any(axis=1))
         raise ValueError(
@@ -111,8 +112,8 @@ def frame_energies(
 
     def energies(truth: NDArray, fitted: NDArray) -> tuple[NDArray, NDArray]:
         """Return the energies of a block of frames, and of their errors."""
-        fitted = np.where(tracks.seen_points(truth)[:, None], fitted, np.nan)
-        truth, fitted = (tracks.centred_frames(rows)[0] for rows in (truth, fitted))
+        fitted = np.where(_tables.seen_points(truth)[:, None], fitted, np.nan)
+        truth, fitted = (_tables.centred_frames(rows)[0] for rows in (truth, fitted))
         error = np.nansum((truth - fitted) ** 2, axis=(1, 2))
         return np.nansum(truth**2, axis=(1, 2)), error
 
