@@ -467,6 +467,14 @@ class TestEstimator:
         assert_array_equal(other.alpha_, body.alpha_)
 
     @pytest.mark.slow
+    @pytest.mark.xfail(reason="sums in another order end elsewhere in a flat valley")
+    def test_order_of_frames_does_not_matter(self, body):
+        """Permuted rows have permuted shapes."""
+        other = consensus_fit(X[np.random.default_rng(0).permutation(len(X))])
+        before, after = (in_camera(model, X) for model in (body, other))
+        assert mean_shape_error_3d(before, after, convention="camera") < 0.01
+
+    @pytest.mark.slow
     def test_missing_points(self, body):
         """Hidden points are found, nearly as well as from the complete table."""
         table = X.reshape(len(X), -1, 2).copy()
@@ -477,6 +485,22 @@ class TestEstimator:
         convention = {"convention": "camera"}
         error = mean_shape_error_3d(SHAPES, in_camera(model, table), **convention)
         assert error < 2 * mean_shape_error_3d(SHAPES, in_camera(body, X), **convention)
+
+    @pytest.mark.slow
+    @pytest.mark.xfail(reason="outliers double the errors: 0.065 in place of 0.034")
+    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    def test_robust_losses(self, loss):
+        """A few outliers hardly change the shapes."""
+        table, truth = articulated()
+        wrong, frames = table.copy(), np.arange(len(table))
+        rows = np.random.default_rng(2).choice(frames, 10, replace=False)
+        wrong[rows, 6] += 0.3
+        good, errors = np.setdiff1d(frames, rows), []
+        for data, name in ((wrong, loss), (table, "linear")):
+            found = in_camera(consensus_fit(data, 14, loss=name), data)[good]
+            error = mean_shape_error_3d(truth[good], found, convention="camera")
+            errors.append(error)
+        assert errors[0] < 1.3 * errors[1]
 
     @pytest.mark.parametrize("noise", [0.0, 0.02])
     def test_a_sufficient_joint_fit_is_kept(self, noise):
