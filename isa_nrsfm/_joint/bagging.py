@@ -42,9 +42,10 @@ from isa_nrsfm._linalg import centred
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables import FEWEST_POINTS, FrameBlocks, spread
 
-# Largest numbers of frames and directions, and steps: docs/benchmarks/README.md,
-# "Thresholds".
+# Largest numbers of frames and directions, and steps, and largest squared error of the
+# depths by other explanations: docs/benchmarks/README.md, "Thresholds".
 MOST_FRAMES, MOST_DIRECTIONS, MOST_STEPS = 600, 24, 50
+MOST_DEFORMATION = 0.01
 
 
 def bagged(
@@ -52,10 +53,14 @@ def bagged(
 ) -> tuple[FrameModel, Widths]:
     """Return the model of the mean of fits of parts of the points, and its widths.
 
-    The given ones are those of a joint fit with calibrated cameras. Without noise all
-    fits would be equal, and groups have at least two points: otherwise these are
-    returned.
+    The given ones are those of a joint fit with calibrated cameras. They are returned
+    without noise, as all fits would be equal; if groups have less than two points; with
+    many frames, as shapes of a part of them would replace those of all; and if the
+    images have another explanation, as fits of parts may have either.
     """
+    determined_depth = model.certainty.deformation < MOST_DEFORMATION
+    if not determined_depth or len(table.sizes) > MOST_FRAMES:
+        return model, widths
     part, fit, w = inlying_rows(model, table.rows, MOST_FRAMES, table.weights)
     n_points = part.shape[2]
     chosen = spread(np.arange(n_points), MOST_POINTS)
