@@ -321,8 +321,10 @@ def _joint_fit(
         certainty = settings.remembered("certainty", depth_certainty, *of)
         model, needed = replace(model, certainty=certainty), False
     if errors and widths is not None and not grouped:
-        model, widths = bagged(model, table, settings, widths)
-        tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
+        mean = bagged(model, table, settings, widths)
+        if mean is not None:
+            model, widths = mean
+            tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
         model, widths = consensus(model, table, settings, needed, fit), None
         tracks = JointFrames.from_points(table.rows, table.complete)

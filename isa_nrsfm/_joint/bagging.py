@@ -50,24 +50,24 @@ MOST_DEFORMATION = 0.01
 
 def bagged(
     model: FrameModel, table: ScaledTable, settings: FitSettings, widths: Widths
-) -> tuple[FrameModel, Widths]:
+) -> tuple[FrameModel, Widths] | None:
     """Return the model of the mean of fits of parts of the points, and its widths.
 
-    The given ones are those of a joint fit with calibrated cameras. They are returned
-    without noise, as all fits would be equal; if groups have less than two points; with
-    many frames, as shapes of a part of them would replace those of all; and if the
-    images have another explanation, as fits of parts may have either.
+    The given ones are those of a joint fit with calibrated cameras. None without noise,
+    as all fits would be equal; if groups have less than two points; with many frames,
+    as shapes of a part of them would replace those of all; and if the images have
+    another explanation, as fits of parts may have either.
     """
-    determined_depth = model.certainty.deformation < MOST_DEFORMATION
-    if not determined_depth or len(table.sizes) > MOST_FRAMES:
-        return model, widths
+    unique = model.certainty.deformation < MOST_DEFORMATION
+    if not unique or len(table.sizes) > MOST_FRAMES:
+        return None
     part, fit, w = inlying_rows(model, table.rows, MOST_FRAMES, table.weights)
     n_points = part.shape[2]
     chosen = spread(np.arange(n_points), MOST_POINTS)
     # A fit with noise ends at its floor or above it, up to rounding.
     exact = model.noise_variance < 0.5 * LEAST_NOISE * np.nanmean(part**2)
     if exact or len(chosen) < 2 * N_GROUPS:
-        return model, widths
+        return None
     n_directions = min(len(model.shapes) - 1, MOST_DIRECTIONS)
     settings = settings._replace(on_step=None)
 
@@ -102,9 +102,8 @@ def bagged(
         change[at] += size * depths - own
         count[at] += 1
     change = centred(change / np.maximum(count, 1))
-    fitted_frames = count.any(axis=1, keepdims=True)
-    shared = change.sum(axis=0) / max(fitted_frames.sum(), 1)
-    change -= fitted_frames * shared
+    counted = count.any(axis=1, keepdims=True)
+    change -= counted * (change.sum(axis=0) / max(counted.sum(), 1))
     change = change @ interpolation(model.shapes[0], chosen) / scales[:, None]
     S = S + rotations[:, 2, :, None] * change[:, None]
     # The model of the changed shapes
