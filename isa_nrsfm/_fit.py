@@ -506,11 +506,10 @@ def _joint_frames(
         mean_shape, basis = gauge.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share, slices = weight / table.n_points, posteriors.slices
-    prior_moments = covariance
+    information = shape_information(motion, alpha, covariance, share, slices)
     if widths is not None:  # as in `MarginalLikelihood`
-        penalty = model.noise_variance / (widths.variances * len(motion))
-        prior_moments = covariance + np.diag(penalty)
-    information = shape_information(motion, alpha, prior_moments, share, slices)
+        ridge = np.append(0.0, model.noise_variance / widths.variances)
+        information += np.diag(np.repeat(ridge, 3))
     if prior is None:
         uncertainty = np.linalg.pinv(information, hermitian=True)
         attributes["_halves"] = half_tables(

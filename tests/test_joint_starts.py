@@ -256,25 +256,24 @@ def random_problem(kind="complete", n_frames=30, **options):
     return problem, JointState(shapes, scene.motion, NOISE**2)
 
 
-def mean_images(state):
-    """Return the mean over frames of the products <M B_k, M B_l>."""
-    images = [(M @ state.shapes[1:]).reshape(3, -1) for M in state.motion]
-    return np.mean([image @ image.T for image in images], axis=0)
+def basis_products(state):
+    """Return the products <B_k, B_l>."""
+    basis = state.shapes[1:].reshape(3, -1)
+    return basis @ basis.T
 
 
 def shares_and_variances(problem, state, v):
     """Return g_k and the next v_k after a round from prior variances v_k."""
-    penalty = 1 / (len(state.motion) * v)
-    curvature = MarginalLikelihood(problem.frames, penalty)(*state).shape_curvature
-    C = np.mean([M.T @ M for M in state.motion], axis=0)
+    curvature = MarginalLikelihood(problem.frames)(*state).shape_curvature
+    curvature = curvature + NOISE**2 * np.diag(np.repeat([0.0, *1 / v], 3))
     traces = np.zeros(3)
     for j in range(FEW_POINTS):
         covariance = NOISE**2 * np.linalg.inv(curvature[j % len(curvature)])
         for k in range(3):
             of_shape = slice(3 * k + 3, 3 * k + 6)
-            traces[k] += np.trace(C @ covariance[of_shape, of_shape])
+            traces[k] += np.trace(covariance[of_shape, of_shape])
     g = 1 - traces / (3 * FEW_POINTS * v)
-    return g, np.diag(mean_images(state)) / (3 * FEW_POINTS * g)
+    return g, np.diag(basis_products(state)) / (3 * FEW_POINTS * g)
 
 
 class TestWholeDistribution:
@@ -284,13 +283,13 @@ class TestWholeDistribution:
     def test_rounds_by_their_definition(self, kind):
         problem, state = random_problem(kind)
         reached, widths = determined(problem, state, None)
-        # Another basis of the same shapes, whose images are orthogonal
+        # Another basis of the same shapes, which is orthogonal
         assert_allclose(reached.shapes[0], state.shapes[0])
         before = np.linalg.pinv(state.shapes[1:].reshape(3, -1))
         mixing = reached.shapes[1:].reshape(3, -1) @ before
         assert_allclose(mixing @ mixing.T, np.eye(3), atol=1e-10)
-        energies = np.linalg.eigvalsh(mean_images(state))[::-1]
-        assert_allclose(mean_images(reached), np.diag(energies), atol=1e-9)
+        energies = np.linalg.eigvalsh(basis_products(state))[::-1]
+        assert_allclose(basis_products(reached), np.diag(energies), atol=1e-9)
         v = energies / (3 * FEW_POINTS)
         for _ in range(2):
             shares, v = shares_and_variances(problem, reached, v)
@@ -302,7 +301,8 @@ class TestWholeDistribution:
     def test_noise_has_the_coordinates_that_are_left(self):
         problem, state = random_problem()
         widths = Widths(np.full(3, 0.1), np.array([1.0, 0.5, 0.0]), 36)
-        plain = replace(problem, penalty=1 / (0.1 * 30)).likelihood(*state)
+        precisions = np.tile(10 * np.eye(3), (3, 1, 1))
+        plain = MarginalLikelihood(problem.frames, precisions=precisions)(*state)
         found = replace(problem, widths=widths).likelihood(*state)
         n_unknowns = 30 * (2 + 6) + 36 * 2.5  # affine cameras
         change = n_unknowns * np.log(state.noise)

@@ -6,6 +6,7 @@ import scenes
 from frame_parts import Regression
 from numpy.testing import assert_allclose
 from scenes import likelihood_of, shape_prior
+from scipy.linalg import block_diag
 
 NOISE = 0.05
 PENALTY = 7.0
@@ -14,10 +15,10 @@ PENALTY = 7.0
 class Scene(scenes.Scene):
     """A table, and shapes and cameras that are near it, but not at the optimum."""
 
-    def at(self, penalty=0.0, noise=NOISE, prior=None, **options):
+    def at(self, penalty=0.0, noise=NOISE, prior=None, precisions=None, **options):
         """Return the objective and its derivatives, frames first."""
         likelihood = likelihood_of(self.tracks, self.weights, penalty, **options)
-        likelihood = likelihood._replace(prior=prior)
+        likelihood = likelihood._replace(prior=prior, precisions=precisions)
         terms = likelihood(self.shapes, self.motion, noise)
         gradient = terms.motion_gradient.transpose(2, 0, 1)
         return terms._replace(motion_gradient=gradient)
@@ -38,7 +39,7 @@ def second_moments(frame, noise, penalty):
     c = np.concatenate([[1.0], frame.mean(noise)])
     E = np.outer(c, c)
     E[1:, 1:] += noise * np.linalg.inv(frame.precision(noise))
-    E[1:, 1:] += noise * np.diag(np.broadcast_to(penalty, len(c) - 1))
+    E[1:, 1:] += noise * np.eye(len(c) - 1) * penalty
     return E
 
 
@@ -48,8 +49,13 @@ def scene(request):
     return random_scene(request.param)
 
 
-PRICES = np.array([0.3, 7.0, 2.0])  # one for each basis shape
-PENALTIES = pytest.mark.parametrize("penalty", [0.0, PRICES], ids=str)
+PENALTIES = pytest.mark.parametrize("penalty", [0.0, PENALTY])
+
+
+def precisions():
+    """Return positive definite matrices, one for each basis shape."""
+    roots = np.random.default_rng(3).normal(size=(3, 3, 4))
+    return roots @ roots.mT
 
 
 class TestValue:
@@ -68,6 +74,12 @@ class TestValue:
         energies = sum(np.sum(frame.X**2, axis=0) for frame in frames_of(scene))
         added = scene.at(penalty).value - scene.at().value
         assert added == pytest.approx(np.sum(penalty * energies), rel=1e-12)
+
+    def test_precisions_add_the_squares_of_the_basis_shapes(self, scene):
+        added = scene.at(precisions=precisions()).value - scene.at().value
+        pairs = zip(precisions(), scene.shapes[1:], strict=True)
+        expected = sum(np.trace(B.T @ P @ B) for P, B in pairs)
+        assert added == pytest.approx(expected, rel=1e-12)
 
     def test_coefficients_and_residual(self, scene):
         passed = scene.at(PENALTY)
@@ -126,19 +138,22 @@ class TestValue:
 
 class TestGradient:
     @PENALTIES
-    @pytest.mark.parametrize("name", ["shapes", "motion", "shapes near a prior"])
+    @pytest.mark.parametrize(
+        "name", ["shapes", "motion", "shapes near a prior", "shapes of precisions"]
+    )
     def test_against_differences(self, scene, penalty, name):
-        prior = shape_prior(scene) if "prior" in name else None
+        given = {"prior": shape_prior(scene)} if "prior" in name else {}
+        given |= {"precisions": precisions()} if "precisions" in name else {}
         name = name.partition(" ")[0]
         field = {"shapes": "shape_gradient", "motion": "motion_gradient"}[name]
-        gradient = getattr(scene.at(penalty, prior=prior), field)
+        gradient = getattr(scene.at(penalty, **given), field)
         rng = np.random.default_rng(1)
         for _ in range(5):
             change = rng.normal(size=gradient.shape)
             step = 1e-5
             moved = (getattr(scene, name) + s * step * change for s in (1, -1))
             above, below = (scene._replace(**{name: value}) for value in moved)
-            values = (each.at(penalty, prior=prior).value for each in (above, below))
+            values = (each.at(penalty, **given).value for each in (above, below))
             slope = np.subtract(*values) / (2 * step)
             assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
 
@@ -159,9 +174,10 @@ class TestGradient:
 @PENALTIES
 class TestCurvature:
     def test_of_the_shapes_at_each_point(self, scene, penalty):
-        got = scene.at(penalty).shape_curvature
-        n_shapes, _, n_points = scene.shapes.shape
-        expected = np.zeros((n_points, 3 * n_shapes, 3 * n_shapes))
+        got = scene.at(penalty, precisions=precisions()).shape_curvature
+        n_points = scene.shapes.shape[2]
+        prior = NOISE * block_diag(np.zeros((3, 3)), *precisions())
+        expected = np.tile(prior, (n_points, 1, 1))
         weights = 1.0 if scene.weights is None else scene.weights
         weights = np.broadcast_to(weights, scene.tracks.shape[:2])
         for i, (frame, M) in enumerate(

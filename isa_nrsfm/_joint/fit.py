@@ -66,7 +66,7 @@ from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 FIRST_COMPONENTS = 3, 1, 12
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains are those of two fits of one minimum.
-HOPELESS, LEAST_GAIN = 5.0, 1.0
+HOPELESS, LEAST_GAIN = 5.0, 0.02
 # Numbers of groups of similar frames that may be reversed in depth:
 # docs/benchmarks/README.md, "Thresholds".
 GROUPS = 2, 4
@@ -237,7 +237,8 @@ def steadiest(
     restarts = problem.settings.limits.restarts
     if not restarts or not np.isfinite(before):  # nothing turns
         return fit
-    found, latest = [(evidence(problem, fit) - LEAST_GAIN, before, fit)], fit
+    least_gain = LEAST_GAIN * problem.frames.totals[0] / problem.frames.n_frames
+    found, latest = [(evidence(problem, fit) - least_gain, before, fit)], fit
 
     def lifted(motion: NDArray, k: int) -> JointFit:
         """Return the fit of n directions from cameras, first with k of them."""
@@ -271,7 +272,7 @@ def steadiest(
         motion = reversed_groups(problem, rows, best.state.motion, alpha, n_groups)
         if np.any(motion != best.state.motion):
             other = problem.turned_back(lifted(motion, n), problem.cameras, refined)
-            compare(other, -LEAST_GAIN)
+            compare(other, -least_gain)
     found.sort(key=itemgetter(0))
     rivals = rival_depths(problem, [(value, fit) for value, _, fit in found])
     return found[0][2]._replace(rivals=rivals)

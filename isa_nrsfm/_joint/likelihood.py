@@ -9,9 +9,10 @@ likelihood of all frames is, up to a constant ::
     N log s2 + sum_i [ min_alpha (||W_i - M_i sum_k c_k B_k||^2 / s2 + ||alpha||^2)
                        + log det(I + H_i / s2) ]
 
-with N the number of coordinates that were seen. The objective adds ``penalty * sum_i tr
-H_i``, minus twice the log prior of the basis shapes, and with calibrated cameras the
-prior of the extents (`extent_penalty`).
+with N the number of coordinates that were seen. The objective adds minus twice the log
+prior of the basis shapes: ``penalty * sum_i tr H_i`` for their images, or ``sum_kj
+B_kj^T P_k B_kj`` for their points in space, with precisions P_k. With calibrated
+cameras it adds the prior of the extents (`extent_penalty`).
 
 Positions are eliminated by least squares: tracks and shapes are centred over the seen
 points of each frame. Without weights the given shapes have to be centred already.
@@ -35,6 +36,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from isa_nrsfm._compat.lazy import cached_property
 from isa_nrsfm._frames.search import (
@@ -213,17 +215,18 @@ class LikelihoodTerms(NamedTuple):
 class MarginalLikelihood(NamedTuple):
     """The objective and its derivatives, as a sum over blocks of frames.
 
-    penalty: factor of ``sum_i tr H_i``, or one (K,) for each diagonal entry.
+    penalty: factor of ``sum_i tr H_i``. precisions (K, 3, 3): P_k, if any.
     extent_weight: weight of the prior of the extents, for each coordinate.
     prior: that of the shapes, by a fitted model.
     n_unknowns: number of coordinates that determine parameters, not the noise.
     """
 
     frames: JointFrames
-    penalty: NDArray | float = 0.0
+    penalty: float = 0.0
     extent_weight: float = 0.0
     prior: ShapePrior | None = None
     n_unknowns: float = 0.0
+    precisions: NDArray | None = None
 
     def __call__(
         self, shapes: NDArray, motion: NDArray, noise: float
@@ -259,6 +262,12 @@ class MarginalLikelihood(NamedTuple):
             penalty, slope = extent_penalty(shapes, self.frames.point_shares)
             value += weight * penalty
             shape_gradient = shape_gradient + weight * slope
+        if self.precisions is not None:
+            slope = self.precisions @ shapes[1:]
+            value += np.vdot(slope, shapes[1:])
+            shape_gradient[1:] += 2.0 * slope
+            penalties = block_diag(np.zeros((3, 3)), *self.precisions)
+            curvature = curvature + noise * penalties
         if self.prior is not None:
             term, slope = self.prior.term(shapes)
             value, shape_gradient = value + term, shape_gradient + slope
@@ -292,7 +301,7 @@ def _terms(
     M: NDArray,
     shapes: ShapeProducts,
     noise: float,
-    penalty: NDArray | float,
+    penalty: float,
     tiny_noise: bool,
 ) -> Terms:
     """Return the sums over frames, M (2, 3, n_frames), for `MarginalLikelihood`.
@@ -304,13 +313,13 @@ def _terms(
     posterior = coefficient_posterior(products, M, noise, refined=tiny_noise)
     c, alpha = posterior.c, posterior.alpha
     value = np.sum(posterior.objective / noise + posterior.log_determinant)
-    value += np.sum(penalty * posterior.image_energy.sum(axis=1))
+    value += penalty * np.sum(posterior.image_energy)
     residual = float(posterior.residual(noise).sum())
     spread = float(posterior.spread(noise).sum())
 
     # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
     moments = posterior.second_moments(noise)
-    moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
+    moments[diagonal_of(moments)[1:]] += noise * penalty
     cameras = camera_gram(M)
     # With respect to the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
     motion_curvature = products.gram.moments(moments)

@@ -148,11 +148,17 @@ class Widths(NamedTuple):
         """Return the number of coordinates that determine cameras and shapes."""
         return (2 + CAMERAS[camera].n_parameters) * n_frames + self.n_determined
 
-    def likelihood(self, frames: JointFrames, camera: str) -> MarginalLikelihood:
-        """Return the objective of some frames, without other priors."""
-        penalty = 1.0 / (self.variances * frames.n_frames)
+    def likelihood(
+        self, frames: JointFrames, camera: str, stretch: NDArray | None = None
+    ) -> MarginalLikelihood:
+        """Return the objective of some frames, without other priors.
+
+        A stretch (3, 3) is that of the shapes and of their prior.
+        """
+        T = np.eye(3) if stretch is None else stretch
+        precisions = np.linalg.inv(T @ T.T) / self.variances[:, None, None]
         unknowns = self.n_unknowns(frames.n_frames, camera)
-        return MarginalLikelihood(frames, penalty, n_unknowns=unknowns)
+        return MarginalLikelihood(frames, n_unknowns=unknowns, precisions=precisions)
 
 
 class JointFit(NamedTuple):
@@ -185,14 +191,14 @@ class JointProblem:
     """The objective of the joint fit of some frames, and the steps that minimise it.
 
     thorough: whether many starts are compared, as for small tables.
-    penalty: factor of the prior of the basis shapes, or one (K,) for each.
+    penalty: factor of the prior of the basis shapes.
     widths: prior variances of all directions of a shape, in place of the penalty.
     """
 
     frames: JointFrames
     settings: FitSettings
     thorough: bool = False
-    penalty: NDArray | float = 0.0
+    penalty: float = 0.0
     widths: Widths | None = None
 
     def part(self, chosen: NDArray, tol: float) -> "JointProblem":

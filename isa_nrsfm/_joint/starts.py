@@ -273,7 +273,7 @@ def with_prior(problem: JointProblem, state: JointState) -> JointState:
 
 
 def likely_basis(
-    shapes: NDArray, motion: NDArray, alpha: NDArray, penalty: NDArray | float
+    shapes: NDArray, motion: NDArray, alpha: NDArray, penalty: float
 ) -> NDArray:
     """Return the same shapes (K + 1, 3, J) in the basis of greatest likelihood.
 

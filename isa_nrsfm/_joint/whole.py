@@ -4,15 +4,17 @@ A shape has 3J - 7 directions of deformation. With calibrated cameras the joint 
 as many of them as frames and time allow, whatever number of coefficients is reported:
 deformation that a fit lacks would distort cameras and depths.
 
-The images of the 3J numbers of each direction have a prior variance v_k, which follows
-from the table (automatic relevance determination: MacKay, "Bayesian interpolation",
-1992; Bishop, "Bayesian PCA", 1999). With the posterior covariance ``cov B_k``, the
-coefficients' moments held fixed, and ``C = mean_i M_i^T M_i`` the iteration is
+The 3J numbers of each direction have a prior variance v_k, which follows from the table
+(automatic relevance determination: MacKay, "Bayesian interpolation", 1992; Bishop,
+"Bayesian PCA", 1999). With the posterior covariance ``cov B_k``, the coefficients'
+moments held fixed, the iteration is
 
-    g_k = 1 - tr(C cov B_k) / (3J v_k),   v_k <- mean_i ||M_i B_k||^2 / (3J g_k).
+    g_k = 1 - tr(cov B_k) / (3J v_k),   v_k <- ||B_k||^2 / (3J g_k).
 
 g_k is the share of the 3J numbers of B_k that the table determines rather than the
 prior. Directions that fit noise get smaller, and less determined, with each round.
+Points deform alike in x, y and z: a prior of the images would let depths deform without
+limit, and faces that turn less and deform ten times more in depth would be as likely.
 
 The noise variance s2 follows in the same way. Of the N coordinates ``n = sum_i (2 + p)
 + 3J (1 + sum_k g_k)`` determine positions, the p parameters of each camera, and the
@@ -33,7 +35,6 @@ from isa_nrsfm._joint.problem import (
     Widths,
     regular,
 )
-from isa_nrsfm._joint.starts import camera_moments
 from isa_nrsfm._linalg import OF_DISTANCES, frames_last, unpacked
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
@@ -102,11 +103,12 @@ def determined(
     n_numbers = 3 * problem.frames.points(state.shapes).shape[2]
     # Positions of shapes have no images.
     state = state._replace(shapes=problem.frames.centred(state.shapes))
-    # Basis shapes whose images are orthogonal on average
-    C, images = image_moments(state)
-    energy, axes = np.linalg.eigh(images)
+    # Orthogonal basis shapes
+    basis = state.shapes[1:]
+    products = np.tensordot(basis, basis, axes=([1, 2], [1, 2]))
+    energy, axes = np.linalg.eigh(products)
     energy, axes = np.maximum(energy[::-1], 0.0), axes[:, ::-1]
-    basis = np.tensordot(axes.T, state.shapes[1:], 1)
+    basis = np.tensordot(axes.T, basis, 1)
     state = state._replace(shapes=np.concatenate([state.shapes[:1], basis]))
     least = 1e-9 * max(energy.max(), OF_DISTANCES * problem.mean_square) / n_numbers
     variances = np.maximum(energy / n_numbers, least)
@@ -120,7 +122,7 @@ def determined(
     # If all weights are one, one matrix is valid for all points.
     total = covariance.sum(axis=0) * (n_numbers / 3 / len(covariance))
     total = total.reshape(len(basis) + 1, 3, len(basis) + 1, 3)
-    uncertain = np.einsum("ab,kakb->k", C, total)[1:]
+    uncertain = np.einsum("kaka->k", total)[1:]
     shares = np.clip(1.0 - uncertain / (variances * n_numbers), 1e-9, 1.0)
     variances = np.maximum(energy / (n_numbers * shares), least)
     # The large noise of the first round hides directions.
@@ -129,12 +131,6 @@ def determined(
     shapes = state.shapes[np.append(True, kept)]
     widths = Widths(variances[kept], shares[kept], n_numbers)
     return state._replace(shapes=shapes), widths
-
-
-def image_moments(state: JointState) -> tuple[NDArray, NDArray]:
-    """Return ``C = mean_i M_i^T M_i`` and the moments ``mean_i <M_i B_k, M_i B_l>``."""
-    C, basis = camera_moments(state.motion), state.shapes[1:]
-    return C, np.einsum("ab,kaj,lbj->kl", C, basis, basis, optimize=True)
 
 
 def evidence(problem: JointProblem, fit: JointFit) -> float:
@@ -147,9 +143,9 @@ def evidence(problem: JointProblem, fit: JointFit) -> float:
 
         F / n + mean_i log det C_i + log det V + (log det A + 3J sum_k log v_k) / n.
 
-    A is that along axes in which ``mean_i M_i^T M_i`` is the identity, as for v_k. So
-    turning has a price, as deforming has. det V is that along the two axes of
-    largest spread. Without widths the shapes have no prior and do not count.
+    v_0 is the mean square of the mean shape. So turning has a price, as deforming has.
+    det V is that along the two axes of largest spread. Without widths the shapes have
+    no prior and do not count.
     """
     part, widths = replace(problem, penalty=0.0, widths=fit.widths), fit.widths
     shapes, motion, noise = fit.state
@@ -167,8 +163,8 @@ def evidence(problem: JointProblem, fit: JointFit) -> float:
         return np.inf
     if widths is not None:
         known = np.linalg.slogdet(regular(terms.shape_curvature) / noise)[1].mean()
-        known -= len(shapes) * np.linalg.slogdet(camera_moments(motion))[1]
         known = known / 3 + np.log(widths.variances).sum()
+        known += np.log(np.sum(shapes[0] ** 2) / widths.n_numbers)
         price += widths.n_numbers * known / len(motion)
     return float(terms.value / len(motion) + price)
 
