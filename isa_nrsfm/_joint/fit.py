@@ -65,7 +65,7 @@ from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 # docs/benchmarks/README.md, "Thresholds".
 FIRST_COMPONENTS = 3, 1, 12
 # Differences of `evidence`, on the same page: starts that are further off are not
-# refined; smaller gains are those of two fits of one minimum.
+# refined; smaller gains of a coordinate are within the error of the noise variance.
 HOPELESS, LEAST_GAIN = 5.0, 0.02
 # Numbers of groups of similar frames that may be reversed in depth:
 # docs/benchmarks/README.md, "Thresholds".
