@@ -153,10 +153,10 @@ class Widths(NamedTuple):
     ) -> MarginalLikelihood:
         """Return the objective of some frames, without other priors.
 
-        A stretch (3, 3) is that of the shapes and of their prior.
+        stretch (3, 3), symmetric: of the standard deviations, by default the identity.
         """
-        T = np.eye(3) if stretch is None else stretch
-        precisions = np.linalg.inv(T @ T.T) / self.variances[:, None, None]
+        root = np.linalg.inv(np.eye(3) if stretch is None else stretch)
+        precisions = root @ root / self.variances[:, None, None]
         unknowns = self.n_unknowns(frames.n_frames, camera)
         return MarginalLikelihood(frames, n_unknowns=unknowns, precisions=precisions)
 

@@ -298,6 +298,8 @@ def depth_certainty(
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[: most + 1, :, points], fit.motion[known]
     tracks, camera = part[known], CAMERAS[frames.camera]
+    # The prior of the directions does not limit depths along the mean line of sight.
+    _, deep = stretched(JointState(shapes, motion, 1.0), camera, FAR)
     prior, extents = settings.shape_prior, EXTENT_WEIGHT
     if prior is not None:  # which does not let depths grow
         prior, extents = prior.of_points(points), 0.0
@@ -314,7 +316,6 @@ def depth_certainty(
         start: JointState | None = None,
         extents: float = 0.0,
         prior: ShapePrior | None = prior,
-        stretch: NDArray | None = None,
     ) -> tuple[JointState, NDArray, NDArray, float]:
         """Fit the kept points by a few steps, by default from the fit of all points.
 
@@ -327,7 +328,7 @@ def depth_certainty(
             likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
         elif widths is not None:
             own = widths.of_points(int(kept.sum()), most)
-            likelihood = own.likelihood(part, frames.camera, stretch)
+            likelihood = own.likelihood(part, frames.camera, deep)
         else:
             penalty = part.basis_penalty(limits.basis_std)
             likelihood = MarginalLikelihood(part, penalty)
@@ -350,9 +351,8 @@ def depth_certainty(
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
-        starts = (stretched(state, camera, FAR) for state in (whole, still))
-        rises = (refit(every, start, stretch=T)[-1] for start, T in starts)
-        rise = min(rises) - value
+        starts = (stretched(state, camera, FAR)[0] for state in (whole, still))
+        rise = min(refit(every, start)[-1] for start in starts) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:
         costs, stretches = [0.5 * prior.cost], [0.0]
