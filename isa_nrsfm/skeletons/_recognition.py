@@ -16,21 +16,18 @@ from isa_nrsfm.skeletons._skeleton import Skeleton
 
 def _tuples(value: Any) -> Any:
     """Return a value of a data file, with tuples in place of lists."""
+    if isinstance(value, dict):
+        return {name: _tuples(each) for name, each in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-_FILE = Path(__file__).with_name("layouts.toml")
-_TABLES: dict[str, dict[str, Any]] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-SKELETONS = MappingProxyType(
-    {
-        name: Skeleton(name, **{part: _tuples(entry[part]) for part in entry})
-        for name, entry in _TABLES["layouts"].items()
-    }
+_TEXT = Path(__file__).with_name("layouts.toml").read_text("utf-8")
+_TABLES = _tuples(tomllib.loads(_TEXT))
+SKELETONS: Mapping[str, Skeleton] = MappingProxyType(
+    {name: Skeleton(name, **entry) for name, entry in _TABLES["layouts"].items()}
 )
 # The layouts in which the readers of `isa_nrsfm.io` find points without names.
-LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = {
-    reader: tuple(names) for reader, names in _TABLES["readers"].items()
-}
+LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = _TABLES["readers"]
 
 # Edges of a layout are short: so long at most is their mean, relative to the mean
 # distance of all points. Faces in their own order have 0.14 to 0.25 in single images
