@@ -46,6 +46,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import aligned
 from isa_nrsfm._linalg import OF_DIFFERENCES
 from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.analysis._frame_columns import unit_columns
 
 # Why a label cannot be tested.
 ONE_EVENT = (
@@ -587,7 +588,7 @@ def association(
     alpha, labels, _, order = _known_frames(alpha, y, groups, time)
     kind = _frame_columns.kind_of(labels, kind)
     columns, classes = _label_columns(labels, kind), kind == "classes"
-    standard = _unit_columns(alpha if classes else rankdata(alpha, axis=0))
+    standard = unit_columns(alpha if classes else rankdata(alpha, axis=0))
     covariances = columns.T @ standard
     statistic = np.sum(covariances**2, axis=0) if classes else covariances[0]
     rng = check_random_state(random_state)
@@ -651,7 +652,7 @@ def predictability(
     kind = _frame_columns.kind_of(labels, kind)
     if groups is None:  # blocks of frames that depend on each other
         columns, numbers = _label_columns(labels, kind)[order.rows], None
-        residuals = unexplained(_unit_columns(features)[order.rows], columns, order)
+        residuals = unexplained(unit_columns(features)[order.rows], columns, order)
         if (length := independent_length(residuals)) > 1:
             numbers = np.empty(len(labels), dtype=int)
             numbers[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
@@ -739,13 +740,6 @@ def _label_columns(labels: NDArray, kind: str) -> csr_array:
     the square of Spearman's rank correlation.
     """
     if kind == "number":
-        return csr_array(_unit_columns(rankdata(labels)[:, None]))
+        return csr_array(unit_columns(rankdata(labels)[:, None]))
     columns = indicators(np.unique(labels, return_inverse=True)[1])
     return csr_array(columns / np.sqrt(columns.sum(axis=0)))
-
-
-def _unit_columns(values: NDArray) -> NDArray:
-    """Return columns (n, k), centred and of norm one; zero where constant."""
-    values = values - values.mean(axis=0)
-    size = np.linalg.norm(values, axis=0)
-    return np.asarray(values / np.where(size > 0, size, 1.0))

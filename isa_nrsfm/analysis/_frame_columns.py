@@ -109,6 +109,13 @@ def checked_times(time: Any, n_rows: int) -> NDArray:
     return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")
 
 
+def unit_columns(values: NDArray) -> NDArray:
+    """Return columns (n, k), centred and of norm one; zero where constant."""
+    values = values - values.mean(axis=0)
+    size = np.linalg.norm(values, axis=0)
+    return np.asarray(values / np.where(size > 0, size, 1.0))
+
+
 def runs_between_gaps(time: NDArray) -> NDArray | None:
     """Return the number of the run of each frame, None if times have no gaps.
 

@@ -13,10 +13,10 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.files import errors_of
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import DEFAULTS
-from isa_nrsfm.cli._reading import Frames, cells_of, column_named
-from isa_nrsfm.cli._times import as_numbers, read_times, video_times
+from isa_nrsfm.cli._reading import Frames, as_numbers, cells_of, column_named
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import EYES, point_numbers
 from isa_nrsfm.export._viewer import MOST_LABELS
@@ -36,9 +36,9 @@ def asked_columns(args: Namespace, frames: Frames) -> Frames:
     if args.time is not None:
         with errors_of(f"--time {args.time}"):
             cells = cells_of(table, args.time, "--time")
-            times, unit = read_times(cells, args.time_format)
+            times, unit = _reading.read_times(cells, args.time_format)
     elif args.fps is not None:
-        times = video_times(frames.images[table.index], groups) / args.fps
+        times = _reading.video_times(frames.images[table.index], groups) / args.fps
     if times is not None:
         try:
             seconds = _frame_columns.checked_times(times, len(table))

@@ -151,14 +151,9 @@ POSITIONAL = ("table", "model")
 SHORT = {"output": ["-o"], "n_components": ["-k"]}
 # The commands with their options, and the help of each option by its name and value.
 _DATA = tomllib.loads(Path(__file__).with_name("options.toml").read_text("utf-8"))
-_LISTS = {
-    "FORMATS": [name for name in FORMATS if name != TABLE],
-    "OPENPOSE_PARTS": choices.OPENPOSE_PARTS,
-    "WHOLE_PARTS": choices.WHOLE_PARTS,
-    "SKELETON_NAMES": choices.SKELETON_NAMES,
-    "FACE_PRIORS": choices.FACE_PRIORS,
-}
-_WORDS = {name: ", ".join(values) for name, values in _LISTS.items()}
+_LISTS = ("OPENPOSE_PARTS", "WHOLE_PARTS", "SKELETON_NAMES", "FACE_PRIORS")
+_WORDS = {name: ", ".join(getattr(choices, name)) for name in _LISTS}
+_WORDS["FORMATS"] = ", ".join(name for name in FORMATS if name != TABLE)
 HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
 # What export writes: suffixes of the files, and options.
 EXPORTS = _DATA["exports"]

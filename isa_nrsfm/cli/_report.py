@@ -32,7 +32,7 @@ from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.analysis._frame_columns import STATISTICS
 from isa_nrsfm.cli._options import PROGRAM
 from isa_nrsfm.cli._reading import MOST_LISTED, Frames, drawing_files
-from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.export._upright import names_of_components
 from isa_nrsfm.io import FORMATS, load_model, save_model, write_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.metrics._measures import frame_energies
@@ -155,6 +155,13 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
     save_model(estimator, folder / "model.npz")
 
 
+def depth_std(args: Namespace, model: AffineNRSfM, X: Any, weights: Any) -> Any:
+    """Return the error bars of the viewer as its argument, if --std asks for them."""
+    if not args.std or model.camera_ == "affine":
+        return {}
+    return {"depth_std": model.reconstruct(X, return_std=True, **weights)[1]}
+
+
 def read_model(args: Namespace) -> AffineNRSfM:
     """Load a model; its missing points have the coordinates of those of its fit.
 
@@ -189,10 +196,8 @@ def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
 
 def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """Return the digests of the named files that exist in a folder."""
-    existing = [name for name in names if (folder / name).is_file()]
-    contents = ((folder / name).read_bytes() for name in existing)
-    digests = [hashlib.sha256(content).hexdigest() for content in contents]
-    return dict(zip(existing, digests, strict=True))
+    existing = {name: folder / name for name in names if (folder / name).is_file()}
+    return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in existing.items()}
 
 
 # Classes whose means are shown, at most.

@@ -13,7 +13,6 @@ from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.export import _upright
-from isa_nrsfm.export._names import frames_of_table, point_places
 from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -176,7 +175,7 @@ def _poses(
     space: _upright.UprightSpace, model: Any, X: Any, point_weight: Any = None
 ) -> FramePoses:
     """Return the poses of frames in an upright space."""
-    motion, alpha = frames_of_table(model, X, point_weight)
+    motion, alpha = _upright.frames_of_table(model, X, point_weight)
     shaped = alpha[:0] if space.metric is None else alpha  # no shapes are needed
     _, rotations, scales = _upright.upright_frames(space, model, motion, shaped)
     # The fitted table must determine the depth.
@@ -262,7 +261,7 @@ def point_distances(
             )
         unit = EYES
     a, b = point_numbers(unit, names)
-    shapes = _upright.upright_frames(space, model, *frames_of_table(model, X)).shapes
+    shapes = _upright.upright_shapes(space, model, X)
     mean = np.nanmean(shapes, axis=0)
     size = np.linalg.norm(mean[a] - mean[b])
     if not size > 0:
@@ -277,7 +276,7 @@ def point_numbers(pair: Sequence[Any], names: Sequence[str]) -> tuple[int, int]:
             "expected pairs of points, such as [(62, 66)] for the distance of points "
             f"62 and 66; got {pair!r} instead of a pair"
         )
-    places = point_places(names)
+    places = _upright.point_places(names)
     for each in pair:
         if str(each) not in places:
             raise ValueError(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.lazy import import_optional
+from isa_nrsfm.skeletons._column_names import checked_names
 
 # Vermilion, blue and black of the palette of Okabe and Ito, which people with any kind
 # of colour vision can distinguish; grey for comparison.
@@ -164,6 +165,11 @@ def add_legend(figure: Any, entries: list[Any], skeleton: Any, **options: Any) -
     entries = [*entries, *drawn]
     style = {"loc": "outside lower center", "frameon": False, "fontsize": "small"}
     figure.legend(handles=entries, ncols=len(entries), **(style | options))
+
+
+def names_of_shapes(names: Any, n_components: int) -> list[str]:
+    """Return the names of basis shapes, by default their numbers from 1."""
+    return checked_names("component_names", names, range(1, n_components + 1))
 
 
 def chosen_numbers(

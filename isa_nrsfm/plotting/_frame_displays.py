@@ -116,9 +116,7 @@ class CoefficientsDisplay:
         self.label = "label" if label is None else label
         if component_names is None and hasattr(alpha, "columns"):
             component_names = [*map(_no_mathematics, alpha.columns)]
-        self.component_names = checked_names(
-            "component_names", component_names, range(1, n_components + 1)
-        )
+        self.component_names = _axes.names_of_shapes(component_names, n_components)
 
     @classmethod
     def from_estimator(

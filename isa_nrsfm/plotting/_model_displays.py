@@ -12,7 +12,6 @@ from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm.plotting import _axes, _views
 from isa_nrsfm.plotting._axes import flat_axes, percent
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
-from isa_nrsfm.skeletons._column_names import checked_names
 
 # Arrows in the units of the points, with the same width in all axes.
 ARROW_STYLE = {
@@ -158,9 +157,7 @@ class BasisShapeDisplay:
                 f"got shape {share.shape}"
             )
         self.energy_share = share
-        self.component_names = checked_names(
-            "component_names", component_names, range(1, n_components + 1)
-        )
+        self.component_names = _axes.names_of_shapes(component_names, n_components)
         _, self.skeleton, self.origin = choose_lines(edges, origin, self.mean_shape)
         self.edges = None if self.skeleton is None else self.skeleton.edges
 
@@ -410,9 +407,7 @@ class ModeCovarianceDisplay:
                 f"shape; got shape {matrix.shape}"
             )
         self.mode_covariance = matrix
-        self.component_names = checked_names(
-            "component_names", component_names, range(1, n_modes // BLOCK + 1)
-        )
+        self.component_names = _axes.names_of_shapes(component_names, n_modes // BLOCK)
 
     @property
     def off_block_share(self) -> float:
