@@ -367,22 +367,17 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
     """
     _upright.suffix_of(path, [".txt"])
     with reading(path, "a point distribution model"):
-        pdm = _from_matrices(*_read_matrices(path))
-        if not all(np.isfinite(part).all() for part in pdm):
+        M, V, E = _read_matrices(path)
+        n_points, n_modes = M.size // 3, E.size
+        if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
+            raise ValueError(
+                "it should have a mean of 3n numbers, components of shape (3n, m) and "
+                f"m variances; got {M.size}, {V.shape} and {E.size}"
+            )
+        if not all(np.isfinite(part).all() for part in (M, V, E)):
             raise ValueError("its numbers should be finite; got NaN or infinity")
-        return pdm
-
-
-def _from_matrices(M: NDArray, V: NDArray, E: NDArray) -> PointDistributionModel:
-    """Return the model of mean (3n x 1), components (3n x m) and m variances."""
-    n_points, n_modes = M.size // 3, E.size
-    if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
-        raise ValueError(
-            "it should have a mean of 3n numbers, components of shape (3n, m) and m "
-            f"variances; got {M.size}, {V.shape} and {E.size}"
-        )
-    modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
-    return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
+        modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
+        return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
 
 
 def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:

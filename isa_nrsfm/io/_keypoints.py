@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
@@ -27,40 +28,15 @@ from isa_nrsfm.io._landmark_columns import (
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes, stacked
 from isa_nrsfm.io._tables import confidences_in, header_names, read_columns, tracks_in
 
-# Entries of images and instances that are no columns under their own name.
-_LEFT_OUT = (
-    *("id", "category_id", "num_keypoints"),
-    *("license", "coco_url", "flickr_url", "date_captured"),
-)
-# COCO-WholeBody: the lists of an instance, and their numbers of points.
-_LISTS = {"keypoints": 17, "foot_kpts": 6, "face_kpts": 68}
-_LISTS |= {"lefthand_kpts": 21, "righthand_kpts": 21}
-# The places of parts in whole bodies of so many points: COCO-WholeBody, Halpe.
-_PLACES = {
-    133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
-    136: [(0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)],
-}
-# The keys of json of programs, outside of all objects but one, and what a value begins
-# with.
-_KINDS = {
-    "coco": r'"(?:images|annotations|image_id)":',
-    "openpose": r'"people":',
-    "mmpose": r'"(?:instance_info|instances|keypoint_scores|predictions)":',
-    "ultralytics": r'"keypoints":\{',
-    "labelme": r'"shapes":',
-    "mediapipe": r'"x":.*"y":|[lL]andmarks":',
-}
+# Names and numbers of the files of other programs.
+_DATA = tomllib.loads(Path(__file__).with_name("keypoints.toml").read_text("utf-8"))
 # A key and the beginning of its value, or another text, or a brace.
 _TOKEN = re.compile(r'("(?:[^"\\]|\\.)*+")(?:\s*:\s*(?=(.)))?|([{}])')
-# The columns of a specimen.
-_TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
     r"\{(?P<points>[^{}]*)\}\s*"
 )
 _N_WFLW = 98
-_WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
-_WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
 # Fields of a line: points and image, without and with the box and the attributes.
 _WFLW_LENGTHS = (197, 207)
 
@@ -82,7 +58,7 @@ def _kind_of(text: str) -> str:
         depth += (brace == "{") - (brace == "}")
         if value and depth == 1:
             keys.append(f"{key}:{value}")
-    found = [kind for kind, e in _KINDS.items() if re.search(e, " ".join(keys))]
+    found = [kind for kind, e in _DATA["kinds"].items() if re.search(e, " ".join(keys))]
     if keys and not found and re.search(r'[lL]andmarks"\s*:\s*\[', text):
         found = ["mediapipe"]  # of frames in an object
     return [*found, "other" if keys else "none"][0]
@@ -259,7 +235,7 @@ def _keypoints(
     entries: Entries, names: Names, part: str | None, what: str
 ) -> tuple[NDArray[np.float64], Names]:
     """Return keypoints of instances (n_instances, n_points, 3) and names, of a part."""
-    gap = {key: [0] * 3 * n for key, n in _LISTS.items()} | {"keypoints": None}
+    gap = {key: [0] * 3 * n for key, n in _DATA["lists"].items()} | {"keypoints": None}
     further = [key for key in gap if any(key in entry for entry in entries)][1:]
     if further and part is None:
         part = "body"
@@ -267,7 +243,7 @@ def _keypoints(
             f"the points of bodies are read, and those in {', '.join(further)} are "
             f"left out: choose with {named('part')}, one of {', '.join(WHOLE_PARTS)}"
         )
-    keys = [*_LISTS] if further and part != "body" else ["keypoints"]
+    keys = [*_DATA["lists"]] if further and part != "body" else ["keypoints"]
     n_points = len(names) if names and len(keys) == 1 else 0
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
@@ -283,11 +259,11 @@ def _keypoints(
             )
     values = np.reshape(found, (len(entries), n_points, 3))
     places: dict[str, tuple[int, int]] = dict.fromkeys(("body", "all"), (0, n_points))
-    places |= zip(WHOLE_PARTS, _PLACES.get(n_points, []), strict=False)
+    places |= _DATA["places"].get(str(n_points), {})
     if part is not None and part not in places:
         raise ValueError(
             f"part={part!r} is none of {', '.join(places)}, the parts of {n_points} "
-            f"points; whole bodies have {' or '.join(map(str, _PLACES))}"
+            f"points; whole bodies have {' or '.join(_DATA['places'])}"
         )
     chosen = slice(*places[part or "all"])
     if names and len(names) == n_points:
@@ -323,7 +299,7 @@ def _scalars(entry: dict[str, Any]) -> dict[str, Any]:
         entry = further | entry
     for name, value in entry.items():
         value = value[0] if isinstance(value, list) and len(value) == 1 else value
-        if isinstance(value, str | int | float) and name not in _LEFT_OUT:
+        if isinstance(value, str | int | float) and name not in _DATA["left_out"]:
             found[name] = value
     return found
 
@@ -524,7 +500,7 @@ def read_tps(path: Path) -> Landmarks:
                 raise ValueError(f"there are more than {count} landmarks")
         n_left += sum(not equals for _, equals, _ in entries)
         found = {name.strip().lower(): value.strip() for name, _, value in entries}
-        rows.append({name: found[name] for name in _TPS_ENTRIES if name in found})
+        rows.append({name: found[name] for name in _DATA["tps"] if name in found})
     if n_left and not any(len(each[0]) for each in tracks):
         raise ValueError(
             f"all its {n_left} points are on curves, which are left out: append them "
@@ -557,8 +533,8 @@ def read_wflw(path: Path) -> Landmarks:
     if n_fields == _WFLW_LENGTHS[1]:
         if not np.isin(attributes, (0, 1)).all():
             raise ValueError("the six attributes before the image must be 0 or 1")
-        frames |= zip(_WFLW_BOX, box.T, strict=True)
-        frames |= zip(_WFLW_ATTRIBUTES, attributes.T.astype(int), strict=True)
+        frames |= zip(_DATA["wflw_box"], box.T, strict=True)
+        frames |= zip(_DATA["wflw_attributes"], attributes.T.astype(int), strict=True)
     return assemble(points.reshape(-1, _N_WFLW, 2), None, frames, format="wflw")
 
 

@@ -547,9 +547,6 @@ def with_points(
     Other columns are written so where all their cells are such numbers.
     """
     texts = frame[[*names]].select_dtypes(["object", "string"])
-    columns = (texts[name].astype(str) for name in texts)
-    if not any(column.str.contains(",", regex=False).any() for column in columns):
-        return frame
     cells = {*map(str, texts.to_numpy(object).ravel())}
     commas = [cell for cell in cells if "," in cell]
     decimal = {*filter(_DECIMAL_COMMA.fullmatch, commas)}
