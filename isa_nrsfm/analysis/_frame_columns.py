@@ -1,7 +1,9 @@
 """Columns with one entry for each frame, such as labels, groups and times."""
 
 import contextlib
+import tomllib
 from datetime import UTC
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,11 +14,7 @@ from sklearn.utils.multiclass import type_of_target
 from isa_nrsfm._parameters import named
 
 Kind = Literal["classes", "number"]
-# Names and meanings of the statistics of labels, by their kind.
-STATISTICS = {
-    "classes": ("eta squared", "share of the variance between classes"),
-    "number": ("Spearman", "rank correlation, from -1 to 1"),
-}
+TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
 
 
 def checked_column(name: str, values: Any, n_frames: int) -> NDArray:

@@ -124,11 +124,9 @@ def _is_layout(text: str) -> bool:
     return text in choices.SKELETON_NAMES or text.lower().endswith(CONFIGURATIONS)
 
 
-# Arguments without a leading -- in the command line.
-POSITIONAL = ("table", "model")
-SHORT = {"output": ["-o"], "n_components": ["-k"]}
 # The commands with their options, and the help of each option by its name and value.
 _DATA = tomllib.loads(Path(__file__).with_name("options.toml").read_text("utf-8"))
+POSITIONAL = _DATA["positional"]
 _LISTS = ("OPENPOSE_PARTS", "WHOLE_PARTS", "SKELETON_NAMES", "FACE_PRIORS")
 _WORDS = {name: ", ".join(getattr(choices, name)) for name in _LISTS}
 _WORDS["FORMATS"] = ", ".join(name for name in FORMATS if name != TABLE)
@@ -165,10 +163,8 @@ CHOICES: dict[str, Sequence[str]] = _DATA["choices"] | {
     "independence": (*choices.INDEPENDENCE, NONE),
     "loss": choices.LOSSES,
 }
-# Options whose first choice is their value by default, which the help states.
-FIRST = ("isa", "block_recovery", "independence")
+FIRST = _DATA["first"]
 DEFAULTS = _DATA["defaults"] | {n: CHOICES[n][0] for n in ("format", *FIRST)}
-REPEATED = ("skip_rows", "missing_value", "label", "distance")
 
 
 class Parser(argparse.ArgumentParser):
@@ -197,7 +193,7 @@ def build_parser() -> Parser:
                 place = group if is_one else group.add_mutually_exclusive_group()
                 for name in [option] if is_one else option:
                     flags = [name if name in POSITIONAL else flag_of(name)]
-                    flags = SHORT.get(name, []) + flags
+                    flags = _DATA["short"].get(name, []) + flags
                     place.add_argument(*flags, **_settings(command, name))
     return top
 
@@ -219,7 +215,7 @@ def _settings(command: str, name: str) -> dict[str, Any]:
         settings["required"] = default is None
     if key in FIRST:
         help += f" (default: {default})"
-    if key in REPEATED:
+    if key in _DATA["repeated"]:
         help += "; may be repeated"
         settings |= {"action": "append", "default": []}
     return settings | {"help": help}

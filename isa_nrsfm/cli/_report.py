@@ -29,7 +29,7 @@ from isa_nrsfm._compat.texts import as_utf8, escape, first_items, percent
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._advice import FIT, camera_meaning, verdict
 from isa_nrsfm.analysis._diagnostics import Diagnostics
-from isa_nrsfm.analysis._frame_columns import STATISTICS
+from isa_nrsfm.analysis._frame_columns import TEXTS
 from isa_nrsfm.cli._options import PROGRAM
 from isa_nrsfm.cli._reading import MOST_LISTED, Frames, drawing_files
 from isa_nrsfm.export._upright import names_of_components
@@ -644,7 +644,7 @@ def _label(label: dict[str, Any]) -> Section:
     counts = {"n_copies": copies, "n_without_label": "without a label left out"}
     title += "".join(f"; {label[n]} {what}" for n, what in counts.items() if label[n])
     names = names_of_components(None, len(label["values"]))
-    statistic, meaning = STATISTICS[label["kind"]]
+    statistic, meaning = TEXTS["statistics"][label["kind"]]
     columns = {"": names, statistic: [f"{value:z.2f}" for value in label["values"]]}
     columns["p"] = ["" if label["untested"] else f"{p:.3f}" for p in label["p_values"]]
     if label["corrected"] is not None:

@@ -601,9 +601,8 @@ def _points_apart(frame: "pd.DataFrame", pair: Given, given: Given) -> Apart:
             f"Choose with {named('columns')}, {listed}"
         )
     frame, by_frame, by_point = found
-    row = np.zeros(len(frame), int)
-    if by_frame:
-        row += frame.groupby(by_frame, sort=False, dropna=False).ngroup().to_numpy()
+    groups = frame.groupby(by_frame or np.zeros(len(frame)), sort=False, dropna=False)
+    row = groups.ngroup().to_numpy()
     texts = frame[by_point].astype(str).apply(lambda column: column.str.strip())
     texts = texts.agg("_".join, axis=1) if len(by_point) > 1 else texts[by_point[0]]
     point, labels = pd.factorize(texts)
