@@ -18,7 +18,7 @@ from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import DEFAULTS
 from isa_nrsfm.cli._reading import Frames, as_numbers, cells_of, column_named
 from isa_nrsfm.export import point_distances
-from isa_nrsfm.export._poses import EYES, point_numbers
+from isa_nrsfm.export._upright import EYES, point_numbers
 from isa_nrsfm.export._viewer import MOST_LABELS
 
 

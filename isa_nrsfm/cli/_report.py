@@ -242,8 +242,7 @@ def quality_report(error: float, square: float, weighted: bool) -> dict[str, Any
 def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     """Describe a fitted model, with the diagnostics of a joint fit, and its quality."""
     # Not needed by transform
-    from isa_nrsfm.plotting._axes import SPANNING_TREE
-    from isa_nrsfm.plotting._views import view_and_layout
+    from isa_nrsfm.plotting._views import SPANNING_TREE, view_and_layout
 
     estimator, frames, edges = fit.estimator, fit.frames, fit.drawn["edges"]
     X, alpha = frames.X, estimator.alpha_

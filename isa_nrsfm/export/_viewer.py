@@ -22,8 +22,8 @@ from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
 from isa_nrsfm.export import _upright
-from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
-from isa_nrsfm.plotting._views import UPSIDE_DOWN, Edges, Origin
+from isa_nrsfm.plotting import _views
+from isa_nrsfm.plotting._views import SPANNING_TREE, UPSIDE_DOWN, Edges, Origin
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -448,7 +448,7 @@ def _primitives(
         "material": 0,
     }
     primitives = []
-    if surface is None or not is_dense(shapes[0]):
+    if surface is None or not _views.is_dense(shapes[0]):
         primitives.append(bare | {"mode": POINTS})
     if surface is not None:
         indices = file.add(surface.ravel())
