@@ -316,10 +316,8 @@ def _select(names: Columns, patterns: Sequence[str]) -> LandmarkColumns:
     for x_pattern, y_pattern in zip(patterns[::2], patterns[1::2], strict=True):
         x_by_key = _columns_matching(names, x_pattern)
         y_by_key = _columns_matching(names, y_pattern)
-        for one, other, pattern in (
-            (x_by_key, y_by_key, y_pattern),
-            (y_by_key, x_by_key, x_pattern),
-        ):
+        sides = (x_by_key, y_by_key, y_pattern), (y_by_key, x_by_key, x_pattern)
+        for one, other, pattern in sides:
             if alone := [name for key, name in one.items() if key not in other]:
                 more = f" (nor have {len(alone) - 1} more)" if len(alone) > 1 else ""
                 raise ValueError(
