@@ -19,8 +19,8 @@ from sklearn.model_selection import GroupKFold
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
 from isa_nrsfm.analysis import WithinGroups, association, between_share
 from isa_nrsfm.cli import main
+from isa_nrsfm.cli._reading import read_times  # noqa: F401  in refusals.txt
 from isa_nrsfm.cli._report import fit_sections, summary
-from isa_nrsfm.cli._times import read_times  # noqa: F401  in refusals.txt
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses
 

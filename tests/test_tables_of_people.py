@@ -19,8 +19,7 @@ from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.cli._columns import asked_columns
 from isa_nrsfm.cli._options import build_parser
-from isa_nrsfm.cli._reading import read_frames
-from isa_nrsfm.cli._times import image_numbers
+from isa_nrsfm.cli._reading import image_numbers, read_frames
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table, open_table, read_landmarks, read_table
 from isa_nrsfm.skeletons import read_skeleton

@@ -46,22 +46,8 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import aligned
 from isa_nrsfm._linalg import OF_DIFFERENCES
 from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.analysis._frame_columns import TEXTS, unit_columns
 
-# Why a label cannot be tested.
-ONE_EVENT = (
-    "the coefficients and the label change slowly or with one period: they have one "
-    "event in common, which may be chance. Record more events, or give several people "
-    "or videos as groups"
-)
-REPEATED = (
-    "frames with nearly the same coefficients have the same label far more often than "
-    "their coefficients tell, as photos of the same people do. Give the people as "
-    "groups"
-)
-JUMPS = (
-    "the coefficients jump {} times, first after {} frames, as where clips are joined. "
-    "Give the clips as groups"
-)
 # Within so many groups, signs of groups are drawn: 128 different results.
 MANY_GROUPS = 8
 # Number of the nearest frames whose labels are compared, and level of this test.
@@ -206,13 +192,13 @@ def permuted_energies(
             units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
             one_event = _one_event(alpha, labels, order)
         if length > 1 and not permuted:
-            untested = ONE_EVENT * one_event
+            untested = TEXTS["untested"]["one_event"] * one_event
             if len(means) == 1:
                 cuts = np.intersect1d(seams(values[order.rows]), seams(residuals))
                 if len(cuts):
-                    untested = JUMPS.format(len(cuts), cuts[0])
+                    untested = TEXTS["untested"]["jumps"].format(len(cuts), cuts[0])
         if length == len(means) == 1 and _people_repeat(alpha, labels):
-            untested = REPEATED
+            untested = TEXTS["untested"]["repeated"]
         if not untested:
             statistic = _studentised if length == 1 else _energies
             energies += statistic(alpha, labels, shuffled)
@@ -457,7 +443,7 @@ class Association(NamedTuple):
 
     def __repr__(self) -> str:
         """Return the results as a table and what they are."""
-        name, meaning = _frame_columns.STATISTICS[self.kind]
+        name, meaning = TEXTS["statistics"][self.kind]
         values = {name: self.statistic}
         if self.corrected is not None:
             values["corrected"] = self.corrected
@@ -587,7 +573,7 @@ def association(
     alpha, labels, _, order = _known_frames(alpha, y, groups, time)
     kind = _frame_columns.kind_of(labels, kind)
     columns, classes = _label_columns(labels, kind), kind == "classes"
-    standard = _unit_columns(alpha if classes else rankdata(alpha, axis=0))
+    standard = unit_columns(alpha if classes else rankdata(alpha, axis=0))
     covariances = columns.T @ standard
     statistic = np.sum(covariances**2, axis=0) if classes else covariances[0]
     rng = check_random_state(random_state)
@@ -651,7 +637,7 @@ def predictability(
     kind = _frame_columns.kind_of(labels, kind)
     if groups is None:  # blocks of frames that depend on each other
         columns, numbers = _label_columns(labels, kind)[order.rows], None
-        residuals = unexplained(_unit_columns(features)[order.rows], columns, order)
+        residuals = unexplained(unit_columns(features)[order.rows], columns, order)
         if (length := independent_length(residuals)) > 1:
             numbers = np.empty(len(labels), dtype=int)
             numbers[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
@@ -739,13 +725,6 @@ def _label_columns(labels: NDArray, kind: str) -> csr_array:
     the square of Spearman's rank correlation.
     """
     if kind == "number":
-        return csr_array(_unit_columns(rankdata(labels)[:, None]))
+        return csr_array(unit_columns(rankdata(labels)[:, None]))
     columns = indicators(np.unique(labels, return_inverse=True)[1])
     return csr_array(columns / np.sqrt(columns.sum(axis=0)))
-
-
-def _unit_columns(values: NDArray) -> NDArray:
-    """Return columns (n, k), centred and of norm one; zero where constant."""
-    values = values - values.mean(axis=0)
-    size = np.linalg.norm(values, axis=0)
-    return np.asarray(values / np.where(size > 0, size, 1.0))

@@ -28,6 +28,7 @@ from isa_nrsfm._parameters import named
 from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.analysis import _advice
 from isa_nrsfm.analysis._advice import camera_meaning
+from isa_nrsfm.analysis._frame_columns import unit_columns
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -415,9 +416,7 @@ def stability(
         alpha = alpha[:, :n_components]
         if tables.kind[-1]:
             alpha = alpha - pose_part(cameras, pose_effect(cameras, alpha))
-        alpha = alpha - alpha.mean(axis=0)
-        size = np.linalg.norm(alpha, axis=0)
-        return np.asarray(alpha / np.where(size > 0, size, 1.0))
+        return unit_columns(alpha)
 
     whole, found = scores(gauge), list[NDArray]()
     for shapes, half in zip(tables.shapes, tables.halves, strict=True):

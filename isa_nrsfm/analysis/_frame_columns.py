@@ -1,7 +1,9 @@
 """Columns with one entry for each frame, such as labels, groups and times."""
 
 import contextlib
+import tomllib
 from datetime import UTC
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,11 +14,7 @@ from sklearn.utils.multiclass import type_of_target
 from isa_nrsfm._parameters import named
 
 Kind = Literal["classes", "number"]
-# Names and meanings of the statistics of labels, by their kind.
-STATISTICS = {
-    "classes": ("eta squared", "share of the variance between classes"),
-    "number": ("Spearman", "rank correlation, from -1 to 1"),
-}
+TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
 
 
 def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
@@ -107,6 +105,13 @@ def checked_times(time: Any, n_rows: int) -> NDArray:
     if time.dtype.kind in "mM":
         return np.asarray((time - time.min()) / np.timedelta64(1, "s"))
     return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")
+
+
+def unit_columns(values: NDArray) -> NDArray:
+    """Return columns (n, k), centred and of norm one; zero where constant."""
+    values = values - values.mean(axis=0)
+    size = np.linalg.norm(values, axis=0)
+    return np.asarray(values / np.where(size > 0, size, 1.0))
 
 
 def runs_between_gaps(time: NDArray) -> NDArray | None:

@@ -25,11 +25,7 @@ from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg import OF_RANKS, polar
 from isa_nrsfm._tables import Layout
 from isa_nrsfm.baselines._low_rank import ShapeSequenceNRSfM
-from isa_nrsfm.calibration._metric import (
-    LARGEST_STRETCH,
-    conformal_equations,
-    strain_basis,
-)
+from isa_nrsfm.calibration import _metric
 
 # Growth of the penalty in each step; with 1.02 the end is far from stationary.
 GROWTH = 1.001
@@ -204,14 +200,16 @@ def metric_correction(blocks: NDArray) -> NDArray:
     positive definite, its axes are kept, and stretches differ by a factor of at most
     20.
     """
-    equations = conformal_equations(blocks)
+    equations = _metric.conformal_equations(blocks)
     _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
     n_determined = min(int(np.sum(values > OF_RANKS * values[0])), 5)
     solutions = vectors[n_determined:]
-    basis = strain_basis("orthographic")  # the last one is the identity / sqrt(3)
+    basis = _metric.strain_basis(
+        "orthographic"
+    )  # the last one is the identity / sqrt(3)
     nearest = np.sqrt(3) * solutions[:, 5] @ solutions
     eigenvalues, axes = np.linalg.eigh(np.tensordot(nearest, basis, 1))
-    eigenvalues = np.maximum(eigenvalues, eigenvalues[-1] / LARGEST_STRETCH**2)
+    eigenvalues = np.maximum(eigenvalues, eigenvalues[-1] / _metric.LARGEST_STRETCH**2)
     return axes * np.sqrt(eigenvalues)
 
 

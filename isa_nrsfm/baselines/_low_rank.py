@@ -21,10 +21,10 @@ from isa_nrsfm import _tables
 from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
-from isa_nrsfm._frames.camera_models import CAMERAS, compose, project
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.camera_models import compose
 from isa_nrsfm._frames.gauge import canonical_rotation
-from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._frames.models import Decomposition, FrameMap, FrameModel
 from isa_nrsfm._joint.consensus import principal_shapes
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._linalg import OF_RANKS, orientations, polar
@@ -139,16 +139,20 @@ class ShapeSequenceNRSfM(
         self.inverse_snr_ = float(error / np.mean(W**2))
 
         # Without the scaling of frames the shapes have the unit of the table.
-        self._unit = table.unit or 1.0
-        scales = (table.sizes / self._unit)[:, None, None]
-        dtype = X.dtype
-        self.mean_shape_ = (self._unit * mean_shape).astype(dtype)
-        self.basis_ = (self._unit * basis).astype(dtype)
-        self.shapes_ = (self._unit * shapes).astype(dtype)
-        self.motion_ = (scales * cameras).astype(dtype)
+        unit, dtype, K = table.unit or 1.0, X.dtype, self.n_components
+        self.mean_shape_ = (unit * mean_shape).astype(dtype)
+        self.basis_ = (unit * basis).astype(dtype)
+        self.shapes_ = (unit * shapes).astype(dtype)
+        self.motion_ = (table.sizes[:, None, None] / unit * cameras).astype(dtype)
         self.translation_ = table.translation.astype(dtype)
         # At least a share of the mean square of the coordinates.
-        self.noise_variance_ = self._unit**2 * max(float(noise), 1e-12)
+        noise = max(float(noise), 1e-12)
+        self.noise_variance_ = unit**2 * noise
+        shapes = np.concatenate([mean_shape[None], basis]).mT
+        gauge, starts = FrameMap(np.eye(K + 1), unit * np.eye(3)), np.empty((0, K))
+        frames = FrameModel(shapes, noise, starts, "linear", gauge, "orthographic")
+        public = self.mean_shape_, self.basis_
+        self._model = TableModel(frames, *public, K, self.layout, table.unit)
         self.alpha_ = self._decompose(X).alpha
         self._n_features_out = self.n_components
         return self
@@ -228,11 +232,7 @@ class ShapeSequenceNRSfM(
             Points of the model's shapes in their cameras, in the order of `layout`.
             `inverse_snr_` refers to `shapes_` in `motion_` instead.
         """
-        motion, translation, alpha, _ = self.decompose(X)
-        shapes = compose(self.mean_shape_, self.basis_, alpha)
-        return _tables.tracks_to_table(
-            project(shapes, motion, translation), self.layout
-        )
+        return self._model.reproject(self.decompose(X))
 
     def __sklearn_tags__(self) -> Any:
         """Return the estimator's tags."""
@@ -255,20 +255,10 @@ class ShapeSequenceNRSfM(
     def _decompose(self, X: NDArray) -> Decomposition:
         """Return camera and coefficients of each frame of a valid table."""
         rows = _tables.table_to_rows(X, self.layout).astype(np.float64)
-        sizes = np.full(len(rows), self._unit)
         if self.scale_frames:
             _, report = _tables.centred_frames(rows)
             _tables.refuse_one_place(report, rows.shape[2])
-            sizes = report.size
-        shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
-        shapes = shapes.transpose(0, 2, 1).astype(float)
-        search = FrameSearch(shapes, CAMERAS["orthographic"])
-        noise = self.noise_variance_ / self._unit**2
-        fits = search.fit_rows(rows / sizes[:, None, None], noise, covariances=False)
-        motion = (sizes / self._unit)[:, None, None] * fits.motion
-        translation = sizes[:, None] * fits.translation
-        found = (motion, translation, fits.alpha, np.full_like(fits.alpha, np.nan))
-        return Decomposition(*(part.astype(X.dtype) for part in found))
+        return self._model.decompose(rows, deviations=False, dtype=X.dtype)
 
 
 def shape_signs(shapes: NDArray) -> NDArray:

@@ -34,23 +34,19 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
     X, n_components = _reading.as_fitted(estimator, frames.X), len(estimator.basis_)
     alpha = std = np.empty((0, n_components))
     quality = ["fit", "", "no frame was fitted"]
+    weights = frames.weighting
     if len(X):
-        motion, translation, alpha, std = estimator.decompose(X, **frames.weighting)
+        motion, translation, alpha, std = estimator.decompose(X, **weights)
         explained = estimator.inverse_transform(alpha, motion, translation)
         square = np.nanmean((explained - np.asarray(X)) ** 2)
-        error, weighted = (
-            -estimator.score(X, **frames.weighting),
-            bool(frames.weighting),
-        )
+        error, weighted = -estimator.score(X, **weights), bool(weights)
         quality = _report.quality_row(_report.quality_report(error, square, weighted))
-        if args.std and args.viewer is not None and estimator.camera_ != "affine":
-            drawn["depth_std"] = estimator.reconstruct(
-                X, return_std=True, **frames.weighting
-            )[1]
+        if args.viewer is not None:
+            drawn |= _report.depth_std(args, estimator, X, weights)
         alpha = alpha - removed_part(estimator, motion)
     _report.write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
-        _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
+        _write_viewer(outputs[1], estimator, X=X, **weights, **drawn)
     files = "  ".join(map(str, outputs))
     rows = [
         ["model", "", args.model],

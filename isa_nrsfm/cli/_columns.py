@@ -1,7 +1,7 @@
 """Labels, groups, times and distances: the other columns that a fit is asked about."""
 
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,12 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.files import errors_of
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm.analysis import _frame_columns
+from isa_nrsfm.cli import _reading
 from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import DEFAULTS
-from isa_nrsfm.cli._reading import Frames, cells_of, column_named
-from isa_nrsfm.cli._times import as_numbers, read_times, video_times
+from isa_nrsfm.cli._reading import Frames, as_numbers, cells_of, column_named
 from isa_nrsfm.export import point_distances
-from isa_nrsfm.export._poses import EYES, point_numbers
+from isa_nrsfm.export._upright import EYES, point_numbers
 from isa_nrsfm.export._viewer import MOST_LABELS
 
 
@@ -36,9 +36,9 @@ def asked_columns(args: Namespace, frames: Frames) -> Frames:
     if args.time is not None:
         with errors_of(f"--time {args.time}"):
             cells = cells_of(table, args.time, "--time")
-            times, unit = read_times(cells, args.time_format)
+            times, unit = _reading.read_times(cells, args.time_format)
     elif args.fps is not None:
-        times = video_times(frames.images[table.index], groups) / args.fps
+        times = _reading.video_times(frames.images[table.index], groups) / args.fps
     if times is not None:
         try:
             seconds = _frame_columns.checked_times(times, len(table))
@@ -70,10 +70,7 @@ def column_results(
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
     if frames.labels:
-        features = {"alpha": alpha} | _aligned_pca(estimator, X)
-        std = getattr(estimator, "alpha_std_", None)
-        options = features, frames, args.random_state, std
-        report["labels"] = [_label_report(each, *options) for each in frames.labels]
+        report["labels"] = [*_label_reports(args, estimator, frames)]
     if frames.groups is not None:
         report["groups"] = {"column": args.group}
         try:
@@ -210,51 +207,49 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray
     return {"pca": scores[:, :n_shapes], "pca_of_rank": scores}
 
 
-def _label_report(
-    label: "pd.Series",
-    features: dict[str, NDArray],
-    frames: Frames,
-    seed: int,
-    std: Any,
-) -> dict[str, Any]:
-    """Return the association of coefficients with a label."""
-    alpha = features["alpha"]
-    labelled, classes = label.notna().to_numpy(), has_classes(label)
-    options: dict[str, Any] = {
-        "y": label.dropna().to_numpy(),
-        "groups": None if frames.groups is None else frames.groups[labelled],
-        "time": None if frames.times is None else frames.times[labelled],
-        "kind": "classes" if classes else "number",
-        "random_state": seed,
-    }
-    deviations = None if std is None else std[labelled]
-    found = analysis.association(alpha[labelled], alpha_std=deviations, **options)
-    report: dict[str, Any] = {
-        "column": label.name,
-        "kind": found.kind,
-        "n_frames": found.n_frames,
-        "n_without_label": np.sum(~labelled),
-        "n_copies": np.sum(labelled) - found.n_frames,
-        "statistic": "eta_squared" if classes else "spearman",
-        "values": found.statistic,
-        "corrected": found.corrected,
-        "p_values": found.p_value,
-        "permuted": found.permuted,
-        "untested": found.untested,
-        "score": "accuracy" if classes else "r_squared",
-    }
-    if classes:
-        counts = label.value_counts(sort=False)
-        report["classes"] = counts.rename(str).to_dict()
-        report["largest_class"] = counts.max() / counts.sum()
-        report["class_means"] = class_means(label, alpha)
-    try:
-        for name, values in features.items():
-            scores = analysis.predictability(values[labelled], **options)
-            key = "cross_validated" + f"_{name}" * (name != "alpha")
-            report[key], n = scores.mean(), len(scores)
-            report[f"{key}_standard_error"] = scores.std(ddof=1) / np.sqrt(n)
-            report[f"{key}_n_features"] = values.shape[1]
-    except ValueError as error:  # too few frames of a class, or groups, for two folds
-        report["not_cross_validated"] = str(error)
-    return report
+def _label_reports(
+    args: Namespace, estimator: AffineNRSfM, frames: Frames
+) -> Iterator[dict[str, Any]]:
+    """Yield the association of coefficients with each label."""
+    alpha, std = estimator.alpha_, getattr(estimator, "alpha_std_", None)
+    features = {"alpha": alpha} | _aligned_pca(estimator, frames.X)
+    for label in frames.labels:
+        labelled, classes = label.notna().to_numpy(), has_classes(label)
+        options: dict[str, Any] = {
+            "y": label.dropna().to_numpy(),
+            "groups": None if frames.groups is None else frames.groups[labelled],
+            "time": None if frames.times is None else frames.times[labelled],
+            "kind": "classes" if classes else "number",
+            "random_state": args.random_state,
+        }
+        deviations = None if std is None else std[labelled]
+        found = analysis.association(alpha[labelled], alpha_std=deviations, **options)
+        report: dict[str, Any] = {
+            "column": label.name,
+            "kind": found.kind,
+            "n_frames": found.n_frames,
+            "n_without_label": np.sum(~labelled),
+            "n_copies": np.sum(labelled) - found.n_frames,
+            "statistic": "eta_squared" if classes else "spearman",
+            "values": found.statistic,
+            "corrected": found.corrected,
+            "p_values": found.p_value,
+            "permuted": found.permuted,
+            "untested": found.untested,
+            "score": "accuracy" if classes else "r_squared",
+        }
+        if classes:
+            counts = label.value_counts(sort=False)
+            report["classes"] = counts.rename(str).to_dict()
+            report["largest_class"] = counts.max() / counts.sum()
+            report["class_means"] = class_means(label, alpha)
+        try:
+            for name, values in features.items():
+                scores = analysis.predictability(values[labelled], **options)
+                key = "cross_validated" + f"_{name}" * (name != "alpha")
+                report[key], n = scores.mean(), len(scores)
+                report[f"{key}_standard_error"] = scores.std(ddof=1) / np.sqrt(n)
+                report[f"{key}_n_features"] = values.shape[1]
+        except ValueError as error:  # too few frames, or groups, for two folds
+            report["not_cross_validated"] = str(error)
+        yield report

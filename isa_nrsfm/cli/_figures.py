@@ -17,8 +17,8 @@ from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.cli._report import MOST_CLASSES, Fit
-from isa_nrsfm.export._names import names_of_components
-from isa_nrsfm.plotting import _axes
+from isa_nrsfm.export._upright import names_of_components
+from isa_nrsfm.plotting import _views
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
 # `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.
@@ -124,27 +124,27 @@ def _shapes_by_label(label: "pd.Series", fit: Fit) -> plotting.BasisShapeDisplay
     mean = whole.mean_shape
     means = [*class_means(label, fit.estimator.alpha_).values()]
     shapes = mean + np.tensordot(means, whole.basis, 1)
-    (limits,), _ = _axes.block_limits([np.concatenate([mean[None], shapes])])
-    axes = _axes.new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
+    (limits,), _ = _views.block_limits([np.concatenate([mean[None], shapes])])
+    axes = _views.new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
     counts = label.value_counts(sort=False)
     for shape, pair, (name, count) in zip(shapes, axes, counts.items(), strict=True):
-        for points, colour in ((mean, "0.8"), (shape, _axes.MEAN_COLOUR)):
+        for points, colour in ((mean, "0.8"), (shape, _views.MEAN_COLOUR)):
             display = plotting.BasisShapeDisplay(
                 mean_shape=points,
                 basis=np.empty((0, *points.shape)),
                 edges=whole.skeleton,
                 origin=whole.origin,
             ).plot(pair, point_kw={"color": colour})
-        for axis, view in zip(pair, _axes.VIEWS, strict=True):
-            _axes.show_view(axis, view, limits, whole.origin)
+        for axis, view in zip(pair, _views.VIEWS, strict=True):
+            _views.show_view(axis, view, limits, whole.origin)
         pair[1].set_xlabel(whole.depth_note, loc="right", fontsize="x-small")
-        title = _axes.wrap_title(f"{name} ({count} frames)", pair)
+        title = _views.wrap_title(f"{name} ({count} frames)", pair)
         pair[0].set_title(title, loc="left", fontsize="small", parse_math=False)
     line = import_optional("matplotlib.lines", extra="plot").Line2D
     style = {"marker": "o", "markersize": 3, "linewidth": 1.5}
     entries = [
         line([], [], color=colour, label=f"mean of {frames}", **style)
-        for frames, colour in (("all frames", "0.8"), ("the class", _axes.MEAN_COLOUR))
+        for frames, colour in (("all frames", "0.8"), ("the class", _views.MEAN_COLOUR))
     ]
-    _axes.add_legend(display.figure_, entries, whole.skeleton)
+    _views.add_legend(display.figure_, entries, whole.skeleton)
     return display

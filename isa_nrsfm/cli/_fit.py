@@ -29,20 +29,9 @@ from isa_nrsfm._parameters import (
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import FIRST, Trial, decided, first_settings, standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
-from isa_nrsfm.cli import _reading, _report
-from isa_nrsfm.cli._columns import asked_columns, column_results, first_classes
-from isa_nrsfm.cli._figures import figures_of, write_figures
+from isa_nrsfm.cli import _columns, _figures, _options, _reading, _report
 from isa_nrsfm.cli._main import show_stage
-from isa_nrsfm.cli._options import (
-    AUTO,
-    FACE_PRIOR,
-    FACE_PRIORS,
-    NONE,
-    PROGRAM,
-    build_parser,
-    flag_of,
-)
-from isa_nrsfm.cli._report import Fit
+from isa_nrsfm.cli._options import AUTO, FACE_PRIORS, NONE, flag_of
 from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
@@ -95,7 +84,7 @@ def fit_table(
         raise ValueError(
             f"{args.table} has no row that can be fitted: {', '.join(out)}"
         )
-    frames = asked_columns(args, frames)
+    frames = _columns.asked_columns(args, frames)
     needs_centre = args.camera == "perspective" or args.focal_length is not None
     if needs_centre and frames.principal_point is None:
         option = "--focal-length" if args.focal_length else "--camera perspective"
@@ -105,7 +94,7 @@ def fit_table(
             "the camera, with --principal-point X Y (0 0 and --focal-length 1 for "
             "normalised coordinates)"
         )
-    figures = {} if args.no_figures else figures_of(frames)
+    figures = {} if args.no_figures else _figures.figures_of(frames)
     drawn = _reading.drawing(args, frames.columns.points, frames.skeleton)
     results = dict.fromkeys(_report.RESULTS, "")
     inputs = [prior] * (prior not in (None, NONE, *FACE_PRIORS))
@@ -127,25 +116,22 @@ def fit_table(
         unused.sort(key=lambda name: not LABEL.search(str(name)))
         estimator, trials, choice, diagnostics = _fitted(args, frames)
         show_stage("answers")
-        answers, columns, smooth = column_results(args, estimator, frames)
+        answers, columns, smooth = _columns.column_results(args, estimator, frames)
         show_stage("tables")
         with files.files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
             _report.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
-            labels = first_classes(frames.labels)
+            labels = _columns.first_classes(frames.labels)
             viewer_data = {"labels": labels, "times": frames.times}
-            if args.std and estimator.camera_ != "affine":
-                viewer_data["depth_std"] = estimator.reconstruct(
-                    X, return_std=True, **frames.weighting
-                )[1]
+            viewer_data |= _report.depth_std(args, estimator, X, frames.weighting)
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
             explained = estimator.reproject(X, **frames.weighting)
-            fit = Fit(estimator, frames, smooth, drawn, explained)
+            fit = _report.Fit(estimator, frames, smooth, drawn, explained)
             _report.write_results(new, fit, unit, **viewer_data)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
-                answers["prior"] = {"name": prior or FACE_PRIOR, "std": std}
+                answers["prior"] = {"name": prior or _options.FACE_PRIOR, "std": std}
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
@@ -169,7 +155,7 @@ def fit_table(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
                 )
-            captions = write_figures(new, figures, fit)
+            captions = _figures.write_figures(new, figures, fit)
             report |= {"files": results | captions}
             report = _report.write_report(new, report)
     return report, estimator
@@ -314,7 +300,7 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
         *_reading.drawing_options(args),
     ]
     started = Namespace(arguments=options, since=args.since)
-    parsed = build_parser().parse_args(options, started)
+    parsed = _options.build_parser().parse_args(options, started)
     report, model = fit_table(parsed, warned, table=table)
     shapes = model.shapes(model.alpha_)
     rigid = np.broadcast_to(model.mean_shape_, shapes.shape)
@@ -323,6 +309,6 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
         f"the 3D shapes of the frames are off by {100 * error:.1f} % (the mean shape "
         f"alone: {100 * alone:.1f} %)"
     )
-    again = shlex.join([PROGRAM, *options])
+    again = shlex.join([_options.PROGRAM, *options])
     rows = [*report["summary"], ["truth", "", truth], ["again", "", again]]
     return _report.text_of(_report.fit_title(report), rows)

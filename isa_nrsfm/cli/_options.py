@@ -81,10 +81,12 @@ def _numbers_of_shapes(text: str) -> tuple[int | str, ...]:
     return tuple(sorted(numbers))
 
 
-def _share_or_number(text: str) -> float:
-    """Read a number, a whole one as int."""
+def _share_or_number(text: str) -> float | None:
+    """Read a share between 0 and 1, or a whole number as int."""
     number = float(text)
-    return int(number) if number.is_integer() else number
+    if number >= 1 and number.is_integer():
+        return int(number)
+    return number if 0 < number < 1 else None
 
 
 def _image_size(text: str) -> tuple[int, int] | None:
@@ -111,55 +113,43 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
 
 
+def _pair(text: str) -> tuple[str, ...] | None:
+    """Read two names."""
+    names = tuple(_names(text))
+    return names if len(names) == 2 and all(names) else None
+
+
+def _is_layout(text: str) -> bool:
+    """Return whether a text is the name of a layout, or of a configuration."""
+    return text in choices.SKELETON_NAMES or text.lower().endswith(CONFIGURATIONS)
+
+
+# The commands with their options, and the help of each option by its name and value.
+_DATA = tomllib.loads(Path(__file__).with_name("options.toml").read_text("utf-8"))
+POSITIONAL = _DATA["positional"]
+_LISTS = ("OPENPOSE_PARTS", "WHOLE_PARTS", "SKELETON_NAMES", "FACE_PRIORS")
+_WORDS = {name: ", ".join(getattr(choices, name)) for name in _LISTS}
+_WORDS["FORMATS"] = ", ".join(name for name in FORMATS if name != TABLE)
+HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
+_EXPECTED = {name: text.format(**_WORDS) for name, text in _DATA["expected"].items()}
 # How the values of options are read, by their names in the help; others are texts.
 TYPES: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(("FILE", "DIR", "TABLE", "MODEL"), _path),
-    "COLUMN=REGEX": _reader("COLUMN=REGEX, such as 'name=^ir'", _row_rule),
+    "COLUMN=REGEX": _reader(_EXPECTED["COLUMN=REGEX"], _row_rule),
     "CONFIDENCE": float,
     "K": _numbers_of_shapes,
-    "LAYOUT": _reader(
-        f"one of {', '.join(choices.SKELETON_NAMES)}, or a .yaml file",
-        str,
-        lambda text: (
-            text in choices.SKELETON_NAMES or text.lower().endswith(CONFIGURATIONS)
-        ),
-    ),
-    "MODES": _reader(
-        "a whole number or a share between 0 and 1",
-        _share_or_number,
-        lambda number: 0 < number < 1 or (isinstance(number, int) and number >= 1),
-    ),
+    "LAYOUT": _reader(_EXPECTED["LAYOUT"], str, _is_layout),
+    "MODES": _reader(_EXPECTED["MODES"], _share_or_number),
     "N": int,
     "NAMES": _names,
-    "NUMBER": _reader("a number above zero", float, lambda n: 0 < n < math.inf),
-    "POINT,POINT": _reader(
-        "two points with a comma between them, such as 48,54",
-        lambda text: tuple(_names(text)),
-        lambda pair: len(pair) == 2 and all(pair),
-    ),
+    "NUMBER": _reader(_EXPECTED["NUMBER"], float, lambda n: 0 < n < math.inf),
+    "POINT,POINT": _reader(_EXPECTED["POINT,POINT"], _pair),
     "SEED": _whole_number(0, 2**32 - 1),
     "STARTS": _whole_number(1),
-    **dict.fromkeys(
-        ("VALUE", "X Y"), _reader("a number, such as -1", float, math.isfinite)
-    ),
-    "WIDTHxHEIGHT": _reader("WIDTHxHEIGHT, such as 1920x1080", _image_size),
+    "VALUE": _reader(_EXPECTED["VALUE"], float, math.isfinite),
+    "WIDTHxHEIGHT": _reader(_EXPECTED["WIDTHxHEIGHT"], _image_size),
+    "X Y": _reader(_EXPECTED["VALUE"], float, math.isfinite),
 }
-
-
-# Arguments without a leading -- in the command line.
-POSITIONAL = ("table", "model")
-SHORT = {"output": ["-o"], "n_components": ["-k"]}
-# The commands with their options, and the help of each option by its name and value.
-_DATA = tomllib.loads(Path(__file__).with_name("options.toml").read_text("utf-8"))
-_LISTS = {
-    "FORMATS": [name for name in FORMATS if name != TABLE],
-    "OPENPOSE_PARTS": choices.OPENPOSE_PARTS,
-    "WHOLE_PARTS": choices.WHOLE_PARTS,
-    "SKELETON_NAMES": choices.SKELETON_NAMES,
-    "FACE_PRIORS": choices.FACE_PRIORS,
-}
-_WORDS = {name: ", ".join(values) for name, values in _LISTS.items()}
-HELP = {option: text.format(**_WORDS) for option, text in _DATA["help"].items()}
 # What export writes: suffixes of the files, and options.
 EXPORTS = _DATA["exports"]
 TIMES = _DATA["times"]
@@ -173,10 +163,8 @@ CHOICES: dict[str, Sequence[str]] = _DATA["choices"] | {
     "independence": (*choices.INDEPENDENCE, NONE),
     "loss": choices.LOSSES,
 }
-# Options whose first choice is their value by default, which the help states.
-FIRST = ("isa", "block_recovery", "independence")
+FIRST = _DATA["first"]
 DEFAULTS = _DATA["defaults"] | {n: CHOICES[n][0] for n in ("format", *FIRST)}
-REPEATED = ("skip_rows", "missing_value", "label", "distance")
 
 
 class Parser(argparse.ArgumentParser):
@@ -205,7 +193,7 @@ def build_parser() -> Parser:
                 place = group if is_one else group.add_mutually_exclusive_group()
                 for name in [option] if is_one else option:
                     flags = [name if name in POSITIONAL else flag_of(name)]
-                    flags = SHORT.get(name, []) + flags
+                    flags = _DATA["short"].get(name, []) + flags
                     place.add_argument(*flags, **_settings(command, name))
     return top
 
@@ -227,7 +215,7 @@ def _settings(command: str, name: str) -> dict[str, Any]:
         settings["required"] = default is None
     if key in FIRST:
         help += f" (default: {default})"
-    if key in REPEATED:
+    if key in _DATA["repeated"]:
         help += "; may be repeated"
         settings |= {"action": "append", "default": []}
     return settings | {"help": help}

@@ -1,49 +1,34 @@
-"""Read the table of a command: landmarks, layout, other columns, unusable rows."""
+"""Read the table of a command: landmarks, layout, columns, times, unusable rows."""
 
+import re
 import shlex
+import warnings
 from argparse import Namespace
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, skeletons
-from isa_nrsfm._compat import pandas as pd
+from isa_nrsfm import AffineNRSfM, _tables, skeletons
+from isa_nrsfm._compat import pandas as pd, texts
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.files import errors_of, reading
-from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
 from isa_nrsfm._parameters import FACE_PRIORS, SKELETON_NAMES
 from isa_nrsfm._prepare.coordinates import UNSURE, CoordinateWarning, warn_of_places
-from isa_nrsfm._tables import (
-    FEWEST_POINTS,
-    FrameReport,
-    centred_frames,
-    clean_rows,
-    of_all_rows,
-    tracks_to_table,
-)
-from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, flag_of
-from isa_nrsfm.cli._times import image_numbers
-from isa_nrsfm.export._names import point_places
-from isa_nrsfm.io import FORMATS, find_format, read_table
-from isa_nrsfm.io._formats import TABLE
-from isa_nrsfm.io._landmark_columns import (
-    CONFIDENCES,
-    LandmarkColumns,
-    find_landmark_columns,
-    frames_of,
-    landmark_sets,
-)
+from isa_nrsfm._tables import FEWEST_POINTS
+from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, TIMES, flag_of
+from isa_nrsfm.export._upright import point_places
+from isa_nrsfm.io import FORMATS, _landmark_columns, _tables as io_tables
+from isa_nrsfm.io._formats import TABLE, find_format
+from isa_nrsfm.io._landmark_columns import LandmarkColumns, find_landmark_columns
 from isa_nrsfm.io._landmarks import unsure_points
-from isa_nrsfm.io._tables import confidences_in, individuals_as_rows, tracks_in
-from isa_nrsfm.skeletons import SKELETONS, Skeleton
-from isa_nrsfm.skeletons._column_names import (
-    individuals_with,
-    names_of_points,
-    parse_coordinate,
-)
+from isa_nrsfm.io._tables import confidences_in, read_table, tracks_in
+from isa_nrsfm.skeletons import SKELETONS, Skeleton, _column_names
+from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
 
 # Options of some formats.
 _OF_FORMATS = ("image_size", "columns", "individuals", "row_per_point", "part")
@@ -114,8 +99,9 @@ def read_frames(
         if found.confidence is not None:
             sure = found.confidence.set_axis(x, axis=1)
     elif table is None:
-        table = individuals_as_rows(read_table(args.table), args.individuals)
-        table, names = frames_of(table, args.columns, args.row_per_point)
+        table = io_tables.individuals_as_rows(read_table(args.table), args.individuals)
+        shape = args.columns, args.row_per_point
+        table, names = _landmark_columns.frames_of(table, *shape)
         if names is not None:
             chosen = find_landmark_columns(table.columns, names)
     if estimator is not None:
@@ -136,9 +122,10 @@ def read_frames(
         table = table.drop(columns=dropped)
         not_used[f"--points {args.points}"] = len(dropped) // 2
     rows, names = np.flatnonzero(kept), columns.interleaved
-    stripped = [name.strip() for name in names]
+    titles = [name.strip() for name in names]
     rows_kept = slice(None) if kept.all() else kept  # large tables are not copied
-    tracks = of_all_rows(tracks_in(table[rows_kept], names, args.missing_value), kept)
+    tracks = tracks_in(table[rows_kept], names, args.missing_value)
+    tracks = _tables.of_all_rows(tracks, kept)
     confidence = np.full(tracks.shape[:2], np.nan)
     if not sure.empty:
         confidence = sure[list(columns.x)].to_numpy(np.float64)
@@ -153,7 +140,7 @@ def read_frames(
             "are missing: other points are elsewhere. --keep-zeros keeps them",
             CoordinateWarning,
         )
-    cleaned = clean_rows(tracks.mT, "interleaved", np.array(stripped))[rows_kept]
+    cleaned = _tables.clean_rows(tracks.mT, "interleaved", np.array(titles))[rows_kept]
     tracks, confidence, weighting = cleaned.mT, confidence[rows_kept], {}
     if args.weights is not None:
         tracks[confidence == 0] = np.nan
@@ -167,7 +154,7 @@ def read_frames(
             confidence = confidence / largest
             warn_caller(f"confidences up to {largest:g} are divided by it, as weights")
         weighting["point_weight"] = np.where(np.isnan(confidence), 1.0, confidence)
-    _, report = centred_frames(cleaned)
+    _, report = _tables.centred_frames(cleaned)
     reasons = _reasons(report, None if found is None else found.failed[rows])
     left_out += [_left_out(why, rows[which]) for why, which in reasons.items()]
     usable = slice(None) if report.usable.all() else report.usable
@@ -176,11 +163,11 @@ def read_frames(
         _warn_of_unsure(confidence, ~np.isnan(tracks[..., 0]))
     other = table.drop(columns=names)
     if found is None:
-        sets = landmark_sets(other.columns)
+        sets = _landmark_columns.landmark_sets(other.columns)
         if columns.z:
             sets[f"{columns.z[0].strip()}, ... (third coordinate)"] = len(columns.z)
         not_used = sets | not_used
-    points = pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped)
+    points = pd.DataFrame(_tables.tracks_to_table(tracks), index=rows, columns=titles)
     return Frames(
         points=points,
         X=points if report.usable.all() else points[report.usable],
@@ -242,7 +229,7 @@ def as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
     fitted = getattr(estimator, "feature_names_in_", None)
     if fitted is None:
         tracks = points.to_numpy().reshape(len(points), len(estimator.mean_shape_), 2)
-        return tracks_to_table(tracks, estimator.layout)
+        return _tables.tracks_to_table(tracks, estimator.layout)
     in_order = points[[str(name).strip() for name in fitted]]
     return in_order.set_axis(list(fitted), axis=1)
 
@@ -311,8 +298,9 @@ def _with_confidences(
     if known.empty and option:
         raise ValueError(
             f"{option}: {args.table} ({args.format}) has no confidences of all points. "
-            "Their columns need the names of the x columns, with one of the "
-            f"words {', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
+            "Their columns need the names of the x columns, with one of the words "
+            f"{', '.join(_landmark_columns.CONFIDENCES)} for x, such as nose_conf "
+            "beside nose_x"
         )
     not_used = {f"{names[0].strip()}, ... (confidences)": len(names)} if names else {}
     return table.drop(columns=names), known, {} if option else not_used
@@ -340,7 +328,7 @@ def _left_out(reason: str, rows: NDArray, skipped: bool = False) -> dict[str, An
     return entry | {"first_rows": rows[:MOST_LISTED]}
 
 
-def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:
+def _reasons(report: _tables.FrameReport, failed: NDArray | None) -> dict[str, NDArray]:
     """Return reasons why frames cannot be fitted, and the frames of each."""
     nothing = report.n_seen == 0
     reasons = {"all points missing": nothing}
@@ -390,7 +378,7 @@ def _columns_of_model(
             for some, where in ((absent, "model"), (surplus, "table"))
             if some
         ]
-        individuals = individuals_with(table.columns, names[::2])
+        individuals = _column_names.individuals_with(table.columns, names[::2])
         option = shlex.quote(",".join(individuals))
         hint = f". Individuals in one row: --individuals {option}"
         raise ValueError(
@@ -418,7 +406,7 @@ def _layout(
         return stored
     tracks = tracks_in(table, columns.interleaved, args.missing_value)
     complete = tracks[np.isfinite(tracks).all(axis=(1, 2))]
-    centred, report = centred_frames(complete.transpose(0, 2, 1))
+    centred, report = _tables.centred_frames(complete.transpose(0, 2, 1))
     extended = report.size > 0
     images = centred[extended] / report.size[extended, None, None]
     shape = images.mean(axis=0).T if extended.any() else None
@@ -565,3 +553,157 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
     if not edges:
         raise ValueError(f"{path} has no edges; use --edges none to draw only points")
     return np.array(edges)
+
+
+# Times of frames: numbers, dates and durations, each in one reading for all rows.
+_MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
+_DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
+_DATES, _OF_DAY = TIMES["dates"], TIMES["of_day"]
+_DAYS = [date.format(sign) for date, sign in product(_DATES, "/-. ")]
+_TIMES = [" ".join(pair) for pair in product(_DAYS, _OF_DAY)]
+# The ways in which dates and durations are usually written.
+_FORMATS = ("ISO8601", *_DAYS, *_TIMES, *_OF_DAY[3:], _MINUTES, _HOURS)
+_ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
+
+
+def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
+    """Return times as numbers, dates, or durations in seconds, and their unit.
+
+    All cells are read in one format, which is given, or the only one that reads all.
+    """
+    if column.dtype.kind == "m":
+        return np.asarray(column.dt.total_seconds()), "seconds"
+    if column.dtype.kind == "M":
+        dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
+        return np.asarray(dates), "seconds"
+    cells = column.dropna().astype(str)
+    numbers = as_numbers(cells)
+    if format is None and numbers.notna().all():
+        of_frames = re.fullmatch(FRAME, str(column.name).strip(), re.IGNORECASE)
+        unit = "frames" if of_frames else f"in the unit of the column {column.name}"
+        return np.asarray(numbers.reindex(column.index), dtype=float), unit
+    zoned = cells.str.fullmatch(f".*{_ZONE}")
+    if zoned.any() and not zoned.all():
+        raise ValueError(
+            f"{zoned.sum()} of {len(cells)} frames have a time zone, such as Z or "
+            f"+01:00, and others have none (first: {_cell(cells, ~zoned)})"
+        )
+    readings = {
+        each: _read(cells, each)
+        for each in ([format] if format else _FORMATS)
+        if format or _read(cells.iloc[:1], each).notna().all()
+    }
+    whole = {each: read for each, read in readings.items() if read.notna().all()}
+    if not whole:  # the format that reads most rows before it fails
+        unread = [read.isna() for read in readings.values()]
+        wrong = max(unread, key=lambda each: each.argmax(), default=cells.notna())
+        expected = f"times written as {format}" if format else "numbers or dates"
+        raise ValueError(
+            f"expected {expected}, written alike in all frames; {wrong.sum()} of "
+            f"{len(column)} are not (first: {_cell(cells, wrong)}). Name how they are "
+            "written with --time-format, such as %d.%m.%Y, or use numbers"
+        )
+    chosen, first = next(iter(whole.items()))
+    if others := {name: read for name, read in whole.items() if not read.equals(first)}:
+        row = (next(iter(others.values())) != first).idxmax()
+        listed = [
+            f"{_shown(read[row])} (--time-format '{name}')"
+            for name, read in ({chosen: first} | others).items()
+        ]
+        raise ValueError(
+            f"{cells[row]!r} in row {row} can be {' or '.join(listed)}, and no other "
+            "row decides it: choose one with --time-format"
+        )
+    return np.asarray(first.reindex(column.index)), "seconds"
+
+
+def as_numbers(cells: "pd.Series") -> "pd.Series":
+    """Return the numbers in cells, also with decimal commas; NaN in other cells."""
+    with warnings.catch_warnings(action="ignore"):  # of commas
+        written = io_tables.with_points(cells.to_frame("cells"), ["cells"])["cells"]
+    return pd.to_numeric(written, errors="coerce")
+
+
+def image_numbers(table: "pd.DataFrame", fps: float | None = None) -> "pd.Series":
+    """Return the number of the image of each row, under the name of its column.
+
+    It is the number of the frame, that in the name of the image, or that of the image
+    among all. Otherwise rows count. Warn if times by fps leave out those in names.
+    """
+    for expression in (FRAME, IMAGE_NAME, texts.IMAGE):
+        for name in table.columns:
+            if not re.fullmatch(expression, str(name).strip(), re.IGNORECASE):
+                continue
+            numbers: Any = pd.to_numeric(table[name], errors="coerce")
+            if expression == IMAGE_NAME:  # not of videos with many rows each
+                several = name == "file" and table[name].duplicated().any()
+                is_name = numbers.isna().all() and not several
+                names = [*map(str, table[name])]
+                numbers = texts.frame_numbers(names) if is_name else None
+                if fps and is_name and texts.have_times(names):
+                    warn_caller(
+                        f"--fps: the names of images in the column {name} have times "
+                        f"(first: {names[0]}) instead of numbers of frames. Images "
+                        "count as successive frames, in their order. For these times "
+                        f"use --time {name} with a --time-format, such as "
+                        "%Y-%m-%d_%H-%M-%S.png, or a column frame of numbers"
+                    )
+            elif expression == texts.IMAGE:
+                numbers = pd.factorize(table[name])[0]
+            if numbers is not None and np.isfinite(numbers).all():
+                return pd.Series(numbers, dtype=float, name=str(name).strip())
+    return pd.Series(range(len(table)))
+
+
+def video_times(numbers: "pd.Series", groups: NDArray | None) -> NDArray:
+    """Return the numbers of images, which must be a sequence within each group.
+
+    Numbers without a name are those of rows, which must follow one another.
+    """
+    found = pd.DataFrame({"image": numbers, "group": 0 if groups is None else groups})
+    again, name = found.duplicated(), numbers.name
+    if again.any():
+        raise ValueError(
+            f"--fps: {again.sum()} of {len(again)} frames show the same image as an "
+            f"earlier row (column {name}, first: row {again.idxmax()}): the table has "
+            "several faces or videos. Name the column that tells them apart with "
+            "--group, or leave the others out with --skip-rows"
+        )
+    steps = found.groupby("group")["image"].diff()
+    if name is None and steps.median() > 1:
+        raise ValueError(
+            "--fps counts the rows of the table, but most rows that follow one another "
+            f"are {steps.median():g} rows apart: the table seems to have several rows "
+            "an image. Add a column frame with the number of the frame, or use --time"
+        )
+    return np.asarray(numbers)
+
+
+def _read(cells: "pd.Series", format: str) -> "pd.Series":
+    """Return the dates or seconds of a format, missing where cells are not written so.
+
+    Minutes and seconds may have hours before them in some rows.
+    """
+    if format not in _DURATIONS:
+        dates = pd.to_datetime(cells, format=format, errors="coerce", utc=True)
+        return dates.dt.tz_localize(None)
+    parts = cells.str.extract(f"^{_DURATION}$").astype(float)
+    seconds = 3600 * parts[0].fillna(0.0) + 60 * parts[1] + parts[2]
+    if format == _MINUTES:
+        return seconds
+    if format == _ALL_THREE:
+        return seconds.where(parts[0].notna())
+    of_day = parts[0].isna() & (parts[1] < 24) & ~cells.str.contains(".", regex=False)
+    return (60 * seconds).where(of_day)
+
+
+def _shown(time: object) -> str:
+    """Return a date, or seconds, as they are read by people."""
+    if isinstance(time, float):
+        return f"{time:g} s"
+    return str(time).removesuffix(" 00:00:00")
+
+
+def _cell(cells: "pd.Series", which: "pd.Series") -> str:
+    """Name the first of some cells."""
+    return f"row {which.idxmax()}, {cells[which].iloc[0]!r}"

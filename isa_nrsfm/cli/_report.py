@@ -29,10 +29,10 @@ from isa_nrsfm._compat.texts import as_utf8, escape, first_items, percent
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._advice import FIT, camera_meaning, verdict
 from isa_nrsfm.analysis._diagnostics import Diagnostics
-from isa_nrsfm.analysis._frame_columns import STATISTICS
+from isa_nrsfm.analysis._frame_columns import TEXTS
 from isa_nrsfm.cli._options import PROGRAM
 from isa_nrsfm.cli._reading import MOST_LISTED, Frames, drawing_files
-from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.export._upright import names_of_components
 from isa_nrsfm.io import FORMATS, load_model, save_model, write_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.metrics._measures import frame_energies
@@ -155,6 +155,13 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
     save_model(estimator, folder / "model.npz")
 
 
+def depth_std(args: Namespace, model: AffineNRSfM, X: Any, weights: Any) -> Any:
+    """Return the error bars of the viewer as its argument, if --std asks for them."""
+    if not args.std or model.camera_ == "affine":
+        return {}
+    return {"depth_std": model.reconstruct(X, return_std=True, **weights)[1]}
+
+
 def read_model(args: Namespace) -> AffineNRSfM:
     """Load a model; its missing points have the coordinates of those of its fit.
 
@@ -189,10 +196,8 @@ def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
 
 def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """Return the digests of the named files that exist in a folder."""
-    existing = [name for name in names if (folder / name).is_file()]
-    contents = ((folder / name).read_bytes() for name in existing)
-    digests = [hashlib.sha256(content).hexdigest() for content in contents]
-    return dict(zip(existing, digests, strict=True))
+    existing = {name: folder / name for name in names if (folder / name).is_file()}
+    return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in existing.items()}
 
 
 # Classes whose means are shown, at most.
@@ -237,8 +242,7 @@ def quality_report(error: float, square: float, weighted: bool) -> dict[str, Any
 def model_report(fit: Fit, found: Diagnostics | None) -> dict[str, Any]:
     """Describe a fitted model, with the diagnostics of a joint fit, and its quality."""
     # Not needed by transform
-    from isa_nrsfm.plotting._axes import SPANNING_TREE
-    from isa_nrsfm.plotting._views import view_and_layout
+    from isa_nrsfm.plotting._views import SPANNING_TREE, view_and_layout
 
     estimator, frames, edges = fit.estimator, fit.frames, fit.drawn["edges"]
     X, alpha = frames.X, estimator.alpha_
@@ -639,7 +643,7 @@ def _label(label: dict[str, Any]) -> Section:
     counts = {"n_copies": copies, "n_without_label": "without a label left out"}
     title += "".join(f"; {label[n]} {what}" for n, what in counts.items() if label[n])
     names = names_of_components(None, len(label["values"]))
-    statistic, meaning = STATISTICS[label["kind"]]
+    statistic, meaning = TEXTS["statistics"][label["kind"]]
     columns = {"": names, statistic: [f"{value:z.2f}" for value in label["values"]]}
     columns["p"] = ["" if label["untested"] else f"{p:.3f}" for p in label["p_values"]]
     if label["corrected"] is not None:

@@ -90,17 +90,14 @@ def model_of_points(
     share, size = square / square_in_file, np.sqrt(np.mean(some[0] ** 2))
     C, shapes = C * size**2 / share, some / size
     mean_shape, basis = shapes[0], shapes[1 : K + 1]
-    noise, inverse_snr, rank_floor, *certain = stored["numbers"].tolist()
+    noise, inverse_snr, rank_floor, total, *errors = stored["numbers"].tolist()
     # Components that are left out become noise of the two coordinates of an image.
     others = shapes[K + 1 :]
     left = np.einsum("ab,kja,kjb->", C, others, others) / (2 * len(mean_shape))
-    total, residual, constant, slope = certain
-    variances, residual = (
-        stored["points"][points] / share,
-        residual / share + 2.0 * left,
-    )
-    errors = {"residual": residual, "images": (constant, slope)}
-    certainty = DepthCertainty(total, 0.0, stored["turns"], variances, **errors)
+    residual, *images = errors
+    known = {"residual": residual / share + 2.0 * left, "images": tuple(images)}
+    variances = stored["points"][points] / share
+    certainty = DepthCertainty(total, 0.0, stored["turns"], variances, **known)
     noise, camera = noise / share + left, "weak_perspective"
     shapes = np.ascontiguousarray(shapes[: K + 1].mT)
     gauge, starts = FrameMap.identity(K), np.zeros((0, K))

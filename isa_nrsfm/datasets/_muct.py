@@ -23,14 +23,9 @@ from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables import table_to_tracks
-from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, fetch_file
+from isa_nrsfm.datasets._remote import PARAMETERS, SOURCES, DataHome, fetch_file
 
-URL = (
-    "https://raw.githubusercontent.com/aviralgoyal1997/"
-    "Gender-Classification-On-Muct-database/"
-    "0c0e908dadec1d89533b522ac37e5227455fc6a1/muct76-opencv.csv"
-)
-SHA256 = "e5f393a52b6c8b1cdd945063d450476c0ca6be6ac07b3b2cd3cd5357f202c0eb"
+URL, SHA256 = SOURCES["muct"]
 
 DESCR = f"{__doc__}\nSource: free for academic use, {URL}\n"
 

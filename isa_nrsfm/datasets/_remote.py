@@ -2,12 +2,14 @@
 
 import hashlib
 import os
+import tomllib
 from pathlib import Path
 from typing import Any
 
 from isa_nrsfm._compat.lazy import import_optional
 
 DataHome = str | os.PathLike[str] | None
+SOURCES = tomllib.loads(Path(__file__).with_name("sources.toml").read_text("utf-8"))
 
 # Constraints of the parameters that all fetchers have in common.
 PARAMETERS: dict[str, list[Any]] = {

@@ -9,8 +9,8 @@ indices of the iBUG-68 scheme; the other half is the mirror image.
 
 import tomllib
 from collections.abc import Callable, Sequence
-from importlib.resources import files
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -382,7 +382,7 @@ def _drawn_shapes(names: Sequence[str]) -> NDArray[np.float64]:
     face, mirror = get_skeleton("ibug-68"), np.arange(68)
     mirror[[*face.left, *face.right]] = [*face.right, *face.left]
     columns = [("name", "U20"), ("point", int), ("place", float, 3)]
-    with (files("isa_nrsfm.datasets") / "face_model.csv").open() as file:
+    with Path(__file__).with_name("face_model.csv").open() as file:
         table = np.loadtxt(file, delimiter=",", dtype=columns)
     shapes = np.zeros((len(names), 68, 3))
     for shape, name in zip(shapes, names, strict=True):
@@ -546,9 +546,7 @@ OF_PEOPLE = PARAMETERS | {"n_people": [Interval(Integral, 1, None, closed="left"
 # Standard deviation of the logarithms of a person's size and of single bones
 SIZES, BONES = 0.06, 0.05
 ACTIONS = ("walk", "reach", "squat")
-FIGURES: dict[str, Any] = tomllib.loads(
-    (files("isa_nrsfm.datasets") / "figures.toml").read_text(encoding="utf-8")
-)
+FIGURES = tomllib.loads(Path(__file__).with_name("figures.toml").read_text("utf-8"))
 STEPS_A_SECOND, MOVES_A_SECOND = 0.9, 0.5
 
 

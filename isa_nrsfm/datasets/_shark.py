@@ -17,13 +17,9 @@ from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables import tracks_to_table
-from isa_nrsfm.datasets._remote import PARAMETERS, DataHome, fetch_file
+from isa_nrsfm.datasets._remote import PARAMETERS, SOURCES, DataHome, fetch_file
 
-URL = (
-    "https://raw.githubusercontent.com/scivision/em-sfm/"
-    "c0abf730b7148c35831b1fdf5ae02ae928471dbf/data/jaws.mat"
-)
-SHA256 = "e962fe60aaed847397d922889496519310d34374a098c6d6f9282232d0635fcc"
+URL, SHA256 = SOURCES["shark"]
 
 DESCR = f"{__doc__}\nSource: free for non-commercial use, {URL}\n"
 

@@ -11,12 +11,6 @@ from typing import TYPE_CHECKING
 from isa_nrsfm._compat.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from isa_nrsfm.export._poses import (
-        FramePoses as FramePoses,
-        frame_poses as frame_poses,
-        point_distances as point_distances,
-        pose_function as pose_function,
-    )
     from isa_nrsfm.export._shape_files import (
         FramePoints as FramePoints,
         PointDistributionModel as PointDistributionModel,
@@ -28,6 +22,12 @@ if TYPE_CHECKING:
         write_pdm as write_pdm,
         write_points as write_points,
         write_shapes as write_shapes,
+    )
+    from isa_nrsfm.export._upright import (
+        FramePoses as FramePoses,
+        frame_poses as frame_poses,
+        point_distances as point_distances,
+        pose_function as pose_function,
     )
     from isa_nrsfm.export._viewer import (
         write_glb as write_glb,

@@ -23,7 +23,6 @@ from isa_nrsfm._fitted_model import frames_of, points_in_space
 from isa_nrsfm._linalg import procrustes
 from isa_nrsfm.analysis._advice import depth_advice, facts_of
 from isa_nrsfm.export import _upright
-from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -104,7 +103,7 @@ def shape_arrays(model: Any) -> ShapeArrays:
         np.asarray(getattr(model, f"{name}_", np.empty(kept.get(name, 0))))
         for name in ShapeArrays._fields[:-2]
     ]
-    names = names_of_points(model), names_of_components(None, n_components)
+    names = names_of_points(model), _upright.names_of_components(None, n_components)
     return ShapeArrays(*arrays, *(np.array(each, dtype=str) for each in names))
 
 
@@ -137,7 +136,7 @@ def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
     coefficient k of frame i, mean_shape(j, :) point j, squeeze(basis(k, j, :)) its
     drift.
     """
-    suffix = suffix_of(path, [".npz", ".mat"])
+    suffix = _upright.suffix_of(path, [".npz", ".mat"])
     arrays = shape_arrays(model)._asdict()
     with whole_file(path) as file:
         if suffix == ".npz":
@@ -272,7 +271,7 @@ def point_distribution_model(
     ((68, 3), (1, 68, 3), (1,))
     """
     space = _upright.upright_space(model, camera, origin)
-    shapes = _upright.upright_frames(space, model, *frames_of_table(model, None)).shapes
+    shapes = _upright.upright_shapes(space, model, None)
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
     if space.camera is not None:
         shapes = _aligned(shapes)
@@ -314,7 +313,7 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     comment lines that begin with ``#``, its numbers of rows and columns, the number 6
     (for doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
     """
-    suffix = suffix_of(path, PDM_SUFFIXES)
+    suffix = _upright.suffix_of(path, PDM_SUFFIXES)
     mean, modes, eigenvalues = checked = PointDistributionModel(*map(np.asarray, pdm))
     fitting = mean.ndim == 2 and mean.shape[1] == 3 and eigenvalues.ndim == 1
     if not fitting or modes.shape != (*eigenvalues.shape, *mean.shape):
@@ -366,24 +365,19 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
     --------
     write_pdm : Write such a file.
     """
-    suffix_of(path, [".txt"])
+    _upright.suffix_of(path, [".txt"])
     with reading(path, "a point distribution model"):
-        pdm = _from_matrices(*_read_matrices(path))
-        if not all(np.isfinite(part).all() for part in pdm):
+        M, V, E = _read_matrices(path)
+        n_points, n_modes = M.size // 3, E.size
+        if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
+            raise ValueError(
+                "it should have a mean of 3n numbers, components of shape (3n, m) and "
+                f"m variances; got {M.size}, {V.shape} and {E.size}"
+            )
+        if not all(np.isfinite(part).all() for part in (M, V, E)):
             raise ValueError("its numbers should be finite; got NaN or infinity")
-        return pdm
-
-
-def _from_matrices(M: NDArray, V: NDArray, E: NDArray) -> PointDistributionModel:
-    """Return the model of mean (3n x 1), components (3n x m) and m variances."""
-    n_points, n_modes = M.size // 3, E.size
-    if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
-        raise ValueError(
-            "it should have a mean of 3n numbers, components of shape (3n, m) and m "
-            f"variances; got {M.size}, {V.shape} and {E.size}"
-        )
-    modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
-    return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
+        modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
+        return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
 
 
 def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
@@ -578,7 +572,7 @@ def write_points(
     ``_std`` at the end of its name, has them; empty cells, in ``.trc`` nan, are not
     determined.
     """
-    suffix, path = suffix_of(path, POINT_SUFFIXES), Path(path)
+    suffix, path = _upright.suffix_of(path, POINT_SUFFIXES), Path(path)
     if fps is None and suffix == ".trc":
         raise ValueError("fps, the frames per second, is needed for .trc files")
     if fps is not None and not 0 < fps < np.inf:
@@ -627,11 +621,9 @@ def _netcdf(
         values = points.determined if kind == "i1" else np.nan * points.determined
         file.createVariable(name, kind, axes[:1] + axes[2:])[:] = values[..., None]
     file.variables["determined"].dtype = "bool"
+    unit = "seconds" if fps else "frames"
     attributes = {"source_software": "isa_nrsfm", "ds_type": "poses", "fps": fps}
-    attributes |= {
-        "time_unit": "seconds" if fps else "frames",
-        "mirror_certainty": sign,
-    }
+    attributes |= {"time_unit": unit, "mirror_certainty": sign}
     for name, value in attributes.items():
         if value is not None:
             setattr(file, name, value)

@@ -1,10 +1,14 @@
-"""The upright space in which shapes are exported, and the shapes of a model in it.
+"""The upright space in which shapes are exported: shapes, head poses and distances.
 
 In that space x points right, y down and z away from the viewer, who sees the object
 from the front. Its lengths and angles are Euclidean as far as the cameras of the fitted
 table determine them. Shapes of calibrated cameras are only rotated.
 """
 
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -12,20 +16,19 @@ from numpy.typing import NDArray
 from sklearn.utils import gen_batches
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm import calibration
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class
-from isa_nrsfm._fitted_model import frames_of
+from isa_nrsfm._fitted_model import frames_of, in_camera_axes, removed_part
 from isa_nrsfm._frames.camera_models import compose, full_rotations
+from isa_nrsfm._frames.models import Decomposition
+from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.scaling import check_frames_kept
 from isa_nrsfm.analysis._advice import depth_advice, facts_of
-from isa_nrsfm.calibration import (
-    DeformationMetric,
-    EuclideanFrames,
-    deformation_metric,
-    euclidean_frames,
-)
+from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.skeletons import Skeleton
+from isa_nrsfm.skeletons._column_names import checked_names, names_of_points
 
 Camera = Literal["weak_perspective"] | None
 
@@ -40,7 +43,7 @@ class UprightSpace(NamedTuple):
     """
 
     camera: str | None
-    metric: DeformationMetric | None
+    metric: calibration.DeformationMetric | None
     transform: NDArray
     image_axes: NDArray
     lines: Skeleton | None
@@ -62,7 +65,7 @@ def upright_space(
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
     check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
-    calibration: str | None = camera if fitted == "affine" else fitted
+    calibrated: str | None = camera if fitted == "affine" else fitted
     if camera is not None and not frames_of(model).certainty.determined:
         warn_caller(depth_advice(facts_of(model)))
     to_metric = np.eye(3)
@@ -71,7 +74,7 @@ def upright_space(
     elif camera is None:
         transform = _views.viewing_transform(model.motion_, model.reference_motion_)
     else:
-        metric = deformation_metric(model.motion_, model.alpha_)
+        metric = calibration.deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
         transform = _views.viewing_rotation(
             model.motion_ @ metric.Q,
@@ -87,12 +90,12 @@ def upright_space(
     transform = _views.upright_turn(shape, layout, "upper") @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
-    return UprightSpace(calibration, metric, transform, image_axes, lines)
+    return UprightSpace(calibrated, metric, transform, image_axes, lines)
 
 
 def upright_frames(
     space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
-) -> EuclideanFrames:
+) -> calibration.EuclideanFrames:
     """Return upright Euclidean shapes, rotations and scales of frames.
 
     NaN for frames without a camera. Rotations lead to the image turned upright.
@@ -101,11 +104,16 @@ def upright_frames(
         rotations, scales = full_rotations(np.asarray(motion, dtype=np.float64))
         shapes = compose(model.mean_shape_, model.basis_, alpha)
     else:
-        shapes, rotations, scales = euclidean_frames(
+        shapes, rotations, scales = calibration.euclidean_frames(
             space.metric, motion, alpha, model.mean_shape_, model.basis_
         )
     rotations = space.image_axes @ rotations @ space.transform.T
-    return EuclideanFrames(shapes @ space.transform.T, rotations, scales)
+    return calibration.EuclideanFrames(shapes @ space.transform.T, rotations, scales)
+
+
+def upright_shapes(space: UprightSpace, model: Any, X: Any) -> NDArray:
+    """Return the upright shapes of the frames of `frames_of_table`."""
+    return upright_frames(space, model, *frames_of_table(model, X)).shapes
 
 
 def viewed_shapes(space: UprightSpace, model: Any) -> NDArray[np.float64]:
@@ -133,3 +141,313 @@ def viewed_shapes(space: UprightSpace, model: Any) -> NDArray[np.float64]:
         shapes = fit.reshape(shapes.shape)
     shapes[0] -= shapes[0].mean(axis=0)
     return shapes @ _views.UPSIDE_DOWN
+
+
+def names_of_components(names: Any, n_components: int) -> list[str]:
+    """Return the names of the coefficients, by default alpha_1, alpha_2, ..."""
+    default = [f"alpha_{k + 1}" for k in range(n_components)]
+    return checked_names("names", names, default)
+
+
+def point_places(names: Sequence[str]) -> dict[str, int]:
+    """Return the numbers of points by their names, or by their numbers."""
+    named = {name: j for j, name in enumerate(names)}
+    return {str(j): j for j in range(len(names))} | named
+
+
+def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:
+    """Return the suffix of a path in lower case, which must be one of those given."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in suffixes:
+        raise ValueError(
+            f"path must end in {' or '.join(suffixes)}; got {os.fspath(path)}"
+        )
+    return suffix
+
+
+def frames_of_table(
+    model: Any, X: Any, point_weight: Any = None
+) -> tuple[NDArray, NDArray]:
+    """Return cameras and coefficients of a table or of frames that are fitted.
+
+    Rotations lead to the axes of the camera, if known. None is the fitted table.
+    """
+    if X is None:
+        alpha = model.alpha_ + removed_part(model, model.motion_)
+        return in_camera_axes(model, model.motion_, model.translation_), alpha
+    if not isinstance(X, Decomposition):
+        X = model.decompose(X, point_weight=point_weight)
+    return in_camera_axes(model, X.motion, X.translation), X.alpha
+
+
+# The outer corners of the eyes, of the 68 points of a face.
+EYES = (36, 45)
+
+
+class FramePoses(NamedTuple):
+    """
+    Poses of frames; NaN where a frame has no camera.
+
+    Attributes
+    ----------
+    yaw : ndarray of shape (n_frames,)
+        In degrees, defined by `isa_nrsfm.calibration.view_angles`: zero for
+        a frontal, upright object. Positive where it is turned to the viewer's right.
+    pitch : ndarray of shape (n_frames,)
+        In degrees; positive where it looks up.
+    roll : ndarray of shape (n_frames,)
+        In degrees; positive where it is turned clockwise in the image.
+    scale : ndarray of shape (n_frames,)
+        Pixels, or units of the table, per unit of the shapes.
+    yaw_std : ndarray of shape (n_frames,)
+        Posterior standard deviation of yaw in degrees. NaN if `X` is no table, and for
+        models with affine cameras, which have no rotations.
+    pitch_std : ndarray of shape (n_frames,)
+        That of pitch.
+    roll_std : ndarray of shape (n_frames,)
+        That of roll.
+    """
+
+    yaw: NDArray
+    pitch: NDArray
+    roll: NDArray
+    scale: NDArray
+    yaw_std: NDArray
+    pitch_std: NDArray
+    roll_std: NDArray
+
+
+def frame_poses(
+    model: Any,
+    X: Any = None,
+    *,
+    point_weight: Any = None,
+    camera: Camera = "weak_perspective",
+    edges: Any = "auto",
+    origin: _views.Origin = "auto",
+) -> FramePoses:
+    """
+    Return yaw, pitch and roll of the object in each frame.
+
+    If the layout of the points is known (`isa_nrsfm.skeletons`), angles are relative to
+    an upright, frontal object. Otherwise they are relative to the view of the mean
+    camera.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    X : array-like of shape (n_frames, 2 * n_points), or Decomposition, default=None
+        A table with the points of the fitted one, or the result of ``model.decompose``,
+        whose frames are not fitted again. By default the fitted table.
+    point_weight : array-like of shape (n_frames, n_points), default=None
+        Weights of the points of a table X, as in ``model.fit``.
+    camera : {"weak_perspective"}, default="weak_perspective"
+        Camera model for a model with affine cameras. Calibrated cameras have their own.
+    edges : "auto", str, Skeleton or None, default="auto"
+        The layout of the points or its name; otherwise it is recognised.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        Where y is zero in the table: above, as in images, or below.
+
+    Returns
+    -------
+    FramePoses
+        Named tuple of yaw, pitch, roll, scale and standard deviations (n_frames,).
+
+    Raises
+    ------
+    ValueError
+        If the model has kept no frames, if `camera` is None, or if the cameras see
+        fewer than three directions of space.
+
+    Warns
+    -----
+    UserWarning
+        If the fitted table does not determine the depth. The angles are then NaN.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm.export import frame_poses
+    >>> options = {"camera": "weak_perspective", "random_state": 0}
+    >>> faces = make_face_tracks(40, n_components=1, **options)
+    >>> model = AffineNRSfM(1, **options)
+    >>> frame_poses(model.fit(faces.data)).yaw.shape
+    (40,)
+    """
+    pose = pose_function(model, camera=camera, edges=edges, origin=origin)
+    return pose(X, point_weight)
+
+
+def pose_function(
+    model: Any,
+    *,
+    camera: Camera = "weak_perspective",
+    edges: Any = "auto",
+    origin: _views.Origin = "auto",
+) -> Callable[..., FramePoses]:
+    """
+    Return a function that computes the poses of frames of a model.
+
+    The upright space of the model is computed once, for many calls with few frames.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    camera : {"weak_perspective"}, default="weak_perspective"
+        As in `frame_poses`.
+    edges : "auto", str, Skeleton or None, default="auto"
+        As in `frame_poses`.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        As in `frame_poses`.
+
+    Returns
+    -------
+    callable
+        Function of `X`, a table or the result of ``model.decompose``, or None for the
+        fitted table, and optionally of `point_weight`. It returns `FramePoses`.
+
+    Raises
+    ------
+    ValueError
+        For the reasons given in `frame_poses`.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm.export import pose_function
+    >>> options = {"camera": "weak_perspective", "random_state": 0}
+    >>> faces = make_face_tracks(20, n_components=1, **options)
+    >>> model = AffineNRSfM(1, **options)
+    >>> poses = pose_function(model.fit(faces.data))
+    >>> for row in faces.data[:2]:
+    ...     frame = model.decompose(row[None])
+    ...     shape, pose = model.reconstruct(frame), poses(frame)
+    >>> shape.shape, pose.yaw.shape
+    ((1, 68, 3), (1,))
+    """
+    if camera is None:
+        raise ValueError("angles need calibrated cameras; got camera=None")
+    space = upright_space(model, camera, origin, edges)
+    return partial(_poses, space, model)
+
+
+def _poses(
+    space: UprightSpace, model: Any, X: Any, point_weight: Any = None
+) -> FramePoses:
+    """Return the poses of frames in an upright space."""
+    motion, alpha = frames_of_table(model, X, point_weight)
+    shaped = alpha[:0] if space.metric is None else alpha  # no shapes are needed
+    _, rotations, scales = upright_frames(space, model, motion, shaped)
+    # The fitted table must determine the depth.
+    determined = frames_of(model).certainty.determined
+    if space.metric is not None:
+        determined = space.metric.condition_number <= LARGEST_CONDITION
+    if not determined:
+        rotations = np.full_like(rotations, np.nan)
+    angles = calibration.view_angles(rotations)
+    deviations = np.full((3, len(scales)), np.nan)
+    is_table = not (X is None or isinstance(X, Decomposition))
+    if is_table and space.metric is None and model.refinement in JOINT_REFINEMENTS:
+        covariance = model.rotation_covariance(X, point_weight=point_weight)
+        turned = space.transform @ covariance @ space.transform.T
+        deviations = np.array(calibration.angle_deviations(angles, turned))
+    return FramePoses(*angles, np.asarray(scales), *deviations)
+
+
+def point_distances(
+    model: Any,
+    pairs: Sequence[tuple[Any, Any]],
+    X: Any = None,
+    *,
+    unit: tuple[Any, Any] | None = None,
+    length: float = 1.0,
+    camera: Camera = "weak_perspective",
+) -> NDArray:
+    """
+    Return Euclidean distances of points in the shape of each frame.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    pairs : sequence of (int or str, int or str)
+        Pairs of points, by their numbers from zero or by the names of their columns.
+    X : array-like of shape (n_frames, 2 * n_points), or Decomposition, default=None
+        A table with the points of the fitted one, or the result of ``model.decompose``,
+        whose frames are not fitted again. By default the fitted table.
+    unit : (int or str, int or str), default=None
+        Two points whose distance in the mean shape is `length`. By default the outer
+        corners of the eyes, if the points are the 68 of a face in the order of iBUG.
+    length : float, default=1.0
+        Their distance, for instance 90 for millimetres.
+    camera : {"weak_perspective"}, default="weak_perspective"
+        Camera model for a model with affine cameras.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_pairs)
+        Distances in units of `length`; NaN where a frame has no shape.
+
+    Raises
+    ------
+    ValueError
+        If `pairs` is a single pair, if there is no such point, if `length` is not
+        positive, if `unit` is not given and the points are not those of a face, or for
+        the reasons given in `frame_poses`.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm.export import point_distances
+    >>> options = {"camera": "weak_perspective", "random_state": 0}
+    >>> faces = make_face_tracks(20, n_components=1, **options)
+    >>> model = AffineNRSfM(1, **options)
+    >>> model = model.fit(faces.data)
+    >>> point_distances(model, [(48, 54), (62, 66)]).shape  # of the mouth
+    (20, 2)
+    """
+    if camera is None:
+        raise ValueError("distances need calibrated cameras; got camera=None")
+    if not 0 < length < np.inf:
+        raise ValueError(f"length must be a positive number; got {length}")
+    space = upright_space(model, camera, "auto")
+    names = names_of_points(model)
+    first, second = np.array([point_numbers(pair, names) for pair in pairs]).T
+    if unit is None:
+        if space.lines is None or space.lines.name != "ibug-68":
+            raise ValueError(
+                "unit must name two points, as these are not the 68 of a face"
+            )
+        unit = EYES
+    a, b = point_numbers(unit, names)
+    shapes = upright_shapes(space, model, X)
+    mean = np.nanmean(shapes, axis=0)
+    size = np.linalg.norm(mean[a] - mean[b])
+    if not size > 0:
+        raise ValueError(f"the points {unit} of unit are in one place")
+    return np.linalg.norm(shapes[:, first] - shapes[:, second], axis=2) * length / size
+
+
+def point_numbers(pair: Sequence[Any], names: Sequence[str]) -> tuple[int, int]:
+    """Return the numbers of two different points, given by number or name."""
+    if np.ndim(pair) == 0:
+        raise ValueError(
+            "expected pairs of points, such as [(62, 66)] for the distance of points "
+            f"62 and 66; got {pair!r} instead of a pair"
+        )
+    places = point_places(names)
+    for each in pair:
+        if str(each) not in places:
+            raise ValueError(
+                f"there is no point {each!r}; the {len(names)} points are "
+                f"{', '.join(list(names)[:4])}, ..."
+            )
+    found = [places[str(each)] for each in pair]
+    if len(found) != 2 or found[0] == found[1]:
+        raise ValueError(f"expected two different points; got {tuple(pair)}")
+    return found[0], found[1]

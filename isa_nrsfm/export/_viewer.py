@@ -22,9 +22,8 @@ from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._fitted_model import frames_of, sees_perspective
 from isa_nrsfm.analysis._frame_columns import checked_times, is_missing
 from isa_nrsfm.export import _upright
-from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
-from isa_nrsfm.plotting._axes import SPANNING_TREE, is_dense
-from isa_nrsfm.plotting._views import UPSIDE_DOWN, Edges, Origin
+from isa_nrsfm.plotting import _views
+from isa_nrsfm.plotting._views import SPANNING_TREE, UPSIDE_DOWN, Edges, Origin
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
@@ -155,23 +154,23 @@ def write_viewer(
     the frames; those of calibrated cameras are the model's. Rows with too few visible
     points are not shown; the page gives their number.
     """
-    suffix_of(path, [".html", ".htm"])
+    _upright.suffix_of(path, [".html", ".htm"])
     if not isinstance(cast(Any, n_frames), Integral) or n_frames < 0:
         raise ValueError(
             f"n_frames must be a whole number of at least 0; got {n_frames!r}"
         )
     space = _upright.upright_space(model, camera, origin, edges)
-    components = names_of_components(names, len(model.basis_))
+    components = _upright.names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
     deviations = _deviations(depth_std, n_rows, model)
     # The first and the last row are among those shown.
     rows = np.linspace(0, max(n_rows - 1, 0), min(n_rows, n_frames)).astype(np.intp)
     if X is None or not len(rows):
-        motion, alpha = (part[rows] for part in frames_of_table(model, None))
+        motion, alpha = (part[rows] for part in _upright.frames_of_table(model, None))
     else:
         weights = None if point_weight is None else taken_rows(point_weight, rows)
-        motion, alpha = frames_of_table(model, taken_rows(X, rows), weights)
+        motion, alpha = _upright.frames_of_table(model, taken_rows(X, rows), weights)
     motion, alpha = np.asarray(motion), np.asarray(alpha)
     finite = np.isfinite(alpha).all(axis=1)
     rows, motion, alpha = rows[finite], motion[finite], alpha[finite]
@@ -361,9 +360,9 @@ def write_glb(
     basis shapes of affine cameras are the least squares fit to the shapes of the
     frames; those of calibrated cameras are the model's.
     """
-    suffix_of(path, [".glb"])
+    _upright.suffix_of(path, [".glb"])
     space = _upright.upright_space(model, camera, origin, edges)
-    targets = names_of_components(names, len(model.basis_))
+    targets = _upright.names_of_components(names, len(model.basis_))
     shapes = _upright.viewed_shapes(space, model)
     factor = 1 / np.ptp(shapes[0], axis=0).max()
     shapes = factor * shapes
@@ -449,7 +448,7 @@ def _primitives(
         "material": 0,
     }
     primitives = []
-    if surface is None or not is_dense(shapes[0]):
+    if surface is None or not _views.is_dense(shapes[0]):
         primitives.append(bare | {"mode": POINTS})
     if surface is not None:
         indices = file.add(surface.ravel())

@@ -167,8 +167,7 @@ def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     left_out = {*names}.difference(index, coordinates)
     known: dict[str, Any] = {"text": index, "n_header": len(levels), "names": names}
     frame = read_columns(path, leave_out=left_out, numbers=coordinates, **known)
-    cells = frame[index].fillna("").to_numpy()
-    labels = ["/".join(row) for row in cells]
+    labels = ["/".join(row) for row in frame[index].fillna("").to_numpy()]
     values = frame[coordinates].to_numpy(dtype=np.float64)
     return values, [columns[i] for i in numbers], labels
 
@@ -416,9 +415,7 @@ def _named_dims(dataset: Any) -> list[str] | None:
 
 def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
     """Return the skeleton of the dataset of edges; None if it is empty or absent."""
-    if "edge_names" not in file:
-        return None
-    content = content_of(file, "edge_names")
+    content = content_of(file, "edge_names") if "edge_names" in file else ()
     if not np.size(content):
         return None
     size = np.shape(content)

@@ -341,18 +341,15 @@ def _check_exists(path: Path) -> None:
     """Raise the error of opening a file where there is none."""
     refuse_special(path)
     if not path.is_dir():
-        with path.open("rb"):
-            pass
+        path.open("rb").close()
 
 
 def _listed(suffixes: Sequence[str]) -> str:
     """List suffixes in words."""
-    words = ["a folder" if suffix == _FOLDER else suffix for suffix in suffixes]
-    return " or ".join(words)
+    return " or ".join("a folder" if each == _FOLDER else each for each in suffixes)
 
 
-_FILE = Path(__file__).with_name("formats.toml")
-_ENTRIES: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+_ENTRIES = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))
 FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {name: LandmarkFormat(name, **entry) for name, entry in _ENTRIES.items()}
 )

@@ -1,8 +1,9 @@
-"""Read json and texts of trackers, data sets of images and annotation programs."""
+"""Read csv, json and texts of trackers, data sets of images and annotation programs."""
 
 import json
 import re
-from collections.abc import Callable, Sequence
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -17,43 +18,25 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.files import errors_of, reading, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items, frame_numbers
 from isa_nrsfm._parameters import OPENPOSE_PARTS, WHOLE_PARTS, named
-from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes, stacked
-from isa_nrsfm.io._tables import first_lines, header_names, parse_table
-
-# Entries of images and instances that are no columns under their own name.
-_LEFT_OUT = (
-    *("id", "category_id", "num_keypoints"),
-    *("license", "coco_url", "flickr_url", "date_captured"),
+from isa_nrsfm._prepare.coordinates import are_shares
+from isa_nrsfm.io import _tables
+from isa_nrsfm.io._landmark_columns import (
+    LandmarkColumns,
+    find_landmark_columns,
+    landmark_sets,
 )
-# COCO-WholeBody: the lists of an instance, and their numbers of points.
-_LISTS = {"keypoints": 17, "foot_kpts": 6, "face_kpts": 68}
-_LISTS |= {"lefthand_kpts": 21, "righthand_kpts": 21}
-# The places of parts in whole bodies of so many points: COCO-WholeBody, Halpe.
-_PLACES = {
-    133: [(0, 17), (17, 23), (23, 91), (91, 112), (112, 133), (0, 133)],
-    136: [(0, 26), (20, 26), (26, 94), (94, 115), (115, 136), (0, 136)],
-}
-# The keys of json of programs, outside of all objects but one, and what a value begins
-# with.
-_KINDS = {
-    "coco": r'"(?:images|annotations|image_id)":',
-    "openpose": r'"people":',
-    "mmpose": r'"(?:instance_info|instances|keypoint_scores|predictions)":',
-    "ultralytics": r'"keypoints":\{',
-    "labelme": r'"shapes":',
-    "mediapipe": r'"x":.*"y":|[lL]andmarks":',
-}
+from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes, stacked
+from isa_nrsfm.io._tables import confidences_in, header_names, read_columns, tracks_in
+
+# Names and numbers of the files of other programs.
+_DATA = tomllib.loads(Path(__file__).with_name("keypoints.toml").read_text("utf-8"))
 # A key and the beginning of its value, or another text, or a brace.
 _TOKEN = re.compile(r'("(?:[^"\\]|\\.)*+")(?:\s*:\s*(?=(.)))?|([{}])')
-# The columns of a specimen.
-_TPS_ENTRIES = ("image", "id", "scale", "comment", "variables")
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
     r"\{(?P<points>[^{}]*)\}\s*"
 )
 _N_WFLW = 98
-_WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
-_WFLW_ATTRIBUTES = "pose expression illumination make_up occlusion blur".split()
 # Fields of a line: points and image, without and with the box and the attributes.
 _WFLW_LENGTHS = (197, 207)
 
@@ -75,7 +58,7 @@ def _kind_of(text: str) -> str:
         depth += (brace == "{") - (brace == "}")
         if value and depth == 1:
             keys.append(f"{key}:{value}")
-    found = [kind for kind, e in _KINDS.items() if re.search(e, " ".join(keys))]
+    found = [kind for kind, e in _DATA["kinds"].items() if re.search(e, " ".join(keys))]
     if keys and not found and re.search(r'[lL]andmarks"\s*:\s*\[', text):
         found = ["mediapipe"]  # of frames in an object
     return [*found, "other" if keys else "none"][0]
@@ -105,8 +88,7 @@ def read_coco(path: Path, part: str | None = None) -> Landmarks:
     """
     content = read_json(path)
     if isinstance(content, list):
-        entries = _results(content)
-        return entries_as_rows(entries, "coco", "result", part=part)
+        return entries_as_rows(_results(content), "coco", "result", part=part)
     entries, names = _annotations(content)
     found = entries_as_rows(entries, "coco", "annotation", names, part)
     return replace(found, confidence=None)
@@ -253,7 +235,7 @@ def _keypoints(
     entries: Entries, names: Names, part: str | None, what: str
 ) -> tuple[NDArray[np.float64], Names]:
     """Return keypoints of instances (n_instances, n_points, 3) and names, of a part."""
-    gap = {key: [0] * 3 * n for key, n in _LISTS.items()} | {"keypoints": None}
+    gap = {key: [0] * 3 * n for key, n in _DATA["lists"].items()} | {"keypoints": None}
     further = [key for key in gap if any(key in entry for entry in entries)][1:]
     if further and part is None:
         part = "body"
@@ -261,7 +243,7 @@ def _keypoints(
             f"the points of bodies are read, and those in {', '.join(further)} are "
             f"left out: choose with {named('part')}, one of {', '.join(WHOLE_PARTS)}"
         )
-    keys = [*_LISTS] if further and part != "body" else ["keypoints"]
+    keys = [*_DATA["lists"]] if further and part != "body" else ["keypoints"]
     n_points = len(names) if names and len(keys) == 1 else 0
     found: list[NDArray[np.float64]] = []
     for number, entry in enumerate(entries):
@@ -277,11 +259,11 @@ def _keypoints(
             )
     values = np.reshape(found, (len(entries), n_points, 3))
     places: dict[str, tuple[int, int]] = dict.fromkeys(("body", "all"), (0, n_points))
-    places |= zip(WHOLE_PARTS, _PLACES.get(n_points, []), strict=False)
+    places |= _DATA["places"].get(str(n_points), {})
     if part is not None and part not in places:
         raise ValueError(
             f"part={part!r} is none of {', '.join(places)}, the parts of {n_points} "
-            f"points; whole bodies have {' or '.join(map(str, _PLACES))}"
+            f"points; whole bodies have {' or '.join(_DATA['places'])}"
         )
     chosen = slice(*places[part or "all"])
     if names and len(names) == n_points:
@@ -317,7 +299,7 @@ def _scalars(entry: dict[str, Any]) -> dict[str, Any]:
         entry = further | entry
     for name, value in entry.items():
         value = value[0] if isinstance(value, list) and len(value) == 1 else value
-        if isinstance(value, str | int | float) and name not in _LEFT_OUT:
+        if isinstance(value, str | int | float) and name not in _DATA["left_out"]:
             found[name] = value
     return found
 
@@ -518,7 +500,7 @@ def read_tps(path: Path) -> Landmarks:
                 raise ValueError(f"there are more than {count} landmarks")
         n_left += sum(not equals for _, equals, _ in entries)
         found = {name.strip().lower(): value.strip() for name, _, value in entries}
-        rows.append({name: found[name] for name in _TPS_ENTRIES if name in found})
+        rows.append({name: found[name] for name in _DATA["tps"] if name in found})
     if n_left and not any(len(each[0]) for each in tracks):
         raise ValueError(
             f"all its {n_left} points are on curves, which are left out: append them "
@@ -529,16 +511,6 @@ def read_tps(path: Path) -> Landmarks:
     *_, values = stacked(tracks, [f"specimen {i}" for i in range(len(tracks))])
     values[(values == -1).all(axis=2)] = np.nan  # as tpsDig and geomorph write them
     return assemble(values, None, rows, format="tps")
-
-
-def is_wflw(path: Path) -> bool:
-    """Return whether the first line has the fields of a WFLW list."""
-    fields = "".join(first_lines(path, 1)).split()
-    try:
-        floats_of(fields[: 2 * _N_WFLW])
-    except ValueError:
-        return False
-    return len(fields) in _WFLW_LENGTHS
 
 
 def read_wflw(path: Path) -> Landmarks:
@@ -561,8 +533,8 @@ def read_wflw(path: Path) -> Landmarks:
     if n_fields == _WFLW_LENGTHS[1]:
         if not np.isin(attributes, (0, 1)).all():
             raise ValueError("the six attributes before the image must be 0 or 1")
-        frames |= zip(_WFLW_BOX, box.T, strict=True)
-        frames |= zip(_WFLW_ATTRIBUTES, attributes.T.astype(int), strict=True)
+        frames |= zip(_DATA["wflw_box"], box.T, strict=True)
+        frames |= zip(_DATA["wflw_attributes"], attributes.T.astype(int), strict=True)
     return assemble(points.reshape(-1, _N_WFLW, 2), None, frames, format="wflw")
 
 
@@ -579,7 +551,6 @@ def floats_of(fields: list[str]) -> NDArray[np.float64]:
     return numbers
 
 
-_PLACE = re.compile(r"\s*[-+.\deE]+\s*[\s,]\s*[-+.\deE]+\s*")
 # Fields of a line of YOLO before its points: class and box.
 _N_BOX = 5
 _XYV = ("x", "y", "visible")
@@ -606,7 +577,7 @@ def read_ultralytics(path: Path) -> Landmarks:
         images = read_json(path)
         images = images if all(isinstance(i, list) for i in images) else [images]
     else:
-        table = parse_table(path)
+        table = _tables.parse_table(path)
         texts = table["keypoints"].str.replace("'", '"')
         images = [table.assign(keypoints=texts.map(json.loads)).to_dict("records")]
     entries: list[dict[str, Any]] = []
@@ -617,17 +588,6 @@ def read_ultralytics(path: Path) -> Landmarks:
             known = {"frame": frame, "person": person} | each
             entries.append(known | {"keypoints": [v for p in places for v in p]})
     return entries_as_rows(entries, "ultralytics", "detection")
-
-
-def is_yolo(path: Path) -> bool:
-    """Return whether the first line has a class, a box in shares, and points."""
-    fields = "".join(first_lines(path, 1)).split()
-    try:
-        box = floats_of(fields)[1:_N_BOX]
-    except ValueError:
-        return False
-    shares = len(fields) > 2 * _N_BOX and bool(np.all((box >= 0) & (box <= 1)))
-    return shares and fields[0].isdigit()
 
 
 def read_yolo(path: Path, image_size: Sequence[float] | None = None) -> Landmarks:
@@ -744,12 +704,6 @@ def _rows_of_names(rows: Sequence[Row], format: str) -> Landmarks:
     return assemble(places, names, frames, format=format)
 
 
-def is_places(path: Path) -> bool:
-    """Return whether a text has lines x y, perhaps after their number or the image."""
-    lines = first_lines(path, 3)
-    return len(lines) == 3 and all(map(_PLACE.fullmatch, lines[1:]))
-
-
 def read_places(path: Path) -> Landmarks:
     """Read a text with a line x y for each point of one image (CK+, Helen).
 
@@ -763,3 +717,238 @@ def read_places(path: Path) -> Landmarks:
         raise ValueError("the lines are not x and y of as many points as it says")
     tracks = np.array([floats_of(row) for row in rows])[None]
     return assemble(tracks, None, pd.DataFrame({"image": [image]}), format="places")
+
+
+# OpenFace names points in space, in millimetres, by capital letters.
+_NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
+# The vector that identifies faces, and the mesh beside the 68 points.
+_NOT_PYFEAT = re.compile(r"Identity_\d+|mesh_[xyz]_\d+|z_\d+")
+_PYFEAT_BOX = ("FaceRectX", "FaceRectY", "FaceRectWidth", "FaceRectHeight")
+
+
+def is_openface(path: Path) -> bool:
+    """Return whether the header is one of OpenFace."""
+    names = header_names(path)
+    of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
+    groups = {"x_0", "x0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
+    cut = [{"success", f"x{_}67", f"y{_}67"}.issubset(names) for _ in ("", "_")]
+    of_video |= any(cut)  # without some columns
+    return (of_video or names[:2] == ["face", "confidence"]) and bool(groups)
+
+
+def read_openface(path: Path) -> Landmarks:
+    """Read a csv file of OpenFace 1 or 2, of a video or an image.
+
+    The columns are those of ``RecorderCSV.cpp``: ``frame, face_id, timestamp,
+    confidence, success`` (``face, confidence`` for images) and optional gaze, eyes,
+    pose, ``x_0 ... x_67, y_0 ... y_67`` and more. OpenFace 1 has no ``face_id``, and
+    blanks before the names; the first versions have ``x0 ... x67``. Rows in which
+    ``success`` is 0 hold numbers that are not of a face.
+    """
+    names = header_names(path)
+    if not (first := {"x_0", "x0"}.intersection(names)):
+        raise ValueError(
+            "it has no 2D landmarks x_0, ..., y_0, ...: run OpenFace with -2Dfp"
+        )
+    of_video = names[:1] != ["face"]
+    _need(names, ["success"] if of_video else ["confidence"])
+    scores = [name for name in ("confidence", "success") if name in names]
+    found = find_landmark_columns(names, "x_#,y_#" if "x_0" in first else "x#,y#")
+    numbers = [*found.interleaved, *scores]
+    table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
+    if of_video:
+        if not table["success"].isin((0, 1)).all():
+            raise ValueError("the column success must hold 0 and 1 only")
+        table["success"] = table["success"].astype(int)
+        table.loc[table["success"] == 0, found.interleaved] = np.nan
+    scores = [name for name in scores if name == "confidence"]
+    return _assembled(table, found, "openface", scores, None)
+
+
+def is_pyfeat(path: Path) -> bool:
+    """Return whether the header is one of py-feat."""
+    return {*_PYFEAT_BOX, "x_0"}.issubset(header_names(path))
+
+
+def read_pyfeat(path: Path) -> Landmarks:
+    """
+    Read a csv file of py-feat, of any of its detectors.
+
+    ``Detector`` writes 68 points, ``x_0 ... x_67, y_0 ... y_67``, newer ones with a
+    mesh of 478 points beside them; ``MPDetector`` writes 478 points ``x_0, y_0, z_0,
+    x_1, ...``. ``FaceScore`` is the confidence of the face detector.
+    """
+    names = header_names(path)
+    _need(names, _PYFEAT_BOX)
+    found = find_landmark_columns(names, "x_#,y_#")
+    scores = [name for name in names if name == "FaceScore"]
+    numbers = [*found.interleaved, *scores]
+    table = read_columns(path, leave_out=_NOT_PYFEAT, numbers=numbers, text=["input"])
+    return _assembled(table, found, "pyfeat", scores, None)
+
+
+def is_mediapipe(path: Path) -> bool:
+    """Return whether the header has as many points as MediaPipe's face mesh."""
+    # Without and with the points of the irises
+    sizes = {468, 478}.intersection(landmark_sets(header_names(path)).values())
+    return bool(sizes) and not is_pyfeat(path)
+
+
+def read_mediapipe(
+    path: Path,
+    image_size: tuple[float, float] | None = None,
+    columns: str | None = None,
+    missing: _tables.Missing = None,
+) -> Landmarks:
+    """Read a csv file with the points of MediaPipe.
+
+    Coordinates divided by the width and height of the image are multiplied by
+    ``image_size``, or the columns ``image_width`` and ``image_height``.
+    """
+    names = header_names(path)
+    found = find_landmark_columns(names, columns)
+    sizes = [name for name in ("image_width", "image_height") if name in names]
+    numbers = [*found.interleaved, *sizes]
+    text = {*names}.difference(numbers, found.z)
+    table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
+    sure = confidences_in(table, found.x, found.y)
+    table, scores = table.assign(**sure), [*sure]
+    tracks = tracks_in(table, found.interleaved, missing)
+    scale = table[sizes].to_numpy(float) if len(sizes) == 2 else None
+    tracks = _in_pixels(tracks, image_size, scale)
+    return _assembled(table, found, "mediapipe", scores, tracks)
+
+
+def is_mediapipe_json(path: Path) -> bool:
+    """Return whether json has objects with x and y, or lists called landmarks."""
+    return json_kind(path) == "mediapipe"
+
+
+def read_mediapipe_json(
+    path: Path, image_size: tuple[float, float] | None = None, part: str | None = None
+) -> Landmarks:
+    """Read json of results: lists of objects with x and y, of frames and persons.
+
+    Their names, such as ``pose_landmarks`` or ``poseLandmarks``, are told apart by
+    ``part``; points in space (``world``) are left out.
+    """
+    frames, entries = _frames_in(read_json(path)), []
+    names: dict[str, str] = {}
+    for number, frame in enumerate(frames):
+        found = {n: p for n, value in frame.items() if (p := _persons(value))}
+        found = {n: p for n, p in found.items() if "world" not in n.lower()}
+        names |= {n: re.sub("([A-Z])", r"_\1", n).lower() for n in found}
+        numbered = {"frame": number} if len(frames) > 1 else {}
+        entries.append((numbered | frame, found))
+    chosen = [n for n, plain in names.items() if part is None or part in plain]
+    if not names:
+        raise ValueError("it has no lists of objects with x and y")
+    if len(chosen) != 1:
+        raise ValueError(
+            f"it has {first_items(names)}: choose one with {named('part')}, such as "
+            "'pose'"
+        )
+    every = [p for _, found in entries for each in found.values() for p in each]
+    seen = any(point.get("visibility") for points in every for point in points)
+    persons = (enumerate(found.get(chosen[0]) or [[]]) for _, found in entries)
+    rows = [
+        known | {"person": k, "keypoints": [v for p in points for v in _xyv(p, seen)]}
+        for (known, _), each in zip(entries, persons, strict=True)
+        for k, points in each
+    ]
+    read = entries_as_rows(rows, "mediapipe_json", "result")
+    tracks = read.points.to_numpy().reshape(len(rows), -1, 2)
+    points = read.points.copy()
+    points[:] = _in_pixels(tracks, image_size, None).reshape(len(rows), -1)
+    return replace(read, points=points, confidence=read.confidence if seen else None)
+
+
+def _frames_in(content: Any) -> list[dict[str, Any]]:
+    """Return the frames in a list, or in an object with a list; or the only one."""
+    if isinstance(content, dict):
+        values = (v for v in content.values() if isinstance(v, list) and v)
+        lists = [v for v in values if isinstance(v[0], dict) and not _persons(v)]
+        content = lists[0] if lists else [content]
+    elif isinstance(content[0], dict) and _persons(content):
+        content = [content]
+    return [f if isinstance(f, dict) else {"landmarks": f} for f in content]
+
+
+def _persons(value: Any) -> list[list[dict[str, Any]]]:
+    """Return the points of each person in a list of points, or a list of such."""
+    if not isinstance(value, list) or not value:
+        return []
+    if all(isinstance(p, dict) and {"x", "y"} <= p.keys() for p in value):
+        return [value]
+    inner = [_persons(each) for each in value]
+    return [each[0] for each in inner] if all(len(i) == 1 for i in inner) else []
+
+
+def _xyv(point: dict[str, Any], seen: bool) -> Iterator[float]:
+    """Return x, y and the visibility of a point, 1 if there is none."""
+    visibility = point.get("visibility", 1.0) if seen else 1.0
+    return map(float, (point["x"], point["y"], visibility))
+
+
+def _in_pixels(tracks: NDArray, image_size: Any, sizes: NDArray | None) -> NDArray:
+    """Return tracks (n_frames, n_points, 2) in pixels, by the size of the images."""
+    n_known = np.count_nonzero(~np.isnan(tracks))
+    # Pixels of a face reach beyond this, and fractions of the image's size do not.
+    if 2 * np.count_nonzero((tracks >= -2) & (tracks <= 2)) > n_known:
+        if image_size is None and sizes is None:
+            raise ValueError(
+                "its coordinates are fractions of the image's width and height: give "
+                f"{named('image_size', (1920, 1080))} in pixels, or columns "
+                "image_width and image_height"
+            )
+        _check_inside(tracks)
+        scale = sizes
+        if image_size is not None:
+            scale = checked_sizes("image_size", image_size, 1)
+        with np.errstate(over="ignore"):  # `assemble` refuses infinite numbers
+            return np.asarray(tracks * np.asarray(scale).reshape(-1, 1, 2))
+    if image_size is not None:
+        raise ValueError(
+            "image_size is for coordinates that are fractions of the image's width and "
+            "height; these are in pixels (median "
+            f"{np.nanmedian(np.abs(tracks)):.3g}), for the format table"
+            if n_known
+            else "image_size is given, but there are no points"
+        )
+    return tracks
+
+
+def _check_inside(shares: NDArray[np.float64]) -> None:
+    """Refuse points (n_frames, n_points, 2) if most are outside the image."""
+    beyond = np.maximum(-shares, shares - 1).max(axis=2)
+    n_outside, n_shown = np.sum(beyond > 0), np.sum(~np.isnan(beyond))
+    if 2 * n_outside > n_shown and not are_shares(shares):
+        raise ValueError(
+            f"{n_outside} of {n_shown} points are outside the image: the coordinates "
+            "are no fractions of the width and height of an image. Read them without "
+            "image_size, in the format table"
+        )
+
+
+def _assembled(
+    table: "pd.DataFrame", found: LandmarkColumns, format: str, scores: Any, tracks: Any
+) -> Landmarks:
+    """Return points under the names of their columns, with scores of frame or points.
+
+    The score of a frame is among its other columns.
+    """
+    n_each, used = len(found.points) // max(len(scores), 1), found.interleaved
+    confidence = table[[*scores] * n_each].to_numpy(np.float64) if scores else None
+    used += scores if n_each == 1 else []
+    if tracks is None:
+        tracks = tracks_in(table, found.interleaved)
+    known: dict[str, Any] = {"columns": found.interleaved, "confidence": confidence}
+    frames = table.drop(columns=used)
+    return assemble(tracks, found.points, frames, format=format, **known)
+
+
+def _need(names: list[str], needed: Iterable[str]) -> None:
+    """Raise if a column is missing."""
+    absent = [name for name in needed if name not in names]
+    if absent:
+        raise ValueError(f"it has no column {', '.join(absent)}")

@@ -19,13 +19,8 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME, first_items
 from isa_nrsfm._parameters import named
-from isa_nrsfm.skeletons._column_names import (
-    WORDS,
-    individuals_in,
-    parse_coordinate,
-    point_names,
-    without_boxes,
-)
+from isa_nrsfm.skeletons import _column_names
+from isa_nrsfm.skeletons._column_names import WORDS, parse_coordinate, without_boxes
 
 CONFIDENCES = tuple(WORDS["confidences"].split("|"))
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
@@ -290,7 +285,7 @@ def _refuse_individuals(names: Columns, sets: dict[str, int]) -> None:
     patterns = [pattern.split(",")[0] for pattern in sets]
     lists = [_columns_matching(names, pattern).values() for pattern in patterns]
     x = list(dict.fromkeys(chain.from_iterable(lists)))
-    if not (who := individuals_in(x, MIN_POINTS)):
+    if not (who := _column_names.individuals_in(x, MIN_POINTS)):
         return
     if any(map(_COPY.fullmatch, who)):
         found = [
@@ -321,10 +316,8 @@ def _select(names: Columns, patterns: Sequence[str]) -> LandmarkColumns:
     for x_pattern, y_pattern in zip(patterns[::2], patterns[1::2], strict=True):
         x_by_key = _columns_matching(names, x_pattern)
         y_by_key = _columns_matching(names, y_pattern)
-        for one, other, pattern in (
-            (x_by_key, y_by_key, y_pattern),
-            (y_by_key, x_by_key, x_pattern),
-        ):
+        sides = (x_by_key, y_by_key, y_pattern), (y_by_key, x_by_key, x_pattern)
+        for one, other, pattern in sides:
             if alone := [name for key, name in one.items() if key not in other]:
                 more = f" (nor have {len(alone) - 1} more)" if len(alone) > 1 else ""
                 raise ValueError(
@@ -340,7 +333,7 @@ def _select(names: Columns, patterns: Sequence[str]) -> LandmarkColumns:
         raise ValueError(f"the patterns {joined} match {twice!r} twice")
     if not {"#", "*"}.isdisjoint(joined):
         _warn_of_left_out(names, chosen, joined)
-    points, z = point_names(x), _z_of(names, x)
+    points, z = _column_names.point_names(x), _z_of(names, x)
     return LandmarkColumns(joined, points, tuple(x), tuple(y), z)
 
 
@@ -606,9 +599,8 @@ def _points_apart(frame: "pd.DataFrame", pair: Given, given: Given) -> Apart:
             f"Choose with {named('columns')}, {listed}"
         )
     frame, by_frame, by_point = found
-    row = np.zeros(len(frame), int)
-    if by_frame:
-        row += frame.groupby(by_frame, sort=False, dropna=False).ngroup().to_numpy()
+    groups = frame.groupby(by_frame or np.zeros(len(frame)), sort=False, dropna=False)
+    row = groups.ngroup().to_numpy()
     texts = frame[by_point].astype(str).apply(lambda column: column.str.strip())
     texts = texts.agg("_".join, axis=1) if len(by_point) > 1 else texts[by_point[0]]
     point, labels = pd.factorize(texts)

@@ -32,8 +32,7 @@ from isa_nrsfm._tables import LAYOUTS, SMALLEST
 
 FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
 HEADER = "header"
-_FILE = Path(__file__).with_name("model_file.toml")
-PARTS: dict[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+PARTS = tomllib.loads(Path(__file__).with_name("model_file.toml").read_text("utf-8"))
 Arrays = dict[str, NDArray]
 OUTPUTS = ["default", "pandas", "polars"]
 
@@ -283,9 +282,8 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
     if not frames.joint:
         mean_shape, *basis = frames.shapes.mT
         return {**entries, "mean_shape": mean_shape, "basis": np.array(basis)}
-    certainty = frames.certainty._asdict() | {
-        "images": np.array(frames.certainty.images)
-    }
+    images = np.array(frames.certainty.images)
+    certainty = frames.certainty._asdict() | {"images": images}
     return {
         **entries,
         "loss": frames.loss,

@@ -56,11 +56,10 @@ def open_table(path: str | os.PathLike[str]) -> "StoredTable | NDArray":
     (50, 136)
     """
     path = Path(path)
+    files = [path]
     if path.is_dir():
         visible = (p for p in path.iterdir() if not p.name.startswith((".", "_")))
         files = sorted(visible, key=by_number)
-    else:
-        files = [path]
     if not files:
         raise FileNotFoundError(f"{path} has no {' or '.join(SUFFIXES)} files")
     kinds = {file.suffix for file in files}

@@ -19,18 +19,10 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.files import reading, whole_file
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME
-from isa_nrsfm.io._landmark_columns import (
-    confidence_columns,
-    find_landmark_columns,
-    frames_of,
-)
+from isa_nrsfm.io import _landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
-from isa_nrsfm.skeletons._column_names import (
-    WORDS,
-    columns_of_individuals,
-    parse_coordinate,
-    point_names,
-)
+from isa_nrsfm.skeletons import _column_names
+from isa_nrsfm.skeletons._column_names import parse_coordinate
 
 SEPARATORS = {".csv": ",", ".tsv": "\t", ".txt": "\t"}
 # How pandas reads texts.
@@ -46,7 +38,7 @@ _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?\s*")
 _SEEN = dict.fromkeys((True, "True", "TRUE", "true"), 1.0)
 _SEEN |= dict.fromkeys((False, "False", "FALSE", "false"), 0.0)
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
-_MISSING = WORDS["missing"].split("|")
+_MISSING = _column_names.WORDS["missing"].split("|")
 
 
 Missing = float | Sequence[float] | None
@@ -233,8 +225,8 @@ def landmark_table(
             "(polars tables have a method to_pandas)"
         )
     frame = individuals_as_rows(frame, individuals)
-    frame, columns = frames_of(frame, columns, row_per_point)
-    names = find_landmark_columns(frame.columns, columns).interleaved
+    frame, columns = _landmark_columns.frames_of(frame, columns, row_per_point)
+    names = _landmark_columns.find_landmark_columns(frame.columns, columns).interleaved
     refuse_same_names([str(name) for name in frame.columns])
     values = tracks_in(frame, names, missing).reshape(len(frame), len(names))
     points = pd.DataFrame(values, frame.index, [name.strip() for name in names])
@@ -247,7 +239,7 @@ def individuals_as_rows(
     """Return a table with a row for each individual of each row, if there are any."""
     if individuals is None:
         return frame
-    columns_of = columns_of_individuals(frame.columns, individuals)
+    columns_of = _column_names.columns_of_individuals(frame.columns, individuals)
     frame = frame.reset_index(drop=True)
     common = frame.drop(columns=[*chain.from_iterable(columns_of.values())])
     if "individual" in common:
@@ -275,9 +267,7 @@ def individuals_as_rows(
 
 def _codes(missing: Missing) -> list[float]:
     """Return the numbers of missing points, or raise."""
-    if missing is None:
-        return []
-    codes = np.atleast_1d(missing)
+    codes = np.atleast_1d([] if missing is None else missing)
     if codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
         raise ValueError(f"missing must be None or finite numbers; got {missing!r}")
     return codes.astype(float).tolist()
@@ -308,13 +298,12 @@ def read_named_columns(
     table = parse_table(path)
     points, other = landmark_table(table, columns=columns, missing=missing, **shape)
     names = points.columns
-    confidence = confidences_in(other, names[::2], names[1::2])
+    sure = confidences_in(other, names[::2], names[1::2])
     known: dict[str, Any] = {"format": "table", "columns": list(names)}
-    if not confidence.empty:
-        known["confidence"] = confidence
+    known["confidence"] = None if sure.empty else sure
     tracks = points.to_numpy().reshape(len(points), -1, 2)
-    frames = other.drop(columns=confidence.columns)
-    return assemble(tracks, point_names(names[::2]), frames, **known)
+    frames = other.drop(columns=sure.columns)
+    return assemble(tracks, _column_names.point_names(names[::2]), frames, **known)
 
 
 def confidences_in(
@@ -324,7 +313,7 @@ def confidences_in(
 
     No columns if there are none, or, unless strict, if they are no confidences.
     """
-    names = confidence_columns(frame, x, y)
+    names = _landmark_columns.confidence_columns(frame, x, y)
     try:
         with warnings.catch_warnings(action="ignore"):  # of commas, as in coordinates
             frame = with_points(frame, names)
@@ -418,11 +407,11 @@ def header_names(path: Path) -> list[str]:
     return [name.strip() for row in header_rows(path, 1) for name in row]
 
 
-def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
+def checked_rows(path: Path, separator: str, n_header: int = 1) -> Iterator[list[str]]:
     """Yield the first five non-empty rows of a text file, and a few others.
 
-    Raise if one has not as many cells as the first, if none follows it, or at a null
-    character, as files in UTF-16 without a mark have. pandas would pad or cut the
+    Raise if one has not as many cells as the first, if none follows the header, or at a
+    null character, as files in UTF-16 without a mark have. pandas would pad or cut the
     lines.
     """
     n_lines, n_rows, n_columns = 0, 0, 0
@@ -458,7 +447,7 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
                 )
             n_rows += 1
             yield row
-    if n_rows == 1:
+    if 0 < n_rows <= n_header:
         raise ValueError("it has a header but no rows")
     _refuse_cut_number(path, separator)
 
@@ -489,8 +478,7 @@ def _refuse_cut_number(path: Path, separator: str) -> None:
 def read_parquet(path: Path) -> "pd.DataFrame":
     """Read a parquet file."""
     import_optional("pyarrow", extra="parquet")
-    with path.open("rb"):  # opening errors as for text files
-        pass
+    path.open("rb").close()  # opening errors as for text files
     frame = pd.read_parquet(path)
     if frame.empty:
         raise ValueError("it has no rows")
@@ -522,8 +510,8 @@ def read_columns(
         frame = frame.drop(columns=[name for name in frame if name in leave_out])
     else:
         separator = separator_of(path)
-        if sum(1 for _ in checked_rows(path, separator)) <= n_header:
-            raise ValueError("it has a header but no rows")
+        for _ in checked_rows(path, separator, n_header):
+            pass
         lines: dict[str, Any] = {"sep": separator, "names": names, "header": None}
         lines |= {"skiprows": n_header, "skipinitialspace": True}
         kept = [name for name in names if name not in leave_out]
@@ -559,9 +547,6 @@ def with_points(
     Other columns are written so where all their cells are such numbers.
     """
     texts = frame[[*names]].select_dtypes(["object", "string"])
-    columns = (texts[name].astype(str) for name in texts)
-    if not any(column.str.contains(",", regex=False).any() for column in columns):
-        return frame
     cells = {*map(str, texts.to_numpy(object).ravel())}
     commas = [cell for cell in cells if "," in cell]
     decimal = {*filter(_DECIMAL_COMMA.fullmatch, commas)}

@@ -14,7 +14,7 @@ from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables import FEWEST_POINTS, table_to_tracks, tracks_to_table, unmasked
 from isa_nrsfm.analysis._frame_columns import checked_column, kind_of
 from isa_nrsfm.metrics import inverse_snr
-from isa_nrsfm.plotting import _axes
+from isa_nrsfm.plotting import _views
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
 from isa_nrsfm.skeletons._column_names import checked_names
 
@@ -116,9 +116,7 @@ class CoefficientsDisplay:
         self.label = "label" if label is None else label
         if component_names is None and hasattr(alpha, "columns"):
             component_names = [*map(_no_mathematics, alpha.columns)]
-        self.component_names = checked_names(
-            "component_names", component_names, range(1, n_components + 1)
-        )
+        self.component_names = _views.names_of_shapes(component_names, n_components)
 
     @classmethod
     def from_estimator(
@@ -211,8 +209,8 @@ class CoefficientsDisplay:
         elif kind not in ("auto", "time"):
             raise ValueError(f"kind={kind!r} needs y, a label for each frame")
         n_components = self.alpha.shape[1]
-        size = (_axes.PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
-        self.axes_ = _axes.flat_axes(
+        size = (_views.PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
+        self.axes_ = _views.flat_axes(
             ax, n_components, "one for each basis shape", sharex=True, figsize=size
         )
         self.figure_ = self.axes_[0].figure
@@ -246,7 +244,7 @@ class CoefficientsDisplay:
             positions=range(len(classes)),
             widths=0.6,
             showfliers=False,
-            medianprops={"color": _axes.OBSERVED_COLOUR, "linewidth": 1.4},
+            medianprops={"color": _views.OBSERVED_COLOUR, "linewidth": 1.4},
             **dict.fromkeys(("boxprops", "whiskerprops", "capprops"), THIN),
         )
         names = [str(each) for each in classes]
@@ -266,17 +264,17 @@ class CoefficientsDisplay:
         gaps = np.cumsum([len(piece) for piece in pieces])[:-1]
         times, alpha = np.insert(time[rows], gaps, time[rows][gaps - 1]), self.alpha
         curve = np.insert(alpha[rows, k], gaps, np.nan)
-        axes.plot(times, curve, color=_axes.MINUS_COLOUR, linewidth=0.9)
+        axes.plot(times, curve, color=_views.MINUS_COLOUR, linewidth=0.9)
         single = [piece[0] for piece in pieces if len(piece) == 1]
         if single:
-            axes.plot(time[single], alpha[single, k], ".", color=_axes.MINUS_COLOUR)
+            axes.plot(time[single], alpha[single, k], ".", color=_views.MINUS_COLOUR)
         if self.alpha_std is not None:
             # It is narrower than the curve in tables with little noise.
             median = np.nanmedian(self.alpha_std[rows, k])
             title = f"band: one standard deviation, {median:.2g} (median)"
             axes.set_title(title, loc="right", fontsize="x-small")
             deviation = np.insert(self.alpha_std[rows, k], gaps, np.nan)
-            style = {"color": _axes.MINUS_COLOUR, "alpha": 0.25, "linewidth": 0}
+            style = {"color": _views.MINUS_COLOUR, "alpha": 0.25, "linewidth": 0}
             axes.fill_between(times, curve - deviation, curve + deviation, **style)
 
     def _pieces(self, time: NDArray) -> list[NDArray]:
@@ -307,7 +305,7 @@ def _rows_of_largest(groups: NDArray) -> tuple[NDArray, list[NDArray]]:
 
 def _scatter(axes: Any, x: NDArray, y: NDArray) -> None:
     """Draw frames as faint points."""
-    style = {"color": _axes.MINUS_COLOUR, "alpha": 0.5, "linewidths": 0}
+    style = {"color": _views.MINUS_COLOUR, "alpha": 0.5, "linewidths": 0}
     axes.scatter(x, y, s=5, rasterized=True, **style)
 
 
@@ -500,7 +498,7 @@ class ReprojectionDisplay:
                 )
             rng = check_random_state(random_state)
             frames = np.sort(rng.choice(rows, size=n_frames, replace=False))
-        rows = _axes.chosen_numbers(frames, "frames", len(X), "row numbers of X")
+        rows = _views.chosen_numbers(frames, "frames", len(X), "row numbers of X")
         table = taken_rows(X, rows)
         _, _, skeleton, origin = view_and_layout(estimator, edges, origin)
         observed, reprojected = (
@@ -539,8 +537,8 @@ class ReprojectionDisplay:
         n_frames = len(self.frames)
         n_columns = min(3, n_frames) if n_columns is None else n_columns
         height = (PANEL_WIDTH + 0.4) * -(-n_frames // n_columns)
-        size = (PANEL_WIDTH * n_columns, height + _axes.LEGEND_HEIGHT)
-        self.axes_ = _axes.flat_axes(
+        size = (PANEL_WIDTH * n_columns, height + _views.LEGEND_HEIGHT)
+        self.axes_ = _views.flat_axes(
             ax, n_frames, "one for each frame", n_columns, figsize=size
         )
         self.figure_ = self.axes_[0].figure
@@ -552,30 +550,32 @@ class ReprojectionDisplay:
             self._plot_frame(axes, i)
         if ax is None:
             entries = [self.observed_[0], self.reprojected_[0]]
-            scale = 4.0 if _axes.is_dense(self.observed[0]) else 1.0
-            _axes.add_legend(self.figure_, entries, self.skeleton, markerscale=scale)
+            scale = 4.0 if _views.is_dense(self.observed[0]) else 1.0
+            _views.add_legend(self.figure_, entries, self.skeleton, markerscale=scale)
         return self
 
     def _plot_frame(self, axes: Any, i: int) -> None:
         """Draw one frame."""
         observed, reprojected = self.observed[i], self.reprojected[i]
         if self.skeleton is not None:
-            colours = _axes.side_colours(self.skeleton.edge_sides, _axes.PLUS_COLOUR)
+            colours = _views.side_colours(self.skeleton.edge_sides, _views.PLUS_COLOUR)
             style = {"colors": colours, "alpha": 0.8}
             segments = reprojected[self.skeleton.edges]
-            self.edges_.append(_axes.draw_segments(axes, segments, **style))
-        colour, thin = _axes.OBSERVED_COLOUR, {"linewidths": 0.6}
+            self.edges_.append(_views.draw_segments(axes, segments, **style))
+        colour, thin = _views.OBSERVED_COLOUR, {"linewidths": 0.6}
         style = {"color": colour}
-        if not _axes.is_dense(observed):
+        if not _views.is_dense(observed):
             style = {"s": 14.0, "facecolors": "none", "edgecolors": colour} | thin
             error = np.stack([observed, reprojected], axis=1)
-            self.errors_.append(_axes.draw_segments(axes, error, colors=colour, **thin))
-        drawn = _axes.draw_points(axes, observed, label="observed", **style)
+            self.errors_.append(
+                _views.draw_segments(axes, error, colors=colour, **thin)
+            )
+        drawn = _views.draw_points(axes, observed, label="observed", **style)
         self.observed_.append(drawn)
-        style = {"color": _axes.PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
-        self.reprojected_.append(_axes.draw_points(axes, reprojected, **style))
-        _axes.hide_frame(axes)
+        style = {"color": _views.PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
+        self.reprojected_.append(_views.draw_points(axes, reprojected, **style))
+        _views.hide_frame(axes)
         axes.set_aspect("equal", adjustable="datalim")
         axes.yaxis.set_inverted(self.origin == "upper")
-        share = f"inverse SNR {_axes.percent(self.inverse_snr[i])}"
+        share = f"inverse SNR {_views.percent(self.inverse_snr[i])}"
         axes.set_title(f"row {self.frame_names[i]}\n{share}", fontsize="small")

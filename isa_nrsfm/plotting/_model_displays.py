@@ -9,10 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.lazy import import_optional
-from isa_nrsfm.plotting import _axes, _views
-from isa_nrsfm.plotting._axes import flat_axes, percent
+from isa_nrsfm.plotting import _views
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
-from isa_nrsfm.skeletons._column_names import checked_names
 
 # Arrows in the units of the points, with the same width in all axes.
 ARROW_STYLE = {
@@ -158,9 +156,7 @@ class BasisShapeDisplay:
                 f"got shape {share.shape}"
             )
         self.energy_share = share
-        self.component_names = checked_names(
-            "component_names", component_names, range(1, n_components + 1)
-        )
+        self.component_names = _views.names_of_shapes(component_names, n_components)
         _, self.skeleton, self.origin = choose_lines(edges, origin, self.mean_shape)
         self.edges = None if self.skeleton is None else self.skeleton.edges
 
@@ -268,17 +264,17 @@ class BasisShapeDisplay:
             that does not exist.
         """
         import_optional("matplotlib", extra="plot")
-        self.components_ = _axes.chosen_numbers(
+        self.components_ = _views.chosen_numbers(
             components, "components", len(self.basis), "numbers of basis shapes"
         )
         n_drawn = len(self.components_)
         drift, mean = n_std * self.basis[self.components_], self.mean_shape
         moved = [np.stack([mean, mean + d, mean - d]) for d in drift]
-        limits, reduction = _axes.block_limits([mean[None], *moved])
+        limits, reduction = _views.block_limits([mean[None], *moved])
         page = ax
         if ax is None:
-            page = _axes.new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
-        axes = _axes.flat_axes(page, 2 + 2 * n_drawn, "two views for each shape")
+            page = _views.new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
+        axes = _views.flat_axes(page, 2 + 2 * n_drawn, "two views for each shape")
         self.axes_, self.figure_ = axes.reshape(-1, 2), axes[0].figure
 
         size = f"{n_std:g} standard deviations"
@@ -288,27 +284,27 @@ class BasisShapeDisplay:
         self.plus_: list[Any] = []
         self.arrows_: list[Any] = []
         for block, (pair, d) in enumerate(zip(self.axes_, [0, *drift], strict=True)):
-            shapes = [(self.mean_, mean, _axes.MEAN_COLOUR, "mean shape")]
+            shapes = [(self.mean_, mean, _views.MEAN_COLOUR, "mean shape")]
             if block:
-                shapes.append((self.minus_, mean - d, _axes.MINUS_COLOUR, below))
-                shapes.append((self.plus_, mean + d, _axes.PLUS_COLOUR, above))
-            for view, axis in zip(_axes.VIEWS, pair, strict=True):
+                shapes.append((self.minus_, mean - d, _views.MINUS_COLOUR, below))
+                shapes.append((self.plus_, mean + d, _views.PLUS_COLOUR, above))
+            for view, axis in zip(_views.VIEWS, pair, strict=True):
                 for artists, shape, colour, label in shapes:
                     style = {"color": colour, "label": label} | (point_kw or {})
                     drawn = self._draw(axis, shape[:, view], style, not block)
                     artists.append(drawn)
-                if block and not _axes.is_dense(mean):
+                if block and not _views.is_dense(mean):
                     ends = (*mean[:, view].T, *d[:, view].T)
                     self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE))
-                _axes.hide_frame(axis)
-                _axes.show_view(axis, view, limits[block], self.origin)
+                _views.hide_frame(axis)
+                _views.show_view(axis, view, limits[block], self.origin)
             title = self._title(block, reduction[block])
-            title = _axes.wrap_title(title, pair)
+            title = _views.wrap_title(title, pair)
             pair[0].set_title(title, loc="left", fontsize="small")
             pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
         if ax is None:
             entries = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
-            _axes.add_legend(self.figure_, entries, self.skeleton, markerscale=3.0)
+            _views.add_legend(self.figure_, entries, self.skeleton, markerscale=3.0)
         return self
 
     def _draw(self, axis: Any, points: NDArray, style: Any, sided: bool) -> Any:
@@ -316,12 +312,12 @@ class BasisShapeDisplay:
         layout = self.skeleton
         if layout is not None:
             colours = colour = style["color"]
-            if sided and colour == _axes.MEAN_COLOUR:
-                colours = _axes.side_colours(layout.edge_sides, colour)
-                style = style | {"color": _axes.side_colours(layout.sides, colour)}
-            _axes.draw_segments(axis, points[layout.edges], colors=colours)
+            if sided and colour == _views.MEAN_COLOUR:
+                colours = _views.side_colours(layout.edge_sides, colour)
+                style = style | {"color": _views.side_colours(layout.sides, colour)}
+            _views.draw_segments(axis, points[layout.edges], colors=colours)
             style = {"s": 2.0} | style
-        return _axes.draw_points(axis, points, **style)
+        return _views.draw_points(axis, points, **style)
 
     def _title(self, block: int, reduction: float) -> str:
         """Return the title of the mean shape (0) or of a basis shape."""
@@ -331,7 +327,7 @@ class BasisShapeDisplay:
         name = self.component_names[k]
         title, notes = f"Basis shape {name}" if name == str(k + 1) else name, []
         if self.energy_share is not None:
-            notes.append(f"{_axes.percent(self.energy_share[k])} of energy")
+            notes.append(f"{_views.percent(self.energy_share[k])} of energy")
         if reduction > 1:
             notes.append(f"drawn 1:{reduction:.2g}")
         return f"{title} ({', '.join(notes)})" if notes else title
@@ -410,9 +406,7 @@ class ModeCovarianceDisplay:
                 f"shape; got shape {matrix.shape}"
             )
         self.mode_covariance = matrix
-        self.component_names = checked_names(
-            "component_names", component_names, range(1, n_modes // BLOCK + 1)
-        )
+        self.component_names = _views.names_of_shapes(component_names, n_modes // BLOCK)
 
     @property
     def off_block_share(self) -> float:
@@ -484,7 +478,7 @@ class ModeCovarianceDisplay:
         from matplotlib.ticker import SymmetricalLogLocator
 
         options: dict[str, Any] = {"figsize": (4.4, 3.6), "layout": "compressed"}
-        (self.ax_,) = flat_axes(ax, 1, "the matrix", **options)
+        (self.ax_,) = _views.flat_axes(ax, 1, "the matrix", **options)
         self.figure_ = self.ax_.figure
 
         values = self.mode_covariance
@@ -506,7 +500,7 @@ class ModeCovarianceDisplay:
         for axis in (self.ax_.xaxis, self.ax_.yaxis):
             axis.set_ticks(centres, labels=names[::step])
             axis.set_label_text("basis shape")
-        title = f"{percent(self.off_block_share)} outside the diagonal blocks"
+        title = f"{_views.percent(self.off_block_share)} outside the diagonal blocks"
         self.ax_.set_title(f"{title}\n(0 % if uncorrelated)", fontsize="small")
         self.ax_.tick_params(length=0)
         if max(map(len, names)) > 3:

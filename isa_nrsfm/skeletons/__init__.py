@@ -6,8 +6,14 @@ figures, viewer and glTF draw it. Indices, edges and names are facts of the sour
 each `Skeleton` cites.
 """
 
-from isa_nrsfm.skeletons._recognition import SKELETONS, find_skeleton, get_skeleton
-from isa_nrsfm.skeletons._skeleton import Skeleton, read_skeleton, skeleton_of_names
+from isa_nrsfm.skeletons._recognition import (
+    SKELETONS,
+    Skeleton,
+    find_skeleton,
+    get_skeleton,
+    read_skeleton,
+    skeleton_of_names,
+)
 
 __all__ = [
     "SKELETONS",

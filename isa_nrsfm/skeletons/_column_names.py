@@ -19,27 +19,22 @@ from typing import Any, Literal
 
 _SEPARATORS = r"[ _.\-]"
 # x0, x_0, eye_lmk_x_0. Words may hold line breaks, which a dot matches with DOTALL.
-_AXIS_NUMBER = re.compile(
-    rf"((?:.*{_SEPARATORS})?)([xyzXYZ])({_SEPARATORS}?)(\d+)", re.DOTALL
-)
+_AXIS_NUMBER = re.compile(rf"(?s)((?:.*{_SEPARATORS})?)([xyzXYZ])({_SEPARATORS}?)(\d+)")
 # 0x
 _NUMBER_AXIS = re.compile(r"(\d+)()([xyzXYZ])")
 # 0_x, nose_x, thumb_1_x
-_LABEL_AXIS = re.compile(rf"(.*[^ _.\-])({_SEPARATORS})([xyzXYZ])", re.DOTALL)
+_LABEL_AXIS = re.compile(rf"(?s)(.*[^ _.\-])({_SEPARATORS})([xyzXYZ])")
 # x_nose
-_AXIS_LABEL = re.compile(rf"([xyzXYZ])({_SEPARATORS})([^ _.\-].*)", re.DOTALL)
-_TRAILING_NUMBER = re.compile(r"(.*?)(\d+)", re.DOTALL)
+_AXIS_LABEL = re.compile(rf"(?s)([xyzXYZ])({_SEPARATORS})([^ _.\-].*)")
+_TRAILING_NUMBER = re.compile(r"(?s)(.*?)(\d+)")
 # The sizes of boxes, named like the x of their corner.
 _HEIGHTS = {"w": "h", "W": "H", "width": "height", "Width": "Height"}
 # Not of points that are called w and h.
 _WIDTH = re.compile(r"(?<!\b[xyzXYZ])[wW](?:idth)?(?![xyzXYZ]\b)")
 # Parts of names, with the separator after them: words, or numbers in words.
 _PARTS = (r"[^ _.\-]+[ _.\-]*", r"\d+|\D+")
-_FILE = Path(__file__).with_name("words.toml")
-WORDS = {
-    kind: "|".join(words)
-    for kind, words in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
-}
+_LISTS = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
+WORDS = {kind: "|".join(words) for kind, words in _LISTS.items()}
 _SIDE, _ANIMAL = re.compile(WORDS["sides"]), re.compile(WORDS["individuals"])
 _SERIES = re.compile(rf"(?<![a-z])({WORDS['series']})(?:finger|tip|s)?(?![a-z])")
 # The axis, 0, 1 or 2 for x, y or z; the point, the name without its axis letter ("3",

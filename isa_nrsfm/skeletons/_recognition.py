@@ -1,36 +1,371 @@
-"""Which layout the points of a table have."""
+"""Layouts of landmarks: the class, those that are known, and which one a table has."""
 
+import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, groupby, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import pdist
 
-from isa_nrsfm.skeletons._skeleton import Skeleton
+from isa_nrsfm._compat.files import reading
+from isa_nrsfm._compat.lazy import import_optional
+
+Kind = Literal["face", "hand", "body", "whole body", "other"]
+KINDS: tuple[Kind, ...] = ("face", "hand", "body", "whole body", "other")
+MIDDLE, LEFT, RIGHT = 0, 1, 2
+
+Pairs = tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """
+    A layout of landmarks: names, lines between points, left and right, the pose.
+
+    Points are named by their index in the layout. Left and right are
+    sides of the person or animal, not of the viewer.
+
+    Parameters
+    ----------
+    name : str
+        Name of the layout.
+    kind : {"face", "hand", "body", "whole body", "other"}
+        The object on which the points lie.
+    n_points : int
+        Number of points.
+    curves : tuple of tuples of int
+        Points along each curve, at least two a curve. A closed one ends with the point
+        that it begins with.
+    source : str
+        Where the order and the curves are documented.
+    point_names : tuple of str of length n_points or None, default=None
+        Names of the points, where the layout has them.
+    left, right : tuple of int, default=()
+        Points of the left and of the right side, which are mirror images in turn:
+        ``left[i]`` of ``right[i]``.
+    up : tuple of pairs of int, default=()
+        A lower point and one above it, as `calibration.canonical_pose` takes them.
+    front : tuple of pairs of int, default=()
+        A point and one in front of it, likewise.
+    across : tuple of pairs of int, default=()
+        Pairs of a right and a left point that determine the axis across. By default all
+        pairs of `right` and `left`, which is wrong for points of arms and legs.
+    contour : tuple of int, default=()
+        Points that annotators place on the visible outline, such as the jaw of a face.
+        They slide over the surface as the head turns: the pose changes their place on
+        the face, and with it the coefficients.
+
+    Raises
+    ------
+    ValueError
+        If points do not exist, a name is not given to one point, or the sides have
+        different numbers of points.
+
+    See Also
+    --------
+    find_skeleton : The layout of a table.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.skeletons import Skeleton
+    >>> mouse = Skeleton("mouse", "other", 4, curves=((1, 0, 2), (0, 3)),
+    ...                  source="ours", left=(1,), right=(2,))
+    >>> mouse.edges
+    array([[1, 0],
+           [0, 2],
+           [0, 3]])
+    >>> mouse.edge_sides
+    array([1, 2, 0])
+    """
+
+    name: str
+    kind: Kind
+    n_points: int
+    curves: tuple[tuple[int, ...], ...]
+    source: str
+    point_names: tuple[str, ...] | None = None
+    left: tuple[int, ...] = ()
+    right: tuple[int, ...] = ()
+    up: Pairs = ()
+    front: Pairs = ()
+    across: Pairs = ()
+    contour: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit together."""
+        if self.kind not in KINDS:
+            raise ValueError(f"kind must be one of {KINDS}; got {self.kind!r}")
+        parts = *self.curves, *self.up, *self.front, *self.across
+        named = chain(*parts, self.left, self.right, self.contour)
+        strange = [j for j in named if not 0 <= j < self.n_points]
+        if strange:
+            raise ValueError(
+                f"the points of {self.name!r} are 0 to {self.n_points - 1}; got "
+                f"{strange[0]}"
+            )
+        if len(self.left) != len(self.right):
+            raise ValueError(
+                "left and right must be mirror images, point by point; got "
+                f"{len(self.left)} and {len(self.right)} points"
+            )
+        names = self.point_names
+        if names is not None and len({*names}) != self.n_points:
+            raise ValueError(
+                f"point_names must hold {self.n_points} different names; got "
+                f"{len({*names})}"
+            )
+
+    @property
+    def edges(self) -> NDArray[np.intp]:
+        """Return pairs of neighbours on a curve, integers of shape (n_edges, 2)."""
+        pairs = [pair for curve in self.curves for pair in pairwise(curve)]
+        return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+    @property
+    def left_right(self) -> NDArray[np.intp]:
+        """
+        Return the pairs (n_pairs, 2) that `canonical_pose` takes as `left_right`.
+
+        The point on the right side comes first: it is on the left for somebody who is
+        looked at.
+        """
+        pairs = self.across or tuple(zip(self.right, self.left, strict=True))
+        return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+    @property
+    def sides(self) -> NDArray[np.intp]:
+        """Return the side of each point: 0 in the middle, 1 left, 2 right."""
+        sides = np.full(self.n_points, MIDDLE)
+        sides[list(self.left)] = LEFT
+        sides[list(self.right)] = RIGHT
+        return sides
+
+    @property
+    def edge_sides(self) -> NDArray[np.intp]:
+        """
+        Return the side of each edge: the common side of its ends, otherwise the middle.
+
+        An edge from the middle to a side is on that side.
+        """
+        first, second = self.sides[self.edges].T
+        one = np.where(first == MIDDLE, second, first)
+        return np.where((second == MIDDLE) | (second == one), one, MIDDLE)
+
+    @property
+    def inner(self) -> NDArray[np.intp]:
+        """Return the points that are not on the contour."""
+        return np.setdiff1d(np.arange(self.n_points), self.contour)
+
+    @property
+    def inner_columns(self) -> NDArray[np.intp]:
+        """Return the columns of the inner points in a table x0, y0, x1, y1, ...."""
+        return np.add.outer(2 * self.inner, [0, 1]).ravel()
+
+    def subset(self, points: Iterable[int]) -> "Skeleton":
+        """
+        Return the layout of some of the points.
+
+        Parameters
+        ----------
+        points : iterable of int
+            The points to keep, in their new order.
+
+        Returns
+        -------
+        Skeleton
+            The layout, with the parts of the curves, the sides and the pairs of points
+            that are left. Points whose mirror image is left out are on no side.
+
+        Examples
+        --------
+        >>> from isa_nrsfm.skeletons import get_skeleton
+        >>> face = get_skeleton("wflw-98")
+        >>> face.subset(face.inner).n_points
+        65
+        """
+        new = {int(j): k for k, j in enumerate(points)}
+        names = self.point_names
+
+        def pairs(old: Iterable[tuple[int, int]]) -> Pairs:
+            return tuple((new[a], new[b]) for a, b in old if {a, b} <= new.keys())
+
+        parts = []
+        for curve in self.curves:
+            groups = groupby(curve, new.__contains__)
+            parts += [tuple(new[j] for j in part) for inside, part in groups if inside]
+        sides = pairs(zip(self.left, self.right, strict=True))
+        return replace(
+            self,
+            name=f"{len(new)} points of {self.name}",
+            n_points=len(new),
+            curves=tuple(part for part in parts if len(part) > 1),
+            point_names=None if names is None else tuple(names[j] for j in new),
+            left=tuple(left for left, _ in sides),
+            right=tuple(right for _, right in sides),
+            up=pairs(self.up),
+            front=pairs(self.front),
+            across=pairs(self.across),
+            contour=tuple(new[j] for j in self.contour if j in new),
+        )
+
+    def reordered(self, names: Sequence[str]) -> "Skeleton":
+        """
+        Return the same layout with its points in another order.
+
+        Parameters
+        ----------
+        names : sequence of str of length n_points
+            The names of the points in the new order.
+
+        Returns
+        -------
+        Skeleton
+            The layout, whose `point_names` are those given.
+
+        Raises
+        ------
+        ValueError
+            If the layout has no names, or other ones.
+        """
+        if self.point_names is None or sorted(names) != sorted(self.point_names):
+            raise ValueError(f"these are not the names of the points of {self.name!r}")
+        order = [self.point_names.index(name) for name in names]
+        return replace(self.subset(order), name=self.name)
+
+
+_RIGHT_OF = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
+
+
+def skeleton_of_names(
+    edges: Sequence[Sequence[str]],
+    point_names: Sequence[str],
+    *,
+    name: str,
+    source: str,
+) -> Skeleton:
+    """
+    Make a skeleton of edges between points that have names.
+
+    Parameters
+    ----------
+    edges : sequence of pairs of str
+        The names of the two points of each edge.
+    point_names : sequence of str
+        The names of all points, in their order.
+    name : str
+        What to call the skeleton.
+    source : str
+        Where it is from.
+
+    Returns
+    -------
+    Skeleton
+        Points whose names differ by the words left and right only are on the sides.
+
+    Raises
+    ------
+    ValueError
+        If an edge is not between two of the points, or two points have one name.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.skeletons import skeleton_of_names
+    >>> mouse = skeleton_of_names([("snout", "leftear"), ("snout", "rightear")],
+    ...                           ["snout", "leftear", "rightear"],
+    ...                           name="mouse", source="config.yaml")
+    >>> mouse.left, mouse.right
+    ((1,), (2,))
+    """
+    names = [str(point) for point in point_names]
+    place = {point: j for j, point in enumerate(names)}
+    for edge in edges:
+        if isinstance(edge, str) or len(edge) != 2 or not {*edge} <= place.keys():
+            raise ValueError(
+                f"an edge of {name!r} should be a pair of the points "
+                f"{', '.join(names[:6])}{', ...' if len(names) > 6 else ''}; got "
+                f"{edge!r}"
+            )
+    curves = tuple((place[a], place[b]) for a, b in edges)
+    swapped = (re.sub("left|Left|LEFT", lambda m: _RIGHT_OF[m[0]], n) for n in names)
+    mirror = [place.get(point) for point in swapped]
+    pairs = [(j, k) for j, k in enumerate(mirror) if k is not None and k != j]
+    left, right = (tuple(pair[side] for pair in pairs) for side in (0, 1))
+    points = tuple(names)
+    return Skeleton(name, "other", len(names), curves, source, points, left, right)
+
+
+def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> Skeleton:
+    """
+    Read the skeleton of a project of DeepLabCut.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file ``config.yaml`` of the project, whose list ``skeleton`` has pairs of
+        bodyparts.
+    point_names : sequence of str
+        The names of the points of the table, in their order.
+
+    Returns
+    -------
+    Skeleton
+        The skeleton of these points.
+
+    Raises
+    ------
+    ValueError
+        If the file has no such list, or it has points that are not in the table.
+    OSError
+        If the file cannot be opened.
+    ImportError
+        If PyYAML is not installed.
+
+    See Also
+    --------
+    find_skeleton : A layout that is known.
+    """
+    yaml = import_optional("yaml", extra="yaml")
+    with reading(path, "a configuration of DeepLabCut"):
+        # YAML tells UTF-8 and UTF-16 apart itself. All values stay texts, also NO and
+        # 1, and merge keys, which can take exponential time, are names as others.
+        content = yaml.load(Path(path).read_bytes(), Loader=yaml.BaseLoader)
+        edges = content.get("skeleton") if isinstance(content, dict) else None
+        if not isinstance(edges, list) or not all(
+            isinstance(edge, list) and all(isinstance(part, str) for part in edge)
+            for edge in edges
+        ):
+            raise ValueError(
+                "it has no list of pairs of bodyparts called skeleton, such as [[nose, "
+                "chin], [chin, neck]]"
+            )
+        # A curve may be written as more than two bodyparts in turn.
+        pairs = [pair for edge in edges for pair in pairwise(edge)]
+        name = Path(path).name
+        source = f"DeepLabCut, {name}"
+        return skeleton_of_names(pairs, point_names, name=name, source=source)
 
 
 def _tuples(value: Any) -> Any:
     """Return a value of a data file, with tuples in place of lists."""
+    if isinstance(value, dict):
+        return {name: _tuples(each) for name, each in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-_FILE = Path(__file__).with_name("layouts.toml")
-_TABLES: dict[str, dict[str, Any]] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
-SKELETONS = MappingProxyType(
-    {
-        name: Skeleton(name, **{part: _tuples(entry[part]) for part in entry})
-        for name, entry in _TABLES["layouts"].items()
-    }
+_TEXT = Path(__file__).with_name("layouts.toml").read_text("utf-8")
+_TABLES = _tuples(tomllib.loads(_TEXT))
+SKELETONS: Mapping[str, Skeleton] = MappingProxyType(
+    {name: Skeleton(name, **entry) for name, entry in _TABLES["layouts"].items()}
 )
 # The layouts in which the readers of `isa_nrsfm.io` find points without names.
-LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = {
-    reader: tuple(names) for reader, names in _TABLES["readers"].items()
-}
+LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = _TABLES["readers"]
 
 # Edges of a layout are short: so long at most is their mean, relative to the mean
 # distance of all points. Faces in their own order have 0.14 to 0.25 in single images
