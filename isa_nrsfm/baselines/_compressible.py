@@ -204,9 +204,8 @@ def metric_correction(blocks: NDArray) -> NDArray:
     _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
     n_determined = min(int(np.sum(values > OF_RANKS * values[0])), 5)
     solutions = vectors[n_determined:]
-    basis = _metric.strain_basis(
-        "orthographic"
-    )  # the last one is the identity / sqrt(3)
+    # The last one is the identity / sqrt(3).
+    basis = _metric.strain_basis("orthographic")
     nearest = np.sqrt(3) * solutions[:, 5] @ solutions
     eigenvalues, axes = np.linalg.eigh(np.tensordot(nearest, basis, 1))
     eigenvalues = np.maximum(eigenvalues, eigenvalues[-1] / _metric.LARGEST_STRETCH**2)
