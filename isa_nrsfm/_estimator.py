@@ -195,18 +195,12 @@ default="affine"
         the explained energy (default 1e-10).
     random_state : int, RandomState instance or None, default=None
         Seeds the strategy; an int makes the result reproducible.
-    keep_frames : bool, default=True
-        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept.
-    frames_folder : str, path-like or None, default=None
-        Folder for the kept arrays. Each fit makes a new folder within it, with files
-        ``alpha.npy`` and so on, and never removes others. The attributes are memory
-        maps of these files; ``alpha_.filename`` is the path. None keeps them in memory.
-    working_memory : float or None, default=None
-        Largest memory of a block, in megabytes, of a table that is not in memory (a
-        memory map or a table of `isa_nrsfm.io.open_table`). None is scikit-learn's
-        setting `working_memory`. Each thread has a block of a memory map, of at most
-        128 megabytes. The result does not depend on it. In addition, about 1 kB per
-        frame is always in memory.
+    keep_frames : bool, str or path-like, default=True
+        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept: True
+        keeps them in memory, False not at all. A path is that of a folder for them.
+        Each fit makes a new folder within it, with files ``alpha.npy`` and so on, and
+        never removes others. The attributes are memory maps of these files;
+        ``alpha_.filename`` is the path.
     n_jobs : int or None, default=None
         Number of threads for the frames, in `fit` and in the methods for tables, and of
         joblib workers for strategies that use them and for the groups of the consensus.
@@ -336,8 +330,12 @@ default="affine"
 
     Notes
     -----
-    `fit` and the methods for new tables accept tables that are not in memory. For a
-    dask array, `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays,
+    `fit` and the methods for new tables accept tables that are not in memory: memory
+    maps and tables of `isa_nrsfm.io.open_table`. They are read in blocks, whose largest
+    memory is scikit-learn's setting ``sklearn.set_config(working_memory=...)``, in
+    MiB. Each thread has a block of a memory map, of at most 128 MiB. The result does
+    not depend on it. In addition, about 1 kB per frame is always in memory. For a dask
+    array, `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays,
     like the results of `transform`, `decompose`, `reconstruct` and `reproject`.
 
     Missing points are NaN, in `fit` and everywhere else. A point with one missing
@@ -428,9 +426,7 @@ default="affine"
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "tol": [None, Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
-        "keep_frames": ["boolean"],
-        "frames_folder": [None, str, HasMethods("__fspath__")],
-        "working_memory": [None, Interval(Real, 0, None, closed="neither")],
+        "keep_frames": ["boolean", str, HasMethods("__fspath__")],
         "n_jobs": N_JOBS,
         "verbose": ["verbose"],
     }
@@ -455,9 +451,7 @@ default="affine"
         max_iter: int = 1000,
         tol: float | None = None,
         random_state: Any = None,
-        keep_frames: bool = True,
-        frames_folder: str | os.PathLike[str] | None = None,
-        working_memory: float | None = None,
+        keep_frames: bool | str | os.PathLike[str] = True,
         n_jobs: int | None = None,
         verbose: int = 0,
     ):
@@ -479,8 +473,6 @@ default="affine"
         self.tol = tol
         self.random_state = random_state
         self.keep_frames = keep_frames
-        self.frames_folder = frames_folder
-        self.working_memory = working_memory
         self.n_jobs = n_jobs
         self.verbose = verbose
 
@@ -519,11 +511,11 @@ default="affine"
             for `n_components`, or column names that contradict `layout`; if a frame
             shows one to three points, or points on one line only; if a point is visible
             in too few frames; if parameters or tables need the joint refinement; if
-            `frames_folder` is an empty text; or if weights are negative, not finite, of
+            `keep_frames` is an empty text; or if weights are negative, not finite, of
             another shape, or not supported by parameters or table.
         OSError
-            If `frames_folder` cannot be made or written to, before the fit; if the disk
-            is full, after it.
+            If the folder `keep_frames` cannot be made or written to, before the fit; if
+            the disk is full, after it.
 
         Warns
         -----
@@ -534,7 +526,7 @@ default="affine"
             prior does not suit, or a fit has not converged.
         """
         self._forget()
-        with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
+        with kept_arrays(self.keep_frames) as keep, undetermined(self.camera):
             progress = FitProgress(self, stages_of(self), stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, groups=groups)
         progress.end()
@@ -1157,10 +1149,7 @@ default="affine"
         else:
             X = validated_table(self, X, layout, reset)
         names = getattr(self, "feature_names_in_", None)
-        n_jobs, memory = self.n_jobs, self.working_memory
-        table = open_table(
-            X, layout, names, counted=reset, n_jobs=n_jobs, working_memory=memory
-        )
+        table = open_table(X, layout, names, counted=reset, n_jobs=self.n_jobs)
         for share in self._focal_shares(table):
             table = zoomed_table(table, share, self.principal_point)
         weights: tuple[NDArray, ...] = ()

@@ -598,7 +598,7 @@ def adapting_errors(
     layout, pinhole = estimator._model.layout, estimator._model.pinhole
     given = {"layout": layout, "focal_length": pinhole and pinhole.focal_length}
     given |= {"n_components": "auto", "refinement": "joint", "prior": estimator}
-    adapted = clone(estimator).set_params(**given, frames_folder=None)
+    adapted = clone(estimator).set_params(**given, keep_frames=False)
     of_points = weights[0][::2] if weights else None
     with warnings.catch_warnings(action="ignore"):
         adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)

@@ -308,8 +308,9 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
         X, y = indexable(X, y)
         for_splitter, for_scorer = self._routed("fit", params)
         splits = list(plain.cv.split(X, y, **for_splitter))
-        given = estimator.get_params(deep=False) | {"frames_folder": None}
-        trial = StartedNRSfM(**given)
+        given = estimator.get_params(deep=False)
+        # No files of trials
+        trial = StartedNRSfM(**given | {"keep_frames": bool(estimator.keep_frames)})
         joint = trial.refinement in JOINT_REFINEMENTS
         if joint:  # a consensus only with the chosen K
             trial.set_params(refinement="joint")

@@ -560,7 +560,6 @@ def open_table(
     *,
     counted: bool = True,
     n_jobs: int | None = 1,
-    working_memory: float | None = None,
 ) -> FrameBlocks:
     """Return a table in blocks of rows (n, 2, n_points), float32 or float64.
 
@@ -569,7 +568,7 @@ def open_table(
 
     Arrays in memory must be checked already. `n_jobs` threads share their blocks and
     those of memory maps. Chunks of dask stay on its workers. Blocks of tables that are
-    read later use at most `working_memory` megabytes.
+    read later use at most the working memory of scikit-learn's configuration.
     """
     if X.ndim != 2:
         raise ValueError(
@@ -590,10 +589,9 @@ def open_table(
     if is_on_dask(X):
         blocks = DaskBlocks.of_chunks(X)
     else:
-        if working_memory is None:
-            working_memory = get_config()["working_memory"]
         # A block needs at most eight times its own memory, copies included.
-        numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
+        memory = 2**20 * get_config()["working_memory"]
+        numbers = memory / (8 * np.dtype(float).itemsize)
         most = max(int(numbers // n_columns), 1)
         if isinstance(X, np.memmap):
             most = min(most, length)
