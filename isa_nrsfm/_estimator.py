@@ -43,7 +43,7 @@ from isa_nrsfm._frames.camera_models import (
     focal_shares,
     full_rotations,
     pose_effect,
-    zoomed_table,
+    zoomed,
 )
 from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
@@ -525,7 +525,9 @@ default="affine"
             coordinate, rows are left out or mirror images, outliers bend the shapes, a
             prior does not suit, or a fit has not converged.
         """
-        self._forget()
+        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
+        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
+        self.__dict__ = {name: vars(self)[name] for name in names}
         with kept_arrays(self.keep_frames) as keep, undetermined(self.camera):
             progress = FitProgress(self, stages_of(self), stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, groups=groups)
@@ -651,12 +653,6 @@ default="affine"
         """Return the mean focal length over those of frames (n, 1), if they differ."""
         given = getattr(self, "focal_length_", self.focal_length)
         return focal_shares(given, table.n_frames)
-
-    def _forget(self) -> None:
-        """Remove all results of an earlier fit at once."""
-        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
-        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
-        self.__dict__ = {name: vars(self)[name] for name in names}
 
     def __sklearn_clone__(self) -> Any:
         """Return an unfitted copy, whose prior is still fitted."""
@@ -1151,7 +1147,9 @@ default="affine"
         names = getattr(self, "feature_names_in_", None)
         table = open_table(X, layout, names, counted=reset, n_jobs=self.n_jobs)
         for share in self._focal_shares(table):
-            table = zoomed_table(table, share, self.principal_point)
+            # As cameras with the mean focal length would show the rows
+            moved = partial(zoomed, centre=np.reshape(self.principal_point, (2, 1)))
+            table = table.derive(moved, share[..., None])
         weights: tuple[NDArray, ...] = ()
         if point_weight is not None:
             table, weights = weighted_rows(table, point_weight)

@@ -45,18 +45,20 @@ from isa_nrsfm._frames.camera_models import (
     Pinhole,
     common,
     compose,
+    distances,
     line_of_sight,
+    mean_view,
     nearest_calibrated,
     pinhole_of,
-    reference_camera,
-    reprojection_error,
 )
 from isa_nrsfm._frames.gauge import (
+    canonical_gauge,
+    canonical_space,
+    coefficient_sizes,
+    euclidean_space,
     image_energies,
     independent_gauge,
     mode_covariance,
-    reorder_blocks,
-    rigid_gauge,
 )
 from isa_nrsfm._frames.models import (
     MIRROR,
@@ -87,7 +89,7 @@ from isa_nrsfm._joint.uncertainty import (
 )
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.robust import gross_outliers, robust_square
+from isa_nrsfm._prepare.robust import TUNING, gross_outliers
 from isa_nrsfm._prepare.scaling import (
     ScaledTable,
     largest_n_components,
@@ -214,7 +216,7 @@ def stages_of(estimator: Any) -> list[str]:
     return stages + [PERSPECTIVE_STAGE] * (estimator.camera == "perspective")
 
 
-@one_blas_thread
+@one_blas_thread()
 def fit_table(
     table: ScaledTable,
     n_components: int,
@@ -295,8 +297,10 @@ def _joint_fit(
     that are shown, some attributes are lacking.
     """
     table, settings = factorised.scaled, settings._replace(on_step=progress.step)
-    args = factorised, shapes, given
-    fit, tracks, alpha = settings.remembered("joint", fit_jointly, *args)
+    known = {} if settings.known is None else settings.known
+    if "joint" not in known:
+        known["joint"] = fit_jointly(factorised, shapes, given, settings)
+    fit, tracks, alpha = known["joint"]
     settings = settings._replace(shape_prior=fit.prior)
     progress(JOINT_STAGE)
     (shapes, _, noise), starts, widths = fit.state, spread_starts(alpha, 8), fit.widths
@@ -314,12 +318,12 @@ def _joint_fit(
             n_unknowns = widths.n_unknowns(len(table.sizes), settings.camera)
             noise *= n_numbers / (n_numbers - n_unknowns)
         grouped = fit.misfit > noise
-    if (needed := errors and calibrated) and (
-        not grouped or "certainty" in (settings.known or ())
-    ):
+    needed = errors and calibrated
+    if needed and not grouped and "certainty" not in known:
         of = model, table.rows, table.weights, widths, fit.rivals
-        certainty = settings.remembered("certainty", depth_certainty, *of)
-        model, needed = replace(model, certainty=certainty), False
+        known["certainty"] = depth_certainty(*of, settings)
+    if needed and "certainty" in known:
+        model, needed = replace(model, certainty=known["certainty"]), False
     if errors and widths is not None and not grouped:
         mean = bagged(model, table, settings, widths)
         if mean is not None:
@@ -357,7 +361,7 @@ def _joint_fit(
     return result._replace(converged=fit.converged, attributes=attributes)
 
 
-@one_blas_thread
+@one_blas_thread()
 def supported_components(
     table: ScaledTable,
     isa: Any,
@@ -459,16 +463,36 @@ def _paper_fit(
         scaled = s.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
 
-    # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
-    def fitted(mean_shape: NDArray, basis: NDArray) -> tuple[TableModel, Decomposition]:
+    def fitted() -> tuple[TableModel, Decomposition]:
         frames, K = FrameModel.rigid(mean_shape, basis, s.camera), len(basis)
         model = TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
         return model, table.source.joined(partial(model.decompose, dtype=np.float64))
 
-    model, frames, order = rigid_gauge(
-        shapes[0].T, shapes[1:].mT, table.sizes, fitted, s.camera, table.dtype
-    )
-    covariance = (table.unit or 1.0) ** 2 * reorder_blocks(covariance, order)
+    # The gauge is that of a fit to visible points, not to completed frames. One scaling
+    # is enough, unless frames have fewer points than coefficients need.
+    mean_shape, basis, order = shapes[0].T, shapes[1:].mT, np.arange(len(shapes) - 1)
+    model, frames = fitted()
+    for _ in range(50):
+        motion = frames.motion / table.sizes[:, None, None]
+        if s.camera == "affine":
+            space = canonical_space(mean_shape, motion)
+        else:
+            size = 1.0 if s.camera == "orthographic" else None
+            space = euclidean_space(mean_shape, motion, size)
+        mean_shape, basis, new_order, _ = canonical_gauge(
+            mean_shape, basis, motion, frames.alpha, space
+        )
+        order = order[new_order]
+        # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
+        mean_shape, basis = mean_shape.astype(table.dtype), basis.astype(table.dtype)
+        model, frames = fitted()
+        # Coefficients scale with the basis shapes. If a frame does not determine its
+        # coefficients, their solution of minimum norm changes.
+        off = coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
+        if np.abs(off).max(initial=0.0) <= 1e-6:
+            break
+    index = (3 * order[:, None] + np.arange(3)).ravel()
+    covariance = (table.unit or 1.0) ** 2 * covariance[np.ix_(index, index)]
     return TableFit(model, frames, True, {"mode_covariance_": covariance})
 
 
@@ -558,7 +582,15 @@ def _measures(
     energy = image_energies(cameras, basis, frames.alpha)
     position = (frames.translation - table.translation) / table.sizes[:, None]
     shapes = np.concatenate([mean_shape[None], basis]).mT
-    error = reprojection_error(table.rows, shapes, cameras, position, frames.alpha)
+
+    def energies(rows: NDArray, *fit: NDArray) -> tuple[float, float]:
+        """Return the energies of residuals over visible points, and of frames."""
+        noise = np.nansum(distances(rows, shapes, *fit) ** 2)
+        middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
+        return float(noise), float(np.nansum((rows - middle) ** 2))
+
+    passes = table.rows.map(energies, cameras, position, frames.alpha)
+    noise, signal = np.sum(list(passes), axis=0)
     reference = mean_camera(frames, table.sizes, camera)
     return {
         "mean_shape_": mean_shape,
@@ -566,13 +598,23 @@ def _measures(
         "rank_floor_": factorised.rest_share(3 * K + 3),
         "singular_values_": (table.unit or 1.0) * values[: 3 * K + 3],
         "energy_share_": energy[:K] / (energy.sum() or 1.0),
-        "inverse_snr_": error,
+        "inverse_snr_": float(noise / signal),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 
 def mean_camera(frames: Decomposition, sizes: NDArray, camera: str) -> dict[str, Any]:
-    """Return the attributes of the mean view of frames of some sizes (n,)."""
-    reference = reference_camera(frames.motion / sizes[:, None, None], sizes)
+    """Return the attributes of the mean view of frames of some sizes (n,).
+
+    That of cameras over the sizes of their frames, times the RMS size. If they have no
+    common view, it is the view along the third axis, each axis scaled by its RMS length
+    in the cameras.
+    """
+    motion = frames.motion / sizes[:, None, None]
+    reference = mean_view(motion)
+    if reference is None:
+        lengths = np.sqrt(np.mean(np.sum(motion**2, axis=1), axis=0))
+        reference = lengths * np.eye(2, 3)
+    reference = reference * np.sqrt(np.mean(sizes**2))
     if camera != "affine":
         (row,), (scale,) = nearest_calibrated(reference[None])
         reference = scale * row
@@ -605,11 +647,13 @@ class Images(NamedTuple):
 
         Without a camera they are those of the table.
         """
-        rows, model = self.source, None if fit is None else fit.model
-        known = () if fit is None else (fit.frames.motion, fit.frames.alpha)
+        rows = self.source
         if pinhole is not None:
-            straight = partial(_straight, pinhole=pinhole, model=model)
-            rows = rows.derive(straight, *known)
+            rows = rows.derive(pinhole.virtual, kept=fit is None)
+            if fit is not None:
+                depths, known = fit.model.depths, (fit.frames.motion, fit.frames.alpha)
+                straight = pinhole.straight
+                rows = rows.derive(lambda r, *f: straight(r, depths(*f)), *known)
         return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
@@ -690,12 +734,6 @@ class Images(NamedTuple):
         if self.log_odds(better, worse) < 0:
             better, worse = worse, better
         return {1.0 / f: better, -1.0 / f: worse}
-
-    def preferred(self, model: TableModel, weak: TableModel) -> bool:
-        """Return whether held-out points prefer a model to weak perspective."""
-        known = () if self.weights is None else (self.weights,)
-        ours, theirs = (m.held_out_error(self.source, *known) for m in (model, weak))
-        return ours < theirs
 
     def log_odds(self, fit: TableFit, image: TableFit) -> float:
         """Return the log odds of a fit against its mirror image.
@@ -846,10 +884,13 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
             fit = last(best.pinhole, n_last, fit)
     plain = partial(last, None, n_components or 1, free=n_components is None)
+    weights = () if table.weights is None else (table.weights,)
     if not why and settings.start is None:
         with warnings.catch_warnings(action="ignore"):
             weak = (settings.known or {}).get("weak") or plain(errors=False).model
-        why = "" if table.preferred(fit.model, weak) else NOT_BETTER
+        models = fit.model, weak
+        error, of_weak = (m.held_out_error(table.source, *weights) for m in models)
+        why = "" if error < of_weak else NOT_BETTER
     table.progress(PERSPECTIVE_STAGE)
     if why:
         warn_caller(f"{why}. {WEAK}")
@@ -865,7 +906,6 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         probability = float(expit(table.log_odds(fits[least], fits[-least])))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
     # Frames as new tables have them
-    weights = () if table.weights is None else (table.weights,)
     decompose = partial(model.decompose, dtype=np.float64)
     frames: Decomposition = table.source.joined(decompose, *weights)
     dtype = table.source.empty.dtype
@@ -899,20 +939,11 @@ def focal_error(
     return float(change * deviation / abs(second - first))
 
 
-def _straight(
-    rows: NDArray, *frames: NDArray, pinhole: Pinhole, model: TableModel | None
-) -> NDArray:
-    """Return weak-perspective images (n, 2, J) of rows, for the depths of a model.
-
-    Frames are cameras and coefficients. Without a model depths are equal.
-    """
-    images = pinhole.virtual(rows)
-    return images if model is None else pinhole.straight(images, model.depths(*frames))
-
-
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
     square = model.distances(rows, *model.in_table_cameras(rows, *fit)[:3]) ** 2
     if model.frames.loss != "linear":
-        square = robust_square(square, model.frames.noise_variance)
+        # As the loss "cauchy" has them
+        limit = model.frames.noise_variance * TUNING["cauchy"] ** 2
+        square = limit * np.log1p(square / limit)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

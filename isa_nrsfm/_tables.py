@@ -355,7 +355,7 @@ class FrameBlocks:
 
         return self.read_later(rows, len(chosen), length, self.n_threads)
 
-    @one_blas_thread
+    @one_blas_thread()
     def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
         """Join the results of a function of each block: arrays, or tuples of them."""
         parts = list(self.map(function, *by_frame)) or [function(self.empty)]

@@ -32,7 +32,6 @@ those of the weak-perspective camera with the same rotation and position: ``s_i 
 T_3``, ``t_i = s_i T_12 + c``.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,7 +51,7 @@ from isa_nrsfm._linalg import (
     unpacked,
 )
 from isa_nrsfm._prepare.robust import spatial_median
-from isa_nrsfm._tables import FrameBlocks, centred_frames
+from isa_nrsfm._tables import centred_frames
 
 # Largest rotation of a camera in one step, in radians, and largest change of the
 # logarithm of its scale.
@@ -300,41 +299,6 @@ def mean_view(motion: NDArray) -> NDArray | None:
     return mean if smaller > 0.2 * root_mean_square else None
 
 
-def reference_camera(motion: NDArray, sizes: NDArray) -> NDArray:
-    """Return a typical camera (2, 3) of a table, for default images of shapes.
-
-    The cameras (n, 2, 3) are divided by the sizes (n,) of their frames. The result is
-    their mean, times the RMS size. If they have no common view, it is the view along
-    the third axis, each axis scaled by its RMS length in the cameras.
-    """
-    camera = mean_view(motion)
-    if camera is None:
-        camera = np.sqrt(np.mean(np.sum(motion**2, axis=1), axis=0)) * np.eye(2, 3)
-    return camera * np.sqrt(np.mean(sizes**2))
-
-
-def reprojection_error(
-    W: FrameBlocks, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
-) -> float:
-    """Return the inverse SNR ``||W - W_hat||_F^2 / ||W||_F^2`` over the visible points.
-
-    Frames of W, blocks (n, 2, J), are below centred. Motion (n, 2, 3), position (n, 2)
-    and alpha (n, K) are those of all frames, shapes (K + 1, 3, J).
-    """
-    energies = W.map(partial(_energies, shapes=shapes), motion, position, alpha)
-    noise, signal = np.sum(list(energies), axis=0)
-    return float(noise / signal)
-
-
-def _energies(
-    rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
-) -> tuple[float, float]:
-    """Return the energies of the residuals of a block, and of its centred frames."""
-    noise = np.nansum(distances(rows, shapes, motion, position, alpha) ** 2)
-    middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
-    return float(noise), float(np.nansum((rows - middle) ** 2))
-
-
 def distances(
     rows: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> NDArray:
@@ -519,9 +483,3 @@ def focal_shares(focal_length: Any, n_frames: int) -> tuple[NDArray, ...]:
 def zoomed(rows: NDArray, share: NDArray, centre: NDArray) -> NDArray:
     """Return coordinates with their distances from a centre times a share."""
     return ((rows - centre) * share + centre).astype(rows.dtype)
-
-
-def zoomed_table(table: FrameBlocks, shares: NDArray, centre: Any) -> FrameBlocks:
-    """Return the rows (n, 2, J) that cameras with the mean focal length would show."""
-    middle = np.reshape(centre, (2, 1))
-    return table.derive(lambda r, share: zoomed(r, share[..., None], middle), shares)

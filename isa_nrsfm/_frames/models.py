@@ -444,7 +444,7 @@ class FrameModel:
         if self.loss == "linear":
             return fitted(rows, weights=weights, starts=self.starts)
         # Robust loss: outliers are no reason for further starts. The median of the
-        # residuals hardly depends on them. The threshold is as in `largest_objective`.
+        # residuals hardly depends on them. The threshold is as in `FrameSearch.fit`.
         fit = self._reweighted(rows, fitted)
         distance = distances(rows, self.shapes, *fit[:3])
         median = lower_medians(distance, seen_points(rows))[:, 0]

@@ -462,7 +462,7 @@ def neighbourhoods(distances: NDArray, size: int) -> list[tuple[NDArray, int]]:
     return list(zip(groups, counts.tolist(), strict=True))
 
 
-@one_blas_thread
+@one_blas_thread()
 def group_fit(
     scene: Scene, n_components: int, settings: FitSettings
 ) -> tuple[NDArray, NDArray, float] | None:

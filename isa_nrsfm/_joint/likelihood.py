@@ -229,17 +229,13 @@ class MarginalLikelihood(NamedTuple):
         self, shapes: NDArray, motion: NDArray, noise: float
     ) -> LikelihoodTerms:
         """Return the terms at shapes (n, 3, J), motion (I, 2, 3), noise variance s2."""
-        n_seen, square = self.frames.totals
-        products, penalty = ShapeProducts(shapes), self.penalty
-        # If the noise is tiny, refine the solution of the normal equations by one step.
-        tiny_noise = noise * n_seen < 1e-7 * square
+        products, (n_seen, _) = ShapeProducts(shapes), self.frames.totals
 
         def over_block(block: FrameTracks, motion: NDArray) -> Terms:
             """Return the sums over pieces whose matrices fit the cache."""
             M, parts = frames_last(motion), []
             for frames, piece in block.pieces():
-                M_i = M[:, :, frames]
-                parts.append(_terms(piece, M_i, products, noise, penalty, tiny_noise))
+                parts.append(self._terms(piece, M[:, :, frames], products, noise))
             return _joined(parts)
 
         sums, by_frame = _joined(self.frames.blocks.map(over_block, motion))
@@ -256,8 +252,8 @@ class MarginalLikelihood(NamedTuple):
         shape_gradient = shape_gradient + (2 / noise) * pulled
         if self.extent_weight:
             weight = self.extent_weight * n_seen
-            penalty, slope = extent_penalty(shapes, self.frames.point_shares)
-            value += weight * penalty
+            term, slope = extent_penalty(shapes, self.frames.point_shares)
+            value += weight * term
             shape_gradient = shape_gradient + weight * slope
         if self.prior is not None:
             term, slope = self.prior.term(shapes)
@@ -273,6 +269,51 @@ class MarginalLikelihood(NamedTuple):
             np.ascontiguousarray(alpha.T),
         )
 
+    def _terms(
+        self, block: FrameTracks, M: NDArray, shapes: ShapeProducts, noise: float
+    ) -> Terms:
+        """Return the sums over frames of a block, with cameras M (2, 3, n_frames).
+
+        The curvature of the shapes is packed: (n_pairs, 6, n_points or 1).
+        """
+        n_shapes, _, n_points = shapes.shapes.shape
+        n_seen, square = self.frames.totals
+        products, penalty = frame_sums(block, shapes), self.penalty
+        # If the noise is tiny, refine the solution of the normal equations by one step.
+        tiny = noise * n_seen < 1e-7 * square
+        posterior = coefficient_posterior((products, noise), M, refined=tiny)
+        c, alpha = posterior.c, posterior.alpha
+        value = np.sum(posterior.objective / noise + posterior.log_determinant)
+        value += np.sum(penalty * posterior.image_energy.sum(axis=1))
+        residual = float(posterior.residual(noise).sum())
+        spread = float(posterior.spread(noise).sum())
+
+        # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
+        moments = posterior.second_moments(noise)
+        moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
+        cameras = camera_gram(M)
+        # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
+        motion_curvature = products.gram.moments(moments)
+        G = np.einsum("rbi,bai->rai", M, unpack3(motion_curvature))
+        G -= np.einsum("ki,kari->rai", c, products.cross)
+        # By the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
+        X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
+        shape_gradient = X @ block.deviations.reshape(n_points, -1).T
+        if block.weights is None:
+            shape_curvature = (moments @ cameras.T)[:, :, None]
+        else:
+            pairs = (moments[:, None] * cameras).reshape(6 * len(moments), -1)
+            shape_curvature = (pairs @ block.weights.T).reshape(-1, 6, n_points)
+            # The eliminated position of a frame depends on the means of the shapes.
+            middles = products.shape_centroid
+            mixed = np.einsum("kli,lbi->kbi", unpacked(moments), middles)
+            means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
+            shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
+        noise_gradient = -(residual + spread) / noise
+        shape_gradient = (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape)
+        sums = float(value), noise_gradient, shape_gradient, shape_curvature, residual
+        return sums, ((2 / noise) * G, motion_curvature, alpha)
+
 
 def _joined(parts: Iterable[Terms]) -> Terms:
     """Add the sums of consecutive frames, and concatenate the terms of each frame."""
@@ -285,53 +326,6 @@ def _joined(parts: Iterable[Terms]) -> Terms:
         return sums, own
     join = partial(np.concatenate, axis=-1)
     return sums, tuple(map(join, zip(*by_frame, strict=True)))
-
-
-def _terms(
-    block: FrameTracks,
-    M: NDArray,
-    shapes: ShapeProducts,
-    noise: float,
-    penalty: NDArray | float,
-    tiny_noise: bool,
-) -> Terms:
-    """Return the sums over frames, M (2, 3, n_frames), for `MarginalLikelihood`.
-
-    The curvature of the shapes is packed: (n_pairs, 6, n_points or 1).
-    """
-    n_shapes, _, n_points = shapes.shapes.shape
-    products = frame_sums(block, shapes)
-    posterior = coefficient_posterior(products, M, noise, refined=tiny_noise)
-    c, alpha = posterior.c, posterior.alpha
-    value = np.sum(posterior.objective / noise + posterior.log_determinant)
-    value += np.sum(penalty * posterior.image_energy.sum(axis=1))
-    residual = float(posterior.residual(noise).sum())
-    spread = float(posterior.spread(noise).sum())
-
-    # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
-    moments = posterior.second_moments(noise)
-    moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
-    cameras = camera_gram(M)
-    # With respect to the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
-    motion_curvature = products.gram.moments(moments)
-    G = np.einsum("rbi,bai->rai", M, unpack3(motion_curvature))
-    G -= np.einsum("ki,kari->rai", c, products.cross)
-    # With respect to the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
-    X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
-    shape_gradient = X @ block.deviations.reshape(n_points, -1).T
-    if block.weights is None:
-        shape_curvature = (moments @ cameras.T)[:, :, None]
-    else:
-        pairs = (moments[:, None] * cameras).reshape(6 * len(moments), -1)
-        shape_curvature = (pairs @ block.weights.T).reshape(-1, 6, n_points)
-        # The eliminated position of a frame depends on weighted means of the shapes.
-        mixed = np.einsum("kli,lbi->kbi", unpacked(moments), products.shape_centroid)
-        means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
-        shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
-    noise_gradient = -(residual + spread) / noise
-    shape_gradient = (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape)
-    sums = float(value), noise_gradient, shape_gradient, shape_curvature, residual
-    return sums, ((2 / noise) * G, motion_curvature, alpha)
 
 
 def extent_penalty(

@@ -52,12 +52,6 @@ def frame_weights(
     return np.where(belongs, WEIGHTS[loss](near / deviation), 0.0)
 
 
-def robust_square(square: NDArray, noise: float) -> NDArray:
-    """Return squared distances as the loss "cauchy" has them, for a noise."""
-    limit = noise * TUNING["cauchy"] ** 2
-    return np.asarray(limit * np.log1p(square / limit))
-
-
 def median_noise(distance: NDArray) -> float:
     """Return the noise of a coordinate from the median of distances (n,)."""
     return float(np.median(distance) / MEDIAN_DISTANCE)

@@ -430,7 +430,7 @@ class ScaledTable(NamedTuple):
         return bool((self.n_seen == self.n_points).all())
 
 
-@one_blas_thread
+@one_blas_thread()
 def scaled_table(
     blocks: FrameBlocks, weights: NDArray | None, n_components: int, settings: Any
 ) -> ScaledTable:

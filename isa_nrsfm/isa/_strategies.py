@@ -46,7 +46,7 @@ class BaseSubspaceAnalysis(
     }
 
     # For matrices of this size, threads take more time than they save.
-    @one_blas_thread
+    @one_blas_thread()
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals, size = unmasked(signals), self.subspace_size
