@@ -320,8 +320,7 @@ def _joint_fit(
         grouped = fit.misfit > noise
     needed = errors and calibrated
     if needed and not grouped and "certainty" not in known:
-        of = model, table.rows, table.weights, widths, fit.rivals
-        known["certainty"] = depth_certainty(*of, settings)
+        known["certainty"] = depth_certainty(model, table, fit, settings)
     if needed and "certainty" in known:
         model, needed = replace(model, certainty=known["certainty"]), False
     if errors and widths is not None and not grouped:
@@ -706,11 +705,7 @@ class Images(NamedTuple):
         return fit._replace(energies=square / counts.sum())
 
     def settled(
-        self,
-        pinhole: Pinhole,
-        n_components: int,
-        *fits: TableFit,
-        tol: float = SETTLED,
+        self, pinhole: Pinhole, n_components: int, *fits: TableFit, tol: float = SETTLED
     ) -> list[TableFit]:
         """Repeat fits until depths and fits agree; return them, the best first.
 

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -140,7 +141,8 @@ class TableModel(NamedTuple):
             return rows
         images = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
-        weak = self._replace(frames=self.frames.without_starts, pinhole=None)
+        frames = replace(self.frames, starts=self.frames.starts[:0])
+        weak = self._replace(frames=frames, pinhole=None)
         moving = np.arange(len(rows))
         for _ in range(30 if pinhole.near else 0):
             moving = padded(moving)
@@ -161,13 +163,6 @@ class TableModel(NamedTuple):
         shapes = compose(self.mean_shape, self.basis, alpha)
         return np.vecdot(shapes, line_of_sight(motion)[:, None])
 
-    def mirrored(self) -> "TableModel":
-        """Return the model with shapes mirrored in depth."""
-        mirror = MIRROR.astype(self.mean_shape.dtype)
-        mean_shape, basis = self.mean_shape * mirror, self.basis * mirror
-        frames = self.frames.mirrored()
-        return self._replace(frames=frames, mean_shape=mean_shape, basis=basis)
-
     def mirrored_attributes(self, known: dict[str, Any]) -> dict[str, Any]:
         """Return the attributes of the mirror image in depth, from those of a fit."""
         signs, K = MIRROR.astype(self.mean_shape.dtype), self.n_components
@@ -184,7 +179,12 @@ class TableModel(NamedTuple):
             across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
             found["rotations_"] = (across @ R * signs).astype(R.dtype)
         found["mirror_certainty_"] = 1.0 - known.get("mirror_certainty_", np.nan)
-        return found | {"_model": self.mirrored()}
+        gauge = self.frames.gauge
+        gauge = gauge._replace(space=MIRROR[:, None] * gauge.space)
+        frames, mean_shape = replace(self.frames, gauge=gauge), self.mean_shape * signs
+        basis = self.basis * signs
+        model = self._replace(frames=frames, mean_shape=mean_shape, basis=basis)
+        return found | {"_model": model}
 
     def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
         """
@@ -521,9 +521,7 @@ def of_fits(
     later = is_read_later(X)
     table, weights = estimator._opened(X, point_weight, judged=later)
     shares, n = estimator._focal_shares(table), len(weights)
-
-    def fits(rows: NDArray, *weights: NDArray) -> Decomposition:
-        return estimator._model.decompose(rows, *weights, deviations=deviations)
+    fits = partial(estimator._model.decompose, deviations=deviations)
 
     def results(rows: NDArray, *by_frame: NDArray) -> Any:
         return result(fits(rows, *by_frame[:n]), *by_frame[n:])

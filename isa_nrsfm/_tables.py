@@ -25,7 +25,7 @@ import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import NDArray
 from sklearn import get_config
-from sklearn.utils import check_array
+from sklearn.utils import check_array, gen_batches
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
@@ -386,12 +386,9 @@ class FrameBlocks:
         """Join consecutive blocks in memory into blocks of at most n_frames frames."""
         if not self.cached:
             return self
-        groups: list[list[int]] = [[]]
-        for number, length in enumerate(self.lengths):
-            size = sum(self.lengths[other] for other in groups[-1])
-            if groups[-1] and size + length > n_frames:
-                groups.append([])
-            groups[-1].append(number)
+        together = max(n_frames // max(self.lengths), 1)
+        numbers = range(len(self.lengths))
+        groups = [numbers[part] for part in gen_batches(len(numbers), together)]
         blocks = [join(list(map(self.read, group))) for group in groups]
         lengths = [sum(self.lengths[number] for number in group) for group in groups]
         return self.of_blocks(blocks, lengths, self.n_threads)

@@ -220,10 +220,8 @@ class CalibratedCameras:
 
 
 CameraModel = AffineCameras | CalibratedCameras
-CAMERAS: dict[str, CameraModel] = {
-    model.name: model
-    for model in (AffineCameras(), CalibratedCameras(True), CalibratedCameras(False))
-}
+_MODELS = AffineCameras(), CalibratedCameras(True), CalibratedCameras(False)
+CAMERAS: dict[str, CameraModel] = {model.name: model for model in _MODELS}
 
 
 def turning(M: NDArray) -> NDArray:

@@ -299,19 +299,9 @@ class FrameModel:
         """The search for frames, shared by all tables."""
         return FrameSearch(self.shapes, CAMERAS[self.camera])
 
-    @cached_property
-    def without_starts(self) -> "FrameModel":
-        """The model that fits each frame from zero only."""
-        return replace(self, starts=self.starts[:0])
-
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def mirrored(self) -> "FrameModel":
-        """Return the model whose public shapes are mirrored in depth."""
-        space = MIRROR[:, None] * self.gauge.space
-        return replace(self, gauge=self.gauge._replace(space=space))
 
     def fit(
         self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None

@@ -548,19 +548,15 @@ class FrameSearch:
         weights = np.where(seen_points(rows), given, 0.0)
         complete = (weights == 1.0).all(axis=1)
         fits = FramePosterior.unknown(n_frames, n_components, covariances)
+        fit = partial(self.fit, starts=starts, covariances=covariances)
         # Complete frames share one Gram matrix.
         for chosen in np.flatnonzero(complete), np.flatnonzero(~complete):
             if len(chosen):
                 frames = padded(chosen)
                 own = None if complete[frames[0]] else weights[frames]
-                fit = self.fit(
-                    frame_tracks(rows[frames], own),
-                    noise[frames],
-                    initial=None if initial is None else initial[frames],
-                    starts=starts,
-                    covariances=covariances,
-                )
-                fits.put(frames, fit)
+                first = None if initial is None else initial[frames]
+                tracks = frame_tracks(rows[frames], own)
+                fits.put(frames, fit(tracks, noise[frames], initial=first))
         return fits
 
     def fit(
@@ -690,9 +686,8 @@ class FrameSearch:
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
-        return self._derivatives(
-            problem, position, coefficient_posterior(problem, position)
-        )[0]
+        posterior = coefficient_posterior(problem, position)
+        return self._derivatives(problem, position, posterior)[0]
 
     def _derivatives(
         self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior

@@ -293,9 +293,7 @@ def consensus(
         n_components = min(len(model.shapes) - 1, MOST_FIRST)
         begun = group_fits(scene, distances, n_components, settings)
     if errors:
-        certainty = depth_certainty(
-            model, table.rows, table.weights, joint.widths, joint.rivals, settings
-        )
+        certainty = depth_certainty(model, table, joint, settings)
     groups = []
     for (points, count), result in zip(*begun, strict=True):
         if settings.on_step is not None:

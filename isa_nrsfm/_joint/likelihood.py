@@ -146,7 +146,14 @@ class JointFrames:
     @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
         """Return complete rows (I, 2, J) by products with directions of sum zero."""
-        blocks = rows.derive(partial(_compressed_frames, directions=directions))
+
+        def compressed(rows: NDArray) -> FrameTracks:
+            n, _, n_points = rows.shape
+            products = (rows.reshape(2 * n, -1) @ directions.T).reshape(n, 2, -1)
+            W, weight = np.ascontiguousarray(products.T), np.full(n, float(n_points))
+            return FrameTracks(W, None, np.zeros((2, n)), weight, energies(rows))
+
+        blocks = rows.derive(compressed)
         return cls(blocks.regrouped(joined_frames, BLOCK_FRAMES), directions)
 
     def coordinates(self, shapes: NDArray) -> NDArray:
@@ -171,14 +178,6 @@ class JointFrames:
         lengths = [len(part.weight) for part in taken]
         blocks = FrameBlocks.of_blocks(taken, lengths, self.blocks.n_threads)
         return replace(self, blocks=blocks.regrouped(joined_frames, BLOCK_FRAMES))
-
-
-def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
-    """Return complete frames (I, 2, J) with directions in the place of points."""
-    n_frames, _, n_points = rows.shape
-    products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
-    W, weight = np.ascontiguousarray(products.T), np.full(n_frames, float(n_points))
-    return FrameTracks(W, None, np.zeros((2, n_frames)), weight, energies(rows))
 
 
 # Terms that are summed over frames, and those of each frame, in the order below
@@ -240,7 +239,7 @@ class MarginalLikelihood(NamedTuple):
 
         sums, by_frame = _joined(self.frames.blocks.map(over_block, motion))
         value, noise_gradient, shape_gradient, packed, residual = sums
-        motion_gradient, motion_curvature, alpha = by_frame
+        *of_cameras, alpha = by_frame
         # Matrices (n, size, size) from the sums, packed by shapes and by axes
         size = 3 * len(shapes)
         curvature = unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3)
@@ -258,16 +257,9 @@ class MarginalLikelihood(NamedTuple):
         if self.prior is not None:
             term, slope = self.prior.term(shapes)
             value, shape_gradient = value + term, shape_gradient + slope
-        return LikelihoodTerms(
-            float(value),
-            float(noise_gradient + freedom),
-            shape_gradient,
-            curvature,
-            residual,
-            motion_gradient,
-            motion_curvature,
-            np.ascontiguousarray(alpha.T),
-        )
+        noise_gradient, alpha = float(noise_gradient + freedom), alpha.T.copy()
+        sums = float(value), noise_gradient, shape_gradient, curvature, residual
+        return LikelihoodTerms._make((*sums, *of_cameras, alpha))
 
     def _terms(
         self, block: FrameTracks, M: NDArray, shapes: ShapeProducts, noise: float

@@ -81,12 +81,9 @@ class FactorisedTable(NamedTuple):
         """
         # Mean energy of the dimensions beyond, over that of all seen - 1 dimensions
         seen = float(np.mean(self.scaled.n_seen))
-        n_others = seen - 1 - (3 * n_components + 3)
-        noise = (
-            self.rest_share(3 * n_components + 3) * (seen - 1) / n_others
-            if n_others > 0
-            else 0.0
-        )
+        rank = 3 * n_components + 3
+        n_others = seen - 1 - rank
+        noise = self.rest_share(rank) * (seen - 1) / n_others if n_others > 0 else 0.0
         # Points that were filled in add to the energy of the table, but have no noise.
         return noise * self.W.shape[1] / seen
 

@@ -23,12 +23,7 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._joint.prior import STEP, ShapePrior
-from isa_nrsfm._joint.problem import (
-    FactorisedTable,
-    JointFit,
-    JointProblem,
-    JointState,
-)
+from isa_nrsfm._joint.problem import FactorisedTable, JointFit, JointProblem, JointState
 from isa_nrsfm._linalg import OF_PRODUCTS, frames_last
 from isa_nrsfm._tables import spread
 from isa_nrsfm.calibration._metric_upgrade import best_metric
@@ -133,11 +128,7 @@ def steadied(motion: NDArray) -> NDArray:
 
 
 def reversed_groups(
-    problem: JointProblem,
-    rows: NDArray,
-    motion: NDArray,
-    alpha: NDArray,
-    n_groups: int,
+    problem: JointProblem, rows: NDArray, motion: NDArray, alpha: NDArray, n_groups: int
 ) -> NDArray:
     """Return cameras (I, 2, 3) with groups of similar frames turned back in depth.
 
@@ -248,10 +239,8 @@ def held_fit(
 
     With the large noise of a start, the prior would make basis shapes vanish.
     """
-    state, free = (
-        first_state(problem, rows, motion, shapes),
-        replace(problem, penalty=0.0),
-    )
+    state = first_state(problem, rows, motion, shapes)
+    free = replace(problem, penalty=0.0)
     return free.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
 
 

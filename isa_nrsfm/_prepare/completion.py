@@ -74,9 +74,8 @@ def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     last array is the index (n_frames,) of the pattern of each frame.
     """
     seen = ~np.isnan(rows).any(axis=1)
-    _, first, pattern = np.unique(
-        np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
-    )
+    bits = np.packbits(seen, axis=1)
+    _, first, pattern = np.unique(bits, axis=0, return_index=True, return_inverse=True)
     patterns = seen[first].astype(float)
     return np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1)
 
