@@ -38,18 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._linalg import (
-    COLUMNS,
-    DIAGONAL,
-    ROWS,
-    inverse3,
-    lengths,
-    packed_products,
-    pair_indices,
-    polar,
-    unpack3,
-    unpacked,
-)
+from isa_nrsfm import _linalg as linalg
 from isa_nrsfm._prepare.robust import spatial_median
 from isa_nrsfm._tables import centred_frames
 
@@ -57,7 +46,7 @@ from isa_nrsfm._tables import centred_frames
 # logarithm of its scale.
 LARGEST_TURN = 1.0
 # Places of the entries of a packed symmetric 6x6 matrix
-_PLACES = unpacked(np.arange(21))
+_PLACES = linalg.unpacked(np.arange(21))
 
 
 class AffineCameras:
@@ -97,7 +86,7 @@ class AffineCameras:
         """Return ``tr(D_c A D_d^T)`` along the tangents, packed, as A (6, n) is."""
         packed = np.zeros((21, A.shape[-1]))
         for row in slice(3), slice(3, 6):
-            packed[_PLACES[row, row][ROWS, COLUMNS]] = A
+            packed[_PLACES[row, row][linalg.ROWS, linalg.COLUMNS]] = A
         return packed
 
     def second(self, M: NDArray, G: NDArray, gradient: NDArray) -> NDArray:
@@ -106,7 +95,7 @@ class AffineCameras:
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return inverse curvatures, for `product`, of curvatures (6, n) per row."""
-        return inverse3(curvature)
+        return linalg.inverse3(curvature)
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
         """Return vectors (p, n) times an inverse curvature."""
@@ -160,9 +149,9 @@ class CalibratedCameras:
     def curvature(self, M: NDArray, A: NDArray) -> NDArray:
         """Return ``tr(D_c A D_d^T)``, along the tangents, packed, as A (6, n) is."""
         D = self.tangents(M)
-        DA = np.einsum("crai,abi->crbi", D, unpack3(A))
+        DA = np.einsum("crai,abi->crbi", D, linalg.unpack3(A))
         shape = self.n_parameters, 6, M.shape[-1]
-        return packed_products(DA.reshape(shape), D.reshape(shape))
+        return linalg.packed_products(DA.reshape(shape), D.reshape(shape))
 
     def second(self, M: NDArray, G: NDArray, gradient: NDArray) -> NDArray:
         """Return ``<G, D_cd>`` with the second derivatives D_cd, packed.
@@ -175,14 +164,14 @@ class CalibratedCameras:
         second[:3, :3] = 0.5 * (mixed + mixed.swapaxes(0, 1))
         second[:3, :3] -= np.einsum("aai->i", mixed) * np.eye(3)[:, :, None]
         second[3:], second[:, 3:] = gradient, gradient[:, None]
-        return np.asarray(second[pair_indices(len(gradient))])
+        return np.asarray(second[linalg.pair_indices(len(gradient))])
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return inverses (p, p, n); a scale without curvature does not move."""
-        C = unpacked(self.curvature(M, curvature))
-        turns = C[ROWS, COLUMNS]
-        turns[DIAGONAL] += 1e-9 * turns[DIAGONAL].mean(axis=0)
-        inverse = inverse3(turns)
+        C = linalg.unpacked(self.curvature(M, curvature))
+        turns = C[linalg.ROWS, linalg.COLUMNS]
+        turns[linalg.DIAGONAL] += 1e-9 * turns[linalg.DIAGONAL].mean(axis=0)
+        inverse = linalg.inverse3(turns)
         if not self.scaled:
             return inverse
         # By the Schur complement d - c^T B^-1 c in [[B, c], [c^T, d]]
@@ -263,7 +252,7 @@ def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
     p, q, r = (np.stack([p, q, r]) / divisor)[..., None]
     rows, scales = np.stack([r * x - q * y, p * y - q * x], axis=1), 0.5 * t * size
     if flat.any():
-        rows[flat], values, _ = polar(motion[flat])
+        rows[flat], values, _ = linalg.polar(motion[flat])
         scales[flat] = values.mean(axis=1)
     return rows, scales
 
@@ -301,7 +290,7 @@ def distances(
     rows: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> NDArray:
     """Return distances (n, J) of points (n, 2, J) from a model, NaN if missing."""
-    return lengths(residuals(rows, shapes, motion, alpha) - position[..., None])
+    return linalg.lengths(residuals(rows, shapes, motion, alpha) - position[..., None])
 
 
 def residuals(
