@@ -28,7 +28,6 @@ several groups of points it moves, which gives its deviation (jackknife).
 """
 
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -39,7 +38,7 @@ from scipy.special import expit, logit, stdtr
 from sklearn.base import clone
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import FitProgress, NoProgress, one_blas_thread
+from isa_nrsfm._compat.scikit_learn import NoProgress, Progress, one_blas_thread
 from isa_nrsfm._fitted_model import TableModel, prior_start
 from isa_nrsfm._frames.camera_models import (
     Pinhole,
@@ -99,7 +98,6 @@ from isa_nrsfm._prepare.scaling import (
 )
 from isa_nrsfm._tables import FrameBlocks, of_all_rows, spread
 from isa_nrsfm.isa._pipeline import (
-    Factorisation,
     block_triplets,
     factorise,
     run_paper_pipeline,
@@ -222,7 +220,7 @@ def fit_table(
     n_components: int,
     isa: Any,
     settings: FitSettings,
-    progress: FitProgress | NoProgress,
+    progress: Progress,
 ) -> TableFit:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
@@ -265,7 +263,7 @@ def fit_table(
             first = first._replace(known=None)
             return fit_table(table, supported, isa, first, NoProgress())
     else:
-        fit = _paper_fit(table, factorised.factors, shapes, covariance, settings)
+        fit = _paper_fit(factorised, shapes, covariance, settings)
         fit.attributes["n_iter_"] = n_iter
         fit = fit._replace(converged=converged)
     # The mirror image in depth
@@ -289,7 +287,7 @@ def _joint_fit(
     given: JointState | None,
     settings: FitSettings,
     n_components: int,
-    progress: FitProgress | NoProgress,
+    progress: Progress,
 ) -> TableFit:
     """Return the joint fit from shapes, or a given state, or the consensus of groups.
 
@@ -362,10 +360,7 @@ def _joint_fit(
 
 @one_blas_thread()
 def supported_components(
-    table: ScaledTable,
-    isa: Any,
-    settings: FitSettings,
-    progress: FitProgress | NoProgress,
+    table: ScaledTable, isa: Any, settings: FitSettings, progress: Progress
 ) -> int:
     """Return the number of relevant basis shapes of affine cameras, at most twelve."""
     possible = most_components(len(table.sizes), table.n_points, settings.camera)
@@ -379,10 +374,7 @@ def supported_components(
 
 
 def _factorised(
-    table: ScaledTable,
-    n_components: int,
-    settings: FitSettings,
-    report: Callable[[str], None],
+    table: ScaledTable, n_components: int, settings: FitSettings, report: Progress
 ) -> FactorisedTable:
     """Return a table with outliers (robust loss), completed frames and factors."""
     limits, n_points = settings.limits, table.n_points
@@ -451,16 +443,13 @@ def _started(
 
 
 def _paper_fit(
-    table: ScaledTable,
-    factors: Factorisation,
-    shapes: NDArray,
-    covariance: NDArray,
-    s: FitSettings,
+    factorised: FactorisedTable, shapes: NDArray, covariance: NDArray, s: FitSettings
 ) -> TableFit:
     """Return the fit of the paper's pipeline in its gauge."""
+    table = factorised.scaled
     if s.camera != "affine":
         scaled = s.camera == "weak_perspective"
-        shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
+        shapes = table.sizes[0] * rigid_start(factorised.factors, shapes, scaled)[1]
 
     def fitted() -> tuple[TableModel, Decomposition]:
         frames, K = FrameModel.rigid(mean_shape, basis, s.camera), len(basis)
@@ -629,7 +618,7 @@ class Images(NamedTuple):
     isa: Any
     settings: FitSettings
     principal_point: Any
-    progress: FitProgress | NoProgress
+    progress: Progress
 
     def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
         """Return the camera with a focal length."""
@@ -662,7 +651,7 @@ class Images(NamedTuple):
         before: TableFit | None = None,
         *,
         last: bool = False,
-        progress: FitProgress | NoProgress | None = None,
+        progress: Progress | None = None,
         **changes: Any,
     ) -> TableFit:
         """Return the fit of images that are corrected for the depths of another fit.

@@ -16,7 +16,6 @@ import copy
 import time
 import warnings
 from collections.abc import Callable, Collection
-from functools import partial
 from numbers import Integral
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -934,7 +933,22 @@ def decided(
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    fitted = partial(_fitted, X, {"groups": groups, **weights}, rows)
+
+    def fitted(
+        model: AffineNRSfM, setting: str, robust: bool, first: _Fit | None = None
+    ) -> _Fit:
+        """Return a fit and its trial. Figures may be those of a first fit."""
+        since = time.perf_counter() - (first.trial.seconds if first else 0.0)
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            if not hasattr(model, "_model"):
+                model.fit(X, groups=groups, **weights)
+        seconds = time.perf_counter() - since
+        squares = first.squares if first else rows.squares(model)
+        error = unexplained_share(squares, robust or model.loss != "linear")
+        depth = float(getattr(model, "depth_uncertainty_", np.nan))
+        trial = Trial(setting, error, depth, seconds, "used")
+        return _Fit(model, trial, caught, squares)
+
     robust, used, estimator._continued = False, 0, {"known": {}}
     best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras", robust)
     trials = [best.trial]
@@ -975,28 +989,6 @@ def decided(
         warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
     model._continued, model._trials = None, trials
     return model, trials
-
-
-def _fitted(
-    X: Any,
-    given: dict[str, Any],
-    rows: _Rows,
-    model: AffineNRSfM,
-    setting: str,
-    robust: bool,
-    first: _Fit | None = None,
-) -> _Fit:
-    """Return the fit of a model, and its trial. Figures may be those of a first fit."""
-    since = time.perf_counter() - (first.trial.seconds if first else 0.0)
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        if not hasattr(model, "_model"):
-            model.fit(X, **given)
-    seconds = time.perf_counter() - since
-    squares = first.squares if first else rows.squares(model)
-    error = unexplained_share(squares, robust or model.loss != "linear")
-    depth = float(getattr(model, "depth_uncertainty_", np.nan))
-    trial = Trial(setting, error, depth, seconds, "used")
-    return _Fit(model, trial, caught, squares)
 
 
 def _changed(best: _Fit, name: str, changes: dict[str, Any]) -> AffineNRSfM:

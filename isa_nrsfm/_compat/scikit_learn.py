@@ -294,3 +294,6 @@ class NoProgress:
 
     def step(self) -> None:
         """Begin a step."""
+
+
+Progress = FitProgress | NoProgress

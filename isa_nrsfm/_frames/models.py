@@ -458,10 +458,7 @@ class FrameModel:
         return fit._replace(translation=fit.translation - shift)
 
     def _reweighted(
-        self,
-        rows: NDArray,
-        fitted: Callable[..., FramePosterior],
-        starts: NDArray | None = None,
+        self, rows: NDArray, fitted: Callable[..., Any], starts: NDArray | None = None
     ) -> FramePosterior:
         """Return the fit of rows (n, 2, J) with a robust loss.
 

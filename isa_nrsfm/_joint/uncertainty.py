@@ -159,15 +159,11 @@ def shape_information(
 
 
 def frame_certainty(
-    frames: FrameModel,
-    fits: FrameFits,
-    n_seen: NDArray,
-    weight: NDArray,
-    unknowns: float,
+    frames: FrameModel, fits: FrameFits, n_seen: NDArray, weight: NDArray, n_used: float
 ) -> DepthCertainty:
     """Return the certainty with that of the residuals of frames.
 
-    n_seen (n,): numbers of seen points. weight (n,): sums of their weights. unknowns:
+    n_seen (n,): numbers of seen points. weight (n,): sums of their weights. n_used:
     number of coordinates that determine the shapes. Camera,
     position and coefficients fit a part of the coordinates of a frame. All other
     coordinates determine the shapes, whose errors in an image are
@@ -181,9 +177,9 @@ def frame_certainty(
     left = max(numbers - len(alpha) * n_own, 0.1 * numbers)
     noise = frames.noise_variance
     if frames.loss == "linear":
-        noise = max(noise, residual / max(left - unknowns, 0.1 * numbers))
+        noise = max(noise, residual / max(left - n_used, 0.1 * numbers))
     ratio, square = noise / frames.noise_variance, residual / weight.sum()
-    images = ratio, ratio * unknowns / left / mean
+    images = ratio, ratio * n_used / left / mean
     # Of coefficients from the images
     leverage = None if certainty.leverage is None else mean
     return certainty._replace(residual=square, leverage=leverage, images=images)
