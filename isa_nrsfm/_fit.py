@@ -40,6 +40,7 @@ from sklearn.base import clone
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import NoProgress, Progress, one_blas_thread
 from isa_nrsfm._fitted_model import TableModel, prior_start
+from isa_nrsfm._frames import gauge
 from isa_nrsfm._frames.camera_models import (
     Pinhole,
     common,
@@ -50,15 +51,6 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     pinhole_of,
 )
-from isa_nrsfm._frames.gauge import (
-    canonical_gauge,
-    canonical_space,
-    coefficient_sizes,
-    euclidean_space,
-    image_energies,
-    independent_gauge,
-    mode_covariance,
-)
 from isa_nrsfm._frames.models import (
     MIRROR,
     Decomposition,
@@ -66,6 +58,7 @@ from isa_nrsfm._frames.models import (
     FrameModel,
     spread_starts,
 )
+from isa_nrsfm._joint import uncertainty
 from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
@@ -73,19 +66,6 @@ from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, lifted_shapes, rigid_start
-from isa_nrsfm._joint.uncertainty import (
-    N_GROUPS,
-    FrameFits,
-    depth_certainty,
-    fitted_frames,
-    frame_certainty,
-    half_tables,
-    n_reliable,
-    neighbours,
-    reliabilities,
-    shape_information,
-    shown_frames,
-)
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import TUNING, gross_outliers
@@ -97,12 +77,7 @@ from isa_nrsfm._prepare.scaling import (
     scaled_table,
 )
 from isa_nrsfm._tables import FrameBlocks, of_all_rows, spread
-from isa_nrsfm.isa._pipeline import (
-    block_triplets,
-    factorise,
-    run_paper_pipeline,
-    sample_frames,
-)
+from isa_nrsfm.isa import _pipeline as pipeline
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
@@ -243,7 +218,7 @@ def fit_table(
         given = _started(table, settings, n_components)
     if given is None:
         isa, factors = clone(isa), factorised.factors
-        shapes, covariance, n_iter, converged = run_paper_pipeline(
+        shapes, covariance, n_iter, converged = pipeline.run_paper_pipeline(
             factors.leading(3 * wanted), wanted, isa, settings, progress
         )
         if settings.all_directions:  # the start has a fixed number of basis shapes
@@ -256,7 +231,7 @@ def fit_table(
     if settings.joint:
         fit = _joint_fit(factorised, shapes, given, settings, wanted, progress)
         # Down-weighted outliers, for example, look like basis shapes at first.
-        supported = max(n_reliable(fit.attributes["reliability_"]), 1)
+        supported = max(uncertainty.n_reliable(fit.attributes["reliability_"]), 1)
         falls = settings.free and not settings.all_directions
         if falls and supported < n_components:
             progress("gauge and coefficients")
@@ -318,7 +293,7 @@ def _joint_fit(
         grouped = fit.misfit > noise
     needed = errors and calibrated
     if needed and not grouped and "certainty" not in known:
-        known["certainty"] = depth_certainty(model, table, fit, settings)
+        known["certainty"] = uncertainty.depth_certainty(model, table, fit, settings)
     if needed and "certainty" in known:
         model, needed = replace(model, certainty=known["certainty"]), False
     if errors and widths is not None and not grouped:
@@ -347,7 +322,7 @@ def _joint_fit(
         starts = np.pad(model.starts, ((0, 0), (0, n_more)))
         model = replace(model, shapes=shapes, starts=starts)
         widths = None if widths is None else widths.padded(n_more)
-    fits = fitted_frames(model, tracks, table.rows)
+    fits = uncertainty.fitted_frames(model, tracks, table.rows)
     del tracks  # as much memory as the table
     result = _joint_frames(table, model, fits, settings, n_components, widths)
     if fit.prior is not None:
@@ -368,7 +343,7 @@ def supported_components(
     quiet = NoProgress()
     factorised = _factorised(table, most, settings, quiet)
     factors = factorised.factors
-    shapes, *_ = run_paper_pipeline(factors, most, clone(isa), settings, quiet)
+    shapes, *_ = pipeline.run_paper_pipeline(factors, most, clone(isa), settings, quiet)
     progress("number of basis shapes")
     return count_components(factorised, shapes, settings)
 
@@ -393,16 +368,18 @@ def _factorised(
         completed = complete_rows(completed, n_points, n_components, most)
     report("table")
     shape = 2 * len(table.sizes), n_points
-    triplets = block_triplets(completed, shape, n_triplets, limits.dense)
+    triplets = pipeline.block_triplets(completed, shape, n_triplets, limits.dense)
     values, vectors, rest = triplets
     # With a prior there may be few frames.
     values = np.pad(values, (0, n_triplets - len(values)))
     if settings.joint:
         rigid, first = vectors[:3], limits.sample
-        W, parts = sample_frames(completed, n_points, rigid, first, limits.small_table)
+        W, parts = pipeline.sample_frames(
+            completed, n_points, rigid, first, limits.small_table
+        )
     else:
         W, parts = completed.whole().reshape(shape), []
-    factors = factorise(W, n_components, table.precision, triplets)
+    factors = pipeline.factorise(W, n_components, table.precision, triplets)
     compressed = None
     few = max(24 * (n_components + 1), limits.many_points)
     if settings.joint and settings.prior is None and n_points > few:
@@ -463,11 +440,11 @@ def _paper_fit(
     for _ in range(50):
         motion = frames.motion / table.sizes[:, None, None]
         if s.camera == "affine":
-            space = canonical_space(mean_shape, motion)
+            space = gauge.canonical_space(mean_shape, motion)
         else:
             size = 1.0 if s.camera == "orthographic" else None
-            space = euclidean_space(mean_shape, motion, size)
-        mean_shape, basis, new_order, _ = canonical_gauge(
+            space = gauge.euclidean_space(mean_shape, motion, size)
+        mean_shape, basis, new_order, _ = gauge.canonical_gauge(
             mean_shape, basis, motion, frames.alpha, space
         )
         order = order[new_order]
@@ -476,7 +453,7 @@ def _paper_fit(
         model, frames = fitted()
         # Coefficients scale with the basis shapes. If a frame does not determine its
         # coefficients, their solution of minimum norm changes.
-        off = coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
+        off = gauge.coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
         if np.abs(off).max(initial=0.0) <= 1e-6:
             break
     index = (3 * order[:, None] + np.arange(3)).ravel()
@@ -487,7 +464,7 @@ def _paper_fit(
 def _joint_frames(
     table: ScaledTable,
     model: FrameModel,
-    fits: FrameFits,
+    fits: uncertainty.FrameFits,
     s: FitSettings,
     n_components: int,
     widths: Widths | None,
@@ -512,30 +489,33 @@ def _joint_frames(
     attributes: dict[str, Any] = {}
     if prior is None:
         kind = s.independence, s.camera, unit, n_components, s.remove_pose
-        mean_shape, basis, gauge = independent_gauge(model.shapes, motion, alpha, *kind)
+        chosen = gauge.independent_gauge(model.shapes, motion, alpha, *kind)
+        mean_shape, basis, frame_map = chosen
     else:
-        gauge = prior.gauge
-        mean_shape, basis = gauge.public(model.shapes)
+        frame_map = prior.gauge
+        mean_shape, basis = frame_map.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share, slices = weight / table.n_points, posteriors.slices
     prior_moments = covariance
     if widths is not None:  # as in `MarginalLikelihood`
         penalty = model.noise_variance / (widths.variances * len(motion))
         prior_moments = covariance + np.diag(penalty)
-    information = shape_information(motion, alpha, prior_moments, share, slices)
+    information = uncertainty.shape_information(
+        motion, alpha, prior_moments, share, slices
+    )
     if prior is None:
-        uncertainty = np.linalg.pinv(information, hermitian=True)
-        attributes["_halves"] = half_tables(
-            table, model, motion, alpha, uncertainty, s.groups, kind
+        inverse = np.linalg.pinv(information, hermitian=True)
+        attributes["_halves"] = uncertainty.half_tables(
+            table, model, motion, alpha, inverse, s.groups, kind
         )
     else:
-        uncertainty = prior.inverse(information[None], noise)[0]
+        inverse = prior.inverse(information[None], noise)[0]
     known = prior or widths
     unknowns = float(model.shapes.size) if known is None else known.n_determined
-    certainty = frame_certainty(model, fits, table.n_seen, weight, unknowns)
+    certainty = uncertainty.frame_certainty(model, fits, table.n_seen, weight, unknowns)
     certainty = certainty._replace(weighted=table.weights is not None)
-    model = replace(model, gauge=gauge, certainty=certainty)
-    last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
+    model = replace(model, gauge=frame_map, certainty=certainty)
+    last_pass = partial(uncertainty.shown_frames, frames=model, inverse=inverse)
     passes = posteriors.map(last_pass, table.sizes, table.n_seen, weight)
     parts, moments, noises = zip(*passes, strict=True)
     frames = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
@@ -547,8 +527,10 @@ def _joint_frames(
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
-    modes = mode_covariance(cameras, frames.alpha[:, :n_components])
-    reliability = reliabilities(alpha, covariance, sum(moments), sum(noises))
+    modes = gauge.mode_covariance(cameras, frames.alpha[:, :n_components])
+    reliability = uncertainty.reliabilities(
+        alpha, covariance, sum(moments), sum(noises)
+    )
     attributes |= {
         "mode_covariance_": square * modes,
         "noise_variance_": square * noise,
@@ -567,7 +549,7 @@ def _measures(
     mean_shape, basis, K = model.mean_shape, model.basis, model.n_components
     values = factorised.singular_values
     cameras = frames.motion / table.sizes[:, None, None]
-    energy = image_energies(cameras, basis, frames.alpha)
+    energy = gauge.image_energies(cameras, basis, frames.alpha)
     position = (frames.translation - table.translation) / table.sizes[:, None]
     shapes = np.concatenate([mean_shape[None], basis]).mT
 
@@ -725,7 +707,7 @@ class Images(NamedTuple):
         The evidence is a test of E over groups of points, and the prior, if any.
         """
         gain = image.energies - fit.energies
-        gain = np.bincount(neighbours(fit.model.mean_shape.T), gain)
+        gain = np.bincount(uncertainty.neighbours(fit.model.mean_shape.T), gain)
         t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
         odds = float(logit(stdtr(len(gain) - 1, t)))
         if np.isnan(self.settings.mirror_certainty):
@@ -805,7 +787,7 @@ def minimum(fits: dict[float, TableFit]) -> tuple[float, float]:
     """Return the minimum of a parabola through the three best fits, its deviation."""
     g = sorted(fits, key=lambda g: fits[g].energy)[:3]
     energies = np.array([fits[place].energies for place in g])
-    groups = neighbours(fits[g[0]].model.mean_shape.T)
+    groups = uncertainty.neighbours(fits[g[0]].model.mean_shape.T)
 
     def vertex(kept: NDArray) -> float:
         """Return the minimum for some of the points, or infinity if there is none."""
@@ -813,11 +795,11 @@ def minimum(fits: dict[float, TableFit]) -> tuple[float, float]:
         return float(-0.5 * slope / square) if square > 0 else np.inf
 
     every = vertex(groups >= 0)
-    parts = np.array([vertex(groups != group) for group in range(N_GROUPS)])
+    parts = np.array([vertex(groups != group) for group in range(uncertainty.N_GROUPS)])
     if not np.isfinite(parts).all():
         return every, np.inf
     # Few groups: the error has a t distribution, whose deviation is larger.
-    n_free = N_GROUPS - 1
+    n_free = uncertainty.N_GROUPS - 1
     return every, float(parts.std() * np.sqrt(n_free * n_free / (n_free - 2)))
 
 

@@ -282,8 +282,7 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None, turned: bool = False
     ) -> tuple[NDArray, NDArray]:
         """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
-        fit, variances = self._uncertain(rows, weights)
-        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        fit, shapes, variances = self._uncertain(rows, weights)
         shapes = self.turned(shapes, fit) if turned else shapes
         _, scales = full_rotations(fit.motion)
         deviations = np.sqrt(variances[..., 2]) / scales[:, None]
@@ -297,16 +296,15 @@ class TableModel(NamedTuple):
         x and y are places in the table, z is the depth beyond the origin of the shape,
         in the same units.
         """
-        fit, variances = self._uncertain(rows, weights)
-        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        fit, shapes, variances = self._uncertain(rows, weights)
         points = self.turned(shapes, fit) * full_rotations(fit.motion)[1][:, None, None]
         points[..., :2] += fit.translation[:, None]
         return points, np.sqrt(variances)
 
     def _uncertain(
         self, rows: NDArray, weights: NDArray | None
-    ) -> tuple[Decomposition, NDArray]:
-        """Return frames, and variances (n, J, 3) of points in units of the table.
+    ) -> tuple[Decomposition, NDArray, NDArray]:
+        """Return frames, shapes, variances (n, J, 3) of points in units of the table.
 
         They are along the axes of the camera.
         """
@@ -320,7 +318,8 @@ class TableModel(NamedTuple):
         rotations, _ = full_rotations(self.in_camera_axes(*fit[:2]))
         turns = (rotations @ full_rotations(virtual.motion)[0].mT)[usable, None]
         variances = np.diagonal(turns @ covariances @ turns.mT, axis1=2, axis2=3)
-        return fit, of_all_rows(variances, usable)
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        return fit, shapes, of_all_rows(variances, usable)
 
     def reproject(self, fit: Decomposition, *shares: NDArray) -> NDArray:
         """Return images of fitted frames as a table, zoomed back by shares (n, 1)."""

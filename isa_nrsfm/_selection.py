@@ -53,12 +53,7 @@ from isa_nrsfm._linalg import centred, procrustes
 from isa_nrsfm._parameters import JOINT_REFINEMENTS, named
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables import refuse_stored, spread
-from isa_nrsfm.analysis._advice import (
-    COMPARE,
-    OTHER_CAMERAS,
-    gross_residuals,
-    layout_of,
-)
+from isa_nrsfm.analysis import _advice as advice
 from isa_nrsfm.datasets import load_face_prior
 
 # For held-out errors of 100 % and more.
@@ -830,7 +825,7 @@ def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
     if rows.weights:
         return "points have weights"
     # Fits with all directions of deformation follow outliers, held-out points cannot.
-    if not gross_residuals(np.sqrt(best.squares[..., 0]))[0] > MOST_WRONG:
+    if not advice.gross_residuals(np.sqrt(best.squares[..., 0]))[0] > MOST_WRONG:
         return "no outliers"
     return {"loss": "cauchy"}
 
@@ -856,7 +851,7 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
     """The prior of faces supplies depths that a table does not determine."""
     layout, K = rows.face_layout, best.model.n_components
-    layout = layout or getattr(layout_of(best.model), "name", None)
+    layout = layout or getattr(advice.layout_of(best.model), "name", None)
     if layout not in choices.FACE_PRIORS:
         return "no layout of faces"
     if best.determined:
@@ -895,7 +890,7 @@ def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
 def _affine(best: _Fit, rows: _Rows) -> Proposal:
     """Affine cameras absorb the stretch of images."""
     ratio = best.model.camera_noise_ratio_
-    if best.model.prior or not ratio >= OTHER_CAMERAS:
+    if best.model.prior or not ratio >= advice.OTHER_CAMERAS:
         return "not stretched"
     plain = dict.fromkeys(("focal_length", "principal_point"))
     return {"camera": "affine", "refinement": "joint"} | plain
@@ -986,7 +981,7 @@ def decided(
     if model.prior is not None:
         model.set_params(n_components=model.n_components_)
     for each in best.caught:  # made before the comparison
-        warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
+        warn_caller(str(each.message).replace(f". {advice.COMPARE}", ""), each.category)
     model._continued, model._trials = None, trials
     return model, trials
 

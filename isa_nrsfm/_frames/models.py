@@ -368,9 +368,8 @@ class FrameModel:
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         covariance, ratio = self.widened(fit.alpha, fit.covariance)
         translation = fit.translation * sizes[:, None]
-        return LinearisedFrames(
-            motion, translation, fit.alpha, covariance, precision / ratio, slope
-        )
+        moments = fit.alpha, covariance, precision / ratio
+        return LinearisedFrames(motion, translation, *moments, slope)
 
     def point_covariances(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None

@@ -36,6 +36,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm import _linalg as linalg
 from isa_nrsfm._compat.lazy import cached_property
 from isa_nrsfm._frames.search import (
     FrameTracks,
@@ -47,15 +48,6 @@ from isa_nrsfm._frames.search import (
     joined_frames,
 )
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._linalg import (
-    centred,
-    diagonal_of,
-    energies,
-    frames_last,
-    of_frames,
-    unpack3,
-    unpacked,
-)
 from isa_nrsfm._tables import BLOCK_FRAMES, FrameBlocks, seen_points
 
 # Without the penalty, frontal photos of faces give needle-like shapes. If one extent is
@@ -151,7 +143,7 @@ class JointFrames:
             n, _, n_points = rows.shape
             products = (rows.reshape(2 * n, -1) @ directions.T).reshape(n, 2, -1)
             W, weight = np.ascontiguousarray(products.T), np.full(n, float(n_points))
-            return FrameTracks(W, None, np.zeros((2, n)), weight, energies(rows))
+            return FrameTracks(W, None, np.zeros((2, n)), weight, linalg.energies(rows))
 
         blocks = rows.derive(compressed)
         return cls(blocks.regrouped(joined_frames, BLOCK_FRAMES), directions)
@@ -166,13 +158,13 @@ class JointFrames:
 
     def centred(self, shapes: NDArray) -> NDArray:
         """Return shapes centred over their points. Directions have sum zero already."""
-        return centred(shapes) if self.directions is None else shapes
+        return linalg.centred(shapes) if self.directions is None else shapes
 
     def take(self, frames: NDArray) -> Self:
         """Return some of the frames, in the order of the table."""
         chosen = np.isin(np.arange(self.n_frames), frames)
         parts = self.blocks.map(
-            lambda block, kept: of_frames(block, np.flatnonzero(kept)), chosen
+            lambda block, kept: linalg.of_frames(block, np.flatnonzero(kept)), chosen
         )
         taken = [part for part in parts if len(part.weight)]
         lengths = [len(part.weight) for part in taken]
@@ -232,7 +224,7 @@ class MarginalLikelihood(NamedTuple):
 
         def over_block(block: FrameTracks, motion: NDArray) -> Terms:
             """Return the sums over pieces whose matrices fit the cache."""
-            M, parts = frames_last(motion), []
+            M, parts = linalg.frames_last(motion), []
             for frames, piece in block.pieces():
                 parts.append(self._terms(piece, M[:, :, frames], products, noise))
             return _joined(parts)
@@ -242,7 +234,7 @@ class MarginalLikelihood(NamedTuple):
         *of_cameras, alpha = by_frame
         # Matrices (n, size, size) from the sums, packed by shapes and by axes
         size = 3 * len(shapes)
-        curvature = unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3)
+        curvature = linalg.unpack3(linalg.unpacked(packed)).transpose(4, 0, 2, 1, 3)
         curvature = curvature.reshape(-1, size, size)
         columns = shapes.reshape(size, -1).T[:, :, None]
         pulled = (curvature @ columns)[:, :, 0].T.reshape(shapes.shape)
@@ -282,11 +274,11 @@ class MarginalLikelihood(NamedTuple):
 
         # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
         moments = posterior.second_moments(noise)
-        moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
+        moments[linalg.diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
         cameras = camera_gram(M)
         # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
         motion_curvature = products.gram.moments(moments)
-        G = np.einsum("rbi,bai->rai", M, unpack3(motion_curvature))
+        G = np.einsum("rbi,bai->rai", M, linalg.unpack3(motion_curvature))
         G -= np.einsum("ki,kari->rai", c, products.cross)
         # By the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
         X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
@@ -298,8 +290,8 @@ class MarginalLikelihood(NamedTuple):
             shape_curvature = (pairs @ block.weights.T).reshape(-1, 6, n_points)
             # The eliminated position of a frame depends on the means of the shapes.
             middles = products.shape_centroid
-            mixed = np.einsum("kli,lbi->kbi", unpacked(moments), middles)
-            means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
+            mixed = np.einsum("kli,lbi->kbi", linalg.unpacked(moments), middles)
+            means = np.einsum("abi,kbi->kai", linalg.unpack3(cameras), mixed)
             shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
         noise_gradient = -(residual + spread) / noise
         shape_gradient = (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape)

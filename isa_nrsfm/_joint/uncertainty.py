@@ -191,7 +191,7 @@ def shown_frames(
     n_seen: NDArray,
     weight: NDArray,
     frames: FrameModel,
-    uncertainty: NDArray,
+    inverse: NDArray,
 ) -> tuple[Decomposition, NDArray, float]:
     """Return fits in the gauge, and the effect of their noise on their coefficients.
 
@@ -203,7 +203,7 @@ def shown_frames(
     """
     motion, alpha = posterior.motion, posterior.alpha
     X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
-    Z = X @ uncertainty
+    Z = X @ inverse
     # Degrees of freedom of the residual, without the parameters of the shapes
     leverage = np.einsum("irp,irp->i", X, Z)
     n_pose = 2 + CAMERAS[frames.camera].n_parameters
