@@ -663,8 +663,7 @@ class Images(NamedTuple):
             if before is not None and n_components == before.model.n_components:
                 return before
         table = self.straight(n_components, pinhole, before)
-        args = table, n_components, isa, settings, progress or quiet
-        fit = fit_table(*args)
+        fit = fit_table(table, n_components, isa, settings, progress or quiet)
         fit = fit._replace(model=fit.model._replace(pinhole=pinhole))
         if before is not None:
             change = fit.change(before, self.source.slices)

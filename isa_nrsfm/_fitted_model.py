@@ -327,8 +327,7 @@ class TableModel(NamedTuple):
         images = self.images(shapes, fit.motion, fit.translation)
         known = self.pinhole or self.axes
         if known is not None and shares:
-            centre = known.centre[:, 0]
-            images = zoomed(images, 1.0 / shares[0][..., None], centre)
+            images = zoomed(images, 1.0 / shares[0][..., None], known.centre[:, 0])
         return tracks_to_table(images, self.layout)
 
     def images(self, shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
@@ -534,8 +533,7 @@ def of_fits(
 
 def hold_open(estimator: Any, X: Any, point_weight: Any = None) -> None:
     """Open a fitted table once for all methods that it is given to."""
-    opened = estimator._opened(X, point_weight, judged=False)
-    estimator._held = X, point_weight, opened
+    estimator._held = X, point_weight, estimator._opened(X, point_weight, judged=False)
 
 
 def warn_if_foreign(

@@ -191,8 +191,7 @@ def sweep(
         packed[places[i]] = scaled
         np.negative(inverse, out=rows[i][0])
     # With where=... NumPy rounds differently next to entries that are left out.
-    logarithms = np.log(np.where(inverses > 0, inverses, 1.0))
-    return -logarithms.sum(axis=0), positive
+    return -np.log(np.where(inverses > 0, inverses, 1.0)).sum(axis=0), positive
 
 
 def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:

@@ -146,8 +146,7 @@ class FrameReport(NamedTuple):
         seen edge on. With missing points it may be a line of the object, which can turn
         around it.
         """
-        enough = self.n_seen >= FEWEST_POINTS
-        return enough & ~self.in_one_place & ~self.on_line
+        return (self.n_seen >= FEWEST_POINTS) & ~self.in_one_place & ~self.on_line
 
 
 def seen_points(rows: NDArray) -> NDArray:
@@ -343,8 +342,7 @@ class FrameBlocks:
         """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
         length = max(self.lengths[:-1] or self.lengths)
         if self.cached:
-            array = self.joined(getitem, frames)
-            return self.of_array(array, length, self.n_threads)
+            return self.of_array(self.joined(getitem, frames), length, self.n_threads)
         chosen, ends = np.flatnonzero(frames), np.cumsum(self.lengths)
 
         def rows(part: slice) -> NDArray:

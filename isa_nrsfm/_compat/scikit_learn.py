@@ -116,8 +116,7 @@ class CoefficientsMixin(ClassNamePrefixFeaturesOutMixin):
             ``alpha_1``, ``alpha_2`` and so on, as in the files of the command line.
         """
         n_components = len(super().get_feature_names_out(input_features))
-        names = [f"alpha_{k + 1}" for k in range(n_components)]
-        return np.array(names, dtype=object)
+        return np.array([f"alpha_{k + 1}" for k in range(n_components)], dtype=object)
 
 
 class OneBlasThread:

@@ -134,8 +134,7 @@ class CalibratedCameras:
         """Return the steps (n, p) that move cameras (n, 2, 3) to others."""
         (R, scales), (turned, others) = map(full_rotations, (first, second))
         turns = Rotation.from_matrix(R.swapaxes(1, 2) @ turned).as_rotvec()
-        steps = np.column_stack([turns, np.log(others / scales)])
-        return steps[:, : self.n_parameters]
+        return np.column_stack([turns, np.log(others / scales)])[:, : self.n_parameters]
 
     def tangents(self, M: NDArray) -> NDArray:
         """Return ``M hat(e_c)``, and M itself where there are scales."""

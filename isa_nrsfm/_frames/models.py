@@ -447,8 +447,7 @@ class FrameModel:
     ) -> FramePosterior:
         """Return the fit of rows (n, 2, J) without some of the points (J,)."""
         if weights is not None or not seen_points(rows).all():
-            visible = np.where(hidden, np.nan, rows)
-            return self.posterior(visible, False, weights)
+            return self.posterior(np.where(hidden, np.nan, rows), False, weights)
         shapes = self.shapes[:, :, ~hidden]
         fit = replace(self, shapes=centred(shapes)).posterior(rows[..., ~hidden], False)
         middles = shapes.mean(axis=2)

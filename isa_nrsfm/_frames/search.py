@@ -703,8 +703,7 @@ class FrameSearch:
         through = posterior.covaried(coupling)
         hessian = definite + self.model.second(M, G, gradient)
         hessian -= packed_products(through.swapaxes(0, 1), coupling.swapaxes(0, 1))
-        value = posterior.value(noise)
-        return State(M, value, -gradient, definite, hessian), through
+        return State(M, posterior.value(noise), -gradient, definite, hessian), through
 
     def _unreversed(
         self, problem: FrameProblem, M: NDArray, converged: NDArray

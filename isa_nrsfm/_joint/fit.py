@@ -499,8 +499,7 @@ def reweighted(
         typical = distance[some] / residual_deviations(
             state, alpha[some], weights[some], problem.cameras
         )
-        noise = median_noise(typical[np.isfinite(typical)])
-        deviation = max(noise, OF_DISTANCES)
+        deviation = max(median_noise(typical[np.isfinite(typical)]), OF_DISTANCES)
         before, weights = weights, frame_weights(loss, distance, deviation, sizes)
         if np.mean((weights - before) ** 2) < 2.5e-5:
             break

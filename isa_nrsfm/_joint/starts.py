@@ -123,8 +123,7 @@ def steadied(motion: NDArray) -> NDArray:
     frame[:, 2] *= np.linalg.det(frame)
     across = views @ frame
     angle = np.arctan2(across[:, 1], across[:, 0])
-    turn = Rotation.from_rotvec(np.outer(angle, frame[:, 2]))
-    return motion @ turn.as_matrix()
+    return motion @ Rotation.from_rotvec(np.outer(angle, frame[:, 2])).as_matrix()
 
 
 def reversed_groups(

@@ -63,8 +63,7 @@ def completion_model(
 def filled_in(rows: NDArray, model: Model) -> NDArray:
     """Return frames (n_frames, 2, n_points), NaN filled in by the model, centred."""
     z, t, *_ = _posterior(*_frames(rows), *model)
-    filled = np.where(np.isnan(rows), z @ model[0] + t, rows)
-    return centred(filled)
+    return centred(np.where(np.isnan(rows), z @ model[0] + t, rows))
 
 
 def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
