@@ -717,7 +717,9 @@ class Images(NamedTuple):
 
     def started(self, model: TableModel, n_components: Any) -> TableFit:
         """Return the fit from the model of a similar table, with its focal length."""
-        frames = self.source.joined(model.in_virtual_cameras)
+        weak = model._replace(pinhole=None)  # its frames are those of virtual cameras
+        virtual = partial(weak.decompose, deviations=False, dtype=np.float64)
+        frames = self.source.derive(model.straightened, kept=False).joined(virtual)
         fit = TableFit(model, frames, True, {"isa_": None})
         return self.settled(fit.pinhole, n_components, fit)[0]
 

@@ -87,19 +87,12 @@ class TableModel(NamedTuple):
         Weights (n, n_points) are zero where points are missing, by default one.
         """
         dtype = rows.dtype if dtype is None else dtype
-        fit = self.in_virtual_cameras(rows, weights, deviations)
-        fit = self.in_table_cameras(rows, *fit)
-        return Decomposition(*(part.astype(dtype) for part in fit))
-
-    def in_virtual_cameras(
-        self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
-    ) -> Decomposition:
-        """Return fits of weak-perspective images."""
-        rows = self.straightened(rows, weights)
-        usable, centred, translation, sizes, weights = self._ready(rows, weights)
+        straight = self.straightened(rows, weights)
+        usable, centred, translation, sizes, weights = self._ready(straight, weights)
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
-        return Decomposition(*(of_all_rows(part, usable) for part in fit))
+        fit = self.in_table_cameras(rows, *(of_all_rows(part, usable) for part in fit))
+        return Decomposition(*(part.astype(dtype) for part in fit))
 
     def in_table_cameras(self, rows: NDArray, *fit: NDArray) -> Decomposition:
         """Return fits of rows in virtual cameras with the cameras of the table."""

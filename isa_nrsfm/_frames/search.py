@@ -121,7 +121,7 @@ class Gram:
         """Return the Gram matrices of some of the frames."""
         if self.pairs.ndim == 2:
             return self
-        return type(self)(of_frames(self.pairs, frames))
+        return type(self)(self.pairs.take(frames, -1))
 
 
 class FrameTracks(NamedTuple):
