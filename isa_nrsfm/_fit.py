@@ -291,18 +291,17 @@ def _joint_fit(
             n_unknowns = widths.n_unknowns(len(table.sizes), settings.camera)
             noise *= n_numbers / (n_numbers - n_unknowns)
         grouped = fit.misfit > noise
-    needed = errors and calibrated
-    if needed and not grouped and "certainty" not in known:
+    if errors and calibrated and not grouped and "certainty" not in known:
         known["certainty"] = uncertainty.depth_certainty(model, table, fit, settings)
-    if needed and "certainty" in known:
-        model, needed = replace(model, certainty=known["certainty"]), False
+    if errors and calibrated and "certainty" in known:
+        model = replace(model, certainty=known["certainty"])
     if errors and widths is not None and not grouped:
         mean = bagged(model, table, settings, widths)
         if mean is not None:
             model, widths = mean
             tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
-        model, widths = consensus(model, table, settings, needed, fit), None
+        model, widths = consensus(model, table, settings, fit), None
         tracks = JointFrames.from_points(table.rows, table.complete)
     if settings.refinement == "consensus":
         progress(CONSENSUS_STAGE)

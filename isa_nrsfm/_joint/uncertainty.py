@@ -186,14 +186,12 @@ def frame_certainty(
 
 
 def shown_frames(
-    posterior: FramePosterior,
-    sizes: NDArray,
-    n_seen: NDArray,
-    weight: NDArray,
-    frames: FrameModel,
-    inverse: NDArray,
+    posterior: FramePosterior, *numbers: NDArray, frames: FrameModel, inverse: NDArray
 ) -> tuple[Decomposition, NDArray, float]:
     """Return fits in the gauge, and the effect of their noise on their coefficients.
+
+    numbers: sizes of frames (n,), of seen points, and sums of the weights of these.
+    inverse (p, p): that of the information on a point of the shapes.
 
     The noise of frame i changes the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
     M_i``. This shifts the coefficients of the frame by ``w_i s2_i Sigma_i / s2 tr(M_i
@@ -201,7 +199,7 @@ def shown_frames(
     second result (K, K) is the sum over the frames of ``alpha_i`` times that shift
     times s2, the third the sum of s2_i.
     """
-    motion, alpha = posterior.motion, posterior.alpha
+    motion, alpha, (sizes, n_seen, weight) = posterior.motion, posterior.alpha, numbers
     X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
     Z = X @ inverse
     # Degrees of freedom of the residual, without the parameters of the shapes

@@ -184,15 +184,12 @@ def check_size(
 
 
 def check_points(
-    visible: NDArray,
-    n_points: int,
-    n_components: int,
-    layout: Layout = "interleaved",
-    names: NDArray | None = None,
+    visible: NDArray, n_points: int, n_components: int, *columns: Any
 ) -> None:
     """Refuse tables whose visible points do not determine the shapes.
 
-    `visible` (I, J) is packed, eight points in a byte. The numbers of equations and
+    `visible` (I, J) is packed, eight points in a byte. `columns` are the arguments of
+    `describe_point`: their layout and names. The numbers of equations and
     unknowns are compared, a necessary condition. A point has 3 (K + 1) unknowns, and
     two equations per frame that shows it. A frame of n points has 2 n equations, and 8
     + K unknowns of its own.
@@ -209,7 +206,7 @@ def check_points(
         raise ValueError(
             f"{named('n_components', n_components)} needs every point in at least "
             f"{minimum} frames; fewer show {few.sum()} of {n_points} points (first: "
-            f"{describe_point(point, layout, names)}, in {n_frames[point]} of "
+            f"{describe_point(point, *columns)}, in {n_frames[point]} of "
             f"{counts.sum()} frames). Leave out these points, or take fewer basis "
             "shapes"
         )
@@ -230,8 +227,8 @@ def check_points(
         raise ValueError(
             f"the points fall into {n_groups} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "
-            f"{describe_point(int(group.argmax()), layout, names)} is never visible "
-            f"with {describe_point(0, layout, names)} and its group). Add frames that "
+            f"{describe_point(int(group.argmax()), *columns)} is never visible "
+            f"with {describe_point(0, *columns)} and its group). Add frames that "
             "show points of both, or fit each group separately"
         )
 
