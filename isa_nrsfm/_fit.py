@@ -51,13 +51,7 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     pinhole_of,
 )
-from isa_nrsfm._frames.models import (
-    MIRROR,
-    Decomposition,
-    FrameMap,
-    FrameModel,
-    spread_starts,
-)
+from isa_nrsfm._frames.models import Decomposition, FrameMap, FrameModel, spread_starts
 from isa_nrsfm._joint import uncertainty
 from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
@@ -168,9 +162,10 @@ class TableFit(NamedTuple):
 
     def mirrored(self) -> "TableFit":
         """Return the mirror image in depth."""
-        attributes = self.attributes | self.model.mirrored_attributes(self.attributes)
-        frames = self.frames._replace(motion=self.frames.motion * MIRROR)
-        model = attributes.pop("_model")
+        known = self.attributes | {"motion_": self.frames.motion}
+        attributes = known | self.model.mirrored_attributes(known)
+        model, motion = attributes.pop("_model"), attributes.pop("motion_")
+        frames = self.frames._replace(motion=motion)
         return self._replace(model=model, frames=frames, attributes=attributes)
 
 
