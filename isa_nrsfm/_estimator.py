@@ -13,7 +13,11 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_scalar
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm import _parameters as choices
+from isa_nrsfm import (
+    _fitted_model as fitted_model,
+    _parameters as choices,
+    _tables as tables,
+)
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
     N_JOBS,
@@ -21,55 +25,18 @@ from isa_nrsfm._compat.scikit_learn import (
     FitProgress,
     HasMethods,
     Interval,
-    NoProgress,
+    Progress,
     StrOptions,
     fit_context,
     with_numpy_defaults,
 )
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import STEPWISE, Images, fit_images, stages_of
-from isa_nrsfm._fitted_model import (
-    TableModel,
-    checked_prior,
-    fitted_prior,
-    of_fits,
-    removed_part,
-    sees_perspective,
-    warn_if_foreign,
-)
-from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
-    compose,
-    focal_shares,
-    full_rotations,
-    pose_effect,
-    zoomed_table,
-)
+from isa_nrsfm._frames import camera_models
 from isa_nrsfm._frames.models import Decomposition, FrameModel, leading
 from isa_nrsfm._joint.settings import JOINT_TOL, LIMITS, PAPER_TOL, FitSettings, Limits
+from isa_nrsfm._prepare import scaling
 from isa_nrsfm._prepare.coordinates import warn_of_rows
-from isa_nrsfm._prepare.scaling import (
-    check_camera,
-    check_frames_kept,
-    check_table,
-    checked,
-    undetermined,
-    validated_table,
-    weighted_rows,
-)
-from isa_nrsfm._tables import (
-    CHECKS,
-    LAYOUTS,
-    FrameBlocks,
-    Layout,
-    StoredTable,
-    column_sample,
-    is_on_dask,
-    is_read_later,
-    open_table,
-    tracks_to_table,
-    unmasked,
-)
 from isa_nrsfm.analysis._advice import warn_after_fit
 from isa_nrsfm.analysis._diagnostics import DiagnosedMixin, Diagnostics, diagnose
 from isa_nrsfm.analysis._frame_columns import group_numbers
@@ -195,18 +162,12 @@ default="affine"
         the explained energy (default 1e-10).
     random_state : int, RandomState instance or None, default=None
         Seeds the strategy; an int makes the result reproducible.
-    keep_frames : bool, default=True
-        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept.
-    frames_folder : str, path-like or None, default=None
-        Folder for the kept arrays. Each fit makes a new folder within it, with files
-        ``alpha.npy`` and so on, and never removes others. The attributes are memory
-        maps of these files; ``alpha_.filename`` is the path. None keeps them in memory.
-    working_memory : float or None, default=None
-        Largest memory of a block, in megabytes, of a table that is not in memory (a
-        memory map or a table of `isa_nrsfm.io.open_table`). None is scikit-learn's
-        setting `working_memory`. Each thread has a block of a memory map, of at most
-        128 megabytes. The result does not depend on it. In addition, about 1 kB per
-        frame is always in memory.
+    keep_frames : bool, str or path-like, default=True
+        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept: True
+        keeps them in memory, False not at all. A path is that of a folder for them.
+        Each fit makes a new folder within it, with files ``alpha.npy`` and so on, and
+        never removes others. The attributes are memory maps of these files;
+        ``alpha_.filename`` is the path.
     n_jobs : int or None, default=None
         Number of threads for the frames, in `fit` and in the methods for tables, and of
         joblib workers for strategies that use them and for the groups of the consensus.
@@ -336,8 +297,12 @@ default="affine"
 
     Notes
     -----
-    `fit` and the methods for new tables accept tables that are not in memory. For a
-    dask array, `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays,
+    `fit` and the methods for new tables accept tables that are not in memory: memory
+    maps and tables of `isa_nrsfm.io.open_table`. They are read in blocks, whose largest
+    memory is scikit-learn's setting ``sklearn.set_config(working_memory=...)``, in
+    MiB. Each thread has a block of a memory map, of at most 128 MiB. The result does
+    not depend on it. In addition, about 1 kB per frame is always in memory. For a dask
+    array, `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays,
     like the results of `transform`, `decompose`, `reconstruct` and `reproject`.
 
     Missing points are NaN, in `fit` and everywhere else. A point with one missing
@@ -401,7 +366,7 @@ default="affine"
     n_features_in_: int
     feature_names_in_: NDArray
 
-    _model: TableModel
+    _model: fitted_model.TableModel
     _frame_sizes: NDArray
     _limits: ClassVar[Limits] = LIMITS  # others: `limited`
     # Settings of a fit that continues another one: whole, errors, start, known
@@ -422,15 +387,13 @@ default="affine"
         "independence": [StrOptions(set(choices.INDEPENDENCE)), None],
         "loss": [StrOptions(set(choices.LOSSES))],
         "remove_pose": ["boolean"],
-        "layout": [StrOptions(set(LAYOUTS))],
+        "layout": [StrOptions(set(tables.LAYOUTS))],
         "scale_frames": ["boolean"],
         "hidden_points": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "tol": [None, Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
-        "keep_frames": ["boolean"],
-        "frames_folder": [None, str, HasMethods("__fspath__")],
-        "working_memory": [None, Interval(Real, 0, None, closed="neither")],
+        "keep_frames": ["boolean", str, HasMethods("__fspath__")],
         "n_jobs": N_JOBS,
         "verbose": ["verbose"],
     }
@@ -449,15 +412,13 @@ default="affine"
         independence: choices.Independence | None = "shapes",
         loss: choices.Loss = "linear",
         remove_pose: bool = False,
-        layout: Layout = "interleaved",
+        layout: tables.Layout = "interleaved",
         scale_frames: bool = True,
         hidden_points: bool = True,
         max_iter: int = 1000,
         tol: float | None = None,
         random_state: Any = None,
-        keep_frames: bool = True,
-        frames_folder: str | os.PathLike[str] | None = None,
-        working_memory: float | None = None,
+        keep_frames: bool | str | os.PathLike[str] = True,
         n_jobs: int | None = None,
         verbose: int = 0,
     ):
@@ -479,8 +440,6 @@ default="affine"
         self.tol = tol
         self.random_state = random_state
         self.keep_frames = keep_frames
-        self.frames_folder = frames_folder
-        self.working_memory = working_memory
         self.n_jobs = n_jobs
         self.verbose = verbose
 
@@ -519,11 +478,11 @@ default="affine"
             for `n_components`, or column names that contradict `layout`; if a frame
             shows one to three points, or points on one line only; if a point is visible
             in too few frames; if parameters or tables need the joint refinement; if
-            `frames_folder` is an empty text; or if weights are negative, not finite, of
+            `keep_frames` is an empty text; or if weights are negative, not finite, of
             another shape, or not supported by parameters or table.
         OSError
-            If `frames_folder` cannot be made or written to, before the fit; if the disk
-            is full, after it.
+            If the folder `keep_frames` cannot be made or written to, before the fit; if
+            the disk is full, after it.
 
         Warns
         -----
@@ -533,8 +492,10 @@ default="affine"
             coordinate, rows are left out or mirror images, outliers bend the shapes, a
             prior does not suit, or a fit has not converged.
         """
-        self._forget()
-        with kept_arrays(self.frames_folder) as keep, undetermined(self.camera):
+        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
+        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
+        self.__dict__ = {name: vars(self)[name] for name in names}
+        with kept_arrays(self.keep_frames) as keep, scaling.undetermined(self.camera):
             progress = FitProgress(self, stages_of(self), stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, groups=groups)
         progress.end()
@@ -569,7 +530,7 @@ default="affine"
         self,
         X: Any,
         point_weight: Any,
-        progress: FitProgress | NoProgress,
+        progress: Progress,
         *,
         keep: Keep = dict,
         groups: Any = None,
@@ -604,8 +565,8 @@ default="affine"
         }
         reported = leading(frames, model.n_components)
         if self.remove_pose:
-            self.pose_effect_ = pose_effect(frames.motion, reported.alpha)
-            left = reported.alpha - removed_part(self, frames.motion)
+            self.pose_effect_ = camera_models.pose_effect(frames.motion, reported.alpha)
+            left = reported.alpha - fitted_model.removed_part(self, frames.motion)
             reported = reported._replace(alpha=left)
         if self.keep_frames:
             for name, part in keep(reported._asdict()).items():
@@ -619,26 +580,28 @@ default="affine"
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
         if settings.errors and settings.joint:
-            warn_after_fit(self, fitted_prior(self.prior), frames.motion, left_out)
+            warn_after_fit(
+                self, fitted_model.fitted_prior(self.prior), frames.motion, left_out
+            )
 
     def _ready(
         self, X: Any, point_weight: Any = None
-    ) -> tuple[FrameBlocks, NDArray | None, FitSettings]:
+    ) -> tuple[tables.FrameBlocks, NDArray | None, FitSettings]:
         """Return the checked table of a fit, its weights and settings; set names."""
         joint = self.refinement in choices.JOINT_REFINEMENTS
         params = self.get_params(deep=False)
         choices.check_requirements(params | {"point_weight": point_weight})
         if not joint:
-            if is_on_dask(X) or isinstance(X, StoredTable):
+            if tables.is_on_dask(X) or isinstance(X, tables.StoredTable):
                 raise ValueError(
                     "a table that is not in memory needs refinement='joint'; got "
                     f"refinement={self.refinement!r}"
                 )
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
-        check_camera(self)
+        scaling.check_camera(self)
         source, weights = self._opened(X, point_weight, reset=True)
-        params |= checked_prior(self, source.empty.shape[2])
+        params |= fitted_model.checked_prior(self, source.empty.shape[2])
         if self.tol is None:
             params["tol"] = JOINT_TOL if joint else PAPER_TOL
         if self.camera == "orthographic":  # one scale
@@ -655,16 +618,10 @@ default="affine"
         )
         return source, weights[0] if weights else None, settings
 
-    def _focal_shares(self, table: FrameBlocks) -> tuple[NDArray, ...]:
+    def _focal_shares(self, table: tables.FrameBlocks) -> tuple[NDArray, ...]:
         """Return the mean focal length over those of frames (n, 1), if they differ."""
         given = getattr(self, "focal_length_", self.focal_length)
-        return focal_shares(given, table.n_frames)
-
-    def _forget(self) -> None:
-        """Remove all results of an earlier fit at once."""
-        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
-        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
-        self.__dict__ = {name: vars(self)[name] for name in names}
+        return camera_models.focal_shares(given, table.n_frames)
 
     def __sklearn_clone__(self) -> Any:
         """Return an unfitted copy, whose prior is still fitted."""
@@ -707,9 +664,9 @@ default="affine"
 
         def coefficients(fit: Decomposition, *_: NDArray) -> NDArray:
             alpha = leading(fit, self._model.n_components).alpha
-            return alpha - removed_part(self, fit.motion)
+            return alpha - fitted_model.removed_part(self, fit.motion)
 
-        return of_fits(self, coefficients, X, point_weight)
+        return fitted_model.of_fits(self, coefficients, X, point_weight)
 
     def decompose(self, X: Any, *, point_weight: Any = None) -> Decomposition:
         """
@@ -732,7 +689,7 @@ default="affine"
         def reported(fit: Decomposition, *_: NDArray) -> Decomposition:
             return leading(fit, self._model.n_components)
 
-        return of_fits(self, reported, X, point_weight, deviations=True)
+        return fitted_model.of_fits(self, reported, X, point_weight, deviations=True)
 
     def smooth(
         self,
@@ -799,7 +756,7 @@ default="affine"
         table, weights = self._opened(X, point_weight)
         frames = self._jointly_fitted("smooth")
         alone = table.joined(self._model.linearised, *weights)
-        camera, dtype = CAMERAS[frames.camera], table.empty.dtype
+        camera, dtype = camera_models.CAMERAS[frames.camera], table.empty.dtype
         result = smooth(
             alone, frames.gauge, camera, time, groups, max_gap, max_iter, tol, dtype
         )
@@ -807,7 +764,7 @@ default="affine"
         if self._model.pinhole is not None:
             fit = table.joined(self._model.in_table_cameras, *fit)
         fit = leading(fit, self._model.n_components)
-        left = fit.alpha - removed_part(self, fit.motion)
+        left = fit.alpha - fitted_model.removed_part(self, fit.motion)
         return result._replace(alpha=left, alpha_std=fit.alpha_std, decomposition=fit)
 
     def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
@@ -839,7 +796,7 @@ default="affine"
         posterior = table.joined(self._model.posterior, *weights)
         covariance = space @ posterior.turn_covariance @ space.T
         if certainty.turns is not None:
-            R, _ = full_rotations(posterior.motion @ space.T)
+            R, _ = camera_models.full_rotations(posterior.motion @ space.T)
             covariance = covariance + R.mT @ certainty.turns @ R
         return np.asarray(covariance).astype(table.empty.dtype, copy=False)
 
@@ -943,7 +900,7 @@ default="affine"
                 f"Euclidean as they are; got camera={camera!r}"
             )
         if camera is not None and fitted == "affine":
-            check_frames_kept(self, "reconstruct with a camera")
+            scaling.check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled, model = metric is not None and camera == "orthographic", self._model
 
@@ -954,7 +911,7 @@ default="affine"
         if decomposed:
             return shapes_of(X)
         if not return_std:
-            return of_fits(self, shapes_of, X, point_weight)
+            return fitted_model.of_fits(self, shapes_of, X, point_weight)
         table, weights = self._opened(X, point_weight)
         uncertain = partial(model.uncertain_shapes, turned=turned)
         return table.collect(uncertain, *weights)
@@ -980,11 +937,11 @@ default="affine"
             If there is not one column for each basis shape.
         """
         check_is_fitted(self)
-        alpha = check_array(unmasked(alpha), input_name="alpha", **CHECKS)
+        alpha = check_array(tables.unmasked(alpha), input_name="alpha", **tables.CHECKS)
         if alpha.shape[1] != len(self.basis_):
             expected = len(alpha), len(self.basis_)
             raise ValueError(f"alpha must have shape {expected}; got {alpha.shape}")
-        return compose(self.mean_shape_, self.basis_, alpha)
+        return camera_models.compose(self.mean_shape_, self.basis_, alpha)
 
     def mirrored(self) -> Self:
         """
@@ -1002,7 +959,7 @@ default="affine"
             cameras. Its rotations are those mirrored along the line of sight.
         """
         check_is_fitted(self)
-        if sees_perspective(self):
+        if fitted_model.sees_perspective(self):
             raise ValueError(
                 "perspective decides between the two mirror images: the other one does "
                 "not fit. mirror_certainty_ is the probability of the right one"
@@ -1029,7 +986,7 @@ default="affine"
             few visible points.
         """
         check_is_fitted(self)
-        return of_fits(self, self._model.reproject, X, point_weight)
+        return fitted_model.of_fits(self, self._model.reproject, X, point_weight)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -1060,10 +1017,12 @@ default="affine"
         motion = self.reference_motion_ if motion is None else motion
         if translation is None:
             translation = self.reference_translation_
-        motion = checked("motion", motion, (len(shapes), 2, 3), (2, 3))
-        translation = checked("translation", translation, (len(shapes), 2), (2,))
+        motion = scaling.checked("motion", motion, (len(shapes), 2, 3), (2, 3))
+        translation = scaling.checked(
+            "translation", translation, (len(shapes), 2), (2,)
+        )
         images = self._model.images(shapes, motion, translation)
-        return tracks_to_table(images, self._model.layout)
+        return tables.tracks_to_table(images, self._model.layout)
 
     def score(self, X: Any, y: Any = None, *, point_weight: Any = None) -> float:
         """
@@ -1116,7 +1075,7 @@ default="affine"
         """
         check_is_fitted(self)
         self._jointly_fitted("diagnostics")
-        check_frames_kept(self, "diagnostics")
+        scaling.check_frames_kept(self, "diagnostics")
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
         table, weights = (None, ()) if X is None else self._opened(X, point_weight)
         return diagnose(self, table, weights, rows)
@@ -1135,7 +1094,7 @@ default="affine"
 
     def _opened(
         self, X: Any, point_weight: Any = None, reset: bool = False, judged: bool = True
-    ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
+    ) -> tuple[tables.FrameBlocks, tuple[NDArray, ...]]:
         """Return the rows (n, 2, J) of a table, and the weights (n, J) of their points.
 
         There are no weights if all visible points have weight one. Unless `reset`, the
@@ -1151,23 +1110,26 @@ default="affine"
             known = "joint" if frames.joint else None
             given = {"point_weight": point_weight, "refinement": known}
             choices.check_requirements(given | {"loss": frames.loss})
-        if is_read_later(X):
-            check_table(X, layout)
-            validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
+        if tables.is_read_later(X):
+            scaling.check_table(X, layout)
+            validate_data(
+                self, tables.column_sample(X), reset=reset, skip_check_array=True
+            )
         else:
-            X = validated_table(self, X, layout, reset)
+            X = scaling.validated_table(self, X, layout, reset)
         names = getattr(self, "feature_names_in_", None)
-        n_jobs, memory = self.n_jobs, self.working_memory
-        table = open_table(
-            X, layout, names, counted=reset, n_jobs=n_jobs, working_memory=memory
-        )
+        table = tables.open_table(X, layout, names, counted=reset, n_jobs=self.n_jobs)
         for share in self._focal_shares(table):
-            table = zoomed_table(table, share, self.principal_point)
+            # As cameras with the mean focal length would show the rows
+            moved = partial(
+                camera_models.zoomed, centre=np.reshape(self.principal_point, (2, 1))
+            )
+            table = table.derive(moved, share[..., None])
         weights: tuple[NDArray, ...] = ()
         if point_weight is not None:
-            table, weights = weighted_rows(table, point_weight)
-        if judged and not (reset or is_on_dask(X)):
-            warn_if_foreign(self, table, None, *weights)
+            table, weights = scaling.weighted_rows(table, point_weight)
+        if judged and not (reset or tables.is_on_dask(X)):
+            fitted_model.warn_if_foreign(self, table, None, *weights)
         return table, weights
 
 

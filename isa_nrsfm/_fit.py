@@ -28,7 +28,6 @@ several groups of points it moves, which gives its deviation (jackknife).
 """
 
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -39,32 +38,21 @@ from scipy.special import expit, logit, stdtr
 from sklearn.base import clone
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import FitProgress, NoProgress, one_blas_thread
+from isa_nrsfm._compat.scikit_learn import NoProgress, Progress, one_blas_thread
 from isa_nrsfm._fitted_model import TableModel, prior_start
+from isa_nrsfm._frames import gauge
 from isa_nrsfm._frames.camera_models import (
     Pinhole,
     common,
     compose,
+    distances,
     line_of_sight,
+    mean_view,
     nearest_calibrated,
     pinhole_of,
-    reference_camera,
-    reprojection_error,
 )
-from isa_nrsfm._frames.gauge import (
-    image_energies,
-    independent_gauge,
-    mode_covariance,
-    reorder_blocks,
-    rigid_gauge,
-)
-from isa_nrsfm._frames.models import (
-    MIRROR,
-    Decomposition,
-    FrameMap,
-    FrameModel,
-    spread_starts,
-)
+from isa_nrsfm._frames.models import Decomposition, FrameMap, FrameModel, spread_starts
+from isa_nrsfm._joint import uncertainty
 from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
@@ -72,22 +60,9 @@ from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, lifted_shapes, rigid_start
-from isa_nrsfm._joint.uncertainty import (
-    N_GROUPS,
-    FrameFits,
-    depth_certainty,
-    fitted_frames,
-    frame_certainty,
-    half_tables,
-    n_reliable,
-    neighbours,
-    reliabilities,
-    shape_information,
-    shown_frames,
-)
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.robust import gross_outliers, robust_square
+from isa_nrsfm._prepare.robust import TUNING, gross_outliers
 from isa_nrsfm._prepare.scaling import (
     ScaledTable,
     largest_n_components,
@@ -96,13 +71,7 @@ from isa_nrsfm._prepare.scaling import (
     scaled_table,
 )
 from isa_nrsfm._tables import FrameBlocks, of_all_rows, spread
-from isa_nrsfm.isa._pipeline import (
-    Factorisation,
-    block_triplets,
-    factorise,
-    run_paper_pipeline,
-    sample_frames,
-)
+from isa_nrsfm.isa import _pipeline as pipeline
 
 JOINT_STAGE = "joint refinement"
 CONSENSUS_STAGE = "consensus of groups of points"
@@ -193,9 +162,10 @@ class TableFit(NamedTuple):
 
     def mirrored(self) -> "TableFit":
         """Return the mirror image in depth."""
-        attributes = self.attributes | self.model.mirrored_attributes(self.attributes)
-        frames = self.frames._replace(motion=self.frames.motion * MIRROR)
-        model = attributes.pop("_model")
+        known = self.attributes | {"motion_": self.frames.motion}
+        attributes = known | self.model.mirrored_attributes(known)
+        model, motion = attributes.pop("_model"), attributes.pop("motion_")
+        frames = self.frames._replace(motion=motion)
         return self._replace(model=model, frames=frames, attributes=attributes)
 
 
@@ -214,13 +184,13 @@ def stages_of(estimator: Any) -> list[str]:
     return stages + [PERSPECTIVE_STAGE] * (estimator.camera == "perspective")
 
 
-@one_blas_thread
+@one_blas_thread()
 def fit_table(
     table: ScaledTable,
     n_components: int,
     isa: Any,
     settings: FitSettings,
-    progress: FitProgress | NoProgress,
+    progress: Progress,
 ) -> TableFit:
     """Fit a table, report K coefficients, and fit a clone of the strategy `isa`.
 
@@ -243,7 +213,7 @@ def fit_table(
         given = _started(table, settings, n_components)
     if given is None:
         isa, factors = clone(isa), factorised.factors
-        shapes, covariance, n_iter, converged = run_paper_pipeline(
+        shapes, covariance, n_iter, converged = pipeline.run_paper_pipeline(
             factors.leading(3 * wanted), wanted, isa, settings, progress
         )
         if settings.all_directions:  # the start has a fixed number of basis shapes
@@ -256,14 +226,14 @@ def fit_table(
     if settings.joint:
         fit = _joint_fit(factorised, shapes, given, settings, wanted, progress)
         # Down-weighted outliers, for example, look like basis shapes at first.
-        supported = max(n_reliable(fit.attributes["reliability_"]), 1)
+        supported = max(uncertainty.n_reliable(fit.attributes["reliability_"]), 1)
         falls = settings.free and not settings.all_directions
         if falls and supported < n_components:
             progress("gauge and coefficients")
             first = first._replace(known=None)
             return fit_table(table, supported, isa, first, NoProgress())
     else:
-        fit = _paper_fit(table, factorised.factors, shapes, covariance, settings)
+        fit = _paper_fit(factorised, shapes, covariance, settings)
         fit.attributes["n_iter_"] = n_iter
         fit = fit._replace(converged=converged)
     # The mirror image in depth
@@ -287,7 +257,7 @@ def _joint_fit(
     given: JointState | None,
     settings: FitSettings,
     n_components: int,
-    progress: FitProgress | NoProgress,
+    progress: Progress,
 ) -> TableFit:
     """Return the joint fit from shapes, or a given state, or the consensus of groups.
 
@@ -295,8 +265,10 @@ def _joint_fit(
     that are shown, some attributes are lacking.
     """
     table, settings = factorised.scaled, settings._replace(on_step=progress.step)
-    args = factorised, shapes, given
-    fit, tracks, alpha = settings.remembered("joint", fit_jointly, *args)
+    known = {} if settings.known is None else settings.known
+    if "joint" not in known:
+        known["joint"] = fit_jointly(factorised, shapes, given, settings)
+    fit, tracks, alpha = known["joint"]
     settings = settings._replace(shape_prior=fit.prior)
     progress(JOINT_STAGE)
     (shapes, _, noise), starts, widths = fit.state, spread_starts(alpha, 8), fit.widths
@@ -314,19 +286,17 @@ def _joint_fit(
             n_unknowns = widths.n_unknowns(len(table.sizes), settings.camera)
             noise *= n_numbers / (n_numbers - n_unknowns)
         grouped = fit.misfit > noise
-    if (needed := errors and calibrated) and (
-        not grouped or "certainty" in (settings.known or ())
-    ):
-        of = model, table.rows, table.weights, widths, fit.rivals
-        certainty = settings.remembered("certainty", depth_certainty, *of)
-        model, needed = replace(model, certainty=certainty), False
+    if errors and calibrated and not grouped and "certainty" not in known:
+        known["certainty"] = uncertainty.depth_certainty(model, table, fit, settings)
+    if errors and calibrated and "certainty" in known:
+        model = replace(model, certainty=known["certainty"])
     if errors and widths is not None and not grouped:
         mean = bagged(model, table, settings, widths)
         if mean is not None:
             model, widths = mean
             tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
-        model, widths = consensus(model, table, settings, needed, fit), None
+        model, widths = consensus(model, table, settings, fit), None
         tracks = JointFrames.from_points(table.rows, table.complete)
     if settings.refinement == "consensus":
         progress(CONSENSUS_STAGE)
@@ -346,7 +316,7 @@ def _joint_fit(
         starts = np.pad(model.starts, ((0, 0), (0, n_more)))
         model = replace(model, shapes=shapes, starts=starts)
         widths = None if widths is None else widths.padded(n_more)
-    fits = fitted_frames(model, tracks, table.rows)
+    fits = uncertainty.fitted_frames(model, tracks, table.rows)
     del tracks  # as much memory as the table
     result = _joint_frames(table, model, fits, settings, n_components, widths)
     if fit.prior is not None:
@@ -357,12 +327,9 @@ def _joint_fit(
     return result._replace(converged=fit.converged, attributes=attributes)
 
 
-@one_blas_thread
+@one_blas_thread()
 def supported_components(
-    table: ScaledTable,
-    isa: Any,
-    settings: FitSettings,
-    progress: FitProgress | NoProgress,
+    table: ScaledTable, isa: Any, settings: FitSettings, progress: Progress
 ) -> int:
     """Return the number of relevant basis shapes of affine cameras, at most twelve."""
     possible = most_components(len(table.sizes), table.n_points, settings.camera)
@@ -370,16 +337,13 @@ def supported_components(
     quiet = NoProgress()
     factorised = _factorised(table, most, settings, quiet)
     factors = factorised.factors
-    shapes, *_ = run_paper_pipeline(factors, most, clone(isa), settings, quiet)
+    shapes, *_ = pipeline.run_paper_pipeline(factors, most, clone(isa), settings, quiet)
     progress("number of basis shapes")
     return count_components(factorised, shapes, settings)
 
 
 def _factorised(
-    table: ScaledTable,
-    n_components: int,
-    settings: FitSettings,
-    report: Callable[[str], None],
+    table: ScaledTable, n_components: int, settings: FitSettings, report: Progress
 ) -> FactorisedTable:
     """Return a table with outliers (robust loss), completed frames and factors."""
     limits, n_points = settings.limits, table.n_points
@@ -398,16 +362,18 @@ def _factorised(
         completed = complete_rows(completed, n_points, n_components, most)
     report("table")
     shape = 2 * len(table.sizes), n_points
-    triplets = block_triplets(completed, shape, n_triplets, limits.dense)
+    triplets = pipeline.block_triplets(completed, shape, n_triplets, limits.dense)
     values, vectors, rest = triplets
     # With a prior there may be few frames.
     values = np.pad(values, (0, n_triplets - len(values)))
     if settings.joint:
         rigid, first = vectors[:3], limits.sample
-        W, parts = sample_frames(completed, n_points, rigid, first, limits.small_table)
+        W, parts = pipeline.sample_frames(
+            completed, n_points, rigid, first, limits.small_table
+        )
     else:
         W, parts = completed.whole().reshape(shape), []
-    factors = factorise(W, n_components, table.precision, triplets)
+    factors = pipeline.factorise(W, n_components, table.precision, triplets)
     compressed = None
     few = max(24 * (n_components + 1), limits.many_points)
     if settings.joint and settings.prior is None and n_points > few:
@@ -448,34 +414,51 @@ def _started(
 
 
 def _paper_fit(
-    table: ScaledTable,
-    factors: Factorisation,
-    shapes: NDArray,
-    covariance: NDArray,
-    s: FitSettings,
+    factorised: FactorisedTable, shapes: NDArray, covariance: NDArray, s: FitSettings
 ) -> TableFit:
     """Return the fit of the paper's pipeline in its gauge."""
+    table = factorised.scaled
     if s.camera != "affine":
         scaled = s.camera == "weak_perspective"
-        shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
+        shapes = table.sizes[0] * rigid_start(factorised.factors, shapes, scaled)[1]
 
-    # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
-    def fitted(mean_shape: NDArray, basis: NDArray) -> tuple[TableModel, Decomposition]:
+    def fitted() -> tuple[TableModel, Decomposition]:
         frames, K = FrameModel.rigid(mean_shape, basis, s.camera), len(basis)
         model = TableModel(frames, mean_shape, basis, K, s.layout, table.unit)
         return model, table.source.joined(partial(model.decompose, dtype=np.float64))
 
-    model, frames, order = rigid_gauge(
-        shapes[0].T, shapes[1:].mT, table.sizes, fitted, s.camera, table.dtype
-    )
-    covariance = (table.unit or 1.0) ** 2 * reorder_blocks(covariance, order)
+    # The gauge is that of a fit to visible points, not to completed frames. One scaling
+    # is enough, unless frames have fewer points than coefficients need.
+    mean_shape, basis, order = shapes[0].T, shapes[1:].mT, np.arange(len(shapes) - 1)
+    model, frames = fitted()
+    for _ in range(50):
+        motion = frames.motion / table.sizes[:, None, None]
+        if s.camera == "affine":
+            space = gauge.canonical_space(mean_shape, motion)
+        else:
+            size = 1.0 if s.camera == "orthographic" else None
+            space = gauge.euclidean_space(mean_shape, motion, size)
+        mean_shape, basis, new_order, _ = gauge.canonical_gauge(
+            mean_shape, basis, motion, frames.alpha, space
+        )
+        order = order[new_order]
+        # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
+        mean_shape, basis = mean_shape.astype(table.dtype), basis.astype(table.dtype)
+        model, frames = fitted()
+        # Coefficients scale with the basis shapes. If a frame does not determine its
+        # coefficients, their solution of minimum norm changes.
+        off = gauge.coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
+        if np.abs(off).max(initial=0.0) <= 1e-6:
+            break
+    index = (3 * order[:, None] + np.arange(3)).ravel()
+    covariance = (table.unit or 1.0) ** 2 * covariance[np.ix_(index, index)]
     return TableFit(model, frames, True, {"mode_covariance_": covariance})
 
 
 def _joint_frames(
     table: ScaledTable,
     model: FrameModel,
-    fits: FrameFits,
+    fits: uncertainty.FrameFits,
     s: FitSettings,
     n_components: int,
     widths: Widths | None,
@@ -500,29 +483,32 @@ def _joint_frames(
     attributes: dict[str, Any] = {}
     if prior is None:
         kind = s.independence, s.camera, unit, n_components, s.remove_pose
-        mean_shape, basis, gauge = independent_gauge(model.shapes, motion, alpha, *kind)
+        chosen = gauge.independent_gauge(model.shapes, motion, alpha, *kind)
+        mean_shape, basis, frame_map = chosen
     else:
-        gauge = prior.gauge
-        mean_shape, basis = gauge.public(model.shapes)
+        frame_map = prior.gauge
+        mean_shape, basis = frame_map.public(model.shapes)
     weight = table.n_seen if table.weights is None else table.weights.sum(axis=1)
     share, slices = weight / table.n_points, posteriors.slices
-    information = shape_information(motion, alpha, covariance, share, slices)
+    information = uncertainty.shape_information(
+        motion, alpha, covariance, share, slices
+    )
     if widths is not None:  # as in `MarginalLikelihood`
         ridge = np.append(0.0, model.noise_variance / widths.variances)
         information += np.diag(np.repeat(ridge, 3))
     if prior is None:
-        uncertainty = np.linalg.pinv(information, hermitian=True)
-        attributes["_halves"] = half_tables(
-            table, model, motion, alpha, uncertainty, s.groups, kind
+        inverse = np.linalg.pinv(information, hermitian=True)
+        attributes["_halves"] = uncertainty.half_tables(
+            table, model, motion, alpha, inverse, s.groups, kind
         )
     else:
-        uncertainty = prior.inverse(information[None], noise)[0]
+        inverse = prior.inverse(information[None], noise)[0]
     known = prior or widths
     unknowns = float(model.shapes.size) if known is None else known.n_determined
-    certainty = frame_certainty(model, fits, table.n_seen, weight, unknowns)
+    certainty = uncertainty.frame_certainty(model, fits, table.n_seen, weight, unknowns)
     certainty = certainty._replace(weighted=table.weights is not None)
-    model = replace(model, gauge=gauge, certainty=certainty)
-    last_pass = partial(shown_frames, frames=model, uncertainty=uncertainty)
+    model = replace(model, gauge=frame_map, certainty=certainty)
+    last_pass = partial(uncertainty.shown_frames, frames=model, inverse=inverse)
     passes = posteriors.map(last_pass, table.sizes, table.n_seen, weight)
     parts, moments, noises = zip(*passes, strict=True)
     frames = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
@@ -534,8 +520,10 @@ def _joint_frames(
         depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
-    modes = mode_covariance(cameras, frames.alpha[:, :n_components])
-    reliability = reliabilities(alpha, covariance, sum(moments), sum(noises))
+    modes = gauge.mode_covariance(cameras, frames.alpha[:, :n_components])
+    reliability = uncertainty.reliabilities(
+        alpha, covariance, sum(moments), sum(noises)
+    )
     attributes |= {
         "mode_covariance_": square * modes,
         "noise_variance_": square * noise,
@@ -554,10 +542,18 @@ def _measures(
     mean_shape, basis, K = model.mean_shape, model.basis, model.n_components
     values = factorised.singular_values
     cameras = frames.motion / table.sizes[:, None, None]
-    energy = image_energies(cameras, basis, frames.alpha)
+    energy = gauge.image_energies(cameras, basis, frames.alpha)
     position = (frames.translation - table.translation) / table.sizes[:, None]
     shapes = np.concatenate([mean_shape[None], basis]).mT
-    error = reprojection_error(table.rows, shapes, cameras, position, frames.alpha)
+
+    def energies(rows: NDArray, *fit: NDArray) -> tuple[float, float]:
+        """Return the energies of residuals over visible points, and of frames."""
+        noise = np.nansum(distances(rows, shapes, *fit) ** 2)
+        middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
+        return float(noise), float(np.nansum((rows - middle) ** 2))
+
+    passes = table.rows.map(energies, cameras, position, frames.alpha)
+    noise, signal = np.sum(list(passes), axis=0)
     reference = mean_camera(frames, table.sizes, camera)
     return {
         "mean_shape_": mean_shape,
@@ -565,13 +561,23 @@ def _measures(
         "rank_floor_": factorised.rest_share(3 * K + 3),
         "singular_values_": (table.unit or 1.0) * values[: 3 * K + 3],
         "energy_share_": energy[:K] / (energy.sum() or 1.0),
-        "inverse_snr_": error,
+        "inverse_snr_": float(noise / signal),
     } | {name: value.astype(table.dtype) for name, value in reference.items()}
 
 
 def mean_camera(frames: Decomposition, sizes: NDArray, camera: str) -> dict[str, Any]:
-    """Return the attributes of the mean view of frames of some sizes (n,)."""
-    reference = reference_camera(frames.motion / sizes[:, None, None], sizes)
+    """Return the attributes of the mean view of frames of some sizes (n,).
+
+    That of cameras over the sizes of their frames, times the RMS size. If they have no
+    common view, it is the view along the third axis, each axis scaled by its RMS length
+    in the cameras.
+    """
+    motion = frames.motion / sizes[:, None, None]
+    reference = mean_view(motion)
+    if reference is None:
+        lengths = np.sqrt(np.mean(np.sum(motion**2, axis=1), axis=0))
+        reference = lengths * np.eye(2, 3)
+    reference = reference * np.sqrt(np.mean(sizes**2))
     if camera != "affine":
         (row,), (scale,) = nearest_calibrated(reference[None])
         reference = scale * row
@@ -587,7 +593,7 @@ class Images(NamedTuple):
     isa: Any
     settings: FitSettings
     principal_point: Any
-    progress: FitProgress | NoProgress
+    progress: Progress
 
     def pinhole(self, focal_length: float, near: bool = True) -> Pinhole:
         """Return the camera with a focal length."""
@@ -604,11 +610,13 @@ class Images(NamedTuple):
 
         Without a camera they are those of the table.
         """
-        rows, model = self.source, None if fit is None else fit.model
-        known = () if fit is None else (fit.frames.motion, fit.frames.alpha)
+        rows = self.source
         if pinhole is not None:
-            straight = partial(_straight, pinhole=pinhole, model=model)
-            rows = rows.derive(straight, *known)
+            rows = rows.derive(pinhole.virtual, kept=fit is None)
+            if fit is not None:
+                depths, known = fit.model.depths, (fit.frames.motion, fit.frames.alpha)
+                straight = pinhole.straight
+                rows = rows.derive(lambda r, *f: straight(r, depths(*f)), *known)
         return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
@@ -618,7 +626,7 @@ class Images(NamedTuple):
         before: TableFit | None = None,
         *,
         last: bool = False,
-        progress: FitProgress | NoProgress | None = None,
+        progress: Progress | None = None,
         **changes: Any,
     ) -> TableFit:
         """Return the fit of images that are corrected for the depths of another fit.
@@ -648,8 +656,7 @@ class Images(NamedTuple):
             if before is not None and n_components == before.model.n_components:
                 return before
         table = self.straight(n_components, pinhole, before)
-        args = table, n_components, isa, settings, progress or quiet
-        fit = fit_table(*args)
+        fit = fit_table(table, n_components, isa, settings, progress or quiet)
         fit = fit._replace(model=fit.model._replace(pinhole=pinhole))
         if before is not None:
             change = fit.change(before, self.source.slices)
@@ -661,11 +668,7 @@ class Images(NamedTuple):
         return fit._replace(energies=square / counts.sum())
 
     def settled(
-        self,
-        pinhole: Pinhole,
-        n_components: int,
-        *fits: TableFit,
-        tol: float = SETTLED,
+        self, pinhole: Pinhole, n_components: int, *fits: TableFit, tol: float = SETTLED
     ) -> list[TableFit]:
         """Repeat fits until depths and fits agree; return them, the best first.
 
@@ -690,19 +693,13 @@ class Images(NamedTuple):
             better, worse = worse, better
         return {1.0 / f: better, -1.0 / f: worse}
 
-    def preferred(self, model: TableModel, weak: TableModel) -> bool:
-        """Return whether held-out points prefer a model to weak perspective."""
-        known = () if self.weights is None else (self.weights,)
-        ours, theirs = (m.held_out_error(self.source, *known) for m in (model, weak))
-        return ours < theirs
-
     def log_odds(self, fit: TableFit, image: TableFit) -> float:
         """Return the log odds of a fit against its mirror image.
 
         The evidence is a test of E over groups of points, and the prior, if any.
         """
         gain = image.energies - fit.energies
-        gain = np.bincount(neighbours(fit.model.mean_shape.T), gain)
+        gain = np.bincount(uncertainty.neighbours(fit.model.mean_shape.T), gain)
         t = gain.mean() / gain.std(ddof=1) * np.sqrt(len(gain))
         odds = float(logit(stdtr(len(gain) - 1, t)))
         if np.isnan(self.settings.mirror_certainty):
@@ -713,7 +710,9 @@ class Images(NamedTuple):
 
     def started(self, model: TableModel, n_components: Any) -> TableFit:
         """Return the fit from the model of a similar table, with its focal length."""
-        frames = self.source.joined(model.in_virtual_cameras)
+        weak = model._replace(pinhole=None)  # its frames are those of virtual cameras
+        virtual = partial(weak.decompose, deviations=False, dtype=np.float64)
+        frames = self.source.derive(model.straightened, kept=False).joined(virtual)
         fit = TableFit(model, frames, True, {"isa_": None})
         return self.settled(fit.pinhole, n_components, fit)[0]
 
@@ -782,7 +781,7 @@ def minimum(fits: dict[float, TableFit]) -> tuple[float, float]:
     """Return the minimum of a parabola through the three best fits, its deviation."""
     g = sorted(fits, key=lambda g: fits[g].energy)[:3]
     energies = np.array([fits[place].energies for place in g])
-    groups = neighbours(fits[g[0]].model.mean_shape.T)
+    groups = uncertainty.neighbours(fits[g[0]].model.mean_shape.T)
 
     def vertex(kept: NDArray) -> float:
         """Return the minimum for some of the points, or infinity if there is none."""
@@ -790,11 +789,11 @@ def minimum(fits: dict[float, TableFit]) -> tuple[float, float]:
         return float(-0.5 * slope / square) if square > 0 else np.inf
 
     every = vertex(groups >= 0)
-    parts = np.array([vertex(groups != group) for group in range(N_GROUPS)])
+    parts = np.array([vertex(groups != group) for group in range(uncertainty.N_GROUPS)])
     if not np.isfinite(parts).all():
         return every, np.inf
     # Few groups: the error has a t distribution, whose deviation is larger.
-    n_free = N_GROUPS - 1
+    n_free = uncertainty.N_GROUPS - 1
     return every, float(parts.std() * np.sqrt(n_free * n_free / (n_free - 2)))
 
 
@@ -845,10 +844,13 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
             fit = last(best.pinhole, n_last, fit)
     plain = partial(last, None, n_components or 1, free=n_components is None)
+    weights = () if table.weights is None else (table.weights,)
     if not why and settings.start is None:
         with warnings.catch_warnings(action="ignore"):
             weak = (settings.known or {}).get("weak") or plain(errors=False).model
-        why = "" if table.preferred(fit.model, weak) else NOT_BETTER
+        models = fit.model, weak
+        error, of_weak = (m.held_out_error(table.source, *weights) for m in models)
+        why = "" if error < of_weak else NOT_BETTER
     table.progress(PERSPECTIVE_STAGE)
     if why:
         warn_caller(f"{why}. {WEAK}")
@@ -864,7 +866,6 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         probability = float(expit(table.log_odds(fits[least], fits[-least])))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
     # Frames as new tables have them
-    weights = () if table.weights is None else (table.weights,)
     decompose = partial(model.decompose, dtype=np.float64)
     frames: Decomposition = table.source.joined(decompose, *weights)
     dtype = table.source.empty.dtype
@@ -898,20 +899,11 @@ def focal_error(
     return float(change * deviation / abs(second - first))
 
 
-def _straight(
-    rows: NDArray, *frames: NDArray, pinhole: Pinhole, model: TableModel | None
-) -> NDArray:
-    """Return weak-perspective images (n, 2, J) of rows, for the depths of a model.
-
-    Frames are cameras and coefficients. Without a model depths are equal.
-    """
-    images = pinhole.virtual(rows)
-    return images if model is None else pinhole.straight(images, model.depths(*frames))
-
-
 def _squares(rows: NDArray, *fit: NDArray, model: TableModel) -> NDArray:
     """Return sums (J,) of squared distances, in sizes of frames, and counts."""
     square = model.distances(rows, *model.in_table_cameras(rows, *fit)[:3]) ** 2
     if model.frames.loss != "linear":
-        square = robust_square(square, model.frames.noise_variance)
+        # As the loss "cauchy" has them
+        limit = model.frames.noise_variance * TUNING["cauchy"] ** 2
+        square = limit * np.log1p(square / limit)
     return np.array([np.nansum(square, axis=0), np.isfinite(square).sum(axis=0)])

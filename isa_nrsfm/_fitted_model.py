@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,19 +87,12 @@ class TableModel(NamedTuple):
         Weights (n, n_points) are zero where points are missing, by default one.
         """
         dtype = rows.dtype if dtype is None else dtype
-        fit = self.in_virtual_cameras(rows, weights, deviations)
-        fit = self.in_table_cameras(rows, *fit)
-        return Decomposition(*(part.astype(dtype) for part in fit))
-
-    def in_virtual_cameras(
-        self, rows: NDArray, weights: NDArray | None = None, deviations: bool = False
-    ) -> Decomposition:
-        """Return fits of weak-perspective images."""
-        rows = self.straightened(rows, weights)
-        usable, centred, translation, sizes, weights = self._ready(rows, weights)
+        straight = self.straightened(rows, weights)
+        usable, centred, translation, sizes, weights = self._ready(straight, weights)
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
-        return Decomposition(*(of_all_rows(part, usable) for part in fit))
+        fit = self.in_table_cameras(rows, *(of_all_rows(part, usable) for part in fit))
+        return Decomposition(*(part.astype(dtype) for part in fit))
 
     def in_table_cameras(self, rows: NDArray, *fit: NDArray) -> Decomposition:
         """Return fits of rows in virtual cameras with the cameras of the table."""
@@ -140,7 +134,8 @@ class TableModel(NamedTuple):
             return rows
         images = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
-        weak = self._replace(frames=self.frames.without_starts, pinhole=None)
+        frames = replace(self.frames, starts=self.frames.starts[:0])
+        weak = self._replace(frames=frames, pinhole=None)
         moving = np.arange(len(rows))
         for _ in range(30 if pinhole.near else 0):
             moving = padded(moving)
@@ -161,13 +156,6 @@ class TableModel(NamedTuple):
         shapes = compose(self.mean_shape, self.basis, alpha)
         return np.vecdot(shapes, line_of_sight(motion)[:, None])
 
-    def mirrored(self) -> "TableModel":
-        """Return the model with shapes mirrored in depth."""
-        mirror = MIRROR.astype(self.mean_shape.dtype)
-        mean_shape, basis = self.mean_shape * mirror, self.basis * mirror
-        frames = self.frames.mirrored()
-        return self._replace(frames=frames, mean_shape=mean_shape, basis=basis)
-
     def mirrored_attributes(self, known: dict[str, Any]) -> dict[str, Any]:
         """Return the attributes of the mirror image in depth, from those of a fit."""
         signs, K = MIRROR.astype(self.mean_shape.dtype), self.n_components
@@ -184,7 +172,12 @@ class TableModel(NamedTuple):
             across = np.eye(3) - 2.0 * sight[:, :, None] * sight[:, None] / length
             found["rotations_"] = (across @ R * signs).astype(R.dtype)
         found["mirror_certainty_"] = 1.0 - known.get("mirror_certainty_", np.nan)
-        return found | {"_model": self.mirrored()}
+        gauge = self.frames.gauge
+        gauge = gauge._replace(space=MIRROR[:, None] * gauge.space)
+        frames, mean_shape = replace(self.frames, gauge=gauge), self.mean_shape * signs
+        basis = self.basis * signs
+        model = self._replace(frames=frames, mean_shape=mean_shape, basis=basis)
+        return found | {"_model": model}
 
     def mirror_certainty(self, rows: FrameBlocks, frames: Decomposition) -> float:
         """
@@ -282,8 +275,7 @@ class TableModel(NamedTuple):
         self, rows: NDArray, weights: NDArray | None = None, turned: bool = False
     ) -> tuple[NDArray, NDArray]:
         """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
-        fit, variances = self._uncertain(rows, weights)
-        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        fit, shapes, variances = self._uncertain(rows, weights)
         shapes = self.turned(shapes, fit) if turned else shapes
         _, scales = full_rotations(fit.motion)
         deviations = np.sqrt(variances[..., 2]) / scales[:, None]
@@ -297,16 +289,15 @@ class TableModel(NamedTuple):
         x and y are places in the table, z is the depth beyond the origin of the shape,
         in the same units.
         """
-        fit, variances = self._uncertain(rows, weights)
-        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        fit, shapes, variances = self._uncertain(rows, weights)
         points = self.turned(shapes, fit) * full_rotations(fit.motion)[1][:, None, None]
         points[..., :2] += fit.translation[:, None]
         return points, np.sqrt(variances)
 
     def _uncertain(
         self, rows: NDArray, weights: NDArray | None
-    ) -> tuple[Decomposition, NDArray]:
-        """Return frames, and variances (n, J, 3) of points in units of the table.
+    ) -> tuple[Decomposition, NDArray, NDArray]:
+        """Return frames, shapes, variances (n, J, 3) of points in units of the table.
 
         They are along the axes of the camera.
         """
@@ -320,7 +311,8 @@ class TableModel(NamedTuple):
         rotations, _ = full_rotations(self.in_camera_axes(*fit[:2]))
         turns = (rotations @ full_rotations(virtual.motion)[0].mT)[usable, None]
         variances = np.diagonal(turns @ covariances @ turns.mT, axis1=2, axis2=3)
-        return fit, of_all_rows(variances, usable)
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        return fit, shapes, of_all_rows(variances, usable)
 
     def reproject(self, fit: Decomposition, *shares: NDArray) -> NDArray:
         """Return images of fitted frames as a table, zoomed back by shares (n, 1)."""
@@ -328,8 +320,7 @@ class TableModel(NamedTuple):
         images = self.images(shapes, fit.motion, fit.translation)
         known = self.pinhole or self.axes
         if known is not None and shares:
-            centre = known.centre[:, 0]
-            images = zoomed(images, 1.0 / shares[0][..., None], centre)
+            images = zoomed(images, 1.0 / shares[0][..., None], known.centre[:, 0])
         return tracks_to_table(images, self.layout)
 
     def images(self, shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
@@ -521,9 +512,7 @@ def of_fits(
     later = is_read_later(X)
     table, weights = estimator._opened(X, point_weight, judged=later)
     shares, n = estimator._focal_shares(table), len(weights)
-
-    def fits(rows: NDArray, *weights: NDArray) -> Decomposition:
-        return estimator._model.decompose(rows, *weights, deviations=deviations)
+    fits = partial(estimator._model.decompose, deviations=deviations)
 
     def results(rows: NDArray, *by_frame: NDArray) -> Any:
         return result(fits(rows, *by_frame[:n]), *by_frame[n:])
@@ -537,8 +526,7 @@ def of_fits(
 
 def hold_open(estimator: Any, X: Any, point_weight: Any = None) -> None:
     """Open a fitted table once for all methods that it is given to."""
-    opened = estimator._opened(X, point_weight, judged=False)
-    estimator._held = X, point_weight, opened
+    estimator._held = X, point_weight, estimator._opened(X, point_weight, judged=False)
 
 
 def warn_if_foreign(
@@ -598,7 +586,7 @@ def adapting_errors(
     layout, pinhole = estimator._model.layout, estimator._model.pinhole
     given = {"layout": layout, "focal_length": pinhole and pinhole.focal_length}
     given |= {"n_components": "auto", "refinement": "joint", "prior": estimator}
-    adapted = clone(estimator).set_params(**given, frames_folder=None)
+    adapted = clone(estimator).set_params(**given, keep_frames=False)
     of_points = weights[0][::2] if weights else None
     with warnings.catch_warnings(action="ignore"):
         adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)

@@ -16,7 +16,6 @@ import copy
 import time
 import warnings
 from collections.abc import Callable, Collection
-from functools import partial
 from numbers import Integral
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -54,12 +53,7 @@ from isa_nrsfm._linalg import centred, procrustes
 from isa_nrsfm._parameters import JOINT_REFINEMENTS, named
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables import refuse_stored, spread
-from isa_nrsfm.analysis._advice import (
-    COMPARE,
-    OTHER_CAMERAS,
-    gross_residuals,
-    layout_of,
-)
+from isa_nrsfm.analysis import _advice as advice
 from isa_nrsfm.datasets import load_face_prior
 
 # For held-out errors of 100 % and more.
@@ -308,8 +302,9 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
         X, y = indexable(X, y)
         for_splitter, for_scorer = self._routed("fit", params)
         splits = list(plain.cv.split(X, y, **for_splitter))
-        given = estimator.get_params(deep=False) | {"frames_folder": None}
-        trial = StartedNRSfM(**given)
+        given = estimator.get_params(deep=False)
+        # No files of trials
+        trial = StartedNRSfM(**given | {"keep_frames": bool(estimator.keep_frames)})
         joint = trial.refinement in JOINT_REFINEMENTS
         if joint:  # a consensus only with the chosen K
             trial.set_params(refinement="joint")
@@ -830,7 +825,7 @@ def _robust_loss(best: _Fit, rows: _Rows) -> Proposal:
     if rows.weights:
         return "points have weights"
     # Fits with all directions of deformation follow outliers, held-out points cannot.
-    if not gross_residuals(np.sqrt(best.squares[..., 0]))[0] > MOST_WRONG:
+    if not advice.gross_residuals(np.sqrt(best.squares[..., 0]))[0] > MOST_WRONG:
         return "no outliers"
     return {"loss": "cauchy"}
 
@@ -856,7 +851,7 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
     """The prior of faces supplies depths that a table does not determine."""
     layout, K = rows.face_layout, best.model.n_components
-    layout = layout or getattr(layout_of(best.model), "name", None)
+    layout = layout or getattr(advice.layout_of(best.model), "name", None)
     if layout not in choices.FACE_PRIORS:
         return "no layout of faces"
     if best.determined:
@@ -895,7 +890,7 @@ def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
 def _affine(best: _Fit, rows: _Rows) -> Proposal:
     """Affine cameras absorb the stretch of images."""
     ratio = best.model.camera_noise_ratio_
-    if best.model.prior or not ratio >= OTHER_CAMERAS:
+    if best.model.prior or not ratio >= advice.OTHER_CAMERAS:
         return "not stretched"
     plain = dict.fromkeys(("focal_length", "principal_point"))
     return {"camera": "affine", "refinement": "joint"} | plain
@@ -933,7 +928,22 @@ def decided(
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
-    fitted = partial(_fitted, X, {"groups": groups, **weights}, rows)
+
+    def fitted(
+        model: AffineNRSfM, setting: str, robust: bool, first: _Fit | None = None
+    ) -> _Fit:
+        """Return a fit and its trial. Figures may be those of a first fit."""
+        since = time.perf_counter() - (first.trial.seconds if first else 0.0)
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            if not hasattr(model, "_model"):
+                model.fit(X, groups=groups, **weights)
+        seconds = time.perf_counter() - since
+        squares = first.squares if first else rows.squares(model)
+        error = unexplained_share(squares, robust or model.loss != "linear")
+        depth = float(getattr(model, "depth_uncertainty_", np.nan))
+        trial = Trial(setting, error, depth, seconds, "used")
+        return _Fit(model, trial, caught, squares)
+
     robust, used, estimator._continued = False, 0, {"known": {}}
     best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras", robust)
     trials = [best.trial]
@@ -971,31 +981,9 @@ def decided(
     if model.prior is not None:
         model.set_params(n_components=model.n_components_)
     for each in best.caught:  # made before the comparison
-        warn_caller(str(each.message).replace(f". {COMPARE}", ""), each.category)
+        warn_caller(str(each.message).replace(f". {advice.COMPARE}", ""), each.category)
     model._continued, model._trials = None, trials
     return model, trials
-
-
-def _fitted(
-    X: Any,
-    given: dict[str, Any],
-    rows: _Rows,
-    model: AffineNRSfM,
-    setting: str,
-    robust: bool,
-    first: _Fit | None = None,
-) -> _Fit:
-    """Return the fit of a model, and its trial. Figures may be those of a first fit."""
-    since = time.perf_counter() - (first.trial.seconds if first else 0.0)
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        if not hasattr(model, "_model"):
-            model.fit(X, **given)
-    seconds = time.perf_counter() - since
-    squares = first.squares if first else rows.squares(model)
-    error = unexplained_share(squares, robust or model.loss != "linear")
-    depth = float(getattr(model, "depth_uncertainty_", np.nan))
-    trial = Trial(setting, error, depth, seconds, "used")
-    return _Fit(model, trial, caught, squares)
 
 
 def _changed(best: _Fit, name: str, changes: dict[str, Any]) -> AffineNRSfM:

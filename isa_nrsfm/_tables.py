@@ -25,7 +25,7 @@ import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import NDArray
 from sklearn import get_config
-from sklearn.utils import check_array
+from sklearn.utils import check_array, gen_batches
 
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
@@ -146,8 +146,7 @@ class FrameReport(NamedTuple):
         seen edge on. With missing points it may be a line of the object, which can turn
         around it.
         """
-        enough = self.n_seen >= FEWEST_POINTS
-        return enough & ~self.in_one_place & ~self.on_line
+        return (self.n_seen >= FEWEST_POINTS) & ~self.in_one_place & ~self.on_line
 
 
 def seen_points(rows: NDArray) -> NDArray:
@@ -343,8 +342,7 @@ class FrameBlocks:
         """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
         length = max(self.lengths[:-1] or self.lengths)
         if self.cached:
-            array = self.joined(getitem, frames)
-            return self.of_array(array, length, self.n_threads)
+            return self.of_array(self.joined(getitem, frames), length, self.n_threads)
         chosen, ends = np.flatnonzero(frames), np.cumsum(self.lengths)
 
         def rows(part: slice) -> NDArray:
@@ -355,7 +353,7 @@ class FrameBlocks:
 
         return self.read_later(rows, len(chosen), length, self.n_threads)
 
-    @one_blas_thread
+    @one_blas_thread()
     def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
         """Join the results of a function of each block: arrays, or tuples of them."""
         parts = list(self.map(function, *by_frame)) or [function(self.empty)]
@@ -386,12 +384,9 @@ class FrameBlocks:
         """Join consecutive blocks in memory into blocks of at most n_frames frames."""
         if not self.cached:
             return self
-        groups: list[list[int]] = [[]]
-        for number, length in enumerate(self.lengths):
-            size = sum(self.lengths[other] for other in groups[-1])
-            if groups[-1] and size + length > n_frames:
-                groups.append([])
-            groups[-1].append(number)
+        together = max(n_frames // max(self.lengths), 1)
+        numbers = range(len(self.lengths))
+        groups = [numbers[part] for part in gen_batches(len(numbers), together)]
         blocks = [join(list(map(self.read, group))) for group in groups]
         lengths = [sum(self.lengths[number] for number in group) for group in groups]
         return self.of_blocks(blocks, lengths, self.n_threads)
@@ -560,7 +555,6 @@ def open_table(
     *,
     counted: bool = True,
     n_jobs: int | None = 1,
-    working_memory: float | None = None,
 ) -> FrameBlocks:
     """Return a table in blocks of rows (n, 2, n_points), float32 or float64.
 
@@ -569,7 +563,7 @@ def open_table(
 
     Arrays in memory must be checked already. `n_jobs` threads share their blocks and
     those of memory maps. Chunks of dask stay on its workers. Blocks of tables that are
-    read later use at most `working_memory` megabytes.
+    read later use at most the working memory of scikit-learn's configuration.
     """
     if X.ndim != 2:
         raise ValueError(
@@ -590,10 +584,9 @@ def open_table(
     if is_on_dask(X):
         blocks = DaskBlocks.of_chunks(X)
     else:
-        if working_memory is None:
-            working_memory = get_config()["working_memory"]
         # A block needs at most eight times its own memory, copies included.
-        numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
+        memory = 2**20 * get_config()["working_memory"]
+        numbers = memory / (8 * np.dtype(float).itemsize)
         most = max(int(numbers // n_columns), 1)
         if isinstance(X, np.memmap):
             most = min(most, length)

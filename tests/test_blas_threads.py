@@ -24,7 +24,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 WITH = "with self._lock:"
 
 
-@one_blas_thread
+@one_blas_thread()
 def threads_of_blas(during=lambda: None):
     """Return the numbers of threads after some function has been called."""
     during()
@@ -64,7 +64,7 @@ def test_the_last_thread_to_leave_sets_threads_back(first_to_leave):
     inside, left = Barrier(2), Barrier(2)
     numbers = []
 
-    @one_blas_thread
+    @one_blas_thread()
     def leave(first):
         inside.wait()  # both threads are inside
         if first:

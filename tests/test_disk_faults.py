@@ -141,7 +141,7 @@ class TestKeepFrames:
     @staticmethod
     def estimator(folder, **params):
         quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
-        return AffineNRSfM(1, frames_folder=folder, **quick, **params)
+        return AffineNRSfM(1, keep_frames=folder, **quick, **params)
 
     @pytest.mark.parametrize("strike", slow_after(1, STRIKES))
     def test_a_fit_that_fails_leaves_nothing(self, tmp_path, table, strike):
@@ -181,7 +181,7 @@ class TestKeepFrames:
             raise AssertionError("the fit has begun")
 
         monkeypatch.setattr(FastISA, "fit", never)
-        refused(r"frames_folder should be .* got ''", self.estimator("").fit, table)
+        refused(r"keep_frames should be .* got ''", self.estimator("").fit, table)
         (tmp_path / "file").write_bytes(OLD)
         for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
             error = refused(None, self.estimator(bad).fit, table, error=OSError)

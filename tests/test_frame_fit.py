@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -461,10 +462,10 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
         starts, gauge = np.zeros((0, 1)), FrameMap.identity(1)
         given = shapes, noise**2, starts, loss, gauge
         frames = FrameModel(*given, camera="weak_perspective")
-        blocks = FrameBlocks.of_array(rows, 8)
-        return depth_certainty(
-            frames, blocks, None, None, 0.0, FitSettings(camera="weak_perspective")
-        ).total
+        table = SimpleNamespace(rows=FrameBlocks.of_array(rows, 8), weights=None)
+        fit = SimpleNamespace(widths=None, rivals=0.0)
+        settings = FitSettings(camera=frames.camera)
+        return depth_certainty(frames, table, fit, settings).total
 
     expected = error(hidden)
     assert_allclose(error(spoilt), expected, rtol=0.002)

@@ -542,7 +542,7 @@ class TestReversal:
         M = M * REVERSED
         _, better = self.search(scene, camera, 1e-4, frames_first(M) @ search.space)
         M, _ = search.descend(problem, search.evaluate(problem, M), 6)
-        posterior = coefficient_posterior(problem[0], M, problem[1])
+        posterior = coefficient_posterior(problem, M)
         value = search.evaluate(problem, M).value
         steep = _rise(problem, M, posterior) > LARGE_RISE * value
         assert (better & steep).sum() >= 3

@@ -55,8 +55,8 @@ CASES = {
     "huber": {"loss": "huber", "independence": "coefficients"},
     "weak perspective": CALIBRATED | {"loss": "cauchy"},
     "orthographic": {"camera": "orthographic", "keep_frames": False},
-    "folder": {"frames_folder": "folder"},
-    "path of a folder": {"frames_folder": Path("folder")},
+    "folder": {"keep_frames": "folder"},
+    "path of a folder": {"keep_frames": Path("folder")},
     "mirrored": CALIBRATED | {"mirror": True},
     "prior": CALIBRATED | {"n_components": "auto", "prior": "a model"},
     "numbers of numpy": {"n_components": np.int64(2), "tol": np.float32(0.05)}
@@ -86,10 +86,10 @@ def fitted(tmp_path_factory):
         table = TABLES.get(case, TABLE)
         parameters = {"n_components": 2, "random_state": 0, "max_iter": 3} | CASES[case]
         mirror = parameters.pop("mirror", False)
-        if str(parameters.get("frames_folder")) == "folder":
-            kind = type(parameters["frames_folder"])
+        if str(parameters.get("keep_frames")) == "folder":
+            kind = type(parameters["keep_frames"])
             folder = tmp_path_factory.mktemp("frames")
-            parameters["frames_folder"] = folder if kind is not str else str(folder)
+            parameters["keep_frames"] = folder if kind is not str else str(folder)
         if "prior" in parameters:
             faces = make_face_tracks(60, n_components=2, random_state=1)
             prior = AffineNRSfM(2, camera="weak_perspective", random_state=0)

@@ -9,6 +9,7 @@ from layers import slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 from scipy.spatial.transform import Rotation
+from sklearn import config_context
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm.export import frame_points, frame_poses
@@ -147,7 +148,8 @@ def test_units_order_memory_maps_blocks_and_threads(noisy, tmp_path):
     np.save(tmp_path / "X.npy", 10 * X[order])
     mapped = np.load(tmp_path / "X.npy", mmap_mode="r")
     options = {"focal_length": 10 * F, "principal_point": (6400, 3600)}
-    other = fitted(mapped, AllStarts, n_jobs=2, working_memory=0.1, **options)
+    with config_context(working_memory=0.1):
+        other = fitted(mapped, AllStarts, n_jobs=2, **options)
     same_model(model, other, order)
     place, position = model.translation_[order], model.positions_[order]
     assert_allclose(other.translation_, 10 * place, rtol=1e-3)

@@ -9,7 +9,9 @@ from layers import slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
+from sklearn import config_context
 
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -46,6 +48,12 @@ def table(missing=0.0, n_points=20, n_frames=150, outliers=False, planar=False):
 
 def estimator(limits=ALL, tol=1.0, **params):
     return with_limits(**limits)(K, random_state=0, tol=tol, **params)
+
+
+def in_blocks(method, X, megabytes=0.05):
+    """Call a method with a table, read in blocks of this memory."""
+    with config_context(working_memory=megabytes):
+        return method(X)
 
 
 @made_once
@@ -104,10 +112,11 @@ SLOW_FITS = [
 def test_fit_is_that_in_memory(tmp_path, kind, memory, limits, params, given):
     expected = in_memory(*(tuple(each.items()) for each in (limits, params, given)))
     X = stored(table(**given), tmp_path, kind)
-    got = estimator(limits, working_memory=memory, **params).fit(X)
+    got = in_blocks(estimator(limits, **params).fit, X, memory)
     assert_same_model(got, expected)
-    assert got.score(X) == pytest.approx(expected.score(table(**given)), rel=1e-8)
-    assert_allclose(got.transform(X), got.alpha_, atol=1e-12)
+    score = in_blocks(got.score, X, memory)
+    assert score == pytest.approx(expected.score(table(**given)), rel=1e-8)
+    assert_allclose(in_blocks(got.transform, X, memory), got.alpha_, atol=1e-12)
     if kind == "parquet":
         assert_array_equal(got.feature_names_in_[:2], ["x0", "y0"])
 
@@ -117,12 +126,12 @@ def test_fit_is_that_in_memory(tmp_path, kind, memory, limits, params, given):
 def test_of_many_points_of_which_some_are_missing(tmp_path, loss):
     # Completed frames along directions first: the end is that of the seen points.
     X, params = table(0.1, n_points=210, n_frames=80), {"loss": loss, "tol": 1e-5}
-    few = ALL._replace(many_points=999)
+    few = ALL | {"many_points": 999}
     at_once, model = (estimator(each, **params).fit(X) for each in (few, ALL))
     assert_allclose(model.basis_, at_once.basis_, rtol=0, atol=1e-4)
     assert_allclose(model.alpha_, at_once.alpha_, rtol=0, atol=1e-3)
-    got = estimator(**params, working_memory=1)
-    assert_same_model(got.fit(stored(X, tmp_path)), model)
+    got = in_blocks(estimator(**params).fit, stored(X, tmp_path), 1)
+    assert_same_model(got, model)
 
 
 @pytest.mark.parametrize("kind", ["memmap", "dask"])
@@ -130,13 +139,13 @@ def test_rows_that_show_nothing_are_left_out(tmp_path, kind):
     X = table(0.1).copy()
     empty = np.arange(len(X)) % 7 == 3
     empty[30:112] = True  # a whole chunk
-    params = {"limits": SAMPLED, "working_memory": 0.02}
-    folders = [None if kind == "dask" else tmp_path / name for name in "ab"]
-    expected = estimator(**params, frames_folder=folders[0])
-    expected.fit(stored(X[~empty], tmp_path) if kind == "memmap" else X[~empty])
+    folders = [kind == "dask" or tmp_path / name for name in "ab"]
+    expected, model = (estimator(SAMPLED, keep_frames=folder) for folder in folders)
+    shown = stored(X[~empty], tmp_path) if kind == "memmap" else X[~empty]
+    in_blocks(expected.fit, shown, 0.02)
     X[empty] = np.nan
-    model = estimator(**params, frames_folder=folders[1])
-    warned(f"{empty.sum()} of 150 rows", model.fit, stored(X, tmp_path, kind))
+    blocks = stored(X, tmp_path, kind)
+    warned(f"{empty.sum()} of 150 rows", in_blocks, model.fit, blocks, 0.02)
     atol = 0 if kind == "memmap" else 1e-8
     for name in OF_SHAPES:
         found = getattr(model, name), getattr(expected, name)
@@ -153,35 +162,41 @@ def test_rows_that_show_nothing_are_left_out(tmp_path, kind):
 def test_threads_make_no_difference(tmp_path, kind):
     X = table() if kind else np.tile(table(), (15, 1))  # two blocks in memory
     X = X if kind is None else stored(X, tmp_path)
-    params = {"limits": SAMPLED, "working_memory": 0.1, "max_iter": 5, "tol": 1e3}
-    one, two = (estimator(n_jobs=n, **params).fit(X) for n in (1, 2))
+    params = {"limits": SAMPLED, "max_iter": 5, "tol": 1e3}
+    one, two = (in_blocks(estimator(n_jobs=n, **params).fit, X, 0.1) for n in (1, 2))
     for name in OF_SHAPES + OF_FRAMES:
         assert_array_equal(getattr(one, name), getattr(two, name))
-    assert_array_equal(one.transform(X), two.transform(X))
+    alpha, again = (in_blocks(each.transform, X, 0.1) for each in (one, two))
+    assert_array_equal(alpha, again)
 
 
 @pytest.mark.parametrize("kind", ["memmap", "dask"])
 def test_all_methods_read_blocks(tmp_path, kind):
     X = table(0.1).copy()
     X[7] = np.nan
-    model = in_memory(params=(("working_memory", 0.05),))
+    model = in_memory()
     blocks, calls = stored(X, tmp_path, kind), [("transform",), ("reproject",)]
     calls += [
         ("reconstruct", camera) for camera in ("orthographic", "weak_perspective")
     ]
     for name, *args in [*calls, ("reconstruct",)]:
-        got, expected = (getattr(model, name)(each, *args) for each in (blocks, X))
+
+        def of_table(given, name=name, args=args):
+            return getattr(model, name)(given, *args)
+
+        got, expected = in_blocks(of_table, blocks), of_table(X)
         assert type(got) is (np.ndarray if kind == "memmap" else array.Array)
         assert_allclose(np.asarray(got), expected, rtol=1e-8, atol=1e-10)
-    assert np.isnan(np.asarray(model.transform(blocks))[7]).all()
-    for got, expected in zip(model.decompose(blocks), model.decompose(X), strict=True):
+    assert np.isnan(np.asarray(in_blocks(model.transform, blocks))[7]).all()
+    found = in_blocks(model.decompose, blocks)
+    for got, expected in zip(found, model.decompose(X), strict=True):
         assert_allclose(np.asarray(got), expected, rtol=1e-10, atol=1e-12)
 
 
 class TestKeepFrames:
     def test_in_files(self, tmp_path):
         plain, folder = in_memory(), tmp_path / "found"
-        model = estimator(frames_folder=folder).fit(table())
+        model = estimator(keep_frames=folder).fit(table())
         for name in OF_FRAMES:
             kept = getattr(model, name)
             assert isinstance(kept, np.memmap)
@@ -192,6 +207,12 @@ class TestKeepFrames:
         assert len(list(folder.iterdir())) == 1
         found, expected = (each.diagnostics() for each in (model, plain))
         assert_allclose(found.weak_deviations, expected.weak_deviations)
+
+    def test_of_a_search_are_those_of_the_chosen_fit(self, tmp_path):
+        model = AffineNRSfM(1, keep_frames=tmp_path, random_state=0, tol=1.0)
+        search = AffineNRSfMCV((1,), estimator=model, cv=2).fit(table())
+        folder = Path(search.best_estimator_.alpha_.filename).parent
+        assert list(tmp_path.iterdir()) == [folder]
 
     def test_on_dask(self):
         plain = in_memory()
@@ -224,12 +245,12 @@ def test_chunks_of_unknown_length():
 def test_half_points_are_warned_of_once(tmp_path):
     X = table().copy()
     X[[40, 120], 3] = np.nan
-    model = estimator(working_memory=0.05, max_iter=5, tol=1e3)
+    model = estimator(max_iter=5, tol=1e3)
     with pytest.warns(UserWarning, match="in 2 of 150 rows .*row 40") as w:
-        model.fit(stored(X, tmp_path))
+        in_blocks(model.fit, stored(X, tmp_path))
     assert len(w) == 1
     message = "some points have only one of their two"
-    warned(message, model.transform, stored(X, tmp_path))
+    warned(message, in_blocks, model.transform, stored(X, tmp_path))
 
 
 def test_memory_maps_are_taken_as_arrays_where_that_is_needed(tmp_path):

@@ -4,16 +4,17 @@ All supported versions have them, but for callbacks: these are new and experimen
 scikit-learn 1.9.
 """
 
+import contextlib
 import copy
 import inspect
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from numbers import Integral
 from operator import attrgetter
 from threading import RLock, get_ident
-from typing import Any, ClassVar, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar
 from weakref import WeakSet
 
 import numpy as np
@@ -115,8 +116,7 @@ class CoefficientsMixin(ClassNamePrefixFeaturesOutMixin):
             ``alpha_1``, ``alpha_2`` and so on, as in the files of the command line.
         """
         n_components = len(super().get_feature_names_out(input_features))
-        names = [f"alpha_{k + 1}" for k in range(n_components)]
-        return np.array(names, dtype=object)
+        return np.array([f"alpha_{k + 1}" for k in range(n_components)], dtype=object)
 
 
 class OneBlasThread:
@@ -183,15 +183,11 @@ if hasattr(os, "register_at_fork"):
     )
 
 
-def one_blas_thread(function: Function) -> Function:
-    """Return a function that runs with one BLAS thread."""
-
-    @wraps(function)
-    def limited(*args: Any, **kwargs: Any) -> Any:
-        with OneBlasThread():
-            return function(*args, **kwargs)
-
-    return cast(Function, limited)
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit BLAS to one thread in a block, or in a function that this decorates."""
+    with OneBlasThread():
+        yield
 
 
 def _pools() -> list[Any]:
@@ -297,3 +293,6 @@ class NoProgress:
 
     def step(self) -> None:
         """Begin a step."""
+
+
+Progress = FitProgress | NoProgress

@@ -75,18 +75,20 @@ def array_in(content: bytes) -> NDArray:
 
 
 @contextlib.contextmanager
-def kept_arrays(path: str | os.PathLike[str] | None) -> Iterator[Keep]:
+def kept_arrays(path: bool | str | os.PathLike[str]) -> Iterator[Keep]:
     """Keep arrays in files of a folder, and remove the files if the block fails.
 
     Yields a function that maps arrays by name to memory maps, or to themselves if the
-    path is None. Each block writes to a new folder: no other process writes to mapped
-    files.
+    path is True or False. Each block writes to a new folder: no other process writes
+    to mapped files.
     """
-    if path is None:
+    if isinstance(path, bool | np.bool):
         yield dict
         return
     if not os.fspath(path):
-        raise ValueError("frames_folder should be None or the path of a folder; got ''")
+        raise ValueError(
+            "keep_frames should be True, False or the path of a folder; got ''"
+        )
     folder = Path(path)
     name = f"fit-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid.uuid4().hex[:12]}"
 

@@ -32,33 +32,21 @@ those of the weak-perspective camera with the same rotation and position: ``s_i 
 T_3``, ``t_i = s_i T_12 + c``.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._linalg import (
-    COLUMNS,
-    DIAGONAL,
-    ROWS,
-    inverse3,
-    lengths,
-    packed_products,
-    pair_indices,
-    polar,
-    unpack3,
-    unpacked,
-)
+from isa_nrsfm import _linalg as linalg
 from isa_nrsfm._prepare.robust import spatial_median
-from isa_nrsfm._tables import FrameBlocks, centred_frames
+from isa_nrsfm._tables import centred_frames
 
 # Largest rotation of a camera in one step, in radians, and largest change of the
 # logarithm of its scale.
 LARGEST_TURN = 1.0
 # Places of the entries of a packed symmetric 6x6 matrix
-_PLACES = unpacked(np.arange(21))
+_PLACES = linalg.unpacked(np.arange(21))
 
 
 class AffineCameras:
@@ -98,7 +86,7 @@ class AffineCameras:
         """Return ``tr(D_c A D_d^T)`` along the tangents, packed, as A (6, n) is."""
         packed = np.zeros((21, A.shape[-1]))
         for row in slice(3), slice(3, 6):
-            packed[_PLACES[row, row][ROWS, COLUMNS]] = A
+            packed[_PLACES[row, row][linalg.ROWS, linalg.COLUMNS]] = A
         return packed
 
     def second(self, M: NDArray, G: NDArray, gradient: NDArray) -> NDArray:
@@ -107,7 +95,7 @@ class AffineCameras:
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return inverse curvatures, for `product`, of curvatures (6, n) per row."""
-        return inverse3(curvature)
+        return linalg.inverse3(curvature)
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
         """Return vectors (p, n) times an inverse curvature."""
@@ -146,8 +134,7 @@ class CalibratedCameras:
         """Return the steps (n, p) that move cameras (n, 2, 3) to others."""
         (R, scales), (turned, others) = map(full_rotations, (first, second))
         turns = Rotation.from_matrix(R.swapaxes(1, 2) @ turned).as_rotvec()
-        steps = np.column_stack([turns, np.log(others / scales)])
-        return steps[:, : self.n_parameters]
+        return np.column_stack([turns, np.log(others / scales)])[:, : self.n_parameters]
 
     def tangents(self, M: NDArray) -> NDArray:
         """Return ``M hat(e_c)``, and M itself where there are scales."""
@@ -161,9 +148,9 @@ class CalibratedCameras:
     def curvature(self, M: NDArray, A: NDArray) -> NDArray:
         """Return ``tr(D_c A D_d^T)``, along the tangents, packed, as A (6, n) is."""
         D = self.tangents(M)
-        DA = np.einsum("crai,abi->crbi", D, unpack3(A))
+        DA = np.einsum("crai,abi->crbi", D, linalg.unpack3(A))
         shape = self.n_parameters, 6, M.shape[-1]
-        return packed_products(DA.reshape(shape), D.reshape(shape))
+        return linalg.packed_products(DA.reshape(shape), D.reshape(shape))
 
     def second(self, M: NDArray, G: NDArray, gradient: NDArray) -> NDArray:
         """Return ``<G, D_cd>`` with the second derivatives D_cd, packed.
@@ -176,14 +163,14 @@ class CalibratedCameras:
         second[:3, :3] = 0.5 * (mixed + mixed.swapaxes(0, 1))
         second[:3, :3] -= np.einsum("aai->i", mixed) * np.eye(3)[:, :, None]
         second[3:], second[:, 3:] = gradient, gradient[:, None]
-        return np.asarray(second[pair_indices(len(gradient))])
+        return np.asarray(second[linalg.pair_indices(len(gradient))])
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return inverses (p, p, n); a scale without curvature does not move."""
-        C = unpacked(self.curvature(M, curvature))
-        turns = C[ROWS, COLUMNS]
-        turns[DIAGONAL] += 1e-9 * turns[DIAGONAL].mean(axis=0)
-        inverse = inverse3(turns)
+        C = linalg.unpacked(self.curvature(M, curvature))
+        turns = C[linalg.ROWS, linalg.COLUMNS]
+        turns[linalg.DIAGONAL] += 1e-9 * turns[linalg.DIAGONAL].mean(axis=0)
+        inverse = linalg.inverse3(turns)
         if not self.scaled:
             return inverse
         # By the Schur complement d - c^T B^-1 c in [[B, c], [c^T, d]]
@@ -221,10 +208,8 @@ class CalibratedCameras:
 
 
 CameraModel = AffineCameras | CalibratedCameras
-CAMERAS: dict[str, CameraModel] = {
-    model.name: model
-    for model in (AffineCameras(), CalibratedCameras(True), CalibratedCameras(False))
-}
+_MODELS = AffineCameras(), CalibratedCameras(True), CalibratedCameras(False)
+CAMERAS: dict[str, CameraModel] = {model.name: model for model in _MODELS}
 
 
 def turning(M: NDArray) -> NDArray:
@@ -266,7 +251,7 @@ def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
     p, q, r = (np.stack([p, q, r]) / divisor)[..., None]
     rows, scales = np.stack([r * x - q * y, p * y - q * x], axis=1), 0.5 * t * size
     if flat.any():
-        rows[flat], values, _ = polar(motion[flat])
+        rows[flat], values, _ = linalg.polar(motion[flat])
         scales[flat] = values.mean(axis=1)
     return rows, scales
 
@@ -300,46 +285,11 @@ def mean_view(motion: NDArray) -> NDArray | None:
     return mean if smaller > 0.2 * root_mean_square else None
 
 
-def reference_camera(motion: NDArray, sizes: NDArray) -> NDArray:
-    """Return a typical camera (2, 3) of a table, for default images of shapes.
-
-    The cameras (n, 2, 3) are divided by the sizes (n,) of their frames. The result is
-    their mean, times the RMS size. If they have no common view, it is the view along
-    the third axis, each axis scaled by its RMS length in the cameras.
-    """
-    camera = mean_view(motion)
-    if camera is None:
-        camera = np.sqrt(np.mean(np.sum(motion**2, axis=1), axis=0)) * np.eye(2, 3)
-    return camera * np.sqrt(np.mean(sizes**2))
-
-
-def reprojection_error(
-    W: FrameBlocks, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
-) -> float:
-    """Return the inverse SNR ``||W - W_hat||_F^2 / ||W||_F^2`` over the visible points.
-
-    Frames of W, blocks (n, 2, J), are below centred. Motion (n, 2, 3), position (n, 2)
-    and alpha (n, K) are those of all frames, shapes (K + 1, 3, J).
-    """
-    energies = W.map(partial(_energies, shapes=shapes), motion, position, alpha)
-    noise, signal = np.sum(list(energies), axis=0)
-    return float(noise / signal)
-
-
-def _energies(
-    rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
-) -> tuple[float, float]:
-    """Return the energies of the residuals of a block, and of its centred frames."""
-    noise = np.nansum(distances(rows, shapes, motion, position, alpha) ** 2)
-    middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
-    return float(noise), float(np.nansum((rows - middle) ** 2))
-
-
 def distances(
     rows: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> NDArray:
     """Return distances (n, J) of points (n, 2, J) from a model, NaN if missing."""
-    return lengths(residuals(rows, shapes, motion, alpha) - position[..., None])
+    return linalg.lengths(residuals(rows, shapes, motion, alpha) - position[..., None])
 
 
 def residuals(
@@ -519,9 +469,3 @@ def focal_shares(focal_length: Any, n_frames: int) -> tuple[NDArray, ...]:
 def zoomed(rows: NDArray, share: NDArray, centre: NDArray) -> NDArray:
     """Return coordinates with their distances from a centre times a share."""
     return ((rows - centre) * share + centre).astype(rows.dtype)
-
-
-def zoomed_table(table: FrameBlocks, shares: NDArray, centre: Any) -> FrameBlocks:
-    """Return the rows (n, 2, J) that cameras with the mean focal length would show."""
-    middle = np.reshape(centre, (2, 1))
-    return table.derive(lambda r, share: zoomed(r, share[..., None], middle), shares)

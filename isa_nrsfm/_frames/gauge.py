@@ -23,9 +23,6 @@ that a fit leaves to its basis shapes, with points as samples and d = 3. With d 
 is plain ICA, as for coefficients.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
@@ -37,7 +34,7 @@ from isa_nrsfm._frames.camera_models import (
     pose_part,
     stacked_motion,
 )
-from isa_nrsfm._frames.models import Decomposition, FrameMap
+from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._linalg import OF_DIFFERENCES, OF_RANKS, OF_STEPS, orientations, polar
 from isa_nrsfm._tables import spread
 from isa_nrsfm.isa._strategies import orthogonalise
@@ -116,42 +113,6 @@ def canonical_gauge(
     return mean_shape @ space.T, scaled[order] @ space.T, order, factors[order]
 
 
-def rigid_gauge(
-    mean_shape: NDArray,
-    basis: NDArray,
-    sizes: NDArray,
-    fitted: Callable[[NDArray, NDArray], tuple[Any, Decomposition]],
-    camera: str,
-    dtype: Any,
-) -> tuple[Any, Decomposition, NDArray]:
-    """Return model and frames of the paper's pipeline, and the order of the basis.
-
-    The gauge is that of a fit to visible points, not to completed frames. `fitted`
-    returns both for a mean shape (J, 3) and a basis (K, J, 3), rounded to a dtype.
-    """
-    order, (model, frames) = np.arange(len(basis)), fitted(mean_shape, basis)
-    # One scaling is enough, unless frames have fewer points than coefficients need.
-    for _ in range(50):
-        motion = frames.motion / sizes[:, None, None]
-        if camera == "affine":
-            space = canonical_space(mean_shape, motion)
-        else:
-            size = 1.0 if camera == "orthographic" else None
-            space = euclidean_space(mean_shape, motion, size)
-        mean_shape, basis, new_order, _ = canonical_gauge(
-            mean_shape, basis, motion, frames.alpha, space
-        )
-        order = order[new_order]
-        mean_shape, basis = mean_shape.astype(dtype), basis.astype(dtype)
-        model, frames = fitted(mean_shape, basis)
-        # Coefficients scale with the basis shapes. If a frame does not determine its
-        # coefficients, their solution of minimum norm changes.
-        off = coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
-        if np.abs(off).max(initial=0.0) <= 1e-6:
-            break
-    return model, frames, order
-
-
 def coefficient_sizes(alpha: NDArray) -> NDArray:
     """Return standard deviations (K,) of alpha (I, K), or RMS where they are zero."""
     deviation = alpha.std(axis=0)
@@ -177,12 +138,6 @@ def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
         blocks = stacked_motion(motion[part], alpha[part])[:, 3:]
         total += blocks.T @ blocks
     return total / (2 * len(alpha))
-
-
-def reorder_blocks(matrix: NDArray, order: NDArray) -> NDArray:
-    """Return a matrix of 3x3 blocks with its rows and columns of blocks in an order."""
-    index = (3 * order[:, None] + np.arange(3)).ravel()
-    return matrix[np.ix_(index, index)]
 
 
 def independent_gauge(

@@ -299,19 +299,9 @@ class FrameModel:
         """The search for frames, shared by all tables."""
         return FrameSearch(self.shapes, CAMERAS[self.camera])
 
-    @cached_property
-    def without_starts(self) -> "FrameModel":
-        """The model that fits each frame from zero only."""
-        return replace(self, starts=self.starts[:0])
-
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def mirrored(self) -> "FrameModel":
-        """Return the model whose public shapes are mirrored in depth."""
-        space = MIRROR[:, None] * self.gauge.space
-        return replace(self, gauge=self.gauge._replace(space=space))
 
     def fit(
         self, rows: NDArray, sizes: NDArray, deviations: bool, weights: NDArray | None
@@ -378,9 +368,8 @@ class FrameModel:
         precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         covariance, ratio = self.widened(fit.alpha, fit.covariance)
         translation = fit.translation * sizes[:, None]
-        return LinearisedFrames(
-            motion, translation, fit.alpha, covariance, precision / ratio, slope
-        )
+        moments = fit.alpha, covariance, precision / ratio
+        return LinearisedFrames(motion, translation, *moments, slope)
 
     def point_covariances(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
@@ -444,7 +433,7 @@ class FrameModel:
         if self.loss == "linear":
             return fitted(rows, weights=weights, starts=self.starts)
         # Robust loss: outliers are no reason for further starts. The median of the
-        # residuals hardly depends on them. The threshold is as in `largest_objective`.
+        # residuals hardly depends on them. The threshold is as in `FrameSearch.fit`.
         fit = self._reweighted(rows, fitted)
         distance = distances(rows, self.shapes, *fit[:3])
         median = lower_medians(distance, seen_points(rows))[:, 0]
@@ -458,8 +447,7 @@ class FrameModel:
     ) -> FramePosterior:
         """Return the fit of rows (n, 2, J) without some of the points (J,)."""
         if weights is not None or not seen_points(rows).all():
-            visible = np.where(hidden, np.nan, rows)
-            return self.posterior(visible, False, weights)
+            return self.posterior(np.where(hidden, np.nan, rows), False, weights)
         shapes = self.shapes[:, :, ~hidden]
         fit = replace(self, shapes=centred(shapes)).posterior(rows[..., ~hidden], False)
         middles = shapes.mean(axis=2)
@@ -468,10 +456,7 @@ class FrameModel:
         return fit._replace(translation=fit.translation - shift)
 
     def _reweighted(
-        self,
-        rows: NDArray,
-        fitted: Callable[..., FramePosterior],
-        starts: NDArray | None = None,
+        self, rows: NDArray, fitted: Callable[..., Any], starts: NDArray | None = None
     ) -> FramePosterior:
         """Return the fit of rows (n, 2, J) with a robust loss.
 

@@ -121,7 +121,7 @@ class Gram:
         """Return the Gram matrices of some of the frames."""
         if self.pairs.ndim == 2:
             return self
-        return type(self)(of_frames(self.pairs, frames))
+        return type(self)(self.pairs.take(frames, -1))
 
 
 class FrameTracks(NamedTuple):
@@ -227,10 +227,9 @@ def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
     """Return frames of several blocks, all with weights or none, as one block."""
     if len(parts) == 1:
         return parts[0]
-    joined: list[Any] = []
-    for values in zip(*parts, strict=True):
-        joined.append(None if values[0] is None else np.concatenate(values, axis=-1))
-    return FrameTracks(*joined)
+    columns: Any = zip(*parts, strict=True)
+    join = partial(np.concatenate, axis=-1)
+    return FrameTracks._make(None if c[0] is None else join(c) for c in columns)
 
 
 def _share(weight: NDArray) -> NDArray:
@@ -343,6 +342,10 @@ class CoefficientPosterior(NamedTuple):
         """Means of the coefficients (n_components, n_frames)."""
         return self.c[1:]
 
+    def value(self, noise: NDArray | float) -> NDArray:
+        """Return ``s2 F`` (n,)."""
+        return self.objective + noise * self.log_determinant
+
     def residual(self, noise: NDArray | float) -> NDArray:
         """Return ``||W - M S||^2`` at the means."""
         return self.objective - noise * np.einsum("ki,ki->i", self.alpha, self.alpha)
@@ -368,14 +371,19 @@ class CoefficientPosterior(NamedTuple):
         return moments
 
 
+# Frames, given by their sums for the shapes, and their noise variances (n,)
+FrameProblem = tuple[FrameSums, Any]
+
+
 def coefficient_posterior(
-    products: FrameSums, M: NDArray, noise: NDArray | float, *, refined: bool = False
+    problem: FrameProblem, M: NDArray, *, refined: bool = False
 ) -> CoefficientPosterior:
     """Return the posterior of the coefficients of frames for cameras M (2, 3, n).
 
     If `refined`, a step of iterative refinement keeps rounding errors small where they
     are divided by a tiny noise variance.
     """
+    products, noise = problem
     H = products.gram.energies(camera_gram(M))
     seen = np.einsum("kari,rai->ki", products.cross, M)
     n_shapes = len(seen)
@@ -465,20 +473,6 @@ class FramePosterior(NamedTuple):
             part[frames] = other
 
 
-def largest_objective(n_points: Any, noise: Any) -> Any:
-    """Return the objectives beyond which the minimum may not be the lowest one.
-
-    At the minimum, f / s2 is the squared Mahalanobis distance of a frame from the
-    model. It is chi-squared distributed, with two degrees of freedom per point minus
-    the eight of camera and position. The threshold is three times its expectation.
-    """
-    return 3.0 * noise * np.maximum(2.0 * n_points - 8.0, 1.0)
-
-
-# Frames, given by their sums for the shapes, and their noise variances (n,)
-FrameProblem = tuple[FrameSums, NDArray]
-
-
 def scale_of(problem: FrameProblem) -> NDArray:
     """Return ``||W||^2 + s2`` (n,), the scale of gains and rounding errors."""
     products, noise = problem
@@ -554,19 +548,15 @@ class FrameSearch:
         weights = np.where(seen_points(rows), given, 0.0)
         complete = (weights == 1.0).all(axis=1)
         fits = FramePosterior.unknown(n_frames, n_components, covariances)
+        fit = partial(self.fit, starts=starts, covariances=covariances)
         # Complete frames share one Gram matrix.
         for chosen in np.flatnonzero(complete), np.flatnonzero(~complete):
             if len(chosen):
                 frames = padded(chosen)
                 own = None if complete[frames[0]] else weights[frames]
-                fit = self.fit(
-                    frame_tracks(rows[frames], own),
-                    noise[frames],
-                    initial=None if initial is None else initial[frames],
-                    starts=starts,
-                    covariances=covariances,
-                )
-                fits.put(frames, fit)
+                first = None if initial is None else initial[frames]
+                tracks = frame_tracks(rows[frames], own)
+                fits.put(frames, fit(tracks, noise[frames], initial=first))
         return fits
 
     def fit(
@@ -590,17 +580,53 @@ class FrameSearch:
         """
         n_frames, n_components = len(frames.weight), len(self.shared.shapes) - 1
         noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
-        fit = partial(self._minima, frames, noise, covariances, rough)
-        every = np.arange(n_frames)
+        length, max_steps = frames.n_together, ROUGH_STEPS if rough else MAX_STEPS
+
+        def minima(chosen: NDArray, initial: NDArray) -> FramePosterior:
+            """Return the minima that frames reach from coefficients (n_chosen, K).
+
+            Rough cameras may belong to a higher minimum.
+            """
+            fits = FramePosterior.unknown(len(chosen), n_components, covariances)
+            for first in range(0, len(chosen), length):
+                block = padded(np.arange(first, min(first + length, len(chosen))))
+                products = frame_sums(of_frames(frames, chosen[block]), self.shared)
+                if frames.weights is not None:
+                    determined = determines_camera(products, self.shared.shapes[0])
+                    if not determined.all():
+                        usable = padded(np.flatnonzero(determined))
+                        block, products = block[usable], of_frames(products, usable)
+                problem = self.problem(products, noise[chosen[block]])
+                start = self.evaluate(problem, self.start(problem, initial[block].T))
+                M, converged = self.descend(problem, start, max_steps)
+                if not rough:
+                    M = self._unreversed(problem, M, converged)
+                posterior = coefficient_posterior(problem, M)
+                covariance, turns = fits.covariance[block], fits.turn_covariance[block]
+                if covariances:
+                    spreads = self._covariances(problem, M, posterior)
+                    covariance, turns = map(frames_first, spreads)
+                    turns = self.space.T @ turns @ self.space
+                motion, alpha = frames_first(M), posterior.alpha.T
+                places = products.positions(motion, alpha)
+                kept = covariance, turns, posterior.objective, converged
+                fit = FramePosterior(motion @ self.space, places, alpha, *kept)
+                fits.put(block, fit)
+            return fits
+
         initial = np.zeros((n_frames, n_components)) if initial is None else initial
-        fits = fit(every, initial, ROUGH_STEPS if rough else MAX_STEPS)
+        fits = minima(np.arange(n_frames), initial)
         if rough or starts is None or not len(starts):
             return fits
-        # Further starts for badly fitted frames, all starts at once
-        poor = np.flatnonzero(fits.objective > largest_objective(frames.weight, noise))
+        # Further starts for frames with large residuals, all starts at once. At the
+        # minimum, f / s2 is the squared Mahalanobis distance of a frame from the model.
+        # It is chi-squared distributed, with two degrees of freedom per point minus the
+        # eight of camera and position. The threshold is three times its expectation.
+        most = 3.0 * noise * np.maximum(2.0 * frames.weight - 8.0, 1.0)
+        poor = np.flatnonzero(fits.objective > most)
         if len(poor):
             initial = np.repeat(starts, len(poor), axis=0)
-            others = fit(np.tile(poor, len(starts)), initial, MAX_STEPS)
+            others = minima(np.tile(poor, len(starts)), initial)
             # Of equal minima, keep the first.
             objective = others.objective.reshape(len(starts), -1)
             best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
@@ -608,54 +634,6 @@ class FrameSearch:
             gain = fits.objective[poor] - others.objective[best]
             better = gain > EQUAL * fits.objective[poor]
             fits.put(poor[better], others.take(best[better]))
-        return fits
-
-    def _minima(
-        self,
-        frames: FrameTracks,
-        noise: NDArray,
-        covariances: bool,
-        rough: bool,
-        chosen: NDArray,
-        initial: NDArray,
-        max_steps: int,
-    ) -> FramePosterior:
-        """Return the minima that chosen frames reach from coefficients (n_chosen, K).
-
-        Rough cameras may belong to a higher minimum.
-        """
-        fits = FramePosterior.unknown(len(chosen), initial.shape[1], covariances)
-        length = frames.n_together
-        for first in range(0, len(chosen), length):
-            block = padded(np.arange(first, min(first + length, len(chosen))))
-            products = frame_sums(of_frames(frames, chosen[block]), self.shared)
-            if frames.weights is not None:
-                determined = determines_camera(products, self.shared.shapes[0])
-                if not determined.all():
-                    usable = padded(np.flatnonzero(determined))
-                    block, products = block[usable], of_frames(products, usable)
-            problem = self.problem(products, noise[chosen[block]])
-            start = self.evaluate(problem, self.start(problem, initial[block].T))
-            position, converged = self.descend(problem, start, max_steps)
-            M, alpha, objective = self.solution(
-                problem, position, converged, 0 if rough else max_steps
-            )
-            motion = frames_first(M)
-            covariance, turns = fits.covariance[block], fits.turn_covariance[block]
-            if covariances:
-                spreads = self.covariances(problem, M, alpha)
-                covariance, turns = map(frames_first, spreads)
-                turns = self.space.T @ turns @ self.space
-            minima = FramePosterior(
-                motion @ self.space,
-                products.positions(motion, alpha.T),
-                alpha.T,
-                covariance,
-                turns,
-                np.maximum(objective, 0.0),  # less is rounding errors
-                converged,
-            )
-            fits.put(block, minima)
         return fits
 
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
@@ -673,7 +651,8 @@ class FrameSearch:
         n_steps = 6
         M, _ = self.descend(problem, self.evaluate(problem, M), n_steps)
         # Shapes that are not fitted yet can explain a reversed frame well: try all.
-        value, every = _value(problem, _posterior(problem, M)), np.arange(len(motion))
+        value = coefficient_posterior(problem, M).value(problem[1])
+        every = np.arange(len(motion))
         M, better, _ = self._better_reversed(problem, M, value, every, n_steps)
         motion = motion.copy()
         motion[better] = frames_first(M[:, :, better]) @ self.space
@@ -687,10 +666,10 @@ class FrameSearch:
         The third result (n,) is the rise of -2 log L from the given cameras.
         """
         M = frames_last(motion @ self.space.T)
-        value = _value(problem, _posterior(problem, M))
+        value = coefficient_posterior(problem, M).value(problem[1])
         M, _ = self.descend(problem, self.evaluate(problem, M * REVERSED), 30)
-        posterior = _posterior(problem, M)
-        rise = (_value(problem, posterior) - value) / problem[1]
+        posterior = coefficient_posterior(problem, M)
+        rise = (posterior.value(problem[1]) - value) / problem[1]
         return frames_first(M) @ self.space, posterior.alpha.T, rise
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
@@ -702,12 +681,13 @@ class FrameSearch:
         if not self.model.calibrated:
             return M
         starts = calibrated_starts(self.model, M)
-        values = [_value(problem, _posterior(problem, start)) for start in starts]
+        values = [coefficient_posterior(problem, M).value(problem[1]) for M in starts]
         return np.where(values[1] < values[0], *starts[::-1])
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
-        return self._derivatives(problem, position, _posterior(problem, position))[0]
+        posterior = coefficient_posterior(problem, position)
+        return self._derivatives(problem, position, posterior)[0]
 
     def _derivatives(
         self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
@@ -723,38 +703,33 @@ class FrameSearch:
         through = posterior.covaried(coupling)
         hessian = definite + self.model.second(M, G, gradient)
         hessian -= packed_products(through.swapaxes(0, 1), coupling.swapaxes(0, 1))
-        value = _value(problem, posterior)
-        return State(M, value, -gradient, definite, hessian), through
+        return State(M, posterior.value(noise), -gradient, definite, hessian), through
 
-    def solution(
-        self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
-    ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,).
+    def _unreversed(
+        self, problem: FrameProblem, M: NDArray, converged: NDArray
+    ) -> NDArray:
+        """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
 
-        Cameras are replaced by minima from reversed ones if these are lower.
+        Sets where the search for the latter has converged.
         """
-        posterior = _posterior(problem, position)
-        if n_steps and self.model.calibrated:
-            value = _value(problem, posterior)
-            rise = _rise(problem, position, posterior)
-            tried = np.flatnonzero(~(rise > LARGE_RISE * value))
-            position, better, reached = self._better_reversed(
-                problem, position, value, tried, n_steps
-            )
-            converged[better] = reached[better]
-            if better.any():
-                posterior = _posterior(problem, position)
-        return position, posterior.alpha, posterior.objective
+        if not self.model.calibrated:
+            return M
+        posterior = coefficient_posterior(problem, M)
+        value, rise = posterior.value(problem[1]), _rise(problem, M, posterior)
+        tried = np.flatnonzero(~(rise > LARGE_RISE * value))
+        M, better, reached = self._better_reversed(problem, M, value, tried, MAX_STEPS)
+        converged[better] = reached[better]
+        return M
 
-    def covariances(
-        self, problem: FrameProblem, M: NDArray, alpha: NDArray
+    def _covariances(
+        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
     ) -> tuple[NDArray, NDArray]:
         """Return the covariances of coefficients (K, K, n) and of rotations (3, 3, n).
 
         They come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``. C is the
         coupling, Y the Hessian by the camera with the coefficients eliminated.
         """
-        noise, posterior = problem[1], _posterior(problem, M)
+        noise = problem[1]
         state, through = self._derivatives(problem, M, posterior)
         inverse = state.inverse()
         widened = np.einsum("kci,cdi->kdi", through, inverse)
@@ -788,7 +763,8 @@ class FrameSearch:
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
             known = M, limit, radius
             other, converged[tried] = self.descend(problem, start, max_steps, known)
-            better[tried] = lower = _value(problem, _posterior(problem, other)) < limit
+            reached = coefficient_posterior(problem, other).value(problem[1])
+            better[tried] = lower = reached < limit
             cameras[..., tried] = np.where(lower, other, M)
         return cameras, better, converged
 
@@ -814,7 +790,10 @@ class FrameSearch:
             small = (damping == 0) & (gain <= 1e-12 * scale_of(problem))
             leaving = small | (damping >= LARGEST_DAMPING)
             if known is not None:
-                leaving |= _hopeless(state, gain, *known)
+                minimum, value, radius = known
+                square = (state.position - minimum).reshape(-1, len(gain)) ** 2
+                near = square.sum(axis=0) < radius**2
+                leaving |= near | (state.value - 10.0 * gain > value)
             # Remove frames that have ended; converged ones take a last step.
             if leaving.any():
                 last = self.model.moved(state.position, np.where(small, step, 0.0))
@@ -921,26 +900,6 @@ def _changes(
     F = np.einsum("rbi,kbai->krai", M, changes)
     F -= products.cross[1:].swapaxes(1, 2)
     return F
-
-
-def _value(problem: FrameProblem, posterior: CoefficientPosterior) -> NDArray:
-    """Return ``s2 F`` (n,)."""
-    return posterior.objective + problem[1] * posterior.log_determinant
-
-
-def _posterior(problem: FrameProblem, M: NDArray) -> CoefficientPosterior:
-    """Return the posterior of the coefficients for cameras (2, 3, n)."""
-    products, noise = problem
-    return coefficient_posterior(products, M, noise)
-
-
-def _hopeless(
-    state: State, gain: NDArray, known: NDArray, value: NDArray, radius: NDArray
-) -> NDArray:
-    """Return a mask (n,) of searches that are not expected to end below `Minima`."""
-    square = (state.position - known) ** 2
-    near = square.sum(axis=tuple(range(square.ndim - 1))) < radius**2
-    return near | (state.value - 10.0 * gain > value)
 
 
 def raised(damping: NDArray) -> NDArray:

@@ -48,7 +48,7 @@ from isa_nrsfm._frames.camera_models import (
     rotated,
     turning,
 )
-from isa_nrsfm._frames.models import FrameMap, FrameModel, spread_starts
+from isa_nrsfm._frames.models import NOT_ESTIMATED, FrameMap, FrameModel, spread_starts
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JointFit, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
@@ -259,17 +259,13 @@ class Group(NamedTuple):
 
 
 def consensus(
-    model: FrameModel,
-    table: ScaledTable,
-    settings: FitSettings,
-    errors: bool,
-    joint: JointFit,
+    model: FrameModel, table: ScaledTable, settings: FitSettings, joint: JointFit
 ) -> FrameModel:
     """Fit groups of neighbouring points, and return the model that merges them.
 
     The given model is a joint fit of the table with calibrated cameras. The result has
     all principal components that exceed the noise. The errors of the depths of the
-    joint fit are estimated, if wanted, while other processes fit the groups.
+    joint fit are estimated, if wanted and not known, while other processes fit groups.
     """
     part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
@@ -292,10 +288,8 @@ def consensus(
     if noise > 0.5 * scene.floor:
         n_components = min(len(model.shapes) - 1, MOST_FIRST)
         begun = group_fits(scene, distances, n_components, settings)
-    if errors:
-        certainty = depth_certainty(
-            model, table.rows, table.weights, joint.widths, joint.rivals, settings
-        )
+    if settings.errors and certainty is NOT_ESTIMATED:
+        certainty = depth_certainty(model, table, joint, settings)
     groups = []
     for (points, count), result in zip(*begun, strict=True):
         if settings.on_step is not None:
@@ -462,7 +456,7 @@ def neighbourhoods(distances: NDArray, size: int) -> list[tuple[NDArray, int]]:
     return list(zip(groups, counts.tolist(), strict=True))
 
 
-@one_blas_thread
+@one_blas_thread()
 def group_fit(
     scene: Scene, n_components: int, settings: FitSettings
 ) -> tuple[NDArray, NDArray, float] | None:

@@ -315,10 +315,7 @@ def _visible_frames(table: FactorisedTable) -> JointFrames:
 
 
 def _first_fit(
-    problem: JointProblem,
-    table: FactorisedTable,
-    paper_shapes: NDArray,
-    **limits: Any,
+    problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray, **limits: Any
 ) -> tuple[JointFit, JointState]:
     """Return the fit of the sample, with its noise ratio, and one of its starts."""
     cameras, affine = problem.cameras, CAMERAS["affine"]
@@ -503,8 +500,7 @@ def reweighted(
         typical = distance[some] / residual_deviations(
             state, alpha[some], weights[some], problem.cameras
         )
-        noise = median_noise(typical[np.isfinite(typical)])
-        deviation = max(noise, OF_DISTANCES)
+        deviation = max(median_noise(typical[np.isfinite(typical)]), OF_DISTANCES)
         before, weights = weights, frame_weights(loss, distance, deviation, sizes)
         if np.mean((weights - before) ** 2) < 2.5e-5:
             break
@@ -577,7 +573,8 @@ def left_out_distances(model: FrameModel, rows: NDArray) -> NDArray:
     follow a wrong point explain it, but not from the others. NaN if these are fewer
     than `LEAST_POINTS`, or if with missing points they do not predict the point.
     """
-    fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
+    model, w = replace(model, starts=model.starts[:0]), seen_points(rows) * 1.0
+    fit = model.posterior(rows, False)
     state = JointState(model.shapes, fit.motion, model.noise_variance)
     rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
     distance = np.full(w.shape, np.nan)

@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from isa_nrsfm import _linalg as linalg
 from isa_nrsfm._compat.lazy import cached_property
 from isa_nrsfm._frames.search import (
     FrameTracks,
@@ -49,15 +50,6 @@ from isa_nrsfm._frames.search import (
     joined_frames,
 )
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._linalg import (
-    centred,
-    diagonal_of,
-    energies,
-    frames_last,
-    of_frames,
-    unpack3,
-    unpacked,
-)
 from isa_nrsfm._tables import BLOCK_FRAMES, FrameBlocks, seen_points
 
 # Without the penalty, frontal photos of faces give needle-like shapes. If one extent is
@@ -148,7 +140,14 @@ class JointFrames:
     @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
         """Return complete rows (I, 2, J) by products with directions of sum zero."""
-        blocks = rows.derive(partial(_compressed_frames, directions=directions))
+
+        def compressed(rows: NDArray) -> FrameTracks:
+            n, _, n_points = rows.shape
+            products = (rows.reshape(2 * n, -1) @ directions.T).reshape(n, 2, -1)
+            W, weight = np.ascontiguousarray(products.T), np.full(n, float(n_points))
+            return FrameTracks(W, None, np.zeros((2, n)), weight, linalg.energies(rows))
+
+        blocks = rows.derive(compressed)
         return cls(blocks.regrouped(joined_frames, BLOCK_FRAMES), directions)
 
     def coordinates(self, shapes: NDArray) -> NDArray:
@@ -161,26 +160,18 @@ class JointFrames:
 
     def centred(self, shapes: NDArray) -> NDArray:
         """Return shapes centred over their points. Directions have sum zero already."""
-        return centred(shapes) if self.directions is None else shapes
+        return linalg.centred(shapes) if self.directions is None else shapes
 
     def take(self, frames: NDArray) -> Self:
         """Return some of the frames, in the order of the table."""
         chosen = np.isin(np.arange(self.n_frames), frames)
         parts = self.blocks.map(
-            lambda block, kept: of_frames(block, np.flatnonzero(kept)), chosen
+            lambda block, kept: linalg.of_frames(block, np.flatnonzero(kept)), chosen
         )
         taken = [part for part in parts if len(part.weight)]
         lengths = [len(part.weight) for part in taken]
         blocks = FrameBlocks.of_blocks(taken, lengths, self.blocks.n_threads)
         return replace(self, blocks=blocks.regrouped(joined_frames, BLOCK_FRAMES))
-
-
-def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
-    """Return complete frames (I, 2, J) with directions in the place of points."""
-    n_frames, _, n_points = rows.shape
-    products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
-    W, weight = np.ascontiguousarray(products.T), np.full(n_frames, float(n_points))
-    return FrameTracks(W, None, np.zeros((2, n_frames)), weight, energies(rows))
 
 
 # Terms that are summed over frames, and those of each frame, in the order below
@@ -232,25 +223,21 @@ class MarginalLikelihood(NamedTuple):
         self, shapes: NDArray, motion: NDArray, noise: float
     ) -> LikelihoodTerms:
         """Return the terms at shapes (n, 3, J), motion (I, 2, 3), noise variance s2."""
-        n_seen, square = self.frames.totals
-        products, penalty = ShapeProducts(shapes), self.penalty
-        # If the noise is tiny, refine the solution of the normal equations by one step.
-        tiny_noise = noise * n_seen < 1e-7 * square
+        products, (n_seen, _) = ShapeProducts(shapes), self.frames.totals
 
         def over_block(block: FrameTracks, motion: NDArray) -> Terms:
             """Return the sums over pieces whose matrices fit the cache."""
-            M, parts = frames_last(motion), []
+            M, parts = linalg.frames_last(motion), []
             for frames, piece in block.pieces():
-                M_i = M[:, :, frames]
-                parts.append(_terms(piece, M_i, products, noise, penalty, tiny_noise))
+                parts.append(self._terms(piece, M[:, :, frames], products, noise))
             return _joined(parts)
 
         sums, by_frame = _joined(self.frames.blocks.map(over_block, motion))
         value, noise_gradient, shape_gradient, packed, residual = sums
-        motion_gradient, motion_curvature, alpha = by_frame
+        *of_cameras, alpha = by_frame
         # Matrices (n, size, size) from the sums, packed by shapes and by axes
         size = 3 * len(shapes)
-        curvature = unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3)
+        curvature = linalg.unpack3(linalg.unpacked(packed)).transpose(4, 0, 2, 1, 3)
         curvature = curvature.reshape(-1, size, size)
         columns = shapes.reshape(size, -1).T[:, :, None]
         pulled = (curvature @ columns)[:, :, 0].T.reshape(shapes.shape)
@@ -259,8 +246,8 @@ class MarginalLikelihood(NamedTuple):
         shape_gradient = shape_gradient + (2 / noise) * pulled
         if self.extent_weight:
             weight = self.extent_weight * n_seen
-            penalty, slope = extent_penalty(shapes, self.frames.point_shares)
-            value += weight * penalty
+            term, slope = extent_penalty(shapes, self.frames.point_shares)
+            value += weight * term
             shape_gradient = shape_gradient + weight * slope
         if self.precisions is not None:
             slope = self.precisions @ shapes[1:]
@@ -271,16 +258,54 @@ class MarginalLikelihood(NamedTuple):
         if self.prior is not None:
             term, slope = self.prior.term(shapes)
             value, shape_gradient = value + term, shape_gradient + slope
-        return LikelihoodTerms(
-            float(value),
-            float(noise_gradient + freedom),
-            shape_gradient,
-            curvature,
-            residual,
-            motion_gradient,
-            motion_curvature,
-            np.ascontiguousarray(alpha.T),
-        )
+        noise_gradient, alpha = float(noise_gradient + freedom), alpha.T.copy()
+        sums = float(value), noise_gradient, shape_gradient, curvature, residual
+        return LikelihoodTerms._make((*sums, *of_cameras, alpha))
+
+    def _terms(
+        self, block: FrameTracks, M: NDArray, shapes: ShapeProducts, noise: float
+    ) -> Terms:
+        """Return the sums over frames of a block, with cameras M (2, 3, n_frames).
+
+        The curvature of the shapes is packed: (n_pairs, 6, n_points or 1).
+        """
+        n_shapes, _, n_points = shapes.shapes.shape
+        n_seen, square = self.frames.totals
+        products = frame_sums(block, shapes)
+        # If the noise is tiny, refine the solution of the normal equations by one step.
+        tiny = noise * n_seen < 1e-7 * square
+        posterior = coefficient_posterior((products, noise), M, refined=tiny)
+        c, alpha = posterior.c, posterior.alpha
+        value = np.sum(posterior.objective / noise + posterior.log_determinant)
+        value += self.penalty * np.sum(posterior.image_energy)
+        residual = float(posterior.residual(noise).sum())
+        spread = float(posterior.spread(noise).sum())
+
+        # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
+        moments = posterior.second_moments(noise)
+        moments[linalg.diagonal_of(moments)[1:]] += noise * self.penalty
+        cameras = camera_gram(M)
+        # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
+        motion_curvature = products.gram.moments(moments)
+        G = np.einsum("rbi,bai->rai", M, linalg.unpack3(motion_curvature))
+        G -= np.einsum("ki,kari->rai", c, products.cross)
+        # By the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
+        X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
+        shape_gradient = X @ block.deviations.reshape(n_points, -1).T
+        if block.weights is None:
+            shape_curvature = (moments @ cameras.T)[:, :, None]
+        else:
+            pairs = (moments[:, None] * cameras).reshape(6 * len(moments), -1)
+            shape_curvature = (pairs @ block.weights.T).reshape(-1, 6, n_points)
+            # The eliminated position of a frame depends on the means of the shapes.
+            middles = products.shape_centroid
+            mixed = np.einsum("kli,lbi->kbi", linalg.unpacked(moments), middles)
+            means = np.einsum("abi,kbi->kai", linalg.unpack3(cameras), mixed)
+            shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
+        noise_gradient = -(residual + spread) / noise
+        shape_gradient = (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape)
+        sums = float(value), noise_gradient, shape_gradient, shape_curvature, residual
+        return sums, ((2 / noise) * G, motion_curvature, alpha)
 
 
 def _joined(parts: Iterable[Terms]) -> Terms:
@@ -294,53 +319,6 @@ def _joined(parts: Iterable[Terms]) -> Terms:
         return sums, own
     join = partial(np.concatenate, axis=-1)
     return sums, tuple(map(join, zip(*by_frame, strict=True)))
-
-
-def _terms(
-    block: FrameTracks,
-    M: NDArray,
-    shapes: ShapeProducts,
-    noise: float,
-    penalty: float,
-    tiny_noise: bool,
-) -> Terms:
-    """Return the sums over frames, M (2, 3, n_frames), for `MarginalLikelihood`.
-
-    The curvature of the shapes is packed: (n_pairs, 6, n_points or 1).
-    """
-    n_shapes, _, n_points = shapes.shapes.shape
-    products = frame_sums(block, shapes)
-    posterior = coefficient_posterior(products, M, noise, refined=tiny_noise)
-    c, alpha = posterior.c, posterior.alpha
-    value = np.sum(posterior.objective / noise + posterior.log_determinant)
-    value += penalty * np.sum(posterior.image_energy)
-    residual = float(posterior.residual(noise).sum())
-    spread = float(posterior.spread(noise).sum())
-
-    # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
-    moments = posterior.second_moments(noise)
-    moments[diagonal_of(moments)[1:]] += noise * penalty
-    cameras = camera_gram(M)
-    # With respect to the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
-    motion_curvature = products.gram.moments(moments)
-    G = np.einsum("rbi,bai->rai", M, unpack3(motion_curvature))
-    G -= np.einsum("ki,kari->rai", c, products.cross)
-    # With respect to the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
-    X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
-    shape_gradient = X @ block.deviations.reshape(n_points, -1).T
-    if block.weights is None:
-        shape_curvature = (moments @ cameras.T)[:, :, None]
-    else:
-        pairs = (moments[:, None] * cameras).reshape(6 * len(moments), -1)
-        shape_curvature = (pairs @ block.weights.T).reshape(-1, 6, n_points)
-        # The eliminated position of a frame depends on weighted means of the shapes.
-        mixed = np.einsum("kli,lbi->kbi", unpacked(moments), products.shape_centroid)
-        means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
-        shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
-    noise_gradient = -(residual + spread) / noise
-    shape_gradient = (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape)
-    sums = float(value), noise_gradient, shape_gradient, shape_curvature, residual
-    return sums, ((2 / noise) * G, motion_curvature, alpha)
 
 
 def extent_penalty(

@@ -23,13 +23,7 @@ from isa_nrsfm._frames.search import FrameSearch, FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._linalg import (
-    OF_DIFFERENCES,
-    OF_SUMS,
-    centred,
-    frames_first,
-    frames_last,
-)
+from isa_nrsfm._linalg import OF_DIFFERENCES, OF_SUMS, centred, frames_last
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm.isa._pipeline import Factorisation
 
@@ -81,12 +75,9 @@ class FactorisedTable(NamedTuple):
         """
         # Mean energy of the dimensions beyond, over that of all seen - 1 dimensions
         seen = float(np.mean(self.scaled.n_seen))
-        n_others = seen - 1 - (3 * n_components + 3)
-        noise = (
-            self.rest_share(3 * n_components + 3) * (seen - 1) / n_others
-            if n_others > 0
-            else 0.0
-        )
+        rank = 3 * n_components + 3
+        n_others = seen - 1 - rank
+        noise = self.rest_share(rank) * (seen - 1) / n_others if n_others > 0 else 0.0
         # Points that were filled in add to the energy of the table, but have no noise.
         return noise * self.W.shape[1] / seen
 
@@ -448,7 +439,7 @@ class _Iterate:
     def moved(self, step: NDArray) -> JointState:
         """Return the state after a step; the noise variance is at least floor."""
         shapes, steps, noise = self.split(step)
-        motion = frames_first(self.cameras.moved(self.M, steps))
+        motion = np.moveaxis(self.cameras.moved(self.M, steps), 2, 0)
         noise = max(self.state.noise * np.exp(noise), self.floor)
         return JointState(self.state.shapes + shapes, motion, noise)
 

@@ -114,13 +114,6 @@ class FitSettings(NamedTuple):
         calibrated = self.joint and self.camera != "affine"
         return calibrated and self.whole and self.prior is None
 
-    def remembered(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
-        """Return a known result, or that of a function, which is known from now on."""
-        known = {} if self.known is None else self.known
-        if name not in known:
-            known[name] = function(*args, settings=self)
-        return known[name]
-
     @property
     def joint(self) -> bool:
         """Whether the refinement is the joint fit, or begins with it."""

@@ -23,12 +23,7 @@ from isa_nrsfm._frames.camera_models import (
     rigid_cameras,
 )
 from isa_nrsfm._joint.prior import STEP, ShapePrior
-from isa_nrsfm._joint.problem import (
-    FactorisedTable,
-    JointFit,
-    JointProblem,
-    JointState,
-)
+from isa_nrsfm._joint.problem import FactorisedTable, JointFit, JointProblem, JointState
 from isa_nrsfm._linalg import OF_PRODUCTS, frames_last
 from isa_nrsfm._tables import spread
 from isa_nrsfm.calibration._metric_upgrade import best_metric
@@ -128,16 +123,11 @@ def steadied(motion: NDArray) -> NDArray:
     frame[:, 2] *= np.linalg.det(frame)
     across = views @ frame
     angle = np.arctan2(across[:, 1], across[:, 0])
-    turn = Rotation.from_rotvec(np.outer(angle, frame[:, 2]))
-    return motion @ turn.as_matrix()
+    return motion @ Rotation.from_rotvec(np.outer(angle, frame[:, 2])).as_matrix()
 
 
 def reversed_groups(
-    problem: JointProblem,
-    rows: NDArray,
-    motion: NDArray,
-    alpha: NDArray,
-    n_groups: int,
+    problem: JointProblem, rows: NDArray, motion: NDArray, alpha: NDArray, n_groups: int
 ) -> NDArray:
     """Return cameras (I, 2, 3) with groups of similar frames turned back in depth.
 
@@ -248,10 +238,8 @@ def held_fit(
 
     With the large noise of a start, the prior would make basis shapes vanish.
     """
-    state, free = (
-        first_state(problem, rows, motion, shapes),
-        replace(problem, penalty=0.0),
-    )
+    state = first_state(problem, rows, motion, shapes)
+    free = replace(problem, penalty=0.0)
     return free.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
 
 

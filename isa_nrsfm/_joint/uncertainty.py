@@ -51,7 +51,7 @@ from isa_nrsfm._frames.models import (
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
-from isa_nrsfm._joint.problem import JointProblem, JointState, Widths, refine_joint
+from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import other_depths, steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
@@ -159,15 +159,11 @@ def shape_information(
 
 
 def frame_certainty(
-    frames: FrameModel,
-    fits: FrameFits,
-    n_seen: NDArray,
-    weight: NDArray,
-    unknowns: float,
+    frames: FrameModel, fits: FrameFits, n_seen: NDArray, weight: NDArray, n_used: float
 ) -> DepthCertainty:
     """Return the certainty with that of the residuals of frames.
 
-    n_seen (n,): numbers of seen points. weight (n,): sums of their weights. unknowns:
+    n_seen (n,): numbers of seen points. weight (n,): sums of their weights. n_used:
     number of coordinates that determine the shapes. Camera,
     position and coefficients fit a part of the coordinates of a frame. All other
     coordinates determine the shapes, whose errors in an image are
@@ -181,23 +177,21 @@ def frame_certainty(
     left = max(numbers - len(alpha) * n_own, 0.1 * numbers)
     noise = frames.noise_variance
     if frames.loss == "linear":
-        noise = max(noise, residual / max(left - unknowns, 0.1 * numbers))
+        noise = max(noise, residual / max(left - n_used, 0.1 * numbers))
     ratio, square = noise / frames.noise_variance, residual / weight.sum()
-    images = ratio, ratio * unknowns / left / mean
+    images = ratio, ratio * n_used / left / mean
     # Of coefficients from the images
     leverage = None if certainty.leverage is None else mean
     return certainty._replace(residual=square, leverage=leverage, images=images)
 
 
 def shown_frames(
-    posterior: FramePosterior,
-    sizes: NDArray,
-    n_seen: NDArray,
-    weight: NDArray,
-    frames: FrameModel,
-    uncertainty: NDArray,
+    posterior: FramePosterior, *numbers: NDArray, frames: FrameModel, inverse: NDArray
 ) -> tuple[Decomposition, NDArray, float]:
     """Return fits in the gauge, and the effect of their noise on their coefficients.
+
+    numbers: sizes of frames (n,), of seen points, and sums of the weights of these.
+    inverse (p, p): that of the information on a point of the shapes.
 
     The noise of frame i changes the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
     M_i``. This shifts the coefficients of the frame by ``w_i s2_i Sigma_i / s2 tr(M_i
@@ -205,9 +199,9 @@ def shown_frames(
     second result (K, K) is the sum over the frames of ``alpha_i`` times that shift
     times s2, the third the sum of s2_i.
     """
-    motion, alpha = posterior.motion, posterior.alpha
+    motion, alpha, (sizes, n_seen, weight) = posterior.motion, posterior.alpha, numbers
     X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
-    Z = X @ uncertainty
+    Z = X @ inverse
     # Degrees of freedom of the residual, without the parameters of the shapes
     leverage = np.einsum("irp,irp->i", X, Z)
     n_pose = 2 + CAMERAS[frames.camera].n_parameters
@@ -269,20 +263,11 @@ def n_reliable(reliability: NDArray) -> int:
 
 
 def depth_certainty(
-    frames: FrameModel,
-    rows: FrameBlocks,
-    weights: NDArray | None,
-    widths: Widths | None,
-    rivals: float,
-    settings: FitSettings,
+    frames: FrameModel, table: ScaledTable, joint: JointFit, settings: FitSettings
 ) -> DepthCertainty:
-    """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
-
-    Weights (I, J) are numbers of observations; without them each is one. widths: of a
-    fit of all directions. rivals: as of `JointFit`.
-    """
-    limits = settings.limits
-    part, fit, w = inlying_rows(frames, rows, MOST_FRAMES, weights)
+    """Estimate the errors of the model of a joint fit from some frames, if enough."""
+    limits, widths = settings.limits, joint.widths
+    part, fit, w = inlying_rows(frames, table.rows, MOST_FRAMES, table.weights)
     n_points = frames.shapes.shape[2]
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     # Directions are sorted by their size, and as many as these frames determine.
@@ -347,7 +332,7 @@ def depth_certainty(
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extents=extents)
     problem = JointProblem(of_points(every), settings)
-    deformation = rivals + problem.reversal_error(whole, depths)
+    deformation = joint.rivals + problem.reversal_error(whole, depths)
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
@@ -362,7 +347,14 @@ def depth_certainty(
             stretches.append(change)
         deformation += float(softmax(-np.array(costs)) @ stretches)
     fits = [refit(kept) for kept in parts]
-    centre = depths if prior is not None else mean_depths(parts, fits, depths)
+    centre = depths
+    if prior is None:  # the mean of all fits, mirrored alike
+        centre = np.zeros(depths.shape)
+        for kept, (_, _, z, _) in zip(parts, fits, strict=True):
+            whole_z = depths[:, kept]
+            mirror = np.copysign(1.0, np.sum(z * centred(whole_z)))
+            centre[:, kept] += mirror * z + whole_z.mean(axis=1, keepdims=True)
+        centre /= np.sum(parts, axis=0)
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept, (_, turned, z, _) in zip(parts, fits, strict=True):
         square, turn, squares = differences(turned, z, rotations, centre[:, kept])
@@ -374,18 +366,6 @@ def depth_certainty(
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
     total = float(np.sqrt(factor * total + deformation))
     return DepthCertainty(total, deformation, factor * turns, variances[nearest])
-
-
-def mean_depths(
-    parts: Sequence[NDArray], fits: Sequence[Any], depths: NDArray
-) -> NDArray:
-    """Return the mean depths (I, n) of fits of parts of the points, mirrored alike."""
-    total, number = np.zeros(depths.shape), np.sum(parts, axis=0)
-    for kept, (_, _, z, _) in zip(parts, fits, strict=True):
-        whole = depths[:, kept]
-        mirror = np.copysign(1.0, np.sum(z * centred(whole)))
-        total[:, kept] += mirror * z + whole.mean(axis=1, keepdims=True)
-    return total / number
 
 
 def differences(
@@ -481,9 +461,8 @@ def half_tables(
         rest = (rest - mean[:, :, None]) * w[:, None]
         X = stacked_motion(motion, alpha).reshape(*rest.shape[:2], -1)
         chosen = [part == number for number in range(len(SIGNS))]
-        return np.stack(
-            [np.tensordot(X[i], rest[i], axes=((0, 1), (0, 1))) for i in chosen]
-        )
+        parts = ((X[frames], rest[frames]) for frames in chosen)
+        return np.stack([np.tensordot(x, r, axes=((0, 1), (0, 1))) for x, r in parts])
 
     weights = () if table.weights is None else (table.weights,)
     total = sum(table.rows.map(scores, part, motion, alpha, *weights))

@@ -63,8 +63,7 @@ def completion_model(
 def filled_in(rows: NDArray, model: Model) -> NDArray:
     """Return frames (n_frames, 2, n_points), NaN filled in by the model, centred."""
     z, t, *_ = _posterior(*_frames(rows), *model)
-    filled = np.where(np.isnan(rows), z @ model[0] + t, rows)
-    return centred(filled)
+    return centred(np.where(np.isnan(rows), z @ model[0] + t, rows))
 
 
 def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -74,9 +73,8 @@ def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     last array is the index (n_frames,) of the pattern of each frame.
     """
     seen = ~np.isnan(rows).any(axis=1)
-    _, first, pattern = np.unique(
-        np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
-    )
+    bits = np.packbits(seen, axis=1)
+    _, first, pattern = np.unique(bits, axis=0, return_index=True, return_inverse=True)
     patterns = seen[first].astype(float)
     return np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1)
 

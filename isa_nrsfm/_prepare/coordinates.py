@@ -60,9 +60,8 @@ def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> N
         return
     if are_scaled(tracks, SIMILAR) and warn_of_scaled_columns(rows.whole().mT):
         return
-    warn_of_codes(
-        tracks, "rows" if len(sample) == rows.n_frames else "rows of a sample"
-    )
+    every = len(sample) == rows.n_frames
+    warn_of_codes(tracks, "rows" if every else "rows of a sample")
     if model.camera != "affine":
         warn_of_shares(tracks)
 
@@ -134,17 +133,11 @@ def are_scaled(tracks: NDArray, tol: float) -> bool:
         return False
     X /= largest  # squares stay in range
     low, first, median, third, high = np.nanpercentile(X, [0, 25, 50, 75, 100], axis=0)
-    spreads = (
-        [np.nanstd(X, axis=0)],
-        [np.nanstd(X, axis=0, ddof=1)],
-        [high - low, low],
-        [np.fmax(high, -low)],
-        [third - first, median],
-    )
-    return any(
-        max(np.ptp(each) for each in spread) <= tol * spread[0].max() > 0
-        for spread in spreads
-    )
+    spreads = [[np.nanstd(X, axis=0)], [np.nanstd(X, axis=0, ddof=1)]]
+    spreads += [[high - low, low], [np.fmax(high, -low)], [third - first, median]]
+    ranges = [max(np.ptp(each) for each in spread) for spread in spreads]
+    limits = [tol * spread[0].max() for spread in spreads]
+    return any(r <= limit > 0 for r, limit in zip(ranges, limits, strict=True))
 
 
 def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
@@ -245,11 +238,8 @@ def are_shares(tracks: NDArray) -> bool:
     zero, one = (((tracks == end).any(axis=2) & visible) for end in (0, 1))
     ends, tolerance = (zero.sum(), one.sum()), 4 + visible.sum() / 1000
     scaled = [np.mean(zero.any(axis) & one.any(axis)) > 0.5 for axis in (0, 1)]
-    aligned = (
-        zero.all(axis=0).any()
-        or any(scaled)
-        or (0 < min(ends) and sum(ends) < tolerance)
-    )
+    few_ends = 0 < min(ends) and sum(ends) < tolerance
+    aligned = zero.all(axis=0).any() or any(scaled) or few_ends
     if centred or aligned or inside.sum() < LEAST * visible.sum():
         return False
     return bool(np.ptp(tracks[inside], axis=0).min() > 0.1)

@@ -11,15 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from isa_nrsfm._linalg import (
-    OF_DISTANCES,
-    centred,
-    frames_first,
-    invert_positive,
-    lengths,
-    pair_indices,
-    unpacked,
-)
+from isa_nrsfm import _linalg as linalg
 from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 
 # Tuning constants c of the losses, in standard deviations of a coordinate. With these,
@@ -52,12 +44,6 @@ def frame_weights(
     return np.where(belongs, WEIGHTS[loss](near / deviation), 0.0)
 
 
-def robust_square(square: NDArray, noise: float) -> NDArray:
-    """Return squared distances as the loss "cauchy" has them, for a noise."""
-    limit = noise * TUNING["cauchy"] ** 2
-    return np.asarray(limit * np.log1p(square / limit))
-
-
 def median_noise(distance: NDArray) -> float:
     """Return the noise of a coordinate from the median of distances (n,)."""
     return float(np.median(distance) / MEDIAN_DISTANCE)
@@ -77,7 +63,7 @@ def distant_points(rows: NDArray) -> NDArray:
 
     Missing points are far.
     """
-    return ~(lengths(rows) <= DISTANT * robust_sizes(rows)[:, None])
+    return ~(linalg.lengths(rows) <= DISTANT * robust_sizes(rows)[:, None])
 
 
 def robust_sizes(rows: NDArray) -> NDArray:
@@ -90,7 +76,7 @@ def robust_sizes(rows: NDArray) -> NDArray:
     last, frames = seen_points(rows).sum(axis=1) - 1, np.arange(len(rows))
     median = (square[frames, last // 2] + square[frames, (last + 1) // 2]) / 2
     # If half of the points coincide the median is rounding error: take the mean.
-    exact = median > OF_DISTANCES * square[frames, 3 * last // 4]
+    exact = median > linalg.OF_DISTANCES * square[frames, 3 * last // 4]
     return np.sqrt(np.where(exact, median, np.nanmean(square, axis=1)) / 2)
 
 
@@ -120,7 +106,7 @@ def spatial_median(rows: NDArray) -> NDArray:
     points = np.where(visible, points - origin, 0.0)
     weights, distance, median = _nearest_half(points, half, visible)
     # If half of the points coincide, their place is the median.
-    floor = np.where(median > 0, OF_DISTANCES * median, 1.0)
+    floor = np.where(median > 0, linalg.OF_DISTANCES * median, 1.0)
     counted = np.where(median > 0, visible, distance <= median)
     middle = _middles(points, weights)
     for _ in range(20):
@@ -149,7 +135,7 @@ def _middles(points: NDArray, weights: NDArray) -> NDArray:
 
 def _distances(points: NDArray, middle: NDArray) -> NDArray:
     """Return distances (I, J) of points (2, I, J) from places (2, I)."""
-    return lengths((points - middle[..., None]).swapaxes(0, 1))
+    return linalg.lengths((points - middle[..., None]).swapaxes(0, 1))
 
 
 def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
@@ -176,12 +162,12 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     filled = np.where(hidden[:, None], 0.0, rows)
     for _ in range(100):
         # Rigid factorisation, rank 3, of the filled rows
-        W = centred(filled).reshape(-1, rows.shape[2])
+        W = linalg.centred(filled).reshape(-1, rows.shape[2])
         last = [rows.shape[2] - 3, rows.shape[2] - 1]
         axes = eigh(W.T @ W, subset_by_index=last)[1]
         rigid, distance = _rigid_part(rows, hidden, axes)
         # Typical distances, of the table and of each point
-        typical = max(median_noise(distance[visible]), OF_DISTANCES)
+        typical = max(median_noise(distance[visible]), linalg.OF_DISTANCES)
         of_point = lower_medians(distance.T, visible.T)[:, 0] / MEDIAN_DISTANCE
         limit = 4.5 * np.fmax(typical, of_point)  # NaN: points in no frame
         # Hide points that are too far, and fill them in
@@ -219,9 +205,9 @@ def _rigid_part(
     Axes (J, 3) are fitted to the points that are not hidden.
     """
     design = np.column_stack([axes, np.full(len(axes), len(axes) ** -0.5)])
-    first, second = pair_indices(4)
+    first, second = linalg.pair_indices(4)
     moments = (design[:, first] * design[:, second]).T @ ~hidden.T
-    inverse = frames_first(unpacked(invert_positive(moments)[0]))
+    inverse = linalg.frames_first(linalg.unpacked(linalg.invert_positive(moments)[0]))
     inner = np.where(hidden[:, None], 0.0, rows) @ design
     rigid = inner @ inverse @ design.T
-    return rigid, lengths(rows - rigid)
+    return rigid, linalg.lengths(rows - rigid)

@@ -100,12 +100,10 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
             f"y of a point (first: {others[0]!r}). {ONLY_POINTS}"
         )
     examples = ", ".join(map(str, names[:4]))
-    order = (
-        "neither interleaved nor planar; isa_nrsfm.io.landmark_table(X).points has "
-        "them interleaved"
-        if said == "other"
-        else said
-    )
+    order: str = said
+    if said == "other":
+        way = "isa_nrsfm.io.landmark_table(X).points has them interleaved"
+        order = f"neither interleaved nor planar; {way}"
     raise ValueError(
         f"layout={layout!r} contradicts the column names ({examples}, ...), "
         f"whose order is {order}"
@@ -186,15 +184,12 @@ def check_size(
 
 
 def check_points(
-    visible: NDArray,
-    n_points: int,
-    n_components: int,
-    layout: Layout = "interleaved",
-    names: NDArray | None = None,
+    visible: NDArray, n_points: int, n_components: int, *columns: Any
 ) -> None:
     """Refuse tables whose visible points do not determine the shapes.
 
-    `visible` (I, J) is packed, eight points in a byte. The numbers of equations and
+    `visible` (I, J) is packed, eight points in a byte. `columns` are the arguments of
+    `describe_point`: their layout and names. The numbers of equations and
     unknowns are compared, a necessary condition. A point has 3 (K + 1) unknowns, and
     two equations per frame that shows it. A frame of n points has 2 n equations, and 8
     + K unknowns of its own.
@@ -211,7 +206,7 @@ def check_points(
         raise ValueError(
             f"{named('n_components', n_components)} needs every point in at least "
             f"{minimum} frames; fewer show {few.sum()} of {n_points} points (first: "
-            f"{describe_point(point, layout, names)}, in {n_frames[point]} of "
+            f"{describe_point(point, *columns)}, in {n_frames[point]} of "
             f"{counts.sum()} frames). Leave out these points, or take fewer basis "
             "shapes"
         )
@@ -232,8 +227,8 @@ def check_points(
         raise ValueError(
             f"the points fall into {n_groups} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "
-            f"{describe_point(int(group.argmax()), layout, names)} is never visible "
-            f"with {describe_point(0, layout, names)} and its group). Add frames that "
+            f"{describe_point(int(group.argmax()), *columns)} is never visible "
+            f"with {describe_point(0, *columns)} and its group). Add frames that "
             "show points of both, or fit each group separately"
         )
 
@@ -335,13 +330,8 @@ def _residual(rows: NDArray, rank: int) -> float:
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
     """Return values as a finite array of the first of the allowed shapes, or raise."""
-    array = check_array(
-        unmasked(values),
-        dtype=[np.float64, np.float32],
-        input_name=name,
-        ensure_2d=False,
-        allow_nd=True,
-    )
+    checks: Any = {"input_name": name, "ensure_2d": False, "allow_nd": True}
+    array = check_array(unmasked(values), dtype=CHECKS["dtype"], **checks)
     if array.shape not in allowed:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
@@ -430,7 +420,7 @@ class ScaledTable(NamedTuple):
         return bool((self.n_seen == self.n_points).all())
 
 
-@one_blas_thread
+@one_blas_thread()
 def scaled_table(
     blocks: FrameBlocks, weights: NDArray | None, n_components: int, settings: Any
 ) -> ScaledTable:
@@ -448,9 +438,8 @@ def scaled_table(
     n_points, dtype = blocks.empty.shape[2], blocks.empty.dtype
     if determines:
         check_size(blocks.n_frames, n_points, n_components, camera)
-    n_half, first, visible, largest, *rest = blocks.joined(
-        partial(_examine, robust=robust)
-    )
+    examined = blocks.joined(partial(_examine, robust=robust))
+    n_half, first, visible, largest, *rest = examined
     if n_half.any():
         warn_of_half_points(n_half, first, layout, names)
         blocks = blocks.derive(lambda rows: without_half_points(rows)[0])
@@ -492,21 +481,18 @@ def scaled_table(
     # the SVD. With fewer points matrix products are so small that it saves nothing.
     complete = bool((n_seen == n_points).all())
     single = dtype == np.float32 and n_points >= 200 and complete and not robust
-    unit_rows = partial(_unit_rows, dtype=np.float32 if single else np.float64)
+    working = np.float32 if single else np.float64
+
+    def unit_rows(rows: NDArray, middle: NDArray, size: NDArray) -> NDArray:
+        unit = (rows - middle[:, :, None]) / size[:, None, None]
+        return unit.astype(working, copy=False)
+
     spacing = np.finfo(dtype).eps * largest.astype(np.float64)
-    return ScaledTable(
-        usable,
-        blocks,
-        blocks.derive(unit_rows, translation, size, kept=False),
-        size,
-        translation,
-        n_seen,
-        n_points,
-        None if scale_frames else float(size[0]),
-        float(np.sqrt(np.mean((spacing / size) ** 2))),
-        dtype,
-        weights,
-    )
+    precision = float(np.sqrt(np.mean((spacing / size) ** 2)))
+    unit = None if scale_frames else float(size[0])
+    rows = blocks.derive(unit_rows, translation, size, kept=False)
+    frames = usable, blocks, rows, size, translation, n_seen, n_points
+    return ScaledTable(*frames, unit, precision, dtype, weights)
 
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
@@ -521,14 +507,6 @@ def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
     largest = np.fmax.reduce(np.abs(rows), axis=(1, 2), initial=0.0)
     visible = np.packbits(seen_points(rows), axis=1)
     return *half, visible, largest, *report
-
-
-def _unit_rows(
-    rows: NDArray, translation: NDArray, sizes: NDArray, dtype: Any
-) -> NDArray:
-    """Return rows (n, 2, J) centred and of size one."""
-    unit = (rows - translation[:, :, None]) / sizes[:, None, None]
-    return unit.astype(dtype, copy=False)
 
 
 def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:
@@ -549,13 +527,8 @@ def weighted_rows(
             f"{named('point_weight')} needs a table in memory, because weights are not "
             "read block by block. Give a NumPy array or a dataframe, or no weights"
         )
-    weights = check_array(
-        unmasked(point_weight),
-        dtype=np.float64,
-        order="C",
-        input_name="point_weight",
-        ensure_min_samples=0,
-    )
+    checks: Any = {"input_name": "point_weight", "ensure_min_samples": 0}
+    weights = check_array(unmasked(point_weight), dtype=np.float64, order="C", **checks)
     shape = rows.n_frames, rows.empty.shape[2]
     if weights.shape != shape:
         raise ValueError(

@@ -190,7 +190,7 @@ class DiagnosedMixin(CoefficientsMixin, TransformerMixin):
         return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
 
-@one_blas_thread
+@one_blas_thread()
 def diagnose(
     estimator: Any, table: FrameBlocks | None, weights: Sequence[NDArray], rows: Any
 ) -> Diagnostics:
@@ -400,7 +400,7 @@ SAME = 0.85
 MOST_TOGETHER = 3
 
 
-@one_blas_thread
+@one_blas_thread()
 def stability(
     tables: HalfTables, gauge: FrameMap, n_components: int
 ) -> tuple[NDArray, NDArray]:

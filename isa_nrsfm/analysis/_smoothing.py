@@ -131,7 +131,7 @@ class SmoothedCoefficients(NamedTuple):
     decomposition: Decomposition
 
 
-@one_blas_thread
+@one_blas_thread()
 def smooth(
     alone: LinearisedFrames,
     gauge: FrameMap,

@@ -87,7 +87,7 @@ class ShapeSequenceNRSfM(
         """
 
     @scikit_learn.fit_context(nested=False)
-    @one_blas_thread
+    @one_blas_thread()
     def fit(self, X: Any, y: Any = None) -> Self:
         """
         Factorise a table.
@@ -173,7 +173,7 @@ class ShapeSequenceNRSfM(
         """
         return self.decompose(X).alpha
 
-    @one_blas_thread
+    @one_blas_thread()
     def decompose(self, X: Any) -> Decomposition:
         """
         Return camera and coefficients of each frame of a table.

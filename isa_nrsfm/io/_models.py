@@ -70,8 +70,8 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     estimator : AffineNRSfM
-        A fitted estimator. Memory maps (with `frames_folder`) are copied into the
-        file. Callbacks are left out. Of strategies that are not part of
+        A fitted estimator. Memory maps (with a path as `keep_frames`) are copied into
+        the file. Callbacks are left out. Of strategies that are not part of
         `isa_nrsfm.isa` the file holds the name and the fitted arrays.
     path : str or path-like
         The file to write, by custom with the suffix ``.npz``. An existing file is

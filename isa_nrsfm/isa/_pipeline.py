@@ -27,7 +27,6 @@ M_0^i`` and ``R = sum_i alpha_i M_0^iT M_ik``. It never lowers f.
 """
 
 import warnings
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -37,6 +36,7 @@ from scipy.linalg import eigh, null_space
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import has_fit_parameter
 
+from isa_nrsfm._compat.scikit_learn import Progress
 from isa_nrsfm._linalg import OF_RANKS, energies, orientations, polar
 from isa_nrsfm._tables import FrameBlocks, spread
 
@@ -200,11 +200,7 @@ def _squared(block: NDArray, V: NDArray) -> NDArray:
 
 
 def run_paper_pipeline(
-    factors: Factorisation,
-    n_components: int,
-    isa: Any,
-    settings: Any,
-    report: Callable[[str], None],
+    factors: Factorisation, n_components: int, isa: Any, settings: Any, report: Progress
 ) -> tuple[NDArray, NDArray, int, bool]:
     """Fit the strategy `isa`, recover blocks and refine them, by `FitSettings`.
 

@@ -46,7 +46,7 @@ class BaseSubspaceAnalysis(
     }
 
     # For matrices of this size, threads take more time than they save.
-    @one_blas_thread
+    @one_blas_thread()
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals, size = unmasked(signals), self.subspace_size
@@ -186,13 +186,10 @@ def iterate(
     its step length is halved. Returns the last iterates (n_batch, n, n), and for each
     start the number of steps and whether it has converged.
     """
-    W = W.copy()
-    n_iter = np.zeros(len(W), dtype=int)
-    converged = np.zeros(len(W), dtype=bool)
-    running = np.arange(len(W))
-    length = np.ones(len(W))
-    least_change = np.full(len(W), np.inf)
-    waited = np.zeros(len(W), dtype=int)
+    W, n = W.copy(), len(W)
+    n_iter, waited = np.zeros((2, n), dtype=int)
+    running, converged = np.arange(n), np.zeros(n, dtype=bool)
+    length, least_change = np.ones(n), np.full(n, np.inf)
     for _ in range(max_iter):
         # A step of each running start. Its change is scaled to a step of length 1.
         lengths = length[running]
