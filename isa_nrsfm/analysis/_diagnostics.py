@@ -79,7 +79,8 @@ class Diagnostics(NamedTuple):
         Share of the variance of each coefficient that the pose predicts: R^2 of a
         linear regression on the rotation, for each fifth of the rows fitted to the
         others. Zero or negative if there is no relation, also in small tables. It does
-        not depend on the scale of the depths. NaN with fewer than 20 frames.
+        not depend on the scale of the depths. NaN with fewer than 20 frames, or if the
+        frames turn by less than the error of their rotations.
     pose_removed : ndarray of shape (n_components,)
         Share of the variance of each coefficient that `remove_pose` has removed.
     outlier_share : float
@@ -227,7 +228,9 @@ def diagnose(
     floats = np.finfo(float)
     eigenvalues = np.maximum(eigenvalues, max(floats.eps * eigenvalues[0], floats.tiny))
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
-    share, variance = pose_share(motion, remaining), alpha.var(axis=0)
+    turns = frames.certainty.turns
+    error = 0.0 if turns is None else float(np.trace(turns))
+    share, variance = pose_share(motion, remaining, error), alpha.var(axis=0)
     removed = variance - remaining.var(axis=0)
     found = Diagnostics(
         np.linalg.svd(images, compute_uv=False) / np.sqrt(len(images)),
@@ -262,18 +265,20 @@ def diagnose(
     )
 
 
-def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
+def pose_share(motion: NDArray, alpha: NDArray, error: float = 0.0) -> NDArray:
     """Return the share of the variance of coefficients that the pose predicts.
 
     R^2 (n_components,) in fifths of the rows that are left out of a regression on the
     nine entries of the nearest rotations, second order in yaw, pitch and roll. NaN for
-    zero coefficients, or with fewer than 20 frames.
+    zero coefficients, with fewer than 20 frames, or if the mean square of the rotations
+    from their mean is below their error, radians squared: coefficients cause it.
     """
-    if len(alpha) < 20:
-        return np.full(alpha.shape[1], np.nan)
     rows = polar(motion)[0]
     third = np.cross(rows[:, 0], rows[:, 1])
     predictors = np.hstack([np.ones((len(alpha), 1)), rows.reshape(-1, 6), third])
+    # Of small rotations, the entries have twice the mean square of the vectors.
+    if len(alpha) < 20 or predictors.var(axis=0).sum() < 2.0 * error:
+        return np.full(alpha.shape[1], np.nan)
     left_out = alpha.copy()
     # Neighbours of single frames of a video predict them without any relation to the
     # pose, fifths do not: docs/benchmarks/README.md, "Thresholds".
