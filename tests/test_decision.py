@@ -210,10 +210,12 @@ def in_place():
 def test_the_command_line_leaves_them_out(fits, tmp_path):
     names = [f"{axis}_{j}" for j in range(19) for axis in "xy"]
     table = pd.DataFrame(arena(4).reshape(150, -1), columns=names)
+    table = table.assign(**{f"likelihood_{j}": 0.5 if j < 2 else 1 for j in range(19)})
     table.to_csv(tmp_path / "maze.csv", index=False)
     options = [tmp_path / "maze.csv", "--no-figures", "--refinement", "none", "-k", 1]
     found = fits(*options)
     assert "4 points stand still while the others move through the image" in found.err
+    assert found.err.count("have a confidence below 0.6") == 1
     assert len(found.model.mean_shape_) == 15
     found = fits(*options, "--points", "0-18", "--force")
     assert len(found.model.mean_shape_) == 19

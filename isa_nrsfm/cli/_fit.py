@@ -4,6 +4,7 @@ import contextlib
 import re
 import shlex
 import sys
+import warnings
 from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -189,7 +190,8 @@ def _moving_points(
         f"{len(names)} points stand still while the others move through the image, and "
         f"are left out: {first_items(names, 12)}. --points fits those that it names"
     )
-    return _reading.read_frames(args, table=table)
+    with warnings.catch_warnings(action="ignore"):  # of the first reading
+        return _reading.read_frames(args, table=table)
 
 
 def _check_options(args: Namespace) -> None:
