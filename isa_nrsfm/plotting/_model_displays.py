@@ -57,7 +57,8 @@ class BasisShapeDisplay:
         points up. "auto" is "lower" if a face or a body would otherwise be upside down.
     depth_note : str, default=""
         Certainty of the depth, shown below each side view. `from_estimator` sets it,
-        for example to "depth not determined".
+        for example to "depth not determined". All z are zero then, and there is no side
+        view.
 
     Attributes
     ----------
@@ -217,6 +218,8 @@ class BasisShapeDisplay:
         view, layout, skeleton, origin = view_and_layout(estimator, edges, origin)
         shape = estimator.mean_shape_ @ view.T
         view = _views.upright_turn(shape, layout, origin) @ view
+        if not _views.frames_of(estimator).certainty.determined:
+            view[2] = 0.0
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
@@ -293,6 +296,10 @@ class BasisShapeDisplay:
                 shapes.append((self.minus_, mean - d, _axes.MINUS_COLOUR, below))
                 shapes.append((self.plus_, mean + d, _axes.PLUS_COLOUR, above))
             for view, axis in zip(_axes.VIEWS, pair, strict=True):
+                _axes.hide_frame(axis)
+                _axes.show_view(axis, view, limits[block], self.origin)
+                if not mean[:, view[0]].any():  # no depth, no side view
+                    continue
                 for artists, shape, colour, label in shapes:
                     style = {"color": colour, "label": label} | (point_kw or {})
                     drawn = self._draw(axis, shape[:, view], style, not block)
@@ -300,8 +307,6 @@ class BasisShapeDisplay:
                 if block and not _axes.is_dense(mean):
                     ends = (*mean[:, view].T, *d[:, view].T)
                     self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE))
-                _axes.hide_frame(axis)
-                _axes.show_view(axis, view, limits[block], self.origin)
             title = self._title(block, reduction[block])
             title = _axes.wrap_title(title, pair)
             pair[0].set_title(title, loc="left", fontsize="small")
@@ -326,7 +331,8 @@ class BasisShapeDisplay:
     def _title(self, block: int, reduction: float) -> str:
         """Return the title of the mean shape (0) or of a basis shape."""
         if block == 0:
-            return "Mean shape, front and side"
+            side = self.mean_shape[:, 2].any()
+            return "Mean shape, front and side" if side else "Mean shape"
         k = self.components_[block - 1]
         name = self.component_names[k]
         title, notes = f"Basis shape {name}" if name == str(k + 1) else name, []
