@@ -221,6 +221,22 @@ def test_the_command_line_leaves_them_out(fits, tmp_path):
     assert len(found.model.mean_shape_) == 19
 
 
+def test_two_views_in_a_row_of_a_tracker_are_asked_about(fits, fails, tmp_path):
+    parts = [f"{part}_{view}" for view in ("top", "side") for part in "abcdefgh"]
+    levels = [["scorer"], parts, ["x", "y", "likelihood"]]
+    names = pd.MultiIndex.from_product(levels, names=["scorer", "bodyparts", "coords"])
+    tracks = make_nonrigid_tracks(40, 16, **GIVEN).tracks
+    values = np.dstack([tracks, np.ones((40, 16))]).reshape(40, -1)
+    pd.DataFrame(values, columns=names).to_csv(tmp_path / "mouse.csv")
+    options = ["--no-figures", "--refinement", "none", "-k", 1]
+    message = fails("fit", tmp_path / "mouse.csv", "-o", tmp_path / "out", *options)
+    assert "the 16 points have the same names but for top, side, as those" in message
+    one, both = re.findall("use --points ([0-9-]+)|with --points ([a-z_,]+)", message)
+    for text, n_points in ((one[1], 8), (both[0], 16)):
+        found = fits(tmp_path / "mouse.csv", *options, "--points", text, "--force")
+        assert len(found.model.mean_shape_) == n_points
+
+
 @pytest.mark.parametrize("option", [None, "--keep-zeros"])
 def test_zeros_to_one_side_of_all_points_are_missing(fits, tmp_path, option):
     X = make_nonrigid_tracks(40, 16, noise=0.01, **GIVEN).data
