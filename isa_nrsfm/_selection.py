@@ -62,8 +62,8 @@ from isa_nrsfm.analysis._advice import (
     gross_residuals,
 )
 from isa_nrsfm.datasets import load_face_prior
-from isa_nrsfm.skeletons import find_skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
+from isa_nrsfm.skeletons._recognition import skeleton_in_images
 
 # For held-out errors of 100 % and more.
 NO_SHAPE = (
@@ -772,10 +772,8 @@ class _Rows(NamedTuple):
 
     def rough(self, params: dict[str, Any], **continued: Any) -> StartedNRSfM:
         """Return a fit of few rows."""
-        model, some = (
-            StartedNRSfM(**params),
-            spread(np.arange(self.X.shape[0]), ROUGH_ROWS),
-        )
+        some = spread(np.arange(self.X.shape[0]), ROUGH_ROWS)
+        model = StartedNRSfM(**params)
         model._continued = continued
         weights = {name: w[some] for name, w in self.weights.items()}
         return model.fit(taken_rows(self.X, some), **weights)
@@ -1031,13 +1029,11 @@ def _layout_name(estimator: AffineNRSfM, X: Any) -> str:
     plain = clone(estimator)
     try:
         with warnings.catch_warnings(action="ignore"):  # the fit warns
-            images = plain._ready(X)[0].joined(np.asarray)
-            images = images - np.nanmean(images, axis=2, keepdims=True)
-            shape = np.nanmean(images, axis=0).T
+            tracks = plain._ready(X)[0].joined(np.asarray).mT
     except ValueError:  # the fit raises
         return ""
-    names = names_of_points(plain, len(shape))
-    return getattr(find_skeleton(len(shape), names, shape=shape), "name", "")
+    names = names_of_points(plain, tracks.shape[1])
+    return getattr(skeleton_in_images(tracks, names), "name", "")
 
 
 def _fitted(

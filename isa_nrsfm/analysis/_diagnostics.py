@@ -231,6 +231,8 @@ def diagnose(
     turns = frames.certainty.turns
     error = 0.0 if turns is None else float(np.trace(turns))
     share, variance = pose_share(motion, remaining, error), alpha.var(axis=0)
+    without = remaining - pose_part(motion, pose_effect(motion, remaining))
+    removable = np.nanmax(pose_share(motion, without, error), initial=0.0) <= MOST_POSE
     removed = variance - remaining.var(axis=0)
     found = Diagnostics(
         np.linalg.svd(images, compute_uv=False) / np.sqrt(len(images)),
@@ -255,7 +257,7 @@ def diagnose(
         outlier_energy=found.outlier_energy,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
-        pose=_of_pose(found, layout, estimator),
+        pose=_of_pose(found, layout, estimator, removable),
     )
     return found._replace(
         messages=_advice.advice(facts),
@@ -322,8 +324,13 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
     return text if phrases else ""
 
 
-def _of_pose(found: Diagnostics, layout: Skeleton | None, model: Any) -> str:
-    """Describe coefficients that the pose predicts; empty if there are none."""
+def _of_pose(
+    found: Diagnostics, layout: Skeleton | None, model: Any, removable: bool
+) -> str:
+    """Describe coefficients that the pose predicts; empty if there are none.
+
+    removable: whether none is left with `remove_pose`.
+    """
     large = np.flatnonzero(found.pose_share > MOST_POSE)
     if not len(large):
         return ""
@@ -340,13 +347,15 @@ def _of_pose(found: Diagnostics, layout: Skeleton | None, model: Any) -> str:
             f"{text}, beyond what {named('remove_pose')} has removed. Compare "
             "coefficients of similar views only"
         )
-    way = f"use {named('remove_pose', True)}"
+    way = f"if it moves alike in all views, use {named('remove_pose', True)}"
     if model.camera_ == "affine":
         way = "use isa_nrsfm.AutoNRSfM(AffineNRSfM(remove_pose=True)).fit(X)"
+    elif not removable:
+        way = "compare coefficients of similar views only"
     if layout is None or not layout.contour or model.prior is not None:
         return (
             f"{text}: points slide over the surface as the view changes, or the object "
-            f"moves otherwise in other views. If it moves alike in all views, {way}"
+            f"moves otherwise in other views: {way}"
         )
     return (
         f"{text}: {len(layout.contour)} points of {layout.name} follow the visible "

@@ -44,6 +44,7 @@ from isa_nrsfm.skeletons._column_names import (
     names_of_points,
     parse_coordinate,
 )
+from isa_nrsfm.skeletons._recognition import skeleton_in_images
 
 # Options of some formats.
 _OF_FORMATS = ("image_size", "columns", "individuals", "row_per_point", "part")
@@ -417,12 +418,7 @@ def _layout(
     if stored is not None:
         return stored
     tracks = tracks_in(table, columns.interleaved, args.missing_value)
-    complete = tracks[np.isfinite(tracks).all(axis=(1, 2))]
-    centred, report = centred_frames(complete.transpose(0, 2, 1))
-    extended = report.size > 0
-    images = centred[extended] / report.size[extended, None, None]
-    shape = images.mean(axis=0).T if extended.any() else None
-    return skeletons.find_skeleton(len(names), names, shape=shape)
+    return skeleton_in_images(tracks, names)
 
 
 def zeros_far_away(tracks: NDArray) -> NDArray:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.lazy import import_optional
+from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm.plotting import _axes, _views
 from isa_nrsfm.plotting._axes import flat_axes, percent
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
@@ -218,7 +219,7 @@ class BasisShapeDisplay:
         view, layout, skeleton, origin = view_and_layout(estimator, edges, origin)
         shape = estimator.mean_shape_ @ view.T
         view = _views.upright_turn(shape, layout, origin) @ view
-        if not _views.frames_of(estimator).certainty.determined:
+        if not frames_of(estimator).certainty.determined:
             view[2] = 0.0
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
