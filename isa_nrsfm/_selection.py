@@ -6,12 +6,14 @@ extended by the leading directions of its residuals. The fit of the rows of a sp
 starts from that of all frames with the same number of basis shapes.
 
 AutoNRSfM chooses camera, refinement, loss, prior and K by held-out points. The first
-fit has weak-perspective cameras and all directions of deformation. Each further one
-changes one setting, in the order of its time, and is skipped where it cannot win. The
-consensus has the joint fit of the best fit so far, orthographic cameras start from its
-shapes. Most fits have errors of depths only if they are used.
+fit has weak-perspective cameras and all directions of deformation, or the face prior if
+a rough fit of a face has no depth. Each further one changes one setting, in the order
+of its time, and is skipped where it cannot win. The consensus has the joint fit of the
+best fit so far, orthographic cameras start from its shapes. Most fits have errors of
+depths only if they are used.
 """
 
+import contextlib
 import copy
 import time
 import warnings
@@ -55,6 +57,8 @@ from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables import refuse_stored, spread
 from isa_nrsfm.analysis import _advice as advice
 from isa_nrsfm.datasets import load_face_prior
+from isa_nrsfm.skeletons._column_names import names_of_points
+from isa_nrsfm.skeletons._recognition import skeleton_in_images
 
 # For held-out errors of 100 % and more.
 NO_SHAPE = (
@@ -518,8 +522,9 @@ def line(n_components: int, scores: NDArray, held_out: bool) -> str:
 AUTO = "auto"
 # Components of the face prior: docs/depth.md has figures of nine and of forty.
 FACE_COMPONENTS = 9
-# Rows of rough fits, and basis shapes of fits with perspective, at most.
-ROUGH_ROWS, MOST_SHAPES = 50, 4
+# Rows of rough fits, basis shapes of those that show whether depths are known, and of
+# fits with perspective at most.
+ROUGH_ROWS, ROUGH_SHAPES, MOST_SHAPES = 50, 2, 4
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Share of gross errors of held-out points above which robust losses are tried.
 MOST_WRONG = 1e-3
@@ -578,8 +583,9 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
     The first fit has weak-perspective cameras. Robust losses are tried if the table has
     outliers, orthographic cameras if all frames have one scale, affine ones if images
     are stretched, and perspective if the size of the images is known. If the depth is
-    not determined, the face prior is tried for layouts of faces, and then the consensus
-    of groups of points, which is also tried for objects whose parts turn by themselves.
+    not determined, the face prior is tried for layouts of faces (first, if a rough fit
+    shows this), and then the consensus of groups of points, which is also tried for
+    objects whose parts turn by themselves.
 
     Parameters
     ----------
@@ -758,7 +764,15 @@ class _Rows(NamedTuple):
     X: Any
     weights: dict[str, Any]
     principal_point: Any
-    face_layout: str | None
+    face_layout: str
+
+    def rough(self, params: dict[str, Any], **continued: Any) -> StartedNRSfM:
+        """Return a fit of few rows."""
+        some = spread(np.arange(self.X.shape[0]), ROUGH_ROWS)
+        model = StartedNRSfM(**params)
+        model._continued = continued
+        weights = {name: w[some] for name, w in self.weights.items()}
+        return model.fit(taken_rows(self.X, some), **weights)
 
     def squares(self, model: AffineNRSfM) -> NDArray:
         """Return squared errors and signals (n, J, 2) of held-out points."""
@@ -842,23 +856,44 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
     near |= few if model.n_components == AUTO else {}
     params = model.get_params(deep=False) | few | {"prior": None, "refinement": "joint"}
     params |= near | {"focal_length": 5 * max(point)}
-    some = spread(np.arange(rows.X.shape[0]), ROUGH_ROWS)
-    X, weights = taken_rows(rows.X, some), {n: w[some] for n, w in rows.weights.items()}
-    seen = StartedNRSfM(**params).fit(X, **weights).camera_ == "perspective"
+    seen = rows.rough(params).camera_ == "perspective"
     return near if seen else "held-out points do not show it"
+
+
+def _frontal(estimator: AffineNRSfM, rows: _Rows) -> bool:
+    """Return whether a rough fit, from the shapes of the face prior, has no depth.
+
+    A known size of the images may determine it.
+    """
+    if rows.face_layout not in choices.FACE_PRIORS or rows.principal_point is not None:
+        return False
+    params = estimator.get_params(deep=False)
+    if params["camera"] != "weak_perspective" or hasattr(estimator, "_model"):
+        return False
+    start = load_face_prior(ROUGH_SHAPES, layout=rows.face_layout)._model
+    params |= {"n_components": ROUGH_SHAPES, "refinement": "joint"}
+    try:
+        rough = rows.rough(params, start=start, errors=True)
+    except ValueError:  # such as points that too few of the rows show
+        return False
+    return not rough._model.frames.certainty.determined
 
 
 def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
     """The prior of faces supplies depths that a table does not determine."""
-    layout, K = rows.face_layout, best.model.n_components
-    layout = layout or getattr(advice.layout_of(best.model), "name", None)
-    if layout not in choices.FACE_PRIORS:
+    if rows.face_layout not in choices.FACE_PRIORS:
         return "no layout of faces"
     if best.determined:
         return "the depth is known"
     if best.model.camera != "weak_perspective":
         return f"not with {best.model.camera} cameras"
-    prior = load_face_prior(FACE_COMPONENTS if K == AUTO else K, layout=layout)
+    return _with_face_prior(best.model, rows)
+
+
+def _with_face_prior(model: AffineNRSfM, rows: _Rows) -> dict[str, Any]:
+    """Return the parameters of a fit with the face prior."""
+    K = FACE_COMPONENTS if model.n_components == AUTO else model.n_components
+    prior = load_face_prior(K, layout=rows.face_layout)
     return {"prior": prior, "n_components": AUTO}
 
 
@@ -927,7 +962,9 @@ def decided(
     """
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
-    rows = _Rows(taken_rows(X, some), few, principal_point, face_layout)
+    X_few = taken_rows(X, some)
+    layout = face_layout or _layout_name(estimator, X_few)
+    rows = _Rows(X_few, few, principal_point, layout)
 
     def fitted(
         model: AffineNRSfM, setting: str, robust: bool, first: _Fit | None = None
@@ -944,9 +981,21 @@ def decided(
         trial = Trial(setting, error, depth, seconds, "used")
         return _Fit(model, trial, caught, squares)
 
-    robust, used, estimator._continued = False, 0, {"known": {}}
-    best = fitted(estimator, f"{estimator.camera.replace('_p', ' p')} cameras", robust)
-    trials = [best.trial]
+    robust, trials = False, []
+    setting = f"{estimator.camera.replace('_p', ' p')} cameras"
+    best = None
+    if "prior" in free and _frontal(estimator, rows):
+        faces = clone(estimator).set_params(**_with_face_prior(estimator, rows))
+        with contextlib.suppress(ValueError):  # such as other points than the prior's
+            best = fitted(faces, "face prior", robust)
+    if best is not None and best.determined:
+        why = "a rough fit does not determine the depth"
+        trials, free = [Trial(setting, np.nan, np.nan, 0.0, why)], {*free} - {"prior"}
+    else:
+        estimator._continued = {"known": {}}
+        best = fitted(estimator, setting, robust)
+    used = len(trials)
+    trials.append(best.trial)
     for name, setting, proposal in PROPOSALS:
         if name not in free:
             continue
@@ -984,6 +1033,18 @@ def decided(
         warn_caller(str(each.message).replace(f". {advice.COMPARE}", ""), each.category)
     model._continued, model._trials = None, trials
     return model, trials
+
+
+def _layout_name(estimator: AffineNRSfM, X: Any) -> str:
+    """Return the name of the layout of a table, empty if it is not known."""
+    plain = clone(estimator)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # the fit warns
+            tracks = plain._ready(X)[0].joined(np.asarray).mT
+    except ValueError:  # the fit raises
+        return ""
+    names = names_of_points(plain, tracks.shape[1])
+    return getattr(skeleton_in_images(tracks, names), "name", "")
 
 
 def _changed(best: _Fit, name: str, changes: dict[str, Any]) -> AffineNRSfM:

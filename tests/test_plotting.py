@@ -400,6 +400,20 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert_allclose(drift, 2 * display.basis[2][:, :2], atol=1e-12)
 
 
+def test_undetermined_depth_has_no_side_view():
+    faces = make_face_tracks(30, n_components=1, random_state=0)
+    model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
+    with pytest.warns(UserWarning, match="depth of the shapes is not determined"):
+        model.fit(faces.shapes[..., :2].reshape(30, -1))
+    display = BasisShapeDisplay.from_estimator(model)
+    front, side = display.axes_[0]
+    assert front.get_title(loc="left") == "Mean shape"
+    assert front.collections
+    assert not side.collections
+    assert side.get_xlabel() == "depth not determined"
+    assert not display.basis[..., 2].any()
+
+
 def test_notes_of_narrow_side_views_end_within_the_figure(rng):
     narrow = np.array([0.2, 1.0, 0.2])
     display = BasisShapeDisplay(

@@ -117,6 +117,13 @@ def test_a_prior_keeps_its_origin(plain):
     assert_allclose(left.mean(axis=0), mean, atol=1e-9)
 
 
+def test_what_would_not_be_removed_is_not_advised(table):
+    turned = table.reshape(80, -1, 2)[:, :, ::-1].reshape(80, -1)  # yaw is pitch
+    found = AffineNRSfM(2, **CALIBRATED).fit(turned).diagnostics()
+    assert found.pose_share.max() > 0.3
+    assert found.messages[-1].endswith("compare coefficients of similar views only")
+
+
 def test_diagnostics_say_what_was_removed_and_what_is_left(model, plain):
     before, after = plain.diagnostics(), model.diagnostics()
     assert before.pose_share.max() > 0.3

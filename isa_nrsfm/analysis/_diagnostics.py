@@ -80,7 +80,8 @@ class Diagnostics(NamedTuple):
         Share of the variance of each coefficient that the pose predicts: R^2 of a
         linear regression on the rotation, for each fifth of the rows fitted to the
         others. Zero or negative if there is no relation, also in small tables. It does
-        not depend on the scale of the depths. NaN with fewer than 20 frames.
+        not depend on the scale of the depths. NaN with fewer than 20 frames, or if the
+        frames turn by less than the error of their rotations.
     pose_removed : ndarray of shape (n_components,)
         Share of the variance of each coefficient that `remove_pose` has removed.
     outlier_share : float
@@ -228,7 +229,11 @@ def diagnose(
     floats = np.finfo(float)
     eigenvalues = np.maximum(eigenvalues, max(floats.eps * eigenvalues[0], floats.tiny))
     ratio = getattr(estimator, "camera_noise_ratio_", np.nan)
-    share, variance = pose_share(motion, remaining), alpha.var(axis=0)
+    turns = frames.certainty.turns
+    error = 0.0 if turns is None else float(np.trace(turns))
+    share, variance = pose_share(motion, remaining, error), alpha.var(axis=0)
+    without = remaining - pose_part(motion, pose_effect(motion, remaining))
+    removable = np.nanmax(pose_share(motion, without, error), initial=0.0) <= MOST_POSE
     removed = variance - remaining.var(axis=0)
     found = Diagnostics(
         np.linalg.svd(images, compute_uv=False) / np.sqrt(len(images)),
@@ -253,7 +258,7 @@ def diagnose(
         outlier_energy=found.outlier_energy,
         outliers=outlier_text(found, rows, names),
         few=_few_frames(found, coefficients, rows),
-        pose=_of_pose(found, layout, estimator),
+        pose=_of_pose(found, layout, estimator, removable),
     )
     return found._replace(
         messages=_advice.advice(facts),
@@ -263,18 +268,20 @@ def diagnose(
     )
 
 
-def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
+def pose_share(motion: NDArray, alpha: NDArray, error: float = 0.0) -> NDArray:
     """Return the share of the variance of coefficients that the pose predicts.
 
     R^2 (n_components,) in fifths of the rows that are left out of a regression on the
     nine entries of the nearest rotations, second order in yaw, pitch and roll. NaN for
-    zero coefficients, or with fewer than 20 frames.
+    zero coefficients, with fewer than 20 frames, or if the mean square of the rotations
+    from their mean is below their error, radians squared: coefficients cause it.
     """
-    if len(alpha) < 20:
-        return np.full(alpha.shape[1], np.nan)
     rows = polar(motion)[0]
     third = np.cross(rows[:, 0], rows[:, 1])
     predictors = np.hstack([np.ones((len(alpha), 1)), rows.reshape(-1, 6), third])
+    # Of small rotations, the entries have twice the mean square of the vectors.
+    if len(alpha) < 20 or predictors.var(axis=0).sum() < 2.0 * error:
+        return np.full(alpha.shape[1], np.nan)
     left_out = alpha.copy()
     # Neighbours of single frames of a video predict them without any relation to the
     # pose, fifths do not: docs/benchmarks/README.md, "Thresholds".
@@ -318,8 +325,13 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
     return text if phrases else ""
 
 
-def _of_pose(found: Diagnostics, layout: Skeleton | None, model: Any) -> str:
-    """Describe coefficients that the pose predicts; empty if there are none."""
+def _of_pose(
+    found: Diagnostics, layout: Skeleton | None, model: Any, removable: bool
+) -> str:
+    """Describe coefficients that the pose predicts; empty if there are none.
+
+    removable: whether none is left with `remove_pose`.
+    """
     large = np.flatnonzero(found.pose_share > MOST_POSE)
     if not len(large):
         return ""
@@ -336,13 +348,15 @@ def _of_pose(found: Diagnostics, layout: Skeleton | None, model: Any) -> str:
             f"{text}, beyond what {named('remove_pose')} has removed. Compare "
             "coefficients of similar views only"
         )
-    way = f"use {named('remove_pose', True)}"
+    way = f"if it moves alike in all views, use {named('remove_pose', True)}"
     if model.camera_ == "affine":
         way = "use isa_nrsfm.AutoNRSfM(AffineNRSfM(remove_pose=True)).fit(X)"
+    elif not removable:
+        way = "compare coefficients of similar views only"
     if layout is None or not layout.contour or model.prior is not None:
         return (
             f"{text}: points slide over the surface as the view changes, or the object "
-            f"moves otherwise in other views. If it moves alike in all views, {way}"
+            f"moves otherwise in other views: {way}"
         )
     return (
         f"{text}: {len(layout.contour)} points of {layout.name} follow the visible "

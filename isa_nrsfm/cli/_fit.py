@@ -4,6 +4,7 @@ import contextlib
 import re
 import shlex
 import sys
+import warnings
 from argparse import Namespace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,9 +35,14 @@ from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._options import AUTO, FACE_PRIORS, NONE, flag_of
 from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
+from isa_nrsfm.io._landmark_columns import MIN_POINTS, LandmarkColumns, same_but_for
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
 from isa_nrsfm.metrics import affine_shape_error
-from isa_nrsfm.skeletons._column_names import WORDS
+from isa_nrsfm.skeletons._column_names import (
+    WORDS,
+    columns_of_individuals,
+    individuals_in,
+)
 
 # Columns that are probably labels or groups come first: action units, emotions, people.
 LABEL = re.compile(WORDS["labels"], re.IGNORECASE)
@@ -165,17 +171,34 @@ def _moving_points(
     args: Namespace, frames: _reading.Frames, table: Any
 ) -> _reading.Frames:
     """Leave out points that stand still, unless the options name the points."""
-    tracks = frames.X.to_numpy().reshape(len(frames.X), len(frames.columns.points), 2)
+    points = frames.columns.points
+    if args.points is args.columns is frames.skeleton is None:
+        _refuse_views(frames.columns)
+    tracks = frames.X.to_numpy().reshape(len(frames.X), len(points), 2)
     still = still_points(tracks) if args.points is None else ()
     if not len(still):
         return frames
-    names = [frames.columns.points[j] for j in still]
+    names = [points[j] for j in still]
     args.points = f"without:{','.join(names)}"
     warn_caller(
         f"{len(names)} points stand still while the others move through the image, and "
         f"are left out: {first_items(names, 12)}. --points fits those that it names"
     )
-    return _reading.read_frames(args, table=table)
+    with warnings.catch_warnings(action="ignore"):  # of the first reading
+        return _reading.read_frames(args, table=table)
+
+
+def _refuse_views(columns: LandmarkColumns) -> None:
+    """Raise if points have the names of several individuals, or of views of one."""
+    if not (who := individuals_in(columns.x, MIN_POINTS)):
+        return
+    own, points = columns_of_individuals(columns.x, who)[who[0]], columns.points
+    some = [name for name, x in zip(points, columns.x, strict=True) if x in own]
+    raise ValueError(
+        f"{same_but_for(who, len(points))}. Fit those of one with --points "
+        f"{shlex.quote(','.join(some))}. If all are points of one body, use --points "
+        f"0-{len(points) - 1}"
+    )
 
 
 def _check_options(args: Namespace) -> None:

@@ -29,6 +29,7 @@ from isa_nrsfm.io._landmarks import unsure_points
 from isa_nrsfm.io._tables import confidences_in, read_table, tracks_in
 from isa_nrsfm.skeletons import SKELETONS, Skeleton, _column_names
 from isa_nrsfm.skeletons._column_names import names_of_points, parse_coordinate
+from isa_nrsfm.skeletons._recognition import skeleton_in_images
 
 # Options of some formats.
 _OF_FORMATS = ("image_size", "columns", "individuals", "row_per_point", "part")
@@ -405,12 +406,7 @@ def _layout(
     if stored is not None:
         return stored
     tracks = tracks_in(table, columns.interleaved, args.missing_value)
-    complete = tracks[np.isfinite(tracks).all(axis=(1, 2))]
-    centred, report = _tables.centred_frames(complete.transpose(0, 2, 1))
-    extended = report.size > 0
-    images = centred[extended] / report.size[extended, None, None]
-    shape = images.mean(axis=0).T if extended.any() else None
-    return skeletons.find_skeleton(len(names), names, shape=shape)
+    return skeleton_in_images(tracks, names)
 
 
 def zeros_far_away(tracks: NDArray) -> NDArray:

@@ -303,9 +303,16 @@ def _refuse_individuals(names: Columns, sets: dict[str, int]) -> None:
         else f"Their {n_points} points are too few to fit them; {MIN_POINTS} are needed"
     )
     raise ValueError(
-        f"the {len(x)} points have the same names but for {', '.join(who)}, as those "
-        f"of several individuals in one row, or in views of several cameras. {way}. If "
-        f"all are points of one body, use {named('columns', whole)}"
+        f"{same_but_for(who, len(x))}. {way}. If all are points of one body, use "
+        f"{named('columns', whole)}"
+    )
+
+
+def same_but_for(who: Sequence[str], n_points: int) -> str:
+    """Describe points whose names differ by those of individuals or views."""
+    return (
+        f"the {n_points} points have the same names but for {', '.join(who)}, as those "
+        "of several individuals in one row, or in views of several cameras"
     )
 
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.lazy import import_optional
+from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
 
@@ -55,7 +56,8 @@ class BasisShapeDisplay:
         points up. "auto" is "lower" if a face or a body would otherwise be upside down.
     depth_note : str, default=""
         Certainty of the depth, shown below each side view. `from_estimator` sets it,
-        for example to "depth not determined".
+        for example to "depth not determined". All z are zero then, and there is no side
+        view.
 
     Attributes
     ----------
@@ -213,6 +215,8 @@ class BasisShapeDisplay:
         view, layout, skeleton, origin = view_and_layout(estimator, edges, origin)
         shape = estimator.mean_shape_ @ view.T
         view = _views.upright_turn(shape, layout, origin) @ view
+        if not frames_of(estimator).certainty.determined:
+            view[2] = 0.0
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
@@ -289,6 +293,10 @@ class BasisShapeDisplay:
                 shapes.append((self.minus_, mean - d, _views.MINUS_COLOUR, below))
                 shapes.append((self.plus_, mean + d, _views.PLUS_COLOUR, above))
             for view, axis in zip(_views.VIEWS, pair, strict=True):
+                _views.hide_frame(axis)
+                _views.show_view(axis, view, limits[block], self.origin)
+                if not mean[:, view[0]].any():  # no depth, no side view
+                    continue
                 for artists, shape, colour, label in shapes:
                     style = {"color": colour, "label": label} | (point_kw or {})
                     drawn = self._draw(axis, shape[:, view], style, not block)
@@ -296,8 +304,6 @@ class BasisShapeDisplay:
                 if block and not _views.is_dense(mean):
                     ends = (*mean[:, view].T, *d[:, view].T)
                     self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE))
-                _views.hide_frame(axis)
-                _views.show_view(axis, view, limits[block], self.origin)
             title = self._title(block, reduction[block])
             title = _views.wrap_title(title, pair)
             pair[0].set_title(title, loc="left", fontsize="small")
@@ -322,7 +328,8 @@ class BasisShapeDisplay:
     def _title(self, block: int, reduction: float) -> str:
         """Return the title of the mean shape (0) or of a basis shape."""
         if block == 0:
-            return "Mean shape, front and side"
+            side = self.mean_shape[:, 2].any()
+            return "Mean shape, front and side" if side else "Mean shape"
         k = self.components_[block - 1]
         name = self.component_names[k]
         title, notes = f"Basis shape {name}" if name == str(k + 1) else name, []

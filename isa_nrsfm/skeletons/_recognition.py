@@ -3,6 +3,7 @@
 import os
 import re
 import tomllib
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise
@@ -508,6 +509,14 @@ def find_skeleton(
     if points is not None:
         return _shortest(fitting, points)
     return fitting[0] if len(fitting) == 1 else None
+
+
+def skeleton_in_images(tracks: NDArray, names: Sequence[str]) -> Skeleton | None:
+    """Return the layout of points (n_frames, n_points, 2), by names or mean image."""
+    with warnings.catch_warnings(action="ignore"):  # points that no frame shows
+        images = tracks - np.nanmean(tracks, axis=1, keepdims=True)
+        shape = np.nanmean(images, axis=0)
+    return find_skeleton(len(names), names, shape=shape)
 
 
 def edge_length(shape: NDArray, edges: NDArray) -> float:
