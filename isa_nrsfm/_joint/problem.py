@@ -139,15 +139,9 @@ class Widths(NamedTuple):
         """Return the number of coordinates that determine cameras and shapes."""
         return (2 + CAMERAS[camera].n_parameters) * n_frames + self.n_determined
 
-    def likelihood(
-        self, frames: JointFrames, camera: str, stretch: NDArray | None = None
-    ) -> MarginalLikelihood:
-        """Return the objective of some frames, without other priors.
-
-        stretch (3, 3), symmetric: of the standard deviations, by default the identity.
-        """
-        root = np.linalg.inv(np.eye(3) if stretch is None else stretch)
-        precisions = root @ root / self.variances[:, None, None]
+    def likelihood(self, frames: JointFrames, camera: str) -> MarginalLikelihood:
+        """Return the objective of some frames, without other priors."""
+        precisions = np.eye(3) / self.variances[:, None, None]
         unknowns = self.n_unknowns(frames.n_frames, camera)
         return MarginalLikelihood(frames, n_unknowns=unknowns, precisions=precisions)
 

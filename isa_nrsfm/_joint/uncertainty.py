@@ -53,9 +53,14 @@ from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLike
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._joint.starts import other_depths, steadied, stretched
+from isa_nrsfm._joint.starts import (
+    camera_moments,
+    other_depths,
+    steadied,
+    stretched,
+)
 from isa_nrsfm._joint.whole import FAR_FRAMES
-from isa_nrsfm._linalg import centred
+from isa_nrsfm._linalg import OF_DISTANCES, centred
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables import (
@@ -283,8 +288,6 @@ def depth_certainty(
     w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[: most + 1, :, points], fit.motion[known]
     tracks, camera = part[known], CAMERAS[frames.camera]
-    # The prior of the directions does not limit depths along the mean line of sight.
-    _, deep = stretched(JointState(shapes, motion, 1.0), camera, FAR)
     prior, extents = settings.shape_prior, EXTENT_WEIGHT
     if prior is not None:  # which does not let depths grow
         prior, extents = prior.of_points(points), 0.0
@@ -309,19 +312,20 @@ def depth_certainty(
         """
         part = of_points(kept)
         n_numbers, energy = part.totals
+        noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
+        if start is None:
+            start = JointState(centred(shapes[:, :, kept]), motion, noise)
         if prior is not None:
             likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
         elif widths is not None:
             own = widths.of_points(int(kept.sum()), most)
-            likelihood = own.likelihood(part, frames.camera, deep)
+            likelihood = own.likelihood(part, frames.camera)
+            likelihood = likelihood._replace(precisions=image_precisions(start))
         else:
             penalty = part.basis_penalty(limits.basis_std)
             likelihood = MarginalLikelihood(part, penalty)
         likelihood = likelihood._replace(extent_weight=extents)
-        noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         least = min(noise * n_numbers / energy, limits.least_noise)
-        if start is None:
-            start = JointState(centred(shapes[:, :, kept]), motion, noise)
         start = start._replace(noise=noise)
         ends: Any = {"least_noise": least, "max_iter": limits.error_steps, "tol": TOL}
         state = refine_joint(likelihood, start, camera, **ends).state
@@ -388,6 +392,18 @@ def differences(
     # Without any depths the difference is as large as they are.
     square = np.sum(off**2) / np.sum(z**2) if z.any() else 1.0
     return float(square), turns, np.mean(off**2, axis=0)
+
+
+def image_precisions(state: JointState) -> NDArray:
+    """Return precisions (K, 3, 3) of basis shapes by their images, not their depths.
+
+    A prior that limits depths would hide their errors.
+    """
+    C, basis = camera_moments(state.motion), state.shapes[1:]
+    energy = np.einsum("ab,kaj,kbj->k", C, basis, basis, optimize=True)
+    least = OF_DISTANCES * max(np.sum(state.shapes[0] ** 2), OF_DISTANCES)
+    variances = np.maximum(energy, least) / basis[0].size
+    return C / variances[:, None, None]
 
 
 def neighbours(points: NDArray) -> NDArray:
