@@ -300,7 +300,7 @@ class TestWholeDistribution:
 
     def test_noise_has_the_coordinates_that_are_left(self):
         problem, state = random_problem()
-        widths = Widths(np.full(3, 0.1), np.array([1.0, 0.5, 0.0]), 36)
+        widths = Widths(np.full(3, 0.1), np.array([1.0, 0.5, 0.0]), np.ones(3), 36)
         precisions = np.tile(10 * np.eye(3), (3, 1, 1))
         plain = MarginalLikelihood(problem.frames, precisions=precisions)(*state)
         found = replace(problem, widths=widths).likelihood(*state)

@@ -146,7 +146,7 @@ def test_accuracy(degrees):
     model = fitted(table.X, prior, Thorough)
     reached = error(model, table.S, table.X)
     assert reached < 0.6 * of_prior
-    assert reached < (0.65 if degrees == 3 else 1.2) * without
+    assert reached < (0.8 if degrees == 3 else 1.2) * without
     z = np.vecdot(model.reconstruct(table.X), model.rotations_[:, 2][:, None])
     z = model.scales_[:, None] * z
     square = min(np.mean((sign * z - table.depths) ** 2) for sign in (1, -1))

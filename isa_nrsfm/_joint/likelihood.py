@@ -11,8 +11,9 @@ likelihood of all frames is, up to a constant ::
 
 with N the number of coordinates that were seen. The objective adds minus twice the log
 prior of the basis shapes: ``penalty * sum_i tr H_i`` for their images, or ``sum_kj
-B_kj^T P_k B_kj`` for their points in space, with precisions P_k. With calibrated
-cameras it adds the prior of the extents (`extent_penalty`).
+B_kj^T P_k B_kj`` for their points in space, with precisions P_k, where points count by
+their shares of the observations. With calibrated cameras it adds the prior of the
+extents (`extent_penalty`).
 
 Positions are eliminated by least squares: tracks and shapes are centred over the seen
 points of each frame. Without weights the given shapes have to be centred already.
@@ -250,11 +251,13 @@ class MarginalLikelihood(NamedTuple):
             value += weight * term
             shape_gradient = shape_gradient + weight * slope
         if self.precisions is not None:
-            slope = self.precisions @ shapes[1:]
+            shares = self.frames.point_shares
+            shares = np.ones(1) if shares is None else shares
+            slope = shares * (self.precisions @ shapes[1:])
             value += np.vdot(slope, shapes[1:])
             shape_gradient[1:] += 2.0 * slope
             penalties = block_diag(np.zeros((3, 3)), *self.precisions)
-            curvature = curvature + noise * penalties
+            curvature = curvature + noise * shares[:, None, None] * penalties
         if self.prior is not None:
             term, slope = self.prior.term(shapes)
             value, shape_gradient = value + term, shape_gradient + slope

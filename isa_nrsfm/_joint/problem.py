@@ -31,7 +31,7 @@ from isa_nrsfm.isa._pipeline import Factorisation
 # keeps the objective finite for tables without noise.
 NOISE_FLOOR = 1e-11
 
-# Least share of the numbers of a direction that a table determines, if it is relevant:
+# Least share of the images of a direction that a table determines, if it is relevant:
 # docs/benchmarks/README.md, "Thresholds".
 RELEVANT = 0.99
 
@@ -107,28 +107,30 @@ class Widths(NamedTuple):
     """Prior variances of the directions of a shape, as the table determines them.
 
     variances (D,): v_k of `whole_distribution`. shares (D,): g_k, the shares of the
-    numbers of the directions that the table determines. n_numbers: numbers of each.
+    numbers of the directions that the table determines. of_images (D,): the same for
+    their images. n_numbers: numbers of each.
     """
 
     variances: NDArray
     shares: NDArray
+    of_images: NDArray
     n_numbers: int
 
     def of_points(self, n_points: int, n_directions: int) -> "Widths":
         """Return the widths of the first directions of some of the points."""
-        kept = slice(n_directions)
-        return Widths(self.variances[kept], self.shares[kept], 3 * n_points)
+        parts = [each[:n_directions] for each in self[:3]]
+        return Widths._make([*parts, 3 * n_points])
 
     def padded(self, n_more: int) -> "Widths":
         """Return the widths with further directions, of which nothing is known."""
         variances = np.pad(self.variances, (0, n_more), constant_values=OF_DIFFERENCES)
-        shares = np.pad(self.shares, (0, n_more))
-        return self._replace(variances=variances, shares=shares)
+        shares = [np.pad(each, (0, n_more)) for each in self[1:3]]
+        return Widths._make([variances, *shares, self.n_numbers])
 
     @property
     def n_relevant(self) -> int:
         """Number of directions that the table determines, at least one."""
-        return max(int(np.sum(self.shares > RELEVANT)), 1)
+        return max(int(np.sum(self.of_images > RELEVANT)), 1)
 
     @property
     def n_determined(self) -> float:

@@ -304,11 +304,13 @@ def depth_certainty(
         start: JointState | None = None,
         extents: float = 0.0,
         prior: ShapePrior | None = prior,
+        any_depth: bool = False,
     ) -> tuple[JointState, NDArray, NDArray, float]:
         """Fit the kept points by a few steps, by default from the fit of all points.
 
         Returns the state, rotations (I, 3, 3), centred depths (I, n_kept) and the
-        objective for each frame, without the prior of the extents.
+        objective for each frame, without the prior of the extents. With any depth the
+        prior of the directions is one of their images.
         """
         part = of_points(kept)
         n_numbers, energy = part.totals
@@ -320,7 +322,8 @@ def depth_certainty(
         elif widths is not None:
             own = widths.of_points(int(kept.sum()), most)
             likelihood = own.likelihood(part, frames.camera)
-            likelihood = likelihood._replace(precisions=image_precisions(start))
+            if any_depth:
+                likelihood = likelihood._replace(precisions=image_precisions(start))
         else:
             penalty = part.basis_penalty(limits.basis_std)
             likelihood = MarginalLikelihood(part, penalty)
@@ -340,8 +343,10 @@ def depth_certainty(
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
-        starts = (stretched(state, camera, FAR)[0] for state in (whole, still))
-        rise = min(refit(every, start)[-1] for start in starts) - value
+        far = (stretched(state, camera, FAR)[0] for state in (whole, still))
+        starts = whole, *far
+        value, *others = (refit(every, start, any_depth=True)[-1] for start in starts)
+        rise = min(others) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:
         costs, stretches = [0.5 * prior.cost], [0.0]
@@ -397,7 +402,7 @@ def differences(
 def image_precisions(state: JointState) -> NDArray:
     """Return precisions (K, 3, 3) of basis shapes by their images, not their depths.
 
-    A prior that limits depths would hide their errors.
+    A prior that limits depths would make those of other explanations less likely.
     """
     C, basis = camera_moments(state.motion), state.shapes[1:]
     energy = np.einsum("ab,kaj,kbj->k", C, basis, basis, optimize=True)

@@ -35,6 +35,7 @@ from isa_nrsfm._joint.problem import (
     Widths,
     regular,
 )
+from isa_nrsfm._joint.starts import camera_moments
 from isa_nrsfm._linalg import OF_DISTANCES, frames_last, unpacked
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
@@ -115,21 +116,24 @@ def determined(
     if widths is not None:  # of the same directions, nearly in the same order
         variances = widths.variances[: len(energy)]
     # Posterior covariance of each point: half the Hessian is curvature / s2.
-    every = Widths(variances, np.ones(len(energy)), n_numbers)
+    ones = np.ones(len(energy))
+    every = Widths(variances, ones, ones, n_numbers)
     part = replace(problem, widths=every)
     curvature = part.likelihood(*state).shape_curvature
     covariance = state.noise * np.linalg.inv(regular(curvature))
     # If all weights are one, one matrix is valid for all points.
     total = covariance.sum(axis=0) * (n_numbers / 3 / len(covariance))
     total = total.reshape(len(basis) + 1, 3, len(basis) + 1, 3)
-    uncertain = np.einsum("kaka->k", total)[1:]
-    shares = np.clip(1.0 - uncertain / (variances * n_numbers), 1e-9, 1.0)
+    C, prior = camera_moments(state.motion), variances * n_numbers
+    uncertain = np.einsum("kaka->k", total)[1:] / prior
+    of_images = np.einsum("ab,kakb->k", 3 * C / np.trace(C), total)[1:] / prior
+    shares = np.clip(1.0 - uncertain, 1e-9, 1.0)
     variances = np.maximum(energy / (n_numbers * shares), least)
     # The large noise of the first round hides directions.
     kept = (shares > 0.02) | (widths is None)
     kept[0] = True
     shapes = state.shapes[np.append(True, kept)]
-    widths = Widths(variances[kept], shares[kept], n_numbers)
+    widths = Widths(variances[kept], shares[kept], 1.0 - of_images[kept], n_numbers)
     return state._replace(shapes=shapes), widths
 
 

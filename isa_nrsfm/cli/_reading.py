@@ -21,7 +21,6 @@ from isa_nrsfm._parameters import FACE_PRIORS, SKELETON_NAMES
 from isa_nrsfm._prepare.coordinates import UNSURE, CoordinateWarning, warn_of_places
 from isa_nrsfm._tables import FEWEST_POINTS
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE, TIMES, flag_of
-from isa_nrsfm.export._upright import point_places
 from isa_nrsfm.io import FORMATS, _landmark_columns, _tables as io_tables
 from isa_nrsfm.io._formats import TABLE, find_format
 from isa_nrsfm.io._landmark_columns import LandmarkColumns, find_landmark_columns
@@ -467,7 +466,7 @@ def _kept_points(
                 f"--skeleton ({layouts})"
             )
         return layout.inner.tolist()
-    numbers = point_places(names)
+    numbers = _column_names.point_places(names)
     named: set[int] = set()
     for part in text.removeprefix(WITHOUT).split(","):
         named.update(_range(part.strip(), numbers, names))
@@ -533,7 +532,7 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
     with reading(path, "a list of edges"):
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     edges: list[list[int]] = []
-    numbers = point_places(names)
+    numbers = _column_names.point_places(names)
     if not numbered:
         numbers = {name: numbers[name] for name in names}
     for number, line in enumerate(lines, 1):

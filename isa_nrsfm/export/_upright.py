@@ -28,7 +28,11 @@ from isa_nrsfm.analysis._advice import depth_advice, facts_of
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.skeletons import Skeleton
-from isa_nrsfm.skeletons._column_names import checked_names, names_of_points
+from isa_nrsfm.skeletons._column_names import (
+    checked_names,
+    names_of_points,
+    point_places,
+)
 
 Camera = Literal["weak_perspective"] | None
 
@@ -147,12 +151,6 @@ def names_of_components(names: Any, n_components: int) -> list[str]:
     """Return the names of the coefficients, by default alpha_1, alpha_2, ..."""
     default = [f"alpha_{k + 1}" for k in range(n_components)]
     return checked_names("names", names, default)
-
-
-def point_places(names: Sequence[str]) -> dict[str, int]:
-    """Return the numbers of points by their names, or by their numbers."""
-    named = {name: j for j, name in enumerate(names)}
-    return {str(j): j for j in range(len(names))} | named
 
 
 def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:

@@ -236,3 +236,9 @@ def columns_of_individuals(
             f"no columns have the same names but for {', '.join(who)} (individuals)"
         )
     return best
+
+
+def point_places(names: Sequence[str]) -> dict[str, int]:
+    """Return the numbers of points by their names, or by their numbers."""
+    named = {name: j for j, name in enumerate(names)}
+    return {str(j): j for j in range(len(names))} | named
