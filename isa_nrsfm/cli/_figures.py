@@ -17,8 +17,8 @@ from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._main import show_stage
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.cli._report import MOST_CLASSES, Fit
-from isa_nrsfm.export._upright import names_of_components
 from isa_nrsfm.plotting import _views
+from isa_nrsfm.skeletons._column_names import names_of_components
 
 # Basis shapes and coefficients that are drawn, those with most energy: as many as
 # `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.

@@ -32,11 +32,10 @@ from isa_nrsfm.analysis._diagnostics import Diagnostics
 from isa_nrsfm.analysis._frame_columns import TEXTS
 from isa_nrsfm.cli._options import PROGRAM
 from isa_nrsfm.cli._reading import MOST_LISTED, Frames, drawing_files
-from isa_nrsfm.export._upright import names_of_components
 from isa_nrsfm.io import FORMATS, load_model, save_model, write_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.metrics._measures import frame_energies
-from isa_nrsfm.skeletons._column_names import names_of_points
+from isa_nrsfm.skeletons._column_names import names_of_components, names_of_points
 
 PAGE = "report.html"
 REPORT = "report.json"

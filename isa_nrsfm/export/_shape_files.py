@@ -24,7 +24,7 @@ from isa_nrsfm._linalg import procrustes
 from isa_nrsfm.analysis._advice import depth_advice, facts_of
 from isa_nrsfm.export import _upright
 from isa_nrsfm.plotting._views import Origin
-from isa_nrsfm.skeletons._column_names import names_of_points
+from isa_nrsfm.skeletons._column_names import names_of_components, names_of_points
 
 
 class ShapeArrays(NamedTuple):
@@ -103,7 +103,7 @@ def shape_arrays(model: Any) -> ShapeArrays:
         np.asarray(getattr(model, f"{name}_", np.empty(kept.get(name, 0))))
         for name in ShapeArrays._fields[:-2]
     ]
-    names = names_of_points(model), _upright.names_of_components(None, n_components)
+    names = names_of_points(model), names_of_components(None, n_components)
     return ShapeArrays(*arrays, *(np.array(each, dtype=str) for each in names))
 
 

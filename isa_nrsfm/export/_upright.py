@@ -28,11 +28,7 @@ from isa_nrsfm.analysis._advice import depth_advice, facts_of
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.skeletons import Skeleton
-from isa_nrsfm.skeletons._column_names import (
-    checked_names,
-    names_of_points,
-    point_places,
-)
+from isa_nrsfm.skeletons._column_names import names_of_points, point_places
 
 Camera = Literal["weak_perspective"] | None
 
@@ -145,12 +141,6 @@ def viewed_shapes(space: UprightSpace, model: Any) -> NDArray[np.float64]:
         shapes = fit.reshape(shapes.shape)
     shapes[0] -= shapes[0].mean(axis=0)
     return shapes @ _views.UPSIDE_DOWN
-
-
-def names_of_components(names: Any, n_components: int) -> list[str]:
-    """Return the names of the coefficients, by default alpha_1, alpha_2, ..."""
-    default = [f"alpha_{k + 1}" for k in range(n_components)]
-    return checked_names("names", names, default)
 
 
 def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:

@@ -25,7 +25,7 @@ from isa_nrsfm.export import _upright
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.plotting._views import SPANNING_TREE, UPSIDE_DOWN, Edges, Origin
 from isa_nrsfm.skeletons import Skeleton
-from isa_nrsfm.skeletons._column_names import names_of_points
+from isa_nrsfm.skeletons._column_names import names_of_components, names_of_points
 
 # The colours of more labels than this look alike.
 MOST_LABELS = 30
@@ -160,7 +160,7 @@ def write_viewer(
             f"n_frames must be a whole number of at least 0; got {n_frames!r}"
         )
     space = _upright.upright_space(model, camera, origin, edges)
-    components = _upright.names_of_components(names, len(model.basis_))
+    components = names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
     deviations = _deviations(depth_std, n_rows, model)
@@ -362,7 +362,7 @@ def write_glb(
     """
     _upright.suffix_of(path, [".glb"])
     space = _upright.upright_space(model, camera, origin, edges)
-    targets = _upright.names_of_components(names, len(model.basis_))
+    targets = names_of_components(names, len(model.basis_))
     shapes = _upright.viewed_shapes(space, model)
     factor = 1 / np.ptp(shapes[0], axis=0).max()
     shapes = factor * shapes

@@ -242,3 +242,9 @@ def point_places(names: Sequence[str]) -> dict[str, int]:
     """Return the numbers of points by their names, or by their numbers."""
     named = {name: j for j, name in enumerate(names)}
     return {str(j): j for j in range(len(names))} | named
+
+
+def names_of_components(names: Any, n_components: int) -> list[str]:
+    """Return the names of the coefficients, by default alpha_1, alpha_2, ..."""
+    default = [f"alpha_{k + 1}" for k in range(n_components)]
+    return checked_names("names", names, default)
