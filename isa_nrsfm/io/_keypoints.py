@@ -1,9 +1,9 @@
-"""Read csv, json and texts of trackers, data sets of images and annotation programs."""
+"""Read json and texts of trackers, data sets of images and annotation programs."""
 
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -18,15 +18,8 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.files import errors_of, reading, refuse_special
 from isa_nrsfm._compat.texts import as_utf8, by_number, first_items, frame_numbers
 from isa_nrsfm._parameters import OPENPOSE_PARTS, WHOLE_PARTS, named
-from isa_nrsfm._prepare.coordinates import are_shares
-from isa_nrsfm.io import _tables
-from isa_nrsfm.io._landmark_columns import (
-    LandmarkColumns,
-    find_landmark_columns,
-    landmark_sets,
-)
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes, stacked
-from isa_nrsfm.io._tables import confidences_in, header_names, read_columns, tracks_in
+from isa_nrsfm.io._tables import header_names, parse_table
 
 # Names and numbers of the files of other programs.
 _DATA = tomllib.loads(Path(__file__).with_name("keypoints.toml").read_text("utf-8"))
@@ -577,7 +570,7 @@ def read_ultralytics(path: Path) -> Landmarks:
         images = read_json(path)
         images = images if all(isinstance(i, list) for i in images) else [images]
     else:
-        table = _tables.parse_table(path)
+        table = parse_table(path)
         texts = table["keypoints"].str.replace("'", '"')
         images = [table.assign(keypoints=texts.map(json.loads)).to_dict("records")]
     entries: list[dict[str, Any]] = []
@@ -717,238 +710,3 @@ def read_places(path: Path) -> Landmarks:
         raise ValueError("the lines are not x and y of as many points as it says")
     tracks = np.array([floats_of(row) for row in rows])[None]
     return assemble(tracks, None, pd.DataFrame({"image": [image]}), format="places")
-
-
-# OpenFace names points in space, in millimetres, by capital letters.
-_NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
-# The vector that identifies faces, and the mesh beside the 68 points.
-_NOT_PYFEAT = re.compile(r"Identity_\d+|mesh_[xyz]_\d+|z_\d+")
-_PYFEAT_BOX = ("FaceRectX", "FaceRectY", "FaceRectWidth", "FaceRectHeight")
-
-
-def is_openface(path: Path) -> bool:
-    """Return whether the header is one of OpenFace."""
-    names = header_names(path)
-    of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
-    groups = {"x_0", "x0", "pose_Rx", "gaze_0_x", "AU01_r"}.intersection(names)
-    cut = [{"success", f"x{_}67", f"y{_}67"}.issubset(names) for _ in ("", "_")]
-    of_video |= any(cut)  # without some columns
-    return (of_video or names[:2] == ["face", "confidence"]) and bool(groups)
-
-
-def read_openface(path: Path) -> Landmarks:
-    """Read a csv file of OpenFace 1 or 2, of a video or an image.
-
-    The columns are those of ``RecorderCSV.cpp``: ``frame, face_id, timestamp,
-    confidence, success`` (``face, confidence`` for images) and optional gaze, eyes,
-    pose, ``x_0 ... x_67, y_0 ... y_67`` and more. OpenFace 1 has no ``face_id``, and
-    blanks before the names; the first versions have ``x0 ... x67``. Rows in which
-    ``success`` is 0 hold numbers that are not of a face.
-    """
-    names = header_names(path)
-    if not (first := {"x_0", "x0"}.intersection(names)):
-        raise ValueError(
-            "it has no 2D landmarks x_0, ..., y_0, ...: run OpenFace with -2Dfp"
-        )
-    of_video = names[:1] != ["face"]
-    _need(names, ["success"] if of_video else ["confidence"])
-    scores = [name for name in ("confidence", "success") if name in names]
-    found = find_landmark_columns(names, "x_#,y_#" if "x_0" in first else "x#,y#")
-    numbers = [*found.interleaved, *scores]
-    table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
-    if of_video:
-        if not table["success"].isin((0, 1)).all():
-            raise ValueError("the column success must hold 0 and 1 only")
-        table["success"] = table["success"].astype(int)
-        table.loc[table["success"] == 0, found.interleaved] = np.nan
-    scores = [name for name in scores if name == "confidence"]
-    return _assembled(table, found, "openface", scores, None)
-
-
-def is_pyfeat(path: Path) -> bool:
-    """Return whether the header is one of py-feat."""
-    return {*_PYFEAT_BOX, "x_0"}.issubset(header_names(path))
-
-
-def read_pyfeat(path: Path) -> Landmarks:
-    """
-    Read a csv file of py-feat, of any of its detectors.
-
-    ``Detector`` writes 68 points, ``x_0 ... x_67, y_0 ... y_67``, newer ones with a
-    mesh of 478 points beside them; ``MPDetector`` writes 478 points ``x_0, y_0, z_0,
-    x_1, ...``. ``FaceScore`` is the confidence of the face detector.
-    """
-    names = header_names(path)
-    _need(names, _PYFEAT_BOX)
-    found = find_landmark_columns(names, "x_#,y_#")
-    scores = [name for name in names if name == "FaceScore"]
-    numbers = [*found.interleaved, *scores]
-    table = read_columns(path, leave_out=_NOT_PYFEAT, numbers=numbers, text=["input"])
-    return _assembled(table, found, "pyfeat", scores, None)
-
-
-def is_mediapipe(path: Path) -> bool:
-    """Return whether the header has as many points as MediaPipe's face mesh."""
-    # Without and with the points of the irises
-    sizes = {468, 478}.intersection(landmark_sets(header_names(path)).values())
-    return bool(sizes) and not is_pyfeat(path)
-
-
-def read_mediapipe(
-    path: Path,
-    image_size: tuple[float, float] | None = None,
-    columns: str | None = None,
-    missing: _tables.Missing = None,
-) -> Landmarks:
-    """Read a csv file with the points of MediaPipe.
-
-    Coordinates divided by the width and height of the image are multiplied by
-    ``image_size``, or the columns ``image_width`` and ``image_height``.
-    """
-    names = header_names(path)
-    found = find_landmark_columns(names, columns)
-    sizes = [name for name in ("image_width", "image_height") if name in names]
-    numbers = [*found.interleaved, *sizes]
-    text = {*names}.difference(numbers, found.z)
-    table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
-    sure = confidences_in(table, found.x, found.y)
-    table, scores = table.assign(**sure), [*sure]
-    tracks = tracks_in(table, found.interleaved, missing)
-    scale = table[sizes].to_numpy(float) if len(sizes) == 2 else None
-    tracks = _in_pixels(tracks, image_size, scale)
-    return _assembled(table, found, "mediapipe", scores, tracks)
-
-
-def is_mediapipe_json(path: Path) -> bool:
-    """Return whether json has objects with x and y, or lists called landmarks."""
-    return json_kind(path) == "mediapipe"
-
-
-def read_mediapipe_json(
-    path: Path, image_size: tuple[float, float] | None = None, part: str | None = None
-) -> Landmarks:
-    """Read json of results: lists of objects with x and y, of frames and persons.
-
-    Their names, such as ``pose_landmarks`` or ``poseLandmarks``, are told apart by
-    ``part``; points in space (``world``) are left out.
-    """
-    frames, entries = _frames_in(read_json(path)), []
-    names: dict[str, str] = {}
-    for number, frame in enumerate(frames):
-        found = {n: p for n, value in frame.items() if (p := _persons(value))}
-        found = {n: p for n, p in found.items() if "world" not in n.lower()}
-        names |= {n: re.sub("([A-Z])", r"_\1", n).lower() for n in found}
-        numbered = {"frame": number} if len(frames) > 1 else {}
-        entries.append((numbered | frame, found))
-    chosen = [n for n, plain in names.items() if part is None or part in plain]
-    if not names:
-        raise ValueError("it has no lists of objects with x and y")
-    if len(chosen) != 1:
-        raise ValueError(
-            f"it has {first_items(names)}: choose one with {named('part')}, such as "
-            "'pose'"
-        )
-    every = [p for _, found in entries for each in found.values() for p in each]
-    seen = any(point.get("visibility") for points in every for point in points)
-    persons = (enumerate(found.get(chosen[0]) or [[]]) for _, found in entries)
-    rows = [
-        known | {"person": k, "keypoints": [v for p in points for v in _xyv(p, seen)]}
-        for (known, _), each in zip(entries, persons, strict=True)
-        for k, points in each
-    ]
-    read = entries_as_rows(rows, "mediapipe_json", "result")
-    tracks = read.points.to_numpy().reshape(len(rows), -1, 2)
-    points = read.points.copy()
-    points[:] = _in_pixels(tracks, image_size, None).reshape(len(rows), -1)
-    return replace(read, points=points, confidence=read.confidence if seen else None)
-
-
-def _frames_in(content: Any) -> list[dict[str, Any]]:
-    """Return the frames in a list, or in an object with a list; or the only one."""
-    if isinstance(content, dict):
-        values = (v for v in content.values() if isinstance(v, list) and v)
-        lists = [v for v in values if isinstance(v[0], dict) and not _persons(v)]
-        content = lists[0] if lists else [content]
-    elif isinstance(content[0], dict) and _persons(content):
-        content = [content]
-    return [f if isinstance(f, dict) else {"landmarks": f} for f in content]
-
-
-def _persons(value: Any) -> list[list[dict[str, Any]]]:
-    """Return the points of each person in a list of points, or a list of such."""
-    if not isinstance(value, list) or not value:
-        return []
-    if all(isinstance(p, dict) and {"x", "y"} <= p.keys() for p in value):
-        return [value]
-    inner = [_persons(each) for each in value]
-    return [each[0] for each in inner] if all(len(i) == 1 for i in inner) else []
-
-
-def _xyv(point: dict[str, Any], seen: bool) -> Iterator[float]:
-    """Return x, y and the visibility of a point, 1 if there is none."""
-    visibility = point.get("visibility", 1.0) if seen else 1.0
-    return map(float, (point["x"], point["y"], visibility))
-
-
-def _in_pixels(tracks: NDArray, image_size: Any, sizes: NDArray | None) -> NDArray:
-    """Return tracks (n_frames, n_points, 2) in pixels, by the size of the images."""
-    n_known = np.count_nonzero(~np.isnan(tracks))
-    # Pixels of a face reach beyond this, and fractions of the image's size do not.
-    if 2 * np.count_nonzero((tracks >= -2) & (tracks <= 2)) > n_known:
-        if image_size is None and sizes is None:
-            raise ValueError(
-                "its coordinates are fractions of the image's width and height: give "
-                f"{named('image_size', (1920, 1080))} in pixels, or columns "
-                "image_width and image_height"
-            )
-        _check_inside(tracks)
-        scale = sizes
-        if image_size is not None:
-            scale = checked_sizes("image_size", image_size, 1)
-        with np.errstate(over="ignore"):  # `assemble` refuses infinite numbers
-            return np.asarray(tracks * np.asarray(scale).reshape(-1, 1, 2))
-    if image_size is not None:
-        raise ValueError(
-            "image_size is for coordinates that are fractions of the image's width and "
-            "height; these are in pixels (median "
-            f"{np.nanmedian(np.abs(tracks)):.3g}), for the format table"
-            if n_known
-            else "image_size is given, but there are no points"
-        )
-    return tracks
-
-
-def _check_inside(shares: NDArray[np.float64]) -> None:
-    """Refuse points (n_frames, n_points, 2) if most are outside the image."""
-    beyond = np.maximum(-shares, shares - 1).max(axis=2)
-    n_outside, n_shown = np.sum(beyond > 0), np.sum(~np.isnan(beyond))
-    if 2 * n_outside > n_shown and not are_shares(shares):
-        raise ValueError(
-            f"{n_outside} of {n_shown} points are outside the image: the coordinates "
-            "are no fractions of the width and height of an image. Read them without "
-            "image_size, in the format table"
-        )
-
-
-def _assembled(
-    table: "pd.DataFrame", found: LandmarkColumns, format: str, scores: Any, tracks: Any
-) -> Landmarks:
-    """Return points under the names of their columns, with scores of frame or points.
-
-    The score of a frame is among its other columns.
-    """
-    n_each, used = len(found.points) // max(len(scores), 1), found.interleaved
-    confidence = table[[*scores] * n_each].to_numpy(np.float64) if scores else None
-    used += scores if n_each == 1 else []
-    if tracks is None:
-        tracks = tracks_in(table, found.interleaved)
-    known: dict[str, Any] = {"columns": found.interleaved, "confidence": confidence}
-    frames = table.drop(columns=used)
-    return assemble(tracks, found.points, frames, format=format, **known)
-
-
-def _need(names: list[str], needed: Iterable[str]) -> None:
-    """Raise if a column is missing."""
-    absent = [name for name in needed if name not in names]
-    if absent:
-        raise ValueError(f"it has no column {', '.join(absent)}")
