@@ -492,9 +492,7 @@ default="affine"
             coordinate, rows are left out or mirror images, outliers bend the shapes, a
             prior does not suit, or a fit has not converged.
         """
-        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
-        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
-        self.__dict__ = {name: vars(self)[name] for name in names}
+        self._forget()
         with kept_arrays(self.keep_frames) as keep, scaling.undetermined(self.camera):
             progress = FitProgress(self, stages_of(self), stepwise=STEPWISE, X=X, y=y)
             self._fit(X, point_weight, progress, keep=keep, groups=groups)
@@ -622,6 +620,12 @@ default="affine"
         """Return the mean focal length over those of frames (n, 1), if they differ."""
         given = getattr(self, "focal_length_", self.focal_length)
         return camera_models.focal_shares(given, table.n_frames)
+
+    def _forget(self) -> None:
+        """Remove all results of an earlier fit at once."""
+        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
+        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
+        self.__dict__ = {name: vars(self)[name] for name in names}
 
     def __sklearn_clone__(self) -> Any:
         """Return an unfitted copy, whose prior is still fitted."""

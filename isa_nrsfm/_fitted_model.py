@@ -134,8 +134,7 @@ class TableModel(NamedTuple):
             return rows
         images = pinhole.virtual(rows)
         straight, depths = images.copy(), np.zeros(images[:, 0].shape)
-        frames = replace(self.frames, starts=self.frames.starts[:0])
-        weak = self._replace(frames=frames, pinhole=None)
+        weak = self._replace(frames=self.frames.without_starts, pinhole=None)
         moving = np.arange(len(rows))
         for _ in range(30 if pinhole.near else 0):
             moving = padded(moving)

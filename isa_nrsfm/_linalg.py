@@ -152,9 +152,7 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray]:
     return -swept, positive
 
 
-def sweep(
-    packed: NDArray, first: int = 0, most: int = SMALL
-) -> tuple[NDArray, NDArray]:
+def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
     """Sweep rows of packed symmetric matrices (n_pairs, n), in place.
 
     If A holds the rows from `first` on, ``[[C, G^T], [G, A]]`` becomes
@@ -169,12 +167,38 @@ def sweep(
             S[i, i] = -1.0 / pivot
 
     Returns ``log det A`` (n,) of the positive pivots, and whether all pivots are
-    positive (n,). More than `most` rows are swept matrix by matrix.
+    positive (n,).
     """
+    k = math.isqrt(2 * len(packed))
+    return (_swept if k - first > SMALL else _eliminated)(packed, first)
+
+
+def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
+    """Sweep each matrix by its Cholesky factor, or by `_eliminated` without one."""
+    places = _places(math.isqrt(2 * len(packed)))
+    across, own = places[:first, first:], places[first:, first:]
+    G, A = packed[across], np.ascontiguousarray(packed[own].T)
+    X, upper = np.moveaxis(G, 2, 0).copy(), np.triu_indices(len(own))
+    failed = [dposv(a.T, x.T, 1, 1, 1)[2] for a, x in zip(A, X, strict=True)]
+    pivots, least = A.diagonal(axis1=1, axis2=2).T ** 2, OF_STEPS * packed[np.diag(own)]
+    positive = (np.array(failed) == 0) & (pivots > least).all(axis=0)
+    others = np.flatnonzero(~positive)
+    left, X = packed.take(others, -1), np.moveaxis(X, 0, 2)
+    for a in A:
+        dpotri(a.T, 1, 1)
+    packed[own[upper]], packed[across] = -A[:, *upper].T, X
+    packed[places[:first, :first]] -= np.einsum("rcn,scn->rsn", G, X)
+    log_determinant = np.log(np.where(positive, pivots, 1.0)).sum(axis=0)
+    if len(others):
+        log_determinant[others], positive[others] = _eliminated(left, first)
+        packed[:, others] = left
+    return log_determinant, positive
+
+
+def _eliminated(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
+    """Sweep rows of all matrices, one after the other."""
     rows, n = packed_rows(packed), packed.shape[1]
     k = len(rows)
-    if k - first > most:
-        return _swept(packed, first)
     places, (first_of, second_of) = _places(k), pair_indices(k)
     least = OF_STEPS * packed[diagonal_of(packed)]
     inverses = np.empty((k - first, n))
@@ -191,29 +215,8 @@ def sweep(
         packed[places[i]] = scaled
         np.negative(inverse, out=rows[i][0])
     # With where=... NumPy rounds differently next to entries that are left out.
-    return -np.log(np.where(inverses > 0, inverses, 1.0)).sum(axis=0), positive
-
-
-def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
-    """Sweep each matrix by its Cholesky factor, or by elimination without one."""
-    places = _places(math.isqrt(2 * len(packed)))
-    across, own = places[:first, first:], places[first:, first:]
-    G, A = packed[across], np.ascontiguousarray(packed[own].T)
-    X, upper = np.moveaxis(G, 2, 0).copy(), np.triu_indices(len(own))
-    failed = [dposv(a.T, x.T, 1, 1, 1)[2] for a, x in zip(A, X, strict=True)]
-    pivots, least = A.diagonal(axis1=1, axis2=2).T ** 2, OF_STEPS * packed[np.diag(own)]
-    positive = (np.array(failed) == 0) & (pivots > least).all(axis=0)
-    others = np.flatnonzero(~positive)
-    left, X = packed.take(others, -1), np.moveaxis(X, 0, 2)
-    for a in A:
-        dpotri(a.T, 1, 1)
-    packed[own[upper]], packed[across] = -A[:, *upper].T, X
-    packed[places[:first, :first]] -= np.einsum("rcn,scn->rsn", G, X)
-    log_determinant = np.log(np.where(positive, pivots, 1.0)).sum(axis=0)
-    if len(others):
-        log_determinant[others], positive[others] = sweep(left, first, len(places))
-        packed[:, others] = left
-    return log_determinant, positive
+    logarithms = np.log(np.where(inverses > 0, inverses, 1.0))
+    return -logarithms.sum(axis=0), positive
 
 
 def _inverse_pivot(pivot: NDArray, least: NDArray, positive: NDArray) -> NDArray:

@@ -963,7 +963,9 @@ def decided(
     some = spread(np.arange(X.shape[0]), MOST_ROWS)
     few = {name: np.asarray(each)[some] for name, each in weights.items()}
     X_few = taken_rows(X, some)
-    layout = face_layout or _layout_name(estimator, X_few)
+    layout = face_layout or ""
+    if "prior" in free and not layout:
+        layout = _layout_name(estimator, X_few)
     rows = _Rows(X_few, few, principal_point, layout)
 
     def fitted(

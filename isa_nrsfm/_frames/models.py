@@ -299,6 +299,11 @@ class FrameModel:
         """The search for frames, shared by all tables."""
         return FrameSearch(self.shapes, CAMERAS[self.camera])
 
+    @cached_property
+    def without_starts(self) -> "FrameModel":
+        """The model that fits each frame from zero only."""
+        return replace(self, starts=self.starts[:0])
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}

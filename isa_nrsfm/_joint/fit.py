@@ -573,8 +573,7 @@ def left_out_distances(model: FrameModel, rows: NDArray) -> NDArray:
     follow a wrong point explain it, but not from the others. NaN if these are fewer
     than `LEAST_POINTS`, or if with missing points they do not predict the point.
     """
-    model, w = replace(model, starts=model.starts[:0]), seen_points(rows) * 1.0
-    fit = model.posterior(rows, False)
+    fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
     state = JointState(model.shapes, fit.motion, model.noise_variance)
     rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
     distance = np.full(w.shape, np.nan)

@@ -23,7 +23,13 @@ from isa_nrsfm._frames.search import FrameSearch, FrameTracks, frame_sums
 from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._linalg import OF_DIFFERENCES, OF_SUMS, centred, frames_last
+from isa_nrsfm._linalg import (
+    OF_DIFFERENCES,
+    OF_SUMS,
+    centred,
+    frames_first,
+    frames_last,
+)
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm.isa._pipeline import Factorisation
 
@@ -435,7 +441,7 @@ class _Iterate:
     def moved(self, step: NDArray) -> JointState:
         """Return the state after a step; the noise variance is at least floor."""
         shapes, steps, noise = self.split(step)
-        motion = np.moveaxis(self.cameras.moved(self.M, steps), 2, 0)
+        motion = frames_first(self.cameras.moved(self.M, steps))
         noise = max(self.state.noise * np.exp(noise), self.floor)
         return JointState(self.state.shapes + shapes, motion, noise)
 

@@ -53,12 +53,7 @@ from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, JointFrames, MarginalLike
 from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._joint.starts import (
-    camera_moments,
-    other_depths,
-    steadied,
-    stretched,
-)
+from isa_nrsfm._joint.starts import camera_moments, other_depths, steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
 from isa_nrsfm._linalg import OF_DISTANCES, centred
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
@@ -356,14 +351,7 @@ def depth_certainty(
             stretches.append(change)
         deformation += float(softmax(-np.array(costs)) @ stretches)
     fits = [refit(kept) for kept in parts]
-    centre = depths
-    if prior is None:  # the mean of all fits, mirrored alike
-        centre = np.zeros(depths.shape)
-        for kept, (_, _, z, _) in zip(parts, fits, strict=True):
-            whole_z = depths[:, kept]
-            mirror = np.copysign(1.0, np.sum(z * centred(whole_z)))
-            centre[:, kept] += mirror * z + whole_z.mean(axis=1, keepdims=True)
-        centre /= np.sum(parts, axis=0)
+    centre = depths if prior is not None else mean_depths(parts, fits, depths)
     total, turns, variances = 0.0, np.zeros((3, 3)), np.zeros(len(points))
     for kept, (_, turned, z, _) in zip(parts, fits, strict=True):
         square, turn, squares = differences(turned, z, rotations, centre[:, kept])
@@ -375,6 +363,18 @@ def depth_certainty(
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
     total = float(np.sqrt(factor * total + deformation))
     return DepthCertainty(total, deformation, factor * turns, variances[nearest])
+
+
+def mean_depths(
+    parts: Sequence[NDArray], fits: Sequence[Any], depths: NDArray
+) -> NDArray:
+    """Return the mean depths (I, n) of fits of parts of the points, mirrored alike."""
+    total, number = np.zeros(depths.shape), np.sum(parts, axis=0)
+    for kept, (_, _, z, _) in zip(parts, fits, strict=True):
+        whole = depths[:, kept]
+        mirror = np.copysign(1.0, np.sum(z * centred(whole)))
+        total[:, kept] += mirror * z + whole.mean(axis=1, keepdims=True)
+    return total / number
 
 
 def differences(

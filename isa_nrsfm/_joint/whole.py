@@ -36,7 +36,7 @@ from isa_nrsfm._joint.problem import (
     regular,
 )
 from isa_nrsfm._joint.starts import camera_moments
-from isa_nrsfm._linalg import OF_DISTANCES, frames_last, unpacked
+from isa_nrsfm._linalg import OF_DISTANCES, frames_first, frames_last, unpacked
 
 # All of these: docs/benchmarks/README.md, "Thresholds".
 # Largest number of directions: of small complete tables, and of others, where each
@@ -159,7 +159,7 @@ def evidence(problem: JointProblem, fit: JointFit) -> float:
     objective = part.objective(cameras)._replace(n_unknowns=n_positions)
     terms = objective(*fit.state)
     turns = unpacked(cameras.curvature(frames_last(motion), terms.motion_curvature))
-    price = np.linalg.slogdet(np.moveaxis(turns, 2, 0) / noise)[1].mean()
+    price = np.linalg.slogdet(frames_first(turns) / noise)[1].mean()
     views = full_rotations(motion)[0][:, 2]
     spread = np.linalg.eigvalsh(np.cov(views.T))[1:]
     price += np.log(np.maximum(spread, OF_DISTANCES)).sum()
