@@ -55,7 +55,12 @@ from isa_nrsfm._frames.models import Decomposition, FrameMap, FrameModel, spread
 from isa_nrsfm._joint import uncertainty
 from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import count_components, fit_jointly, left_out_distances
+from isa_nrsfm._joint.fit import (
+    count_components,
+    fit_jointly,
+    left_out_distances,
+    other_fits,
+)
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
@@ -271,9 +276,10 @@ def _joint_fit(
     fit, tracks, alpha = known["joint"]
     settings = settings._replace(shape_prior=fit.prior)
     progress(JOINT_STAGE)
-    (shapes, _, noise), starts, widths = fit.state, spread_starts(alpha, 8), fit.widths
-    kind = settings.loss, FrameMap.identity(len(shapes) - 1), settings.camera
-    model = FrameModel(shapes, noise, starts, *kind)
+    state, starts, widths = fit.state, spread_starts(alpha, 8), fit.widths
+    n_directions = len(state.shapes) - 1
+    kind = settings.loss, FrameMap.identity(n_directions), settings.camera
+    model = FrameModel(state.shapes, state.noise, starts, *kind)
     errors, calibrated = settings.errors, settings.camera != "affine"
     if settings.free and widths is not None:
         n_components = min(widths.n_relevant, MOST_FIRST)
@@ -281,7 +287,7 @@ def _joint_fit(
     if grouped:
         # A residual below the noise of the spectrum leaves nothing for groups.
         n_numbers, square = tracks.totals
-        noise = factorised.noise_level(len(shapes) - 1) * square / n_numbers
+        noise = factorised.noise_level(n_directions) * square / n_numbers
         if widths is not None:  # whose noise is that of the other coordinates
             n_unknowns = widths.n_unknowns(len(table.sizes), settings.camera)
             noise *= n_numbers / (n_numbers - n_unknowns)
@@ -296,7 +302,9 @@ def _joint_fit(
             model, widths = mean
             tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
-        model, widths = consensus(model, table, settings, fit), None
+        several = settings.all_directions and settings.limits.restarts and given is None
+        others = other_fits(factorised, shapes, settings) if several else []
+        model, widths = consensus(model, table, settings, fit, others), None
         tracks = JointFrames.from_points(table.rows, table.complete)
     if settings.refinement == "consensus":
         progress(CONSENSUS_STAGE)

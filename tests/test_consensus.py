@@ -8,6 +8,7 @@ import pytest
 from layers import with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
@@ -23,11 +24,13 @@ from isa_nrsfm._joint.consensus import (
     centred,
     common_coordinates,
     group_fit,
+    group_fits,
     hidden_residuals,
     interpolation,
     merge,
     neighbour_distances,
     neighbourhoods,
+    of_points,
     principal_shapes,
     share_of_first,
     weighted,
@@ -120,24 +123,25 @@ class TestMerge:
         assert_allclose(half[seen], ((rows + fitted) / 2)[seen])
         assert_allclose(half[1, :, 2], fitted[1, :, 2])
 
-    def test_weights_are_inverse_disagreements_of_sizes(self):
-        """Groups of a size share one factor, its inverse mean square disagreement."""
+    def test_weights_are_inverse_disagreements_of_sizes_and_starts(self):
+        """Groups of a size and start share one factor, of the merge of their size."""
         rng = np.random.default_rng(7)
         first = rng.standard_normal((5, 3, 8))
         groups = random_groups(rng, rng.standard_normal((5, 8)), sizes=(5, 5, 5, 6))
+        groups[2] = groups[2]._replace(start=1)
         for group in groups:
             group.coordinates[:, 2] += rng.standard_normal((5, len(group.points)))
         scene = scene_of(first)
         found = weighted(scene, groups)
-        same = groups[:3]
-        z = merge(scene, same)[:, 2]
+        z = merge(scene, groups[:3])[:, 2]
         off = [
             np.mean((centred(g.coordinates[:, 2]) - centred(z[:, g.points])) ** 2)
-            for g in same
+            for g in groups[:3]
         ]
-        square = np.average(off, weights=[g.weight for g in same])
-        for before, after in zip(same, found[:3], strict=True):
-            assert_allclose(after.weight, before.weight / (5 * square), rtol=1e-9)
+        both = np.average(off[:2], weights=[g.weight for g in groups[:2]])
+        for group, square in zip(groups, (both, both, off[2]), strict=False):
+            after = next(g for g in found if g.points is group.points)
+            assert_allclose(after.weight, group.weight / (5 * square), rtol=1e-9)
 
 
 def test_interpolation_of_changes():
@@ -215,6 +219,19 @@ class TestGroupFit:
         assert np.sqrt(np.mean(off**2)) < 0.02
         assert np.sqrt(np.mean((found[:, :2] - truth[frames, :2]) ** 2)) < 0.02
         assert noise >= 1e-5
+
+    def test_each_group_is_fitted_from_the_cameras_of_each_scene(self):
+        """The fits are those of single groups; none depends on the other cameras."""
+        scene, _ = self.scene()
+        turned = scene._replace(motion=scene.motion[::-1])
+        distances = cdist(scene.first[0].T, scene.first[0].T)
+        tasks, fits = group_fits([scene, turned], distances, 2, SETTINGS)
+        assert [start for _, _, start in tasks] == [0, 1]
+        for start, one, fit in zip((0, 1), (scene, turned), fits, strict=True):
+            points = tasks[start][0]
+            own = of_points(one, points)
+            for part, expected in zip(fit, group_fit(own, 2, SETTINGS), strict=True):
+                assert_allclose(part, expected)
 
     def test_mirror_image_is_that_of_the_joint_fit(self):
         """Depths have the sign of those of the joint fit."""

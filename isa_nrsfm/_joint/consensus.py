@@ -4,7 +4,8 @@ K basis shapes of all points are a poor prior of a body, whose limbs move by the
 Neighbouring points have a simpler model, with rotations of their own:
 
 1. Each point and the points nearest to it are a group, in three sizes.
-2. Each larger group is fitted by itself, from the cameras of the joint fit.
+2. Each larger group is fitted by itself, from the cameras of the joint fit and of fits
+   from other starts. Their errors differ, and their mean has smaller ones.
 3. The depths z of a frame minimise ``sum_g ||P (z_g - d_g)||^2`` over the groups g,
    with the depths d_g of the fit of a group. P subtracts the mean.
 4. All groups are fitted together from there, with depths that are common to all
@@ -29,7 +30,7 @@ coordinates at a time. The rotations are eliminated from these (variable project
 Golub, Pereyra, 1973): a group that is tilted turns with its depths.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -248,7 +249,8 @@ class Group(NamedTuple):
     """Fit of a group of points, in the axes of the cameras.
 
     points (n,), frames (n_frames,): indices. coordinates (n_frames, 3, n): x, y and
-    depth. weight: number of the points that have this group as neighbours.
+    depth. weight: number of the points that have this group as neighbours. start: index
+    of the fit whose cameras it started from.
     """
 
     points: NDArray
@@ -256,16 +258,22 @@ class Group(NamedTuple):
     frames: NDArray
     coordinates: NDArray
     noise: float
+    start: int = 0
 
 
 def consensus(
-    model: FrameModel, table: ScaledTable, settings: FitSettings, joint: JointFit
+    model: FrameModel,
+    table: ScaledTable,
+    settings: FitSettings,
+    joint: JointFit,
+    others: Sequence[JointState],
 ) -> FrameModel:
     """Fit groups of neighbouring points, and return the model that merges them.
 
-    The given model is a joint fit of the table with calibrated cameras. The result has
-    all principal components that exceed the noise. The errors of the depths of the
-    joint fit are estimated, if wanted and not known, while other processes fit groups.
+    The given model is a joint fit of the table with calibrated cameras, and others are
+    fits from other starts. The result has all principal components that exceed the
+    noise. The errors of the depths of the joint fit are estimated, if wanted and not
+    known, while other processes fit groups.
     """
     part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
@@ -287,15 +295,17 @@ def consensus(
     # other tables end at this floor or above it, up to rounding.
     if noise > 0.5 * scene.floor:
         n_components = min(len(model.shapes) - 1, MOST_FIRST)
-        begun = group_fits(scene, distances, n_components, settings)
+        cameras = [fit.motion, *(seen_by(model, other, part) for other in others)]
+        scenes = [scene._replace(motion=motion) for motion in cameras]
+        begun = group_fits(scenes, distances, n_components, settings)
     if settings.errors and certainty is NOT_ESTIMATED:
         certainty = depth_certainty(model, table, joint, settings)
     groups = []
-    for (points, count), result in zip(*begun, strict=True):
+    for (points, count, start), result in zip(*begun, strict=True):
         if settings.on_step is not None:
             settings.on_step()
         if result is not None:
-            groups.append(Group(points, count, *result))
+            groups.append(Group(points, count, *result, start))
     most = min(3 * n_points - 7, MOST_COMPONENTS)
 
     def modelled(S: NDArray, noise: float) -> FrameModel:
@@ -315,13 +325,13 @@ def consensus(
     joined = together(scene, groups, distances, scales, noise)
     noise -= (1.0 - LAST_SHARE) * scene.floor
     weights = interpolation(model.shapes[0], chosen)
-    others = np.setdiff1d(np.arange(n_points), chosen)
+    left_out = np.setdiff1d(np.arange(n_points), chosen)
     off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
 
     def merged(joined: NDArray) -> FrameModel:
         """Return the model of coordinates (I, 3, n) in the axes of the cameras."""
         change = (joined - scene.first) @ weights
-        change[:, :2, others] = off[:, :, others]
+        change[:, :2, left_out] = off[:, :, left_out]
         S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
         R = aligning_rotations(centred(S[:, :, chosen]), noise)
         return modelled(R.mT @ S, noise)
@@ -376,7 +386,7 @@ def together(
     Camera scales are (I,); the noise variance includes its floor.
     """
     merged = merge(scene, groups, 1.0 - scene.floor / noise)
-    pairs = [(group.frames, group.points) for group in groups]
+    pairs = [(g.frames, g.points) for g in groups if g.start == 0]
     for points, _ in neighbourhoods(distances, SMALLEST):
         frames = frames_showing(scene.rows[:, :, points])
         if len(frames):
@@ -404,23 +414,43 @@ def disagreements(groups: list[Group], depths: NDArray) -> NDArray:
     return np.divide(squares, weight, out=np.full_like(weight, mean), where=weight > 0)
 
 
+def seen_by(model: FrameModel, state: JointState, rows: NDArray) -> NDArray:
+    """Return the cameras (I, 2, 3) with which a fit from another start sees rows."""
+    shapes, starts = state.shapes, np.empty((0, len(state.shapes) - 1))
+    other = replace(model, shapes=shapes, noise_variance=state.noise, starts=starts)
+    return other.posterior(rows, covariances=False).motion
+
+
 def group_fits(
-    scene: Scene, distances: NDArray, n_components: int, settings: FitSettings
-) -> tuple[list[tuple[NDArray, int]], Iterator[Any]]:
-    """Begin to fit all groups; return their `neighbourhoods`, and the fits to come."""
+    scenes: Sequence[Scene],
+    distances: NDArray,
+    n_components: int,
+    settings: FitSettings,
+) -> tuple[list[tuple[NDArray, int, int]], Iterator[Any]]:
+    """Begin to fit all groups from the cameras of each scene.
+
+    Returns their `neighbourhoods` with the index of the scene, and the fits to come.
+    """
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
-    sizes = [size for size in SIZES if size <= largest]
-    tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
-    rows, first = scene.rows, scene.first
+    tasks = [
+        (points, count, start)
+        for size in SIZES
+        if size <= largest
+        for points, count in neighbourhoods(distances, size)
+        for start in range(len(scenes))
+    ]
     # What other processes need: no other fits
     quiet = settings._replace(on_step=None, start=None, placed=None, known=None)
     # In the order of memory that pickled arrays have, else rounding errors differ.
-    parts = (
-        scene._replace(rows=rows.take(points, 2), first=first.take(points, 2))
-        for points, _ in tasks
-    )
+    parts = (of_points(scenes[start], points) for points, _, start in tasks)
     run = Parallel(n_jobs=settings.n_jobs, return_as="generator")
     return tasks, run(delayed(group_fit)(part, n_components, quiet) for part in parts)
+
+
+def of_points(scene: Scene, points: NDArray) -> Scene:
+    """Return the scene of a group."""
+    rows, first = scene.rows.take(points, 2), scene.first.take(points, 2)
+    return scene._replace(rows=rows, first=first)
 
 
 def neighbour_distances(shapes: NDArray) -> NDArray:
@@ -478,7 +508,10 @@ def group_fit(
     blocks = FrameBlocks.of_array(tracks, len(tracks))
     part = JointFrames.from_points(blocks, bool(seen.all()))
     free, (n_seen, square) = MarginalLikelihood(part), part.totals
-    least, tol = scene.floor * n_seen / square, 0.1 * settings.tol
+    least, tol = (
+        scene.floor * n_seen / square,
+        0.3 * settings.tol,
+    )
     refined = partial(refine_joint, least_noise=least, tol=tol)
     start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
@@ -506,21 +539,28 @@ def frames_showing(rows: NDArray) -> NDArray:
 
 
 def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
-    """Return groups weighted by the inverse mean square disagreement of their size.
+    """Return groups weighted by the inverse mean square disagreement of their kind.
 
-    Each group disagrees with the merge of the groups of its size.
+    Each group disagrees with the merge of the groups of its size. Those of the same
+    size and start are of one kind.
     """
     rounding = OF_DISTANCES**2 * float(np.mean(scene.first**2))
+    kinds: dict[int, dict[int, list[Group]]] = {}
+    for group in groups:
+        of_size = kinds.setdefault(len(group.points), {})
+        of_size.setdefault(group.start, []).append(group)
     weighted_groups = []
-    for size in sorted({len(group.points) for group in groups}):
-        same = [group for group in groups if len(group.points) == size]
-        merged, off, total = merge(scene, same)[:, 2], 0.0, 0.0
-        for group in same:
-            rest = group.coordinates[:, 2] - merged[np.ix_(group.frames, group.points)]
-            off += group.weight * np.mean(centred(rest) ** 2)
-            total += group.weight
-        factor = 1.0 / (size * (off / total + rounding))
-        weighted_groups += [g._replace(weight=factor * g.weight) for g in same]
+    for size, of_size in kinds.items():
+        merged = merge(scene, [g for same in of_size.values() for g in same])[:, 2]
+        for same in of_size.values():
+            off, total = 0.0, 0.0
+            for group in same:
+                own = merged[np.ix_(group.frames, group.points)]
+                rest = centred(group.coordinates[:, 2] - own)
+                off += group.weight * np.mean(rest**2)
+                total += group.weight
+            factor = 1.0 / (size * (off / total + rounding))
+            weighted_groups += [g._replace(weight=factor * g.weight) for g in same]
     return weighted_groups
 
 

@@ -64,6 +64,9 @@ from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 # Numbers of basis shapes of the fits that are compared, first that of the noise ratio:
 # docs/benchmarks/README.md, "Thresholds".
 FIRST_COMPONENTS = 3, 1, 12
+# Those of further fits, from whose cameras the consensus starts:
+# docs/benchmarks/consensus.md.
+OTHER_COMPONENTS = 2, 3, 5, 8
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains of a coordinate are within the error of the noise variance.
 HOPELESS, LEAST_GAIN = 5.0, 0.02
@@ -216,6 +219,26 @@ def _likeliest_fit(
     ratio = max(fits[0].camera_noise_ratio * own / affine, 1.0)
     # With as many steps again, as only the best one is refined further
     return extended(problem, best, n)._replace(camera_noise_ratio=ratio)
+
+
+def other_fits(
+    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings
+) -> list[JointState]:
+    """Return the states of fits from other starts, at the first noise, by points.
+
+    Arguments as in `fit_jointly`.
+    """
+    problem = next(_problems(table, paper_shapes, settings))
+    n = n_directions(problem, paper_shapes.shape[2], few=True)
+    most = min(len(paper_shapes) - 1, n)
+    states = []
+    for k in dict.fromkeys(min(k, most) for k in OTHER_COMPONENTS):
+        paper, limits = paper_shapes[: k + 1], {"tol": settings.tol}
+        fit, _ = _calibrated_fit(problem, table, paper, problem.cameras, **limits)
+        state = extended(problem, fit, n).state
+        shapes = centred(problem.frames.points(state.shapes))
+        states.append(state._replace(shapes=shapes))
+    return states
 
 
 def steadiest(
