@@ -144,9 +144,9 @@ def captured(n_frames, seed, file):
 # Shapes and numbers of basis shapes; in the second half depths are invented easily if
 # the objects hardly turn.
 OBJECTS = {
-    "ICT-68 faces": (rendered, 3, 9),
-    "generated faces": (partial(made, make=make_face_tracks), 3, 9),
-    "bodies": (partial(made, make=make_body_tracks), 3, 12),
+    "ICT-68 faces": (rendered, 3),
+    "generated faces": (partial(made, make=make_face_tracks), 3),
+    "bodies": (partial(made, make=make_body_tracks), 3),
     "animals from the side": (animal, 4),
     "flat hands": (flat_hand, 4),
     "sheets": (sheet, 2),

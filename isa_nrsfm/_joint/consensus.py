@@ -305,7 +305,7 @@ def consensus(
         if settings.on_step is not None:
             settings.on_step()
         if result is not None:
-            groups.append(Group(points, count, *result, start))
+            groups.append(Group(points, count, *result)._replace(start=start))
     most = min(3 * n_points - 7, MOST_COMPONENTS)
 
     def modelled(S: NDArray, noise: float) -> FrameModel:
