@@ -100,7 +100,7 @@ class AffineNRSfM(CallbackSupportMixin, DiagnosedMixin, BaseEstimator):
         "consensus" continues from there, with calibrated cameras: it fits overlapping
         groups of neighbouring points, with rotations of their own, and finds the
         depths that they have in common. Bodies and hands become more accurate, and a
-        fit takes 4 to 7 times as long.
+        fit takes 2 to 7 times as long.
         "alternating" is the paper's alternating least squares for basis shapes and
         coefficients, with fixed rigid cameras.
     camera : {"affine", "weak_perspective", "orthographic", "perspective"}, \
