@@ -438,6 +438,24 @@ def body():
 class TestEstimator:
     """`AffineNRSfM` with refinement="consensus"."""
 
+    def test_fits_of_little_evidence_hardly_count(self, monkeypatch):
+        """The groups of a fit from another start have its weight."""
+        depths = []
+        for weight in (0.0, 1e-9, 1.0):
+
+            def others(*args, weight=weight):
+                *_, fit = args
+                shapes = fit.state.shapes * [[1.0], [0.2], [3.0]]
+                return [(weight, fit.state._replace(shapes=shapes))] if weight else []
+
+            monkeypatch.setattr("isa_nrsfm._fit.other_fits", others)
+            limited = with_limits(few_frames=0, widths=(), error_steps=3)
+            model = limited(3, camera="orthographic", refinement="consensus")
+            fit = model.fit(X[:100])
+            depths.append(fit.reconstruct(X[:100]))
+        change = [np.linalg.norm(z - depths[0]) for z in depths[1:]]
+        assert change[0] < 1e-3 * change[1]
+
     def test_frames_of_the_fit_are_those_of_transform(self, body):
         """`alpha_` and `motion_` are the results of `decompose`."""
         found = body.decompose(X)

@@ -249,8 +249,8 @@ class Group(NamedTuple):
     """Fit of a group of points, in the axes of the cameras.
 
     points (n,), frames (n_frames,): indices. coordinates (n_frames, 3, n): x, y and
-    depth. weight: number of the points that have this group as neighbours. start: index
-    of the fit whose cameras it started from.
+    depth. start: index of the fit whose cameras it started from. weight: number of the
+    points that have this group as neighbours, times the weight of that fit.
     """
 
     points: NDArray
@@ -266,14 +266,14 @@ def consensus(
     table: ScaledTable,
     settings: FitSettings,
     joint: JointFit,
-    others: Sequence[JointState],
+    others: Sequence[tuple[float, JointState]],
 ) -> FrameModel:
     """Fit groups of neighbouring points, and return the model that merges them.
 
     The given model is a joint fit of the table with calibrated cameras, and others are
-    fits from other starts. The result has all principal components that exceed the
-    noise. The errors of the depths of the joint fit are estimated, if wanted and not
-    known, while other processes fit groups.
+    fits from other starts, with their weights. The result has all principal components
+    that exceed the noise. The errors of the depths of the joint fit are estimated, if
+    wanted and not known, while other processes fit groups.
     """
     part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
@@ -295,17 +295,18 @@ def consensus(
     # other tables end at this floor or above it, up to rounding.
     if noise > 0.5 * scene.floor:
         n_components = min(len(model.shapes) - 1, MOST_FIRST)
-        cameras = [fit.motion, *(seen_by(model, other, part) for other in others)]
+        cameras = [fit.motion, *(seen_by(model, other, part) for _, other in others)]
         scenes = [scene._replace(motion=motion) for motion in cameras]
         begun = group_fits(scenes, distances, n_components, settings)
     if settings.errors and certainty is NOT_ESTIMATED:
         certainty = depth_certainty(model, table, joint, settings)
-    groups = []
+    groups, shares = [], [1.0, *(weight for weight, _ in others)]
     for (points, count, start), result in zip(*begun, strict=True):
         if settings.on_step is not None:
             settings.on_step()
         if result is not None:
-            groups.append(Group(points, count, *result)._replace(start=start))
+            weight = count * shares[start]
+            groups.append(Group(points, weight, *result)._replace(start=start))
     most = min(3 * n_points - 7, MOST_COMPONENTS)
 
     def modelled(S: NDArray, noise: float) -> FrameModel:

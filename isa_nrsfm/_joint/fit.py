@@ -64,9 +64,9 @@ from isa_nrsfm._tables import FrameBlocks, representative_frames, seen_points
 # Numbers of basis shapes of the fits that are compared, first that of the noise ratio:
 # docs/benchmarks/README.md, "Thresholds".
 FIRST_COMPONENTS = 3, 1, 12
-# Those of further fits, from whose cameras the consensus starts:
-# docs/benchmarks/consensus.md.
-OTHER_COMPONENTS = 2, 3, 5, 8
+# Those of further fits, from whose cameras the consensus starts, and least weight of
+# these: docs/benchmarks/consensus.md.
+OTHER_COMPONENTS, LEAST_WEIGHT = (2, 3, 5, 8), 0.01
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains of a coordinate are within the error of the noise variance.
 HOPELESS, LEAST_GAIN = 5.0, 0.02
@@ -222,22 +222,28 @@ def _likeliest_fit(
 
 
 def other_fits(
-    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings
-) -> list[JointState]:
+    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings, fit: JointFit
+) -> list[tuple[float, JointState]]:
     """Return the states of fits from other starts, at the first noise, by points.
 
-    Arguments as in `fit_jointly`.
+    With their weights, the evidence of two frames relative to that of the given fit, if
+    they count. Other arguments as in `fit_jointly`.
     """
     problem = next(_problems(table, paper_shapes, settings))
     n = n_directions(problem, paper_shapes.shape[2], few=True)
-    most = min(len(paper_shapes) - 1, n)
-    states = []
+    motion = fit.state.motion[table.parts[0]] if table.parts else fit.state.motion
+    shapes = problem.frames.coordinates(fit.state.shapes[: n + 1])
+    state = fit.state._replace(shapes=shapes, motion=motion)
+    best = evidence(problem, extended(problem, fit._replace(state=state), n))
+    most, states = min(len(paper_shapes) - 1, n), []
     for k in dict.fromkeys(min(k, most) for k in OTHER_COMPONENTS):
         paper, limits = paper_shapes[: k + 1], {"tol": settings.tol}
         fit, _ = _calibrated_fit(problem, table, paper, problem.cameras, **limits)
-        state = extended(problem, fit, n).state
-        shapes = centred(problem.frames.points(state.shapes))
-        states.append(state._replace(shapes=shapes))
+        fit = extended(problem, fit, n)
+        weight = float(np.exp(min(best - evidence(problem, fit), 0.0)))
+        if weight > LEAST_WEIGHT:
+            shapes = centred(problem.frames.points(fit.state.shapes))
+            states.append((weight, fit.state._replace(shapes=shapes)))
     return states
 
 
