@@ -183,9 +183,8 @@ def main(argv=None):
     parser.add_argument("--degrees", type=float, nargs="+", default=every)
     parser.add_argument("--kinds", nargs="+", default=[])
     options = parser.parse_args(argv)
-    cases = [(kind, K) for kind, (_, *numbers) in OBJECTS.items() for K in numbers]
     print(f"{'shapes':22} K turned  of true  of fitted  stated  given  degrees  e/std")
-    for kind, K in cases:
+    for kind, (_, K) in OBJECTS.items():
         for degrees in options.degrees if kind in (options.kinds or [kind]) else ():
             seeds = range(options.seeds)
             found = [measured(kind, K, degrees, seed, options) for seed in seeds]

@@ -302,8 +302,7 @@ def _joint_fit(
             model, widths = mean
             tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
-        several = settings.all_directions and settings.limits.restarts
-        others = other_fits(factorised, shapes, settings, fit) if several else []
+        others = partial(other_fits, factorised, shapes, settings, fit)
         model, widths = consensus(model, table, settings, fit, others), None
         tracks = JointFrames.from_points(table.rows, table.complete)
     if settings.refinement == "consensus":

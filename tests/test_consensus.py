@@ -30,7 +30,6 @@ from isa_nrsfm._joint.consensus import (
     merge,
     neighbour_distances,
     neighbourhoods,
-    of_points,
     principal_shapes,
     share_of_first,
     weighted,
@@ -220,16 +219,18 @@ class TestGroupFit:
         assert np.sqrt(np.mean((found[:, :2] - truth[frames, :2]) ** 2)) < 0.02
         assert noise >= 1e-5
 
-    def test_each_group_is_fitted_from_the_cameras_of_each_scene(self):
+    def test_each_group_is_fitted_from_the_cameras_of_each_start(self):
         """The fits are those of single groups; none depends on the other cameras."""
         scene, _ = self.scene()
-        turned = scene._replace(motion=scene.motion[::-1])
+        cameras = scene.motion, scene.motion[::-1]
         distances = cdist(scene.first[0].T, scene.first[0].T)
-        tasks, fits = group_fits([scene, turned], distances, 2, SETTINGS)
+        starts = list(zip((1.0, 0.5), cameras, strict=True))
+        tasks, fits = group_fits(scene, starts, distances, 2, SETTINGS)
         assert [start for _, _, start in tasks] == [0, 1]
-        for start, one, fit in zip((0, 1), (scene, turned), fits, strict=True):
-            points = tasks[start][0]
-            own = of_points(one, points)
+        assert tasks[1][1] == 0.5 * tasks[0][1]
+        for (points, *_), motion, fit in zip(tasks, cameras, fits, strict=True):
+            rows, first = scene.rows.take(points, 2), scene.first.take(points, 2)
+            own = scene._replace(rows=rows, first=first, motion=motion)
             for part, expected in zip(fit, group_fit(own, 2, SETTINGS), strict=True):
                 assert_allclose(part, expected)
 

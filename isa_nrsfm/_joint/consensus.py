@@ -30,7 +30,7 @@ coordinates at a time. The rotations are eliminated from these (variable project
 Golub, Pereyra, 1973): a group that is tilted turns with its depths.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -266,14 +266,14 @@ def consensus(
     table: ScaledTable,
     settings: FitSettings,
     joint: JointFit,
-    others: Sequence[tuple[float, JointState]],
+    others: Callable[[], list[tuple[float, JointState]]],
 ) -> FrameModel:
     """Fit groups of neighbouring points, and return the model that merges them.
 
-    The given model is a joint fit of the table with calibrated cameras, and others are
-    fits from other starts, with their weights. The result has all principal components
-    that exceed the noise. The errors of the depths of the joint fit are estimated, if
-    wanted and not known, while other processes fit groups.
+    The given model is a joint fit of the table with calibrated cameras, and others()
+    are fits from other starts, with their weights. The result has all principal
+    components that exceed the noise. The errors of the depths of the joint fit are
+    estimated, if wanted and not known, while other processes fit groups.
     """
     part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
@@ -295,17 +295,16 @@ def consensus(
     # other tables end at this floor or above it, up to rounding.
     if noise > 0.5 * scene.floor:
         n_components = min(len(model.shapes) - 1, MOST_FIRST)
-        cameras = [fit.motion, *(seen_by(model, other, part) for _, other in others)]
-        scenes = [scene._replace(motion=motion) for motion in cameras]
-        begun = group_fits(scenes, distances, n_components, settings)
+        starts = [(1.0, fit.motion)]
+        starts += [(share, seen_by(model, state, part)) for share, state in others()]
+        begun = group_fits(scene, starts, distances, n_components, settings)
     if settings.errors and certainty is NOT_ESTIMATED:
         certainty = depth_certainty(model, table, joint, settings)
-    groups, shares = [], [1.0, *(weight for weight, _ in others)]
-    for (points, count, start), result in zip(*begun, strict=True):
+    groups = []
+    for (points, weight, start), result in zip(*begun, strict=True):
         if settings.on_step is not None:
             settings.on_step()
         if result is not None:
-            weight = count * shares[start]
             groups.append(Group(points, weight, *result)._replace(start=start))
     most = min(3 * n_points - 7, MOST_COMPONENTS)
 
@@ -423,35 +422,38 @@ def seen_by(model: FrameModel, state: JointState, rows: NDArray) -> NDArray:
 
 
 def group_fits(
-    scenes: Sequence[Scene],
+    scene: Scene,
+    starts: list[tuple[float, NDArray]],
     distances: NDArray,
     n_components: int,
     settings: FitSettings,
-) -> tuple[list[tuple[NDArray, int, int]], Iterator[Any]]:
-    """Begin to fit all groups from the cameras of each scene.
+) -> tuple[list[tuple[NDArray, float, int]], Iterator[Any]]:
+    """Begin to fit all groups from each start, a weight and cameras (I, 2, 3).
 
-    Returns their `neighbourhoods` with the index of the scene, and the fits to come.
+    Returns the points, weight and index of the start of each, and the fits to come.
     """
     largest = max(LARGEST_SHARE * len(distances), SIZES[0])
+    sizes = [size for size in SIZES if size <= largest]
     tasks = [
-        (points, count, start)
-        for size in SIZES
-        if size <= largest
+        (points, count * share, start)
+        for size in sizes
         for points, count in neighbourhoods(distances, size)
-        for start in range(len(scenes))
+        for start, (share, _) in enumerate(starts)
     ]
+    rows, first = scene.rows, scene.first
     # What other processes need: no other fits
     quiet = settings._replace(on_step=None, start=None, placed=None, known=None)
     # In the order of memory that pickled arrays have, else rounding errors differ.
-    parts = (of_points(scenes[start], points) for points, _, start in tasks)
+    parts = (
+        scene._replace(
+            rows=rows.take(points, 2),
+            first=first.take(points, 2),
+            motion=starts[start][1],
+        )
+        for points, _, start in tasks
+    )
     run = Parallel(n_jobs=settings.n_jobs, return_as="generator")
     return tasks, run(delayed(group_fit)(part, n_components, quiet) for part in parts)
-
-
-def of_points(scene: Scene, points: NDArray) -> Scene:
-    """Return the scene of a group."""
-    rows, first = scene.rows.take(points, 2), scene.first.take(points, 2)
-    return scene._replace(rows=rows, first=first)
 
 
 def neighbour_distances(shapes: NDArray) -> NDArray:
@@ -509,10 +511,7 @@ def group_fit(
     blocks = FrameBlocks.of_array(tracks, len(tracks))
     part = JointFrames.from_points(blocks, bool(seen.all()))
     free, (n_seen, square) = MarginalLikelihood(part), part.totals
-    least, tol = (
-        scene.floor * n_seen / square,
-        0.3 * settings.tol,
-    )
+    least, tol = scene.floor * n_seen / square, 0.3 * settings.tol
     refined = partial(refine_joint, least_noise=least, tol=tol)
     start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
@@ -546,22 +545,19 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
     size and start are of one kind.
     """
     rounding = OF_DISTANCES**2 * float(np.mean(scene.first**2))
-    kinds: dict[int, dict[int, list[Group]]] = {}
-    for group in groups:
-        of_size = kinds.setdefault(len(group.points), {})
-        of_size.setdefault(group.start, []).append(group)
     weighted_groups = []
-    for size, of_size in kinds.items():
-        merged = merge(scene, [g for same in of_size.values() for g in same])[:, 2]
-        for same in of_size.values():
-            off, total = 0.0, 0.0
-            for group in same:
+    for size in sorted({len(group.points) for group in groups}):
+        same = [group for group in groups if len(group.points) == size]
+        merged = merge(scene, same)[:, 2]
+        for start in sorted({group.start for group in same}):
+            kind = [group for group in same if group.start == start]
+            squares = []
+            for group in kind:
                 own = merged[np.ix_(group.frames, group.points)]
-                rest = centred(group.coordinates[:, 2] - own)
-                off += group.weight * np.mean(rest**2)
-                total += group.weight
-            factor = 1.0 / (size * (off / total + rounding))
-            weighted_groups += [g._replace(weight=factor * g.weight) for g in same]
+                squares.append(np.mean(centred(group.coordinates[:, 2] - own) ** 2))
+            square = np.average(squares, weights=[group.weight for group in kind])
+            factor = 1.0 / (size * (square + rounding))
+            weighted_groups += [g._replace(weight=factor * g.weight) for g in kind]
     return weighted_groups
 
 

@@ -222,23 +222,27 @@ def _likeliest_fit(
 
 
 def other_fits(
-    table: FactorisedTable, paper_shapes: NDArray, settings: FitSettings, fit: JointFit
+    table: FactorisedTable, paper: NDArray, settings: FitSettings, joint: JointFit
 ) -> list[tuple[float, JointState]]:
     """Return the states of fits from other starts, at the first noise, by points.
 
-    With their weights, the evidence of two frames relative to that of the given fit, if
-    they count. Other arguments as in `fit_jointly`.
+    With their weights, the evidence of two frames relative to that of the joint fit, if
+    they count. None without all directions. Other arguments as in `fit_jointly`.
     """
-    problem = next(_problems(table, paper_shapes, settings))
-    n = n_directions(problem, paper_shapes.shape[2], few=True)
-    motion = fit.state.motion[table.parts[0]] if table.parts else fit.state.motion
-    shapes = problem.frames.coordinates(fit.state.shapes[: n + 1])
-    state = fit.state._replace(shapes=shapes, motion=motion)
-    best = evidence(problem, extended(problem, fit._replace(state=state), n))
-    most, states = min(len(paper_shapes) - 1, n), []
+    states: list[tuple[float, JointState]] = []
+    if not (settings.all_directions and settings.limits.restarts):
+        return states
+    problem = next(_problems(table, paper, settings))
+    n = n_directions(problem, paper.shape[2], few=True)
+    state = joint.state
+    state = state._replace(shapes=problem.frames.coordinates(state.shapes[: n + 1]))
+    if table.parts:
+        state = state._replace(motion=state.motion[table.parts[0]])
+    best = evidence(problem, extended(problem, joint._replace(state=state), n))
+    most, limits = min(len(paper) - 1, n), {"tol": settings.tol}
     for k in dict.fromkeys(min(k, most) for k in OTHER_COMPONENTS):
-        paper, limits = paper_shapes[: k + 1], {"tol": settings.tol}
-        fit, _ = _calibrated_fit(problem, table, paper, problem.cameras, **limits)
+        part, cameras = paper[: k + 1], problem.cameras
+        fit, _ = _calibrated_fit(problem, table, part, cameras, **limits)
         fit = extended(problem, fit, n)
         weight = float(np.exp(min(best - evidence(problem, fit), 0.0)))
         if weight > LEAST_WEIGHT:
