@@ -340,11 +340,21 @@ def test_a_few_frames_that_determine_a_coefficient_are_named():
     assert effective.min() < 10 < effective.max()
 
 
+OF_MODEL = {"camera": "weak_perspective", "loss": "linear", "consensus": False}
+OF_MODEL |= {"decided": False, "certainty": DepthCertainty(0.1, 0.0), "n_points": 20}
+OF_MODEL |= {"reliability": np.ones(3), "noise_ratio": 1.0, "prior": None}
+
+
 def facts(**known):
     """Return the facts of a fit with three basis shapes."""
-    given = {"camera": "weak_perspective", "loss": "linear", "consensus": False}
-    given |= {"decided": False, "certainty": DepthCertainty(0.1, 0.0), "n_points": 20}
-    return Facts(**given | {"reliability": np.ones(3), "noise_ratio": 1.0} | known)
+    of = SimpleNamespace(**{n: known.pop(n, given) for n, given in OF_MODEL.items()})
+    frames = SimpleNamespace(certainty=of.certainty, loss=of.loss)
+    model = SimpleNamespace(_model=SimpleNamespace(frames=frames), prior=of.prior)
+    model.refinement = "consensus" if of.consensus else "joint"
+    model.camera_, model.camera_noise_ratio_ = of.camera, of.noise_ratio
+    model.mean_shape_, model.reliability_ = np.ones((of.n_points, 3)), of.reliability
+    vars(model).update({"_trials": ()} if of.decided else {})
+    return Facts(model, **known)
 
 
 UNKNOWN = {

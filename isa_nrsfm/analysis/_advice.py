@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.texts import first_items
+from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._frames.models import LARGEST_SHARE, DepthCertainty
+from isa_nrsfm._frames.models import LARGEST_SHARE
 from isa_nrsfm._joint.uncertainty import n_reliable
 from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
@@ -46,20 +47,12 @@ MOST_MESSAGES = 3
 
 class Facts(NamedTuple):
     """
-    What is known of a joint fit.
+    A model after a joint fit, and what was found of it.
 
     Attributes
     ----------
-    camera, loss : str
-        Those of the fit.
-    consensus, decided : bool
-        Whether groups of points were fitted, and whether settings were compared.
-    certainty : DepthCertainty
-        Errors of the depths.
-    reliability, noise_ratio : ndarray of shape (n_components,), float
-        `reliability_` and `camera_noise_ratio_`; NaN if it was not measured.
-    n_points : int
-        Number of points.
+    model : AffineNRSfM
+        The model; with ``_trials`` if settings were compared.
     held_out_error : float
         As in `Diagnostics`.
     deviation : float
@@ -69,54 +62,26 @@ class Facts(NamedTuple):
     outliers, few, pose : str
         Descriptions of outliers, of coefficients that a few frames determine, and of
         those that the pose predicts; empty if there are none.
-    prior : bool
-        Whether a fitted model was the prior.
     """
 
-    camera: str
-    loss: str
-    consensus: bool
-    decided: bool
-    certainty: DepthCertainty
-    reliability: NDArray
-    noise_ratio: float
-    n_points: int
+    model: Any
     held_out_error: float = np.nan
     deviation: float = 0.0
     outlier_energy: float = np.nan
     outliers: str = ""
     few: str = ""
     pose: str = ""
-    prior: bool = False
 
     @property
     def compare(self) -> str:
         """What to do if other settings may be better; nothing if they were compared."""
-        return "" if self.decided else f". {COMPARE}"
+        return "" if hasattr(self.model, "_trials") else f". {COMPARE}"
 
     @property
     def bent(self) -> bool:
         """Whether outliers have their full influence on the fit."""
-        return self.loss == "linear" and self.outlier_energy > MOST_GROSS
-
-    @property
-    def n_supported(self) -> int:
-        """Number of basis shapes that the table supports.
-
-        A consensus has many small components. Without those that are noise, the next
-        smallest ones are.
-        """
-        supported = n_reliable(self.reliability)
-        return len(self.reliability) if supported and self.consensus else supported
-
-
-def facts_of(model: Any, **found: Any) -> Facts:
-    """Return what the attributes of a joint fit tell, and what else was found."""
-    frames, ratio = model._model.frames, getattr(model, "camera_noise_ratio_", np.nan)
-    consensus, decided = model.refinement == "consensus", hasattr(model, "_trials")
-    known = frames.certainty, model.reliability_, ratio, len(model.mean_shape_)
-    found |= {"prior": model.prior is not None}
-    return Facts(model.camera_, frames.loss, consensus, decided, *known, **found)
+        linear = frames_of(self.model).loss == "linear"
+        return linear and self.outlier_energy > MOST_GROSS
 
 
 def layout_of(model: Any) -> Skeleton | None:
@@ -146,28 +111,33 @@ def _messages(facts: Facts) -> Iterator[str]:
     if verdict(facts.held_out_error, *FIT) == "poor":
         yield poor_fit(facts)
         return
-    if facts.bent:
-        yield outlier_advice(facts)
+    yield outlier_advice(facts)
     yield (depth := depth_advice(facts))
     if facts.bent:  # outliers may cause all that follows
         return
-    n_components, n_supported = len(facts.reliability), facts.n_supported
+    model, n_components = facts.model, len(facts.model.reliability_)
+    n_supported = n_reliable(model.reliability_)
+    # A consensus has many small components. Without those that are noise, the next
+    # smallest ones are.
+    if n_supported and model.refinement == "consensus":
+        n_supported = n_components
     if not n_supported:
         yield (
             "no deformation was found beyond the noise: the object may be rigid. Do "
             "not interpret the coefficients"
         )
         return
-    if facts.noise_ratio >= OTHER_CAMERAS and facts.camera != "affine":
-        yield f"{camera_meaning(facts.noise_ratio)}. Make sure that {SAME_UNIT}"
+    ratio = getattr(model, "camera_noise_ratio_", np.nan)
+    if ratio >= OTHER_CAMERAS and model.camera_ != "affine":
+        yield f"{camera_meaning(ratio)}. Make sure that {SAME_UNIT}"
         return  # wrong cameras look like coefficients that depend on the pose
-    if n_supported < n_components and not (facts.prior or facts.decided):
+    if n_supported < n_components and model.prior is None and facts.compare:
         yield (
             f"the table does not support {named('n_components', n_components)}: "
             f"{n_components - n_supported} direction(s) of the coefficients are "
             f"probably noise{facts.compare}"
         )
-    elif facts.camera == "affine" and facts.deviation > LARGEST_DEVIATION:
+    elif model.camera_ == "affine" and facts.deviation > LARGEST_DEVIATION:
         yield (
             f"the basis shapes are uncertain by up to {100 * facts.deviation:.2g} % of "
             "the mean shape: affine cameras absorb such deformation. Record more "
@@ -187,8 +157,8 @@ def poor_fit(facts: Facts) -> str:
         f"their frame ({100 * facts.held_out_error:.2g} % unexplained). Do not "
         "interpret it. "
     )
-    if facts.n_points < FEW_POINTS:
-        return f"{text}There are {facts.n_points} points only: record more of the body"
+    if (n_points := len(facts.model.mean_shape_)) < FEW_POINTS:
+        return f"{text}There are {n_points} points only: record more of the body"
     return (
         f"{text}The points are not those of one deforming body, or a column is not the "
         "same point in all rows, or rows are too few for so large movements"
@@ -216,8 +186,8 @@ def outlier_advice(facts: Facts) -> str:
 
 def depth_advice(facts: Facts) -> str:
     """Return the message on depths that calibrated cameras do not determine."""
-    certainty = facts.certainty
-    if facts.camera == "affine" or certainty.determined:
+    certainty = frames_of(facts.model).certainty
+    if facts.model.camera_ == "affine" or certainty.determined:
         return ""
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
     text = f"the depth of the shapes is not determined: {error}"
@@ -301,7 +271,7 @@ def warn_after_fit(
             f"Make sure that the points are those of the prior, and that {SAME_UNIT}; "
             "or fit the table without a prior"
         )
-    facts = facts_of(model)
+    facts = Facts(model)
     if left_out is not None:
         facts = with_outliers(facts, *left_out)
     advice = filter(None, (outlier_advice(facts), depth_advice(facts)))

@@ -251,7 +251,7 @@ def diagnose(
     )
     names, layout = names_of_points(estimator), _advice.layout_of(estimator)
     error = np.nan if table is None else model.held_out_error(table, *weights)
-    facts = _advice.facts_of(
+    facts = _advice.Facts(
         estimator,
         held_out_error=error,
         deviation=found.weak_deviations[-1],

@@ -21,7 +21,7 @@ from isa_nrsfm._compat.stored_arrays import write_arrays
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._fitted_model import frames_of, points_in_space
 from isa_nrsfm._linalg import procrustes
-from isa_nrsfm.analysis._advice import depth_advice, facts_of
+from isa_nrsfm.analysis._advice import Facts, depth_advice
 from isa_nrsfm.export import _upright
 from isa_nrsfm.plotting._views import Origin
 from isa_nrsfm.skeletons._column_names import names_of_components, names_of_points
@@ -521,7 +521,7 @@ def frame_points(model: Any, X: Any, *, point_weight: Any = None) -> FramePoints
     check_is_fitted(model)
     position, std = map(np.array, points_in_space(model, X, point_weight))
     if not frames_of(model).certainty.determined:
-        warn_caller(depth_advice(facts_of(model)))
+        warn_caller(depth_advice(Facts(model)))
         position[..., 2] = std[..., 2] = np.nan
     return FramePoints(position, std, np.isfinite(position[..., 2]))
 

@@ -24,7 +24,7 @@ from isa_nrsfm._frames.camera_models import compose, full_rotations
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.scaling import check_frames_kept
-from isa_nrsfm.analysis._advice import depth_advice, facts_of
+from isa_nrsfm.analysis._advice import Facts, depth_advice
 from isa_nrsfm.calibration._metric_upgrade import LARGEST_CONDITION
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.skeletons import Skeleton
@@ -67,7 +67,7 @@ def upright_space(
     fitted, metric = model.camera_, None
     calibrated: str | None = camera if fitted == "affine" else fitted
     if camera is not None and not frames_of(model).certainty.determined:
-        warn_caller(depth_advice(facts_of(model)))
+        warn_caller(depth_advice(Facts(model)))
     to_metric = np.eye(3)
     if fitted != "affine":
         transform = _views.euclidean_axes(model)
