@@ -76,8 +76,7 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     for name, (caption, draw) in figures.items():
         show_stage(name)
         try:
-            display, image = draw(fit), io.BytesIO()
-            figure = getattr(display, "figure_", None) or display.figure
+            figure, image = draw(fit).figure_, io.BytesIO()
             figure.savefig(image, format="png", dpi=150)
             plt.close(figure)
             write_whole(folder / name, image.getvalue())

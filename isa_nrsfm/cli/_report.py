@@ -312,14 +312,6 @@ class Cells(NamedTuple):
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
 
-    @property
-    def numbers(self) -> list[bool]:
-        """Which columns have numbers, and are aligned to the right."""
-        return [
-            any(column) and all(cell[:1] in "+-0123456789" for cell in column)
-            for column in zip(*self.rows, strict=True)
-        ]
-
 
 Section = Sequence[str | Cells]
 
@@ -523,12 +515,17 @@ def _markup(name: str, parts: Section) -> list[str]:
         if isinstance(part, str):
             found.append(f"<p>{escape(part)}</p>")
             continue
+        # Numbers are aligned to the right.
+        numbers = [
+            any(column) and all(cell[:1] in "+-0123456789" for cell in column)
+            for column in zip(*part.rows, strict=True)
+        ]
         found.append('<div class="wide"><table>')
         for row in [part.head, *part.rows][not part.head :]:
             tag = "th" if row is part.head else "td"
             cells = (
                 f"<{tag}{' class=number' * is_number}>{escape(cell)}</{tag}>"
-                for cell, is_number in zip(row, part.numbers, strict=False)
+                for cell, is_number in zip(row, numbers, strict=False)
             )
             found.append(f"<tr>{''.join(cells)}</tr>")
         found.append("</table></div>")

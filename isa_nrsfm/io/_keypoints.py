@@ -29,9 +29,6 @@ _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
     r"\{(?P<points>[^{}]*)\}\s*"
 )
-_N_WFLW = 98
-# Fields of a line: points and image, without and with the box and the attributes.
-_WFLW_LENGTHS = (197, 207)
 
 
 def json_kind(path: Path) -> str:
@@ -515,20 +512,19 @@ def read_wflw(path: Path) -> Landmarks:
     """
     fields = np.loadtxt(path, dtype=str, comments=None, encoding="utf-8-sig", ndmin=2)
     n_fields = fields.shape[1]
-    if n_fields not in _WFLW_LENGTHS:
+    if n_fields not in (197, 207):  # without and with the box and the attributes
         raise ValueError(
-            f"the lines have {n_fields} fields; all must have "
-            f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
+            f"the lines have {n_fields} fields; all must have 197 or all 207"
         )
     numbers = np.stack([floats_of(row) for row in fields[:, :-1].tolist()])
     frames: dict[str, object] = {"image": fields[:, -1]}
     points, box, attributes = np.split(numbers, [196, 200], axis=1)
-    if n_fields == _WFLW_LENGTHS[1]:
+    if n_fields == 207:
         if not np.isin(attributes, (0, 1)).all():
             raise ValueError("the six attributes before the image must be 0 or 1")
         frames |= zip(_DATA["wflw_box"], box.T, strict=True)
         frames |= zip(_DATA["wflw_attributes"], attributes.T.astype(int), strict=True)
-    return assemble(points.reshape(-1, _N_WFLW, 2), None, frames, format="wflw")
+    return assemble(points.reshape(-1, 98, 2), None, frames, format="wflw")
 
 
 def floats_of(fields: list[str]) -> NDArray[np.float64]:

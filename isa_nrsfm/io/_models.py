@@ -34,7 +34,6 @@ FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
 HEADER = "header"
 PARTS = tomllib.loads(Path(__file__).with_name("model_file.toml").read_text("utf-8"))
 Arrays = dict[str, NDArray]
-OUTPUTS = ["default", "pandas", "polars"]
 
 
 class NamedStrategy(BaseEstimator):
@@ -214,7 +213,7 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     if entries["sizes"] is not None:
         estimator._frame_sizes = entries["sizes"]
     if (output := header["set_output"]) is not None:
-        if output not in OUTPUTS:
+        if output not in ("default", "pandas", "polars"):
             raise ValueError(f"its set_output is not known: {output}")
         estimator.set_output(transform=output)
     return estimator

@@ -265,14 +265,6 @@ def individuals_as_rows(
     return pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
 
 
-def _codes(missing: Missing) -> list[float]:
-    """Return the numbers of missing points, or raise."""
-    codes = np.atleast_1d([] if missing is None else missing)
-    if codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
-        raise ValueError(f"missing must be None or finite numbers; got {missing!r}")
-    return codes.astype(float).tolist()
-
-
 def tracks_in(
     frame: "pd.DataFrame", names: Sequence[str], missing: Missing = None
 ) -> NDArray[np.float64]:
@@ -283,8 +275,11 @@ def tracks_in(
     frame = with_points(frame, names)
     values = np.stack([_as_numbers(frame[name]) for name in names], axis=1)
     tracks = values.reshape(len(frame), len(names) // 2, 2)
-    for number in _codes(missing):
-        tracks[(tracks == number).all(axis=2)] = np.nan
+    codes = np.atleast_1d([] if missing is None else missing)
+    if codes.dtype.kind not in "iuf" or not np.isfinite(codes).all():
+        raise ValueError(f"missing must be None or finite numbers; got {missing!r}")
+    for code in codes.astype(float):
+        tracks[(tracks == code).all(axis=2)] = np.nan
     return tracks
 
 
