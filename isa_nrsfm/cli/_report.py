@@ -1,7 +1,8 @@
 """The results and the report of a run: as data, text, JSON and a page.
 
 The report has the SHA-256 digests of the model and the other files of its run. A
-section of the page has paragraphs (texts) and tables (`Cells`).
+section of the page has paragraphs (texts) and tables: titles of the columns, which may
+be none, and rows.
 """
 
 import base64
@@ -306,14 +307,7 @@ MOST_SHOWN = 5
 WRAPPED = textwrap.TextWrapper(80, break_on_hyphens=False, break_long_words=False)
 
 
-class Cells(NamedTuple):
-    """A table: titles of the columns if they have any, and rows."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-Section = Sequence[str | Cells]
+Section = Sequence[str | Sequence[Sequence[str]]]
 
 
 def fit_title(report: dict[str, Any]) -> str:
@@ -489,7 +483,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
     title = escape(fit_title(report))
     about = escape(f"{report['table']['path']}, {report['finished']}")
     parts = [f"<h1>{title}</h1>", f'<p class="quiet">{about}</p>']
-    parts += _markup("", [Cells([], report["summary"])])
+    parts += _markup("", [[[], *report["summary"]]])
     for warning in report["warnings"]:
         parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
     parts.append('<p><a href="viewer.html">Shapes and frames in 3D</a></p>')
@@ -515,14 +509,15 @@ def _markup(name: str, parts: Section) -> list[str]:
         if isinstance(part, str):
             found.append(f"<p>{escape(part)}</p>")
             continue
+        head, *rows = part
         # Numbers are aligned to the right.
         numbers = [
             any(column) and all(cell[:1] in "+-0123456789" for cell in column)
-            for column in zip(*part.rows, strict=True)
+            for column in zip(*rows, strict=True)
         ]
         found.append('<div class="wide"><table>')
-        for row in [part.head, *part.rows][not part.head :]:
-            tag = "th" if row is part.head else "td"
+        for row in part[not head :]:
+            tag = "th" if row is head else "td"
             cells = (
                 f"<{tag}{' class=number' * is_number}>{escape(cell)}</{tag}>"
                 for cell, is_number in zip(row, numbers, strict=False)
@@ -612,14 +607,14 @@ def _alpha(model: dict[str, Any]) -> Section:
         for row in model["alpha"]
     ]
     columns = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
-    head, *rows = [[*compress(line, columns)] for line in (head, *rows)]
+    table = [[*compress(line, columns)] for line in (head, *rows)]
     notes = [
         "energy: share of the deformation in the images (sum of squares)",
         "pose: variance that yaw, pitch and roll predict, cross-validated",
         "again: whether a fit of other people has the coefficient, with a correlation "
         "of at least .85",
     ]
-    parts: list[str | Cells] = [Cells(head, rows), *compress(notes, columns[5:])]
+    parts = [table, *compress(notes, columns[5:])]
     if model["parameters"]["remove_pose"]:
         largest = max(model["alpha"], key=lambda row: row["pose_removed"] or 0.0)
         share = f"{100 * (largest['pose_removed'] or 0.0):.0f} % of {largest['name']}"
@@ -651,7 +646,7 @@ def _label(label: dict[str, Any]) -> Section:
     return [
         _answer(label),
         title,
-        Cells([*columns], [*zip(*columns.values(), strict=True)]),
+        [[*columns], *zip(*columns.values(), strict=True)],
         f"{statistic}: {meaning}; {test}",
         *(_class_means(label, names) if means else ()),
         _score(label),
@@ -701,7 +696,7 @@ def _groups(groups: dict[str, Any]) -> Section:
     shares = zip(names, groups["between"], groups["within"], strict=True)
     rows = [[name, f"{100 * a:.1f} %", f"{100 * b:.1f} %"] for name, a, b in shares]
     title = f"{column}: variance between and within {groups['n_groups']} groups"
-    return [title, Cells(["", "between", "within"], rows)]
+    return [title, [["", "between", "within"], *rows]]
 
 
 def _time(time: dict[str, Any]) -> Section:

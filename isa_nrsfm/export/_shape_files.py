@@ -1,6 +1,5 @@
 """Files of a model: its arrays, point distribution models, points of its frames."""
 
-import io
 import os
 from collections.abc import Sequence
 from numbers import Integral, Real
@@ -147,7 +146,6 @@ def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
             savemat(file, arrays, oned_as="column")
 
 
-PDM_SUFFIXES = (".txt", ".mat", ".npz")
 NUMBER_OF_MODES = Interval(Integral, 1, None, closed="left")
 SHARE_OF_VARIANCE = Interval(Real, 0, 1, closed="neither")
 COMMENTS = (
@@ -313,7 +311,7 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     comment lines that begin with ``#``, its numbers of rows and columns, the number 6
     (for doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
     """
-    suffix = _upright.suffix_of(path, PDM_SUFFIXES)
+    suffix = _upright.suffix_of(path, [".txt", ".mat", ".npz"])
     mean, modes, eigenvalues = checked = PointDistributionModel(*map(np.asarray, pdm))
     fitting = mean.ndim == 2 and mean.shape[1] == 3 and eigenvalues.ndim == 1
     if not fitting or modes.shape != (*eigenvalues.shape, *mean.shape):
@@ -582,7 +580,7 @@ def write_points(
     with files_together(path.parent) as folder:
         if suffix == ".nc":
             sign = np.float64(getattr(model, "mirror_certainty_", np.nan))
-            (folder / path.name).write_bytes(_netcdf(points, names, fps, sign))
+            _write_netcdf(folder / path.name, points, names, fps, sign)
             return
         deviations = folder / f"{path.stem}_std{path.suffix}"
         if suffix == ".trc":
@@ -595,42 +593,37 @@ def write_points(
         _write_deeplabcut(deviations, std, names, ("x", "y", "z", "determined"))
 
 
-def _netcdf(
-    points: FramePoints, names: Sequence[str], fps: float | None, sign: float
-) -> bytes:
-    """Return a dataset of movement, as classic netCDF."""
-    content, n_frames = io.BytesIO(), len(points.position)
-    file = netcdf_file(content, "w", version=2)
-    times = np.arange(n_frames) / (fps or 1.0)
+def _write_netcdf(
+    path: Path, points: FramePoints, names: Sequence[str], fps: Any, sign: float
+) -> None:
+    """Write a dataset of movement, as classic netCDF."""
+    times = np.arange(len(points.position)) / (fps or 1.0)
     texts = {"space": "xyz", "keypoint": names, "individual": ["individual_0"]}
-    file.createDimension("time", n_frames)
-    file.createVariable("time", "f8", ("time",))[:] = times
-    for name, words in texts.items():
-        letters = np.array([word.encode() for word in words], dtype="S")
-        size = letters.dtype.itemsize
-        file.createDimension(name, len(words))
-        file.createDimension(f"{name}_letters", size)
-        axis = file.createVariable(name, "c", (name, f"{name}_letters"))
-        axis[:] = letters.view("S1").reshape(len(words), size)
-        setattr(axis, "_Encoding", "utf-8")  # noqa: B010
-    axes = ("time", "space", "keypoint", "individual")
-    for name in ("position", "position_std"):
-        values = getattr(points, name).swapaxes(1, 2)[..., None]
-        file.createVariable(name, "f8", axes)[:] = values
-    for name, kind in (("confidence", "f4"), ("determined", "i1")):
-        values = points.determined if kind == "i1" else np.nan * points.determined
-        file.createVariable(name, kind, axes[:1] + axes[2:])[:] = values[..., None]
-    file.variables["determined"].dtype = "bool"
-    unit = "seconds" if fps else "frames"
-    attributes = {"source_software": "isa_nrsfm", "ds_type": "poses", "fps": fps}
-    attributes |= {"time_unit": unit, "mirror_certainty": sign}
-    for name, value in attributes.items():
-        if value is not None:
-            setattr(file, name, value)
-    file.flush()
-    written = content.getvalue()
-    file.close()
-    return written
+    with netcdf_file(path, "w", version=2) as file:
+        file.createDimension("time", len(times))
+        file.createVariable("time", "f8", ("time",))[:] = times
+        for name, words in texts.items():
+            letters = np.array([word.encode() for word in words], dtype="S")
+            size = letters.dtype.itemsize
+            file.createDimension(name, len(words))
+            file.createDimension(f"{name}_letters", size)
+            axis = file.createVariable(name, "c", (name, f"{name}_letters"))
+            axis[:] = letters.view("S1").reshape(len(words), size)
+            setattr(axis, "_Encoding", "utf-8")  # noqa: B010
+        axes = ("time", "space", "keypoint", "individual")
+        for name in ("position", "position_std"):
+            values = getattr(points, name).swapaxes(1, 2)[..., None]
+            file.createVariable(name, "f8", axes)[:] = values
+        for name, kind in (("confidence", "f4"), ("determined", "i1")):
+            values = points.determined if kind == "i1" else np.nan * points.determined
+            file.createVariable(name, kind, axes[:1] + axes[2:])[:] = values[..., None]
+        file.variables["determined"].dtype = "bool"
+        unit = "seconds" if fps else "frames"
+        attributes = {"source_software": "isa_nrsfm", "ds_type": "poses", "fps": fps}
+        attributes |= {"time_unit": unit, "mirror_certainty": sign}
+        for name, value in attributes.items():
+            if value is not None:
+                setattr(file, name, value)
 
 
 def _write_deeplabcut(

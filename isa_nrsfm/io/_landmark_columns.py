@@ -651,8 +651,7 @@ def _keys_as_given(frame: "pd.DataFrame", given: str | Sequence[str]) -> Keys:
 
     One that is not there is counted among the rows that the others do not tell apart.
     """
-    listed = given.split(",") if isinstance(given, str) else list(given)
-    *by_frame, point = [name.strip() for name in listed]
+    *by_frame, point = split_patterns(given)
     keys = [*by_frame, *point.split("+")]
     present = [name for name in keys if name in frame]
     absent = [name for name in keys if name not in frame]
