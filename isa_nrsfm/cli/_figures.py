@@ -1,6 +1,5 @@
 """The figures of a fit."""
 
-import io
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from isa_nrsfm import plotting
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.files import write_whole
+from isa_nrsfm._compat.files import whole_file
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm.cli._columns import class_means, has_classes
 from isa_nrsfm.cli._main import show_stage
@@ -76,10 +75,10 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     for name, (caption, draw) in figures.items():
         show_stage(name)
         try:
-            figure, image = draw(fit).figure_, io.BytesIO()
-            figure.savefig(image, format="png", dpi=150)
+            figure = draw(fit).figure_
+            with whole_file(folder / name) as file:
+                figure.savefig(file, format="png", dpi=150)
             plt.close(figure)
-            write_whole(folder / name, image.getvalue())
             drawn[name] = caption
         except OSError:
             raise
