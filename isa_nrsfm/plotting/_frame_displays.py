@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables import FEWEST_POINTS, table_to_tracks, tracks_to_table, unmasked
 from isa_nrsfm.analysis._frame_columns import checked_column, kind_of
@@ -202,7 +201,6 @@ class CoefficientsDisplay:
         ValueError
             If `ax` has not one axes for each basis shape, or if `kind` needs `y`.
         """
-        import_optional("matplotlib", extra="plot")
         found: Kind = "time"
         if self.y is not None and kind != "time":
             found = kind_of(self.y, kind)
@@ -533,7 +531,6 @@ class ReprojectionDisplay:
         ValueError
             If there are not as many axes as frames.
         """
-        import_optional("matplotlib", extra="plot")
         n_frames = len(self.frames)
         n_columns = min(3, n_frames) if n_columns is None else n_columns
         height = (PANEL_WIDTH + 0.4) * -(-n_frames // n_columns)

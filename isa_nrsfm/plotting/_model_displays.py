@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
@@ -267,7 +266,6 @@ class BasisShapeDisplay:
             If there are not two axes per shape, or if `components` names a basis shape
             that does not exist.
         """
-        import_optional("matplotlib", extra="plot")
         self.components_ = _views.chosen_numbers(
             components, "components", len(self.basis), "numbers of basis shapes"
         )
@@ -479,14 +477,13 @@ class ModeCovarianceDisplay:
         ValueError
             If `ax` holds several axes.
         """
-        import_optional("matplotlib", extra="plot")
-        from matplotlib.collections import LineCollection
-        from matplotlib.colors import AsinhNorm
-        from matplotlib.ticker import SymmetricalLogLocator
-
         options: dict[str, Any] = {"figsize": (4.4, 3.6), "layout": "compressed"}
         (self.ax_,) = _views.flat_axes(ax, 1, "the matrix", **options)
         self.figure_ = self.ax_.figure
+
+        from matplotlib.collections import LineCollection
+        from matplotlib.colors import AsinhNorm
+        from matplotlib.ticker import SymmetricalLogLocator
 
         values = self.mode_covariance
         largest = np.abs(values).max() or 1.0
