@@ -516,7 +516,6 @@ def frame_points(model: Any, X: Any, *, point_weight: Any = None) -> FramePoints
     ((40, 68, 3), (40, 68, 3), np.True_)
     """
     check_class(model, "model")
-    check_is_fitted(model)
     position, std = map(np.array, points_in_space(model, X, point_weight))
     if not frames_of(model).certainty.determined:
         warn_caller(depth_advice(Facts(model)))
