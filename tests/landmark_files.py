@@ -7,6 +7,8 @@ import pandas as pd
 import pytest
 from scipy.io import savemat
 
+from isa_nrsfm.io import Landmarks
+
 IMAGE_SIZE = (640, 480)
 BODYPARTS = ["snout", "ear_L", "ear_R", "neck", "hip", "tail_1", "tail_2", "tail_3"]
 
@@ -15,6 +17,28 @@ def scene(n_frames=12, n_points=8, seed=0):
     """Return points (n_frames, n_points, 2) in an image, with one decimal."""
     rng = np.random.default_rng(seed)
     return rng.uniform(5, 470, (n_frames, n_points, 2)).round(1)
+
+
+def tracks_of(landmarks):
+    """Return the points (n_frames, n_points, 2), after a look at the whole object."""
+    assert isinstance(landmarks, Landmarks)
+    points, frames, failed = landmarks.points, landmarks.frames, landmarks.failed
+    names, values = [*points.columns, *frames.columns], points.to_numpy()
+    assert values.shape == (len(failed), 2 * len(landmarks.point_names))
+    assert min(values.shape) > 0
+    assert (points.dtypes == np.float64).all()
+    assert not np.isinf(values).any()
+    assert len(set(names)) == len(names)
+    assert len(set(landmarks.point_names)) == len(landmarks.point_names)
+    for table in (points, frames, landmarks.confidence):
+        if table is not None:
+            rows = pd.RangeIndex(len(values))
+            pd.testing.assert_index_equal(table.index, rows, exact=True)
+    if landmarks.confidence is not None:
+        assert tuple(landmarks.confidence) == landmarks.point_names
+    assert failed.dtype == bool
+    assert np.isnan(values[failed]).all()
+    return values.reshape(len(values), -1, 2)
 
 
 def planar(tracks):
@@ -59,18 +83,17 @@ def write_openface(
 
 def saved_again(path, suffix):
     """Save a csv file as another kind of table, as people do with pandas."""
-    frame, new = pd.read_csv(path), path.with_suffix(suffix)
+    frame = pd.read_csv(path)
     path.unlink()
-    if suffix == ".parquet":
-        frame.to_parquet(new)
-    else:
-        frame.to_csv(new, sep="\t", index=False)
-    return new
+    return saved(path.with_suffix(suffix), frame, sep="\t")
 
 
 def saved(path, frame, **options):
-    """Save a table with pandas."""
-    frame.to_csv(path, index=False, **options)
+    """Save a table with pandas, with options of texts."""
+    if path.suffix == ".parquet":
+        frame.to_parquet(path, index=False)
+    else:
+        frame.to_csv(path, index=False, **options)
     return path
 
 
@@ -101,8 +124,7 @@ def write_pyfeat(path, tracks, *, detector="Detector"):
         for axis in "xyz":
             columns |= {f"mesh_{axis}_{j}": np.full(n_frames, 9.0) for j in range(478)}
     columns["input"] = ["video, first.mp4"] * n_frames
-    pd.DataFrame(columns).to_csv(path, index=False)
-    return path
+    return saved(path, pd.DataFrame(columns))
 
 
 def write_mesh(path, tracks, *, shares=True, sizes=False):
@@ -114,8 +136,7 @@ def write_mesh(path, tracks, *, shares=True, sizes=False):
     for j in range(tracks.shape[1]):
         columns |= {f"x_{j}": values[:, j, 0], f"y_{j}": values[:, j, 1]}
         columns[f"z_{j}"] = np.full(len(tracks), -0.01)
-    pd.DataFrame(columns).to_csv(path, index=False)
-    return path
+    return saved(path, pd.DataFrame(columns))
 
 
 def write_pts(folder, tracks):
@@ -124,8 +145,7 @@ def write_pts(folder, tracks):
     for i, points in enumerate(tracks):
         lines = [f"{x:.6f} {y:.6f}" for x, y in points]
         head = ["version: 1", f"n_points:  {len(points)}", "{"]
-        text = "\n".join([*head, *lines, "}"]) + "\n"
-        (folder / f"image_{i:03d}.pts").write_text(text)
+        write_text(folder / f"image_{i:03d}.pts", *head, *lines, "}")
         (folder / f"image_{i:03d}.png").write_bytes(b"\x89PNG")
     return folder
 
@@ -138,8 +158,7 @@ def write_wflw(path, tracks, *, rest=True):
         if rest:
             fields += ["10", "20", "210", "220", *"010010"]
         lines.append(" ".join([*fields, f"37--Soccer/37_Soccer_{i}.jpg"]))
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    return write_text(path, *lines)
 
 
 def deeplabcut_frame(tracks, likelihood=0.9, *, bodyparts=BODYPARTS, individuals=()):
@@ -219,8 +238,7 @@ def write_sleap_csv(path, tracks, scores, *, names=("a", "b"), nodes=BODYPARTS):
             score = scores[frame, track, j]
             row |= {f"{node}.score": score, f"{node}.x": x, f"{node}.y": y}
         rows.append(row)
-    pd.DataFrame(rows).to_csv(path, index=False)
-    return path
+    return saved(path, pd.DataFrame(rows))
 
 
 def coco_annotations(tracks, *, names=BODYPARTS, image=None):
@@ -259,13 +277,11 @@ def write_json(path, content):
 
 def openpose_person(**parts):
     """Return a person as OpenPose does, whose other parts are empty."""
-    names = [f"{part}_keypoints" for part in ("pose", "face", "hand_left")]
-    names = [*names, "hand_right_keypoints"]
-    person = {"person_id": [-1], **{f"{name}_2d": [] for name in names}}
-    person |= {
-        f"{part}_keypoints_2d": np.ravel(p).tolist() for part, p in parts.items()
-    }
-    return person | {f"{name}_3d": [] for name in names}
+    person = {"person_id": [-1]}
+    for part in ("pose", "face", "hand_left", "hand_right"):
+        person[f"{part}_keypoints_2d"] = np.ravel(parts.get(part, ())).tolist()
+        person[f"{part}_keypoints_3d"] = []
+    return person
 
 
 def write_openpose(folder, people, first=0):
@@ -289,8 +305,7 @@ def write_tps(path, tracks):
     for i, points in enumerate(tracks):
         lines += [f"LM={len(points)}", *(f"{x} {y}" for x, y in points)]
         lines += [f"IMAGE=skull {i}.jpg", f"ID={i}", "SCALE=0.05"]
-    path.write_text("\n".join([*lines, ""]))
-    return path
+    return write_text(path, *lines)
 
 
 def write_text(path, *lines):
@@ -364,11 +379,8 @@ def write_facemap(path, tracks):
     h5py = pytest.importorskip("h5py", reason="needs the extra h5")
     with h5py.File(path, "w") as file:
         for name, points in zip(BODYPARTS, tracks.swapaxes(0, 1), strict=True):
-            values = dict(zip("xy", points.T, strict=True))
-            for key, value in (
-                values | {"likelihood": np.full(len(points), 0.9)}
-            ).items():
-                file[f"Facemap/{name}/{key}"] = value
+            file[f"Facemap/{name}/x"], file[f"Facemap/{name}/y"] = points.T
+            file[f"Facemap/{name}/likelihood"] = np.full(len(points), 0.9)
     return path
 
 

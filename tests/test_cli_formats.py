@@ -11,7 +11,7 @@ from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import find_format, read_landmarks
+from isa_nrsfm.io import find_format
 
 N_FRAMES = 40
 LOST, EMPTY = 3, 7
@@ -93,9 +93,8 @@ def write_sized_mesh(folder):
 
 def write_sized_pyfeat(folder, heights=480):
     path = files.write_pyfeat(folder / "fex.csv", tracks(68))
-    table = pd.read_csv(path)
-    table.copy().assign(FrameHeight=heights, FrameWidth=640).to_csv(path, index=False)
-    return path, []
+    table = pd.read_csv(path).copy().assign(FrameHeight=heights, FrameWidth=640)
+    return files.saved(path, table), []
 
 
 def write_coco(folder):
@@ -134,39 +133,13 @@ def test_a_model_of_other_points_is_refused(fails, fits, transforms, tmp_path):
     assert "1 rows: tracking failed" in out
 
 
-def with_confidences(folder, axes):
-    """Return a table of points, confidences for it, and where to write it."""
-    points = tracks(20)
-    names = [axes.format(axis, j) for j in range(20) for axis in "xy"]
-    table = pd.DataFrame(points.reshape(N_FRAMES, -1), columns=names)
+def test_confidences_of_a_plain_table(fits, transforms, tmp_path):
     confidence = np.random.default_rng(0).uniform(0.2, 1.0, (N_FRAMES, 20))
-    table.insert(0, "id", [f"i{i}" for i in range(N_FRAMES)])
-    return table, confidence, folder / "table.csv"
-
-
-@pytest.mark.parametrize(
-    ("axes", "word"),
-    [
-        ("p{1}_{0}", "conf"),
-        ("joint {1}.{0}", "likelihood"),
-        ("{0}{1}", "c"),
-        ("{0}_{1}", "score"),
-    ],
-)
-def test_confidences_of_a_plain_table(fits, transforms, tmp_path, axes, word):
-    table, confidence, path = with_confidences(tmp_path, axes)
-    points = table.columns[1:]
-    without = table.copy()
-    without[points] = without[points].mask(np.repeat(confidence < 0.4, 2, axis=1))
-    for j in range(20):
-        table[axes.format(word, j)] = confidence[:, j]
-    table.to_csv(path, index=False)
-    found = read_landmarks(path, "table", min_confidence=0.4)
-    np.testing.assert_array_equal(found.confidence, confidence)
-    np.testing.assert_array_equal(found.points, without[points])
-    assert list(found.frames) == ["id"]
-    if word != "conf":
-        return
+    table = pd.DataFrame({"id": [f"i{i}" for i in range(N_FRAMES)]})
+    for j, points in enumerate(tracks(20).swapaxes(0, 1)):
+        table[[f"p{j}_x", f"p{j}_y"]] = points
+        table[f"p{j}_conf"] = confidence[:, j]
+    path = files.saved(tmp_path / "table.csv", table)
     unsure = ["--min-confidence", "0.4"]
     found = fits(path, *QUICK, *unsure)
     assert list(found.alpha) == ["row", "id", "alpha_1"]
@@ -185,9 +158,8 @@ def write_shares(folder, change=lambda shares: shares):
     """Write points of hands in normalised coordinates of 1920 x 1080 pixels."""
     shares = change(tracks(21) * [2.5 / 1920, 2.5 / 1080])
     names = [f"{axis}_{j}" for j in range(21) for axis in "xy"]
-    path = folder / "hands.csv"
-    pd.DataFrame(shares.reshape(N_FRAMES, -1), columns=names).to_csv(path, index=False)
-    return path
+    table = pd.DataFrame(shares.reshape(N_FRAMES, -1), columns=names)
+    return files.saved(folder / "hands.csv", table)
 
 
 def test_most_points_are_inside_of_the_image(begins, fails, tmp_path):

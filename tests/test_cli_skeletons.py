@@ -10,7 +10,7 @@ from fit_runs import JOINT, Results
 from layers import slow_after
 from refusals import refusals_of
 
-from isa_nrsfm import datasets
+from isa_nrsfm import datasets, plotting
 from isa_nrsfm.cli import main
 from isa_nrsfm.export import frame_poses
 from isa_nrsfm.skeletons import get_skeleton
@@ -72,10 +72,8 @@ def test_layouts_are_recognised_by_order_or_names(fits, bodies, bodies_fit, tmp_
     assert edges_of(tmp_path / "viewer.html") == (pairs_of("coco-17"), sides)
 
 
-def test_fit_takes_a_skeleton_for_all_that_it_draws(run, table, tmp_path, monkeypatch):
+def test_fit_takes_a_skeleton_for_all_that_it_draws(fits, table, tmp_path, monkeypatch):
     drawn = []
-    from isa_nrsfm import plotting
-
     for display in (plotting.BasisShapeDisplay, plotting.ReprojectionDisplay):
         plot = display.plot
 
@@ -84,8 +82,7 @@ def test_fit_takes_a_skeleton_for_all_that_it_draws(run, table, tmp_path, monkey
             return plot(self, *args, **kw)
 
         monkeypatch.setattr(display, "plot", noted)
-    options = ["-o", tmp_path, "--skeleton", "coco-17", *QUICK]
-    assert run("fit", table, *options)[0] == 0
+    fits(table, "--skeleton", "coco-17", *QUICK)
     assert drawn == ["coco-17", "coco-17"]
     assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("coco-17")
 
@@ -106,7 +103,6 @@ def test_edges_of_a_file(fits, succeeds, table, bodies_fit, tmp_path):
         return edges_of(tmp_path / "a.html")[0]
 
     assert drawn("--edges", "none") == set()
-    own.write_text("5,7\n7,9\n")
     assert drawn("--edges", own) == {(5, 7), (7, 9)}
     config.write_text("skeleton:\n- ['5', '7']\n- ['6', '8']\n")
     assert drawn("--skeleton", config) == {(5, 7), (6, 8)}

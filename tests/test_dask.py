@@ -27,10 +27,6 @@ def table(missing=0.0):
     return with_gaps(X, missing)
 
 
-def chunked(X, columns=40):
-    return array.from_array(X, chunks=(FRAMES, columns))
-
-
 @pytest.fixture(scope="module")
 def cluster():
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
@@ -45,13 +41,10 @@ SampledNRSfM = with_limits(small_table=1000, sample=40, restarts=False)
 
 @pytest.mark.cluster
 class TestCluster:
-    def test_fit_is_that_in_memory(self, cluster):
-        X = table(0.1)
-        model = SampledNRSfM(K, random_state=0).fit(chunked(X))
-        assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
-
-    def test_a_killed_worker_does_not_change_the_result(self, cluster, monkeypatch):
-        X, compute, maps = table(), dask.compute, []
+    # A worker that is killed does not change the result.
+    @pytest.mark.parametrize("missing", [0.0, 0.1])
+    def test_fit_is_that_in_memory(self, cluster, monkeypatch, missing):
+        X, compute, maps = table(missing), dask.compute, []
 
         def compute_and_kill(*tasks):
             maps.append(len(tasks))
@@ -61,7 +54,8 @@ class TestCluster:
             return compute(*tasks)
 
         monkeypatch.setattr(dask, "compute", compute_and_kill)
-        model = SampledNRSfM(K, random_state=0).fit(chunked(X))
+        blocks = array.from_array(X, chunks=(FRAMES, 40))
+        model = SampledNRSfM(K, random_state=0).fit(blocks)
         assert len(maps) > 20
         assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
 

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
+from landmark_files import deeplabcut_frame, write_deeplabcut
 from layers import slow_after, with_limits
 from refusals import refusals_of
 from sklearn.base import clone
@@ -223,11 +224,9 @@ def test_the_command_line_leaves_them_out(fits, tmp_path):
 
 def test_two_views_in_a_row_of_a_tracker_are_asked_about(fits, fails, tmp_path):
     parts = [f"{part}_{view}" for view in ("top", "side") for part in "abcdefgh"]
-    levels = [["scorer"], parts, ["x", "y", "likelihood"]]
-    names = pd.MultiIndex.from_product(levels, names=["scorer", "bodyparts", "coords"])
     tracks = make_nonrigid_tracks(40, 16, **GIVEN).tracks
-    values = np.dstack([tracks, np.ones((40, 16))]).reshape(40, -1)
-    pd.DataFrame(values, columns=names).to_csv(tmp_path / "mouse.csv")
+    table = deeplabcut_frame(tracks, 1.0, bodyparts=parts)
+    write_deeplabcut(tmp_path / "mouse.csv", table)
     options = ["--no-figures", "--refinement", "none", "-k", 1]
     message = fails("fit", tmp_path / "mouse.csv", "-o", tmp_path / "out", *options)
     assert "the 16 points have the same names but for top, side, as those" in message

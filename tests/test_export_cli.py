@@ -11,7 +11,6 @@ from numpy.testing import assert_array_equal, assert_equal
 from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.cli import main
 from isa_nrsfm.export import (
     ShapeArrays,
     point_distribution_model,
@@ -21,7 +20,7 @@ from isa_nrsfm.export import (
 )
 from isa_nrsfm.io import save_model
 
-QUICK = [*"--n-components 1 --isa fast --n-init 2 --no-figures --output".split()]
+QUICK = [*"--n-components 1 --isa fast --n-init 2 --no-figures".split()]
 NAMED = f"named_{MODEL}"
 NAMES = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
 
@@ -36,37 +35,33 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def export(folder, tmp_path, capsys):
-    """Return a function that exports a model: output file, report and errors."""
+def export(folder, tmp_path, succeeds):
+    """Return a function that exports a model: output file and report."""
 
     def run(name, *options, model=NAMED):
         output = tmp_path / name
-        options = map(str, options)
-        argv = ["export", str(folder / model), *options, "--output", str(output)]
-        code = main(argv)
-        captured = capsys.readouterr()
-        assert code == (1 if captured.err else 0)
-        assert output.exists() == (code == 0)
-        return output, captured.out, captured.err
+        out, err = succeeds("export", folder / model, *options, "--output", output)
+        assert err == ""
+        return output, " ".join(out.split())
 
     return run
 
 
 def test_the_suffix_tells_what_is_written(export, tmp_path):
-    output, report, _ = export("face.glb", model=MODEL)
+    output, report = export("face.glb", model=MODEL)
     write_glb(face_model(), tmp_path / "expected.glb")
     assert output.read_bytes() == (tmp_path / "expected.glb").read_bytes()
-    assert f"{output.stat().st_size} bytes" in " ".join(report.split())
+    assert f"{output.stat().st_size} bytes" in report
 
-    output, _, _ = export("face.HTML", model=MODEL)
+    output, _ = export("face.HTML", model=MODEL)
     write_viewer(face_model(), tmp_path / "expected.html")
     assert output.read_text() == (tmp_path / "expected.html").read_text()
 
-    output, report, _ = export("pdm.txt", model=MODEL)
+    output, report = export("pdm.txt", model=MODEL)
     assert_equal(read_pdm(output), point_distribution_model(face_model()))
-    assert "3 modes of 68 points" in " ".join(report.split())
+    assert "3 modes of 68 points" in report
 
-    output, _, _ = export("shapes.npz", model=MODEL)
+    output, _ = export("shapes.npz", model=MODEL)
     with np.load(output) as arrays:
         assert set(arrays) == set(ShapeArrays._fields)
         assert_array_equal(arrays["basis"], face_model().basis_)
@@ -74,29 +69,26 @@ def test_the_suffix_tells_what_is_written(export, tmp_path):
 
 def test_options_reach_what_is_written(export):
     pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
-    output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model=MODEL)
+    output, _ = export("pdm.txt", "--n-modes", 1, *pose, model=MODEL)
     options = {"camera": None, "origin": "lower"}
     mirrored = face_model().mirrored()
     expected = point_distribution_model(mirrored, n_modes=1, **options)
     assert_equal(read_pdm(output), expected)
     assert len(read_pdm(export("b.txt", "--n-modes", "0.1")[0]).modes) == 1
 
-    output, _, _ = export("a.glb", "--names", "jaw open, smile", "--edges", "none")
+    output, _ = export("a.glb", "--names", "jaw open, smile", "--edges", "none")
     assert Read(output).mesh["extras"]["targetNames"] == ["jaw open", "smile"]
     assert len(Read(output).mesh["primitives"]) == 1
 
 
 def test_edges_are_pairs_of_names_or_numbers_of_points(export, tmp_path):
-    path = tmp_path / "edges.csv"
-    path.write_text("00,01\n 01, 02\n\n", encoding="utf-8-sig")
-    read = Read(export("a.glb", "--edges", path)[0])
-    assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
-    path.write_text("0,1\n1,02\n")
-    read = Read(export("c.glb", "--edges", path)[0])
-    assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
+    for name, text in (("a.glb", "\ufeff00,01\n 01, 02\n\n"), ("b.glb", "0,1\n1,02\n")):
+        (tmp_path / "edges.csv").write_text(text, encoding="utf-8")
+        read = Read(export(name, "--edges", tmp_path / "edges.csv")[0])
+        assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
 
 
-def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys, rng):
+def test_the_viewer_of_a_flat_object_has_affine_shapes(fits, tmp_path, rng):
     # Cameras that turn about the viewing direction see two directions of space.
     angle = rng.uniform(0, 2 * np.pi, 40)
     turns = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -104,13 +96,10 @@ def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys, rng):
     names = [f"{axis}{j}" for j in range(20) for axis in "xy"]
     table = pd.DataFrame(tracks.reshape(40, 40), columns=names)
     table.to_csv(tmp_path / "flat.csv", index=False)
-    results = tmp_path / "results"
-    options = ["--camera", "affine", *QUICK, str(results)]
-    assert main(["fit", str(tmp_path / "flat.csv"), *options]) == 0
-    error = capsys.readouterr().err
+    error = fits(tmp_path / "flat.csv", "--camera", "affine", *QUICK).err
     told = "viewer.html has affine shapes, and cameras.csv has no angles: a metric"
     assert f"warning: {told}" in error
-    content = content_of(results / "viewer.html")
+    content = content_of(tmp_path / "viewer.html")
     assert content["about"].startswith("Affine shapes")
     assert content["rotations"] == ""
 

@@ -9,40 +9,18 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from landmark_files import EXPECTED, FRAME, MESH, TRACKS, WFLW, WRITERS, write_json
+from landmark_files import EXPECTED, FRAME, MESH, TRACKS, WFLW, WRITERS, tracks_of
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
 
 from isa_nrsfm.io import (
     FORMATS,
-    Landmarks,
     find_format,
     from_mediapipe,
     from_movement,
     read_landmarks,
 )
 from isa_nrsfm.skeletons import get_skeleton  # noqa: F401  in refusals.txt
-
-
-def tracks_of(landmarks):
-    """Return the points (n_frames, n_points, 2), after a look at the whole object."""
-    assert isinstance(landmarks, Landmarks)
-    points, frames = landmarks.points, landmarks.frames
-    n_frames, n_points = len(points), len(landmarks.point_names)
-    assert points.shape == (n_frames, 2 * n_points)
-    assert (points.dtypes == np.float64).all()
-    names = set(points.columns) | set(frames.columns)
-    assert len(names) == 2 * n_points + len(frames.columns)
-    assert len(set(landmarks.point_names)) == n_points
-    for table in (points, frames, landmarks.confidence):
-        if table is not None:
-            rows = pd.RangeIndex(n_frames)
-            pd.testing.assert_index_equal(table.index, rows, exact=True)
-    if landmarks.confidence is not None:
-        assert tuple(landmarks.confidence) == landmarks.point_names
-    assert landmarks.failed.dtype == bool
-    assert points[landmarks.failed].isna().all(axis=None)
-    return points.to_numpy().reshape(n_frames, n_points, 2)
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -442,12 +420,12 @@ def openpose(folder, content=None, points=None):
     """Return a folder of two files of OpenPose, the second with this content."""
     files.write_openpose(folder / "json", [])
     good = files.openpose_person(pose=points_of_openpose(5))
-    write_json(folder / "json" / "a_keypoints.json", {"people": [good]})
+    files.write_json(folder / "json" / "a_keypoints.json", {"people": [good]})
     if points is not None:
         person = files.openpose_person()
         person["pose_keypoints_2d"] = [number for point in points for number in point]
         content = {"people": [person]}
-    write_json(folder / "json" / "b_keypoints.json", content)
+    files.write_json(folder / "json" / "b_keypoints.json", content)
     return folder / "json"
 
 

@@ -8,6 +8,7 @@ import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
+from scenes import table_of
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -15,14 +16,6 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
 FACES = make_nonrigid_tracks(40, 30, 2, amplitude=0.2, random_state=0).tracks
-LAYOUTS = ["interleaved", "planar"]
-both_layouts = pytest.mark.parametrize("layout", LAYOUTS)
-
-
-def table_of(tracks, layout="interleaved"):
-    """Return the table (n_frames, 2 * n_points) of tracks."""
-    tracks = tracks.swapaxes(1, 2) if layout == "planar" else tracks
-    return tracks.reshape(len(tracks), -1)
 
 
 def fit(X, n_components=1, **params):
@@ -34,7 +27,7 @@ def fit(X, n_components=1, **params):
 
 
 class TestPoints:
-    @both_layouts
+    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
     def test_half_points_are_named_by_their_columns(self, layout):
         X = pd.DataFrame(table_of(FACES, layout), columns=[f"c{i}" for i in range(60)])
         columns = {"interleaved": [14, 15], "planar": [7, 37]}[layout]
@@ -132,6 +125,10 @@ X = make_nonrigid_tracks(**SIZES, noise=0.02, random_state=0).data
 # Both coordinates of some points.
 HIDDEN = np.repeat(np.random.default_rng(1).random((30, 12)) < 0.05, 2, axis=1)
 HOLED = np.where(HIDDEN, np.nan, X)
+# Whole numbers, and a table of pandas with NA
+WHOLE = np.round(1000 * X)
+WITH_NA = pd.DataFrame(WHOLE).astype("Float64").mask(HIDDEN)
+MASKED = np.ma.masked_array(WHOLE.astype(np.int16), HIDDEN)
 
 
 def estimator(**params):
@@ -151,28 +148,19 @@ def test_masked_entries_are_missing(model):
     fitted = model.reproject(HOLED)
     assert inverse_snr(masked, fitted) == inverse_snr(HOLED, fitted)
     assert_array_equal(masked.mask, HIDDEN)
+    assert model.transform(masked.astype(np.float32)).dtype == np.float32
 
 
-def test_masked_whole_numbers_and_single_precision(model):
-    whole = np.ma.masked_array(np.round(1000 * X).astype(np.int16), HIDDEN)
-    expected = model.transform(np.where(HIDDEN, np.nan, np.round(1000 * X)))
-    assert_array_equal(model.transform(whole), expected)
-    single = np.ma.masked_array(X.astype(np.float32), HIDDEN)
-    assert model.transform(single).dtype == np.float32
+@pytest.mark.parametrize("table", [MASKED, WITH_NA, WITH_NA.astype("Int64")], ids=type)
+def test_whole_numbers_may_be_missing(model, table):
+    expected = model.transform(np.where(HIDDEN, np.nan, WHOLE))
+    assert_array_equal(model.transform(table), expected)
 
 
 def test_masked_coefficients_have_no_images(model):
     alpha = np.ma.masked_array(model.alpha_, model.alpha_ > 0)
     images = model.inverse_transform(alpha)
     assert_array_equal(np.isnan(images).all(axis=1), alpha.mask.any(axis=1))
-
-
-@pytest.mark.parametrize("dtype", ["Float64", "Int64"])
-def test_pandas_na_is_missing(model, dtype):
-    numbers = np.round(1000 * X)
-    frame = pd.DataFrame(numbers).astype("Float64").mask(HIDDEN).astype(dtype)
-    expected = model.transform(np.where(HIDDEN, np.nan, numbers))
-    assert_array_equal(model.transform(frame), expected)
 
 
 KINDS_OF_FITS = [{"camera": name} for name in ("weak_perspective", "orthographic")]

@@ -44,8 +44,7 @@ def comma_table(folder, suffix, sign, numbers):
     cells, path = np.resize(numbers.split(), (3, 16)), folder / f"a{suffix}"
     others = {"note, or text": ["1,2", "3,4", "a, b"], "p": ["0,5", "27,5", "3"]}
     table = table_of("{part}_{axis}", cells).assign(**others)
-    table.to_csv(path, sep=sign, index=False)
-    return path, cells.ravel(), others
+    return files.saved(path, table, sep=sign), cells.ravel(), others
 
 
 def commas_in(folder, suffix, sign, numbers, by=""):
@@ -188,9 +187,7 @@ def test_times_in_names_of_images_are_told(tmp_path, begins):
 
 
 LISTS = "keypoints foot_kpts face_kpts lefthand_kpts righthand_kpts".split()
-PARTS = dict(
-    zip("body feet face left_hand right_hand all".split(), range(6), strict=True)
-)
+PARTS = "body feet face left_hand right_hand all".split()
 ENDS = [0, 17, 23, 91, 112, 133]
 BODIES = files.scene(4, 133, 7)
 
@@ -205,7 +202,7 @@ def test_parts_of_whole_bodies(tmp_path, lists, part):
     content = {"images": [{"id": i} for i in range(4)], "annotations": rows}
     content = content if len(lists) > 1 else rows
     path = files.write_json(tmp_path / "a.json", content)
-    first, end = [*pairwise(ENDS), (0, 133)][PARTS[part]]
+    first, end = [*pairwise(ENDS), (0, 133)][PARTS.index(part)]
     found = read_landmarks(path, part=part).points
     assert_array_equal(found, BODIES[:, first:end].reshape(4, -1))
     if len(lists) > 1:
@@ -276,16 +273,29 @@ def of_version(name, wrap, nobody=None):
     return found.points.iloc[0]
 
 
-@pytest.mark.parametrize("word", ["p", "Likelihood", "visibility"])
+@pytest.mark.parametrize(
+    ("name", "parts", "word"),
+    [
+        *(("{part}_{axis}", BODYPARTS, word) for word in ("p", "Likelihood")),
+        ("{part}_{axis}", BODYPARTS, "visibility"),
+        ("p{part}_{axis}", range(8), "conf"),
+        ("joint {part}.{axis}", range(8), "likelihood"),
+        ("{axis}{part}", range(8), "c"),
+        ("{axis}_{part}", range(8), "score"),
+    ],
+)
 @pytest.mark.parametrize("size", [[], ["--image-size", "1000x1000"]])
-def test_confidences_are_read_beside_sizes(tmp_path, begins, word, size):
-    score, path = np.random.default_rng(0).uniform(0.2, 1.0, (N, 8)), tmp_path / "a.csv"
-    table = table_of("{part}_{axis}", POINTS / (1000 if size else 1))
-    scores = {f"{part}_{word}": score[:, j] for j, part in enumerate(BODYPARTS)}
-    table.assign(**scores).to_csv(path, index=False)
+def test_confidences_are_read_beside_sizes(tmp_path, begins, name, parts, word, size):
+    score = np.random.default_rng(0).uniform(0.2, 1.0, (N, 8))
+    table = table_of(name, POINTS / (1000 if size else 1), parts)
+    names = [name.format(part=part, axis=word) for part in parts]
+    table = table.join(pd.DataFrame(score, columns=names))
+    path = files.saved(tmp_path / "a.csv", table)
     given = {"format": "mediapipe", "image_size": (1000, 1000)} if size else {}
     found = read_landmarks(path, min_confidence=0.5, **given)
-    assert_array_equal(found.points.isna().to_numpy()[:, ::2], score < 0.5)
+    assert_array_equal(found.confidence, score)
+    expected = np.where(score[..., None] < 0.5, np.nan, POINTS)
+    assert_allclose(files.tracks_of(found), expected)
     assert found.frames.empty
     if word == "p":
         options = [*size, "--format", "mediapipe" if size else "table"]

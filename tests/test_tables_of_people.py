@@ -10,11 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import fit, write_landmarks
-from landmark_files import deeplabcut_frame, scene, write_deeplabcut, write_openface
+from landmark_files import (
+    deeplabcut_frame,
+    saved,
+    scene,
+    write_deeplabcut,
+    write_openface,
+    write_text,
+)
 from refusals import refusals_of, refused, warned
 from sklearn.base import clone
 
-import isa_nrsfm
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.cli._columns import asked_columns
@@ -44,11 +50,7 @@ def asked_in(folder, columns, *options, suffix=".csv"):
     """Read a table with some columns as the command fit does, without a fit."""
     columns = pd.DataFrame(columns)
     table = pd.concat([landmarks(len(columns)), columns], axis=1)
-    path = folder / f"table{suffix}"
-    if suffix == ".csv":
-        table.to_csv(path, index=False)
-    else:
-        table.to_parquet(path, index=False)
+    path = saved(folder / f"table{suffix}", table)
     return asked_columns(*read_by_fit(path, *options))
 
 
@@ -154,13 +156,13 @@ def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
     for i, name in enumerate(reversed(names)):
         points = np.full((8, 2), float(len(names) - i))
         lines = [f"{x} {y}" for x, y in points]
-        text = "\n".join(["version: 1", "n_points: 8", "{", *lines, "}"])
-        for kind in ("pts", "npy", "parquet"):
+        lines = ["version: 1", "n_points: 8", "{", *lines, "}"]
+        write_text(tmp_path / "pts" / f"{name}.pts", *lines)
+        for kind in ("npy", "parquet"):
             (tmp_path / kind).mkdir(exist_ok=True)
-        (tmp_path / "pts" / f"{name}.pts").write_text(text)
         np.save(tmp_path / "npy" / f"{name}.npy", points.reshape(1, -1))
         table = pd.DataFrame(points.reshape(1, -1), columns=POINTS[:16])
-        table.to_parquet(tmp_path / "parquet" / f"{name}.parquet")
+        saved(tmp_path / "parquet" / f"{name}.parquet", table)
     order = 1 + np.arange(len(names))
     found = read_landmarks(tmp_path / "pts")
     assert list(found.frames["file"]) == [f"{name}.pts" for name in names]
@@ -172,7 +174,7 @@ def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
 def tracks_read(folder, tracks, *options):
     """Read tracks as the command fit does; return points and texts of warnings."""
     table = pd.DataFrame(tracks.reshape(len(tracks), -1), columns=POINTS)
-    table.to_csv(path := folder / "table.csv", index=False)
+    path = saved(folder / "table.csv", table)
     with warnings.catch_warnings(record=True, action="always") as caught:
         _, frames = read_by_fit(path, *options)
     return frames.points.to_numpy(), [str(each.message) for each in caught]
@@ -193,22 +195,18 @@ def test_codes_of_missing_points_cause_a_warning(tmp_path, code, digits):
         told = f"{n_points:,} points at (0, 0), in {n_rows} rows, are missing: "
         assert warning.startswith(told)
         np.testing.assert_array_equal(np.isnan(points[:, ::2]), hidden)
-        assert (
-            len(tracks_read(tmp_path, tracks - [480, 0] * ~hidden[..., None])[1]) == 1
-        )
+        nearer = tracks - [480, 0] * ~hidden[..., None]
+        assert len(tracks_read(tmp_path, nearer)[1]) == 1
         return
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
     assert re.match(rf"{shown} \({n_points} in all\)", warning)
     number = re.search(r"with missing=(\S+)", warning)[1]
     table = pd.DataFrame(tracks.reshape(200, -1), columns=POINTS)
-    found = isa_nrsfm.io.landmark_table(table, missing=code).points.to_numpy()
+    found = landmark_table(table, missing=code).points.to_numpy()
     np.testing.assert_array_equal(np.isnan(found[:, ::2]), hidden)
-    warned(
-        re.escape(warning.partition(" If")[0]),
-        AffineNRSfM(1, refinement=None).fit,
-        table,
-    )
+    told = re.escape(warning.partition(" If")[0])
+    warned(told, AffineNRSfM(1, refinement=None).fit, table)
     points, texts = tracks_read(tmp_path, tracks, f"--missing-value={number}")
     assert texts == []
     expected = np.where(hidden[..., None], np.nan, tracks)
@@ -228,7 +226,7 @@ def test_several_codes_are_missing_together(tmp_path):
     tracks = landmarks().to_numpy().reshape(N, -1, 2) + 50
     tracks[3, 2], tracks[4, 5], tracks[5, 1] = -1, 999, [-1, 3]
     points, _ = tracks_read(
-        tmp_path, tracks, "--missing-value", "-1", "--missing-value", "999"
+        tmp_path, tracks, *["--missing-value", -1, "--missing-value", 999]
     )
     tracks[3, 2] = tracks[4, 5] = np.nan
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
@@ -311,11 +309,7 @@ def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
     table = pd.concat([pd.read_csv(path), further], axis=1)
     if not typed:
         table = table.astype(str)
-    path = path.with_suffix(suffix)
-    if suffix == ".parquet":
-        table.to_parquet(path)
-    else:
-        table.to_csv(path, index=False)
+    path = saved(path.with_suffix(suffix), table)
     found = read_landmarks(path)
     assert found.format == "openface"
     np.testing.assert_array_equal(found.failed, np.arange(12) % 3 == 0)
