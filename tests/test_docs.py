@@ -50,28 +50,30 @@ def blocks(page):
     return BLOCK.findall(text(page))
 
 
-@pytest.fixture
-def tables(tmp_path, monkeypatch):
-    """Write the files that the pages read, and go where they are."""
-    monkeypatch.chdir(tmp_path)
-    faces = make_face_tracks(n_frames=60, n_components=8, random_state=0)
+def write_faces(n_frames, n_components, **others):
+    """Write the tables that the pages read, of three people; return the faces."""
+    faces = make_face_tracks(n_frames, n_components=n_components, random_state=0)
+    people = np.repeat(["Ada", "Ben", "Cyd"], n_frames // 3)
     frame = pd.DataFrame(faces.data, columns=faces.feature_names)
-    frame.insert(0, "person", np.repeat(["Ada", "Ben", "Cyd"], 20))
+    frame = pd.concat([pd.DataFrame({"person": people} | others), frame], axis=1)
     frame.to_csv("faces.csv", index=False)
     frame[:5].to_csv("new_faces.csv", index=False)
+    return faces
+
+
+@pytest.fixture
+def tables(tmp_path, monkeypatch):
+    """Write tables of faces, and go where they are."""
+    monkeypatch.chdir(tmp_path)
+    write_faces(60, 8)
 
 
 @pytest.fixture
 def video(tmp_path, monkeypatch):
-    """Write a video of three people in two conditions, and a file with confidences."""
+    """Write a video in two conditions, and a file with confidences."""
     monkeypatch.chdir(tmp_path)
-    faces = make_face_tracks(n_frames=36, random_state=0)
-    frame = pd.DataFrame(faces.data, columns=faces.feature_names)
-    frame.insert(0, "person", np.repeat(["Ada", "Ben", "Cyd"], 12))
-    frame.insert(1, "condition", np.tile(["before", "after"], 18))
-    frame.insert(2, "seconds", np.tile(np.arange(12) / 25, 3))
-    frame.to_csv("faces.csv", index=False)
-    frame[:5].to_csv("new_faces.csv", index=False)
+    seconds = np.tile(np.arange(12) / 25, 3)
+    faces = write_faces(36, 4, condition=["before", "after"] * 18, seconds=seconds)
     confidence = np.linspace(0.7, 1, 36)
     write_openface(tmp_path / "openface.csv", faces.tracks, confidence=confidence)
 
@@ -264,11 +266,9 @@ def fitted():
     faces = make_face_tracks(40, random_state=0)
     models = [AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(faces.data)]
     for n_points in (17, 7):
-        scene = make_nonrigid_tracks(
-            30, n_points, 1, camera="weak_perspective", random_state=0
-        )
-        model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
-        models.append(model.fit(scene.data))
+        options = {"camera": "weak_perspective", "random_state": 0}
+        scene = make_nonrigid_tracks(30, n_points, 1, **options)
+        models.append(AffineNRSfM(1, **options).fit(scene.data))
     return faces, *models
 
 
@@ -281,9 +281,14 @@ def test_code_of_reference_pages_runs(page, fitted):
         np.save(name, faces.data)
     save_model(model, "model.npz")
     columns = [f"{axis}{j}" for j in range(68) for axis in "xy"]
-    names = {"AffineNRSfM": AffineNRSfM, "GridSearchCV": GridSearchCV}
-    names |= {"sklearn": sklearn, "BasisShapeDisplay": BasisShapeDisplay}
-    names |= {"write_viewer": write_viewer, "canonical_pose": canonical_pose}
+    imported = (
+        AffineNRSfM,
+        GridSearchCV,
+        BasisShapeDisplay,
+        write_viewer,
+        canonical_pose,
+    )
+    names = {"sklearn": sklearn} | {each.__name__: each for each in imported}
     names |= {"X": faces.data, "stream": faces.data[:2], "weights": np.ones((40, 68))}
     names |= {"points": pd.DataFrame(faces.data, columns=columns), "model": model}
     names |= {"new_points": names["points"][:20]}

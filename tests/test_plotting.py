@@ -11,7 +11,8 @@ from cameras import lorentz_cameras
 from layers import may_not_converge, slow_after
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refusals_of, refused
+from refusals import refusals_of, refused, warned
+from scenes import table_of
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
@@ -108,8 +109,8 @@ def test_displays_draw_on_a_new_figure_or_given_axes(kind):
 def test_displays_take_keywords_and_fitted_estimators(kind):
     refused(None, kind, *list(DISPLAYS[kind][0].values())[:2], error=TypeError)
     table = [np.zeros((3, 4))] if kind is ReprojectionDisplay else []
-    with pytest.raises(NotFittedError):
-        kind.from_estimator(AffineNRSfM(), *table)
+    fresh = AffineNRSfM(), *table
+    refused(None, kind.from_estimator, *fresh, error=NotFittedError)
     assert plt.get_fignums() == []
 
 
@@ -230,18 +231,14 @@ def upside_down(faces):
     return AffineNRSfM(2, random_state=0).fit(faces.data * FLIPPED)
 
 
-def random_shapes(n_points=20, **kw):
-    rng = np.random.default_rng(0)
-    mean_shape = rng.standard_normal((n_points, 3))
-    basis = 0.1 * rng.standard_normal((3, n_points, 3))
-    return BasisShapeDisplay(mean_shape=mean_shape, basis=basis, **kw)
+def random_shapes(n_points=20):
+    mean_shape, *basis = np.random.default_rng(0).standard_normal((4, n_points, 3))
+    return drawn_shapes(mean_shape, 0.1 * np.array(basis))
 
 
-def random_frames(n_points=10, **kw):
-    rng = np.random.default_rng(0)
-    observed = rng.standard_normal((4, n_points, 2))
-    noise = 0.1 * rng.standard_normal(observed.shape)
-    return ReprojectionDisplay(observed=observed, reprojected=observed + noise, **kw)
+def random_frames(n_points=10):
+    observed, noise = np.random.default_rng(0).standard_normal((2, 4, n_points, 2))
+    return ReprojectionDisplay(observed=observed, reprojected=observed + 0.1 * noise)
 
 
 def view_of(estimator, display):
@@ -295,12 +292,11 @@ def test_shapes_of_calibrated_cameras_are_only_turned(camera):
     display = BasisShapeDisplay.from_estimator(model)
     error = f"depth error {100 * model.depth_uncertainty_:.2g} %"
     assert [side.get_xlabel() for side in display.axes_[:, 1]] == 3 * [error]
-    scale = np.median(model.scales_)
     shown = [display.mean_shape, *display.basis]
-    shapes = [model.mean_shape_, *model.basis_]
+    shapes = np.median(model.scales_) * np.array([model.mean_shape_, *model.basis_])
     for drawn, shape in zip(shown, shapes, strict=True):
-        drawn, shape = (each / np.linalg.norm(scale * shape) for each in (drawn, shape))
-        assert_allclose(drawn @ drawn.T, scale**2 * shape @ shape.T, atol=1e-6)
+        size = np.sum(shape**2)
+        assert_allclose(drawn @ drawn.T / size, shape @ shape.T / size, atol=1e-6)
     # Points in no known order are seen as the mean camera does.
     order = np.random.RandomState(0).permutation(68)
     model.fit(faces.tracks[:, order].reshape(40, -1))
@@ -403,8 +399,8 @@ def test_titles_have_names_energies_and_drifts(estimator):
 def test_undetermined_depth_has_no_side_view():
     faces = make_face_tracks(30, n_components=1, random_state=0)
     model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
-    with pytest.warns(UserWarning, match="depth of the shapes is not determined"):
-        model.fit(faces.shapes[..., :2].reshape(30, -1))
+    images = faces.shapes[..., :2].reshape(30, -1)
+    warned("depth of the shapes is not determined", model.fit, images)
     display = BasisShapeDisplay.from_estimator(model)
     front, side = display.axes_[0]
     assert front.get_title(loc="left") == "Mean shape"
@@ -415,13 +411,11 @@ def test_undetermined_depth_has_no_side_view():
 
 
 def test_notes_of_narrow_side_views_end_within_the_figure(rng):
-    narrow = np.array([0.2, 1.0, 0.2])
-    display = BasisShapeDisplay(
-        mean_shape=narrow * rng.normal(size=(20, 3)),
-        basis=0.1 * narrow * rng.normal(size=(4, 20, 3)),
-        depth_note="depth not determined",
-    ).plot()
-    display.figure_.canvas.draw()
+    mean, *basis = rng.normal(size=(5, 20, 3)) * [0.2, 1.0, 0.2]
+    display = drawn_shapes(
+        mean, 0.1 * np.array(basis), depth_note="depth not determined"
+    )
+    display.plot().figure_.canvas.draw()
     for side in display.axes_[:, 1]:
         assert side.get_xlabel() == "depth not determined"
         note = side.xaxis.label.get_window_extent()
@@ -560,9 +554,9 @@ def share_outside(matrix):
 def test_points_of_frames_are_the_numbers(faces, estimator):
     show, rows = ReprojectionDisplay.from_estimator, [7, 3, 30]
     display = show(estimator, faces.data, frames=rows)
-    assert_array_equal(display.frames, [7, 3, 30])
+    assert_array_equal(display.frames, rows)
     table = estimator.reproject(faces.data).reshape(-1, 68, 2)
-    for i, row in enumerate([7, 3, 30]):
+    for i, row in enumerate(rows):
         seen, fitted = faces.tracks[row], table[row]
         assert_allclose(display.observed_[i].get_offsets(), seen)
         assert_allclose(display.reprojected_[i].get_offsets(), fitted)
@@ -576,9 +570,9 @@ def test_points_of_frames_are_the_numbers(faces, estimator):
         title = f"row {row}\ninverse SNR {percent(error)}"
         assert display.axes_[i].get_title() == title
     # Planar tables show the same.
-    planar = faces.tracks.transpose(0, 2, 1).reshape(len(table), -1)
+    planar = table_of(faces.tracks, "planar")
     other = clone(estimator).set_params(layout="planar").fit(planar)
-    other = ReprojectionDisplay.from_estimator(other, planar, frames=[7, 3, 30])
+    other = show(other, planar, frames=rows)
     assert_array_equal(display.observed, other.observed)
     assert_allclose(display.reprojected, other.reprojected)
 
