@@ -71,13 +71,32 @@ def joined_clips(rng):
     return np.concatenate(within) + 3 * rng.normal(size=(8, 3))[clip], clip % 2, clip
 
 
-def least_p(trial, n_trials=60, **options):
+def spread(rng):
+    """Return coefficients with another spread in the second class, and the classes."""
+    y = np.arange(200) < 15
+    return rng.normal(size=(200, 3)) * np.where(y, 3, 1)[:, None], y
+
+
+def sessions(rng):
+    """Return coefficients of sessions, their labels, and who is in them."""
+    session = np.repeat(np.arange(80), 8)
+    alpha = rng.normal(size=(640, 3)) + rng.normal(size=(80, 3))[session]
+    return alpha, rng.integers(2, size=80)[session], session // 4
+
+
+def repeated(rng):
+    """Return coefficients of people in any order, and labels of the people."""
+    person = rng.permutation(np.repeat(np.arange(20), 10))
+    alpha = rng.normal(size=(200, 3)) + 3 * rng.normal(size=(20, 3))[person]
+    return alpha, rng.integers(2, size=20)[person]
+
+
+def least_p(trial, n_trials):
     """Return the least p-value of each random trial (alpha, y, groups)."""
     least = []
     for seed in range(n_trials):
-        options = {"n_permutations": 99, "random_state": seed} | options
-        found = association(*trial(seed), **options)
-        least.append(found.p_value.min())
+        options = {"n_permutations": 99, "random_state": seed}
+        least.append(association(*trial(rng_of(seed)), **options).p_value.min())
     return np.array(least)
 
 
@@ -128,25 +147,8 @@ class TestAssociation:
         alone = association(alpha[mixed, None], y[mixed], random_state=0)
         assert alone.untested or alone.p_value[0] < 0.01
 
-    def test_keeps_its_level_for_other_spreads_sessions_and_repeated_people(self):
-        def spread(seed):
-            y = np.arange(200) < 15
-            return rng_of(seed).normal(size=(200, 3)) * np.where(y, 3, 1)[:, None], y
-
-        def sessions(seed):
-            rng, session = rng_of(seed), np.repeat(np.arange(80), 8)
-            alpha = rng.normal(size=(640, 3)) + rng.normal(size=(80, 3))[session]
-            return alpha, rng.integers(2, size=80)[session], session // 4
-
-        def repeated(seed):
-            rng = rng_of(seed)
-            person = rng.permutation(np.repeat(np.arange(20), 10))
-            alpha = rng.normal(size=(200, 3)) + 3 * rng.normal(size=(20, 3))[person]
-            return alpha, rng.integers(2, size=20)[person]
-
-        for trial in (spread, sessions, repeated):
-            assert np.mean(least_p(trial, n_trials=25) <= 0.05) <= 0.12
-        found = [association(*repeated(seed), random_state=0) for seed in range(5)]
+    def test_repeated_people_are_told(self):
+        found = [association(*repeated(rng_of(i)), random_state=0) for i in range(5)]
         assert sum("Give the people as groups" in each.untested for each in found) > 3
 
     def test_correction_for_attenuation(self):
@@ -162,18 +164,20 @@ class TestAssociation:
         assert "corrected" in str(found)
 
     @pytest.mark.parametrize(
-        "trial",
+        ("trial", "n_trials", "level"),
         [
-            lambda r: (rhythm(r, 12), rhythm(r, 12)[:, 0] > 0),
-            lambda r: (wave(r, 3), wave(r, 1)[:, 0]),
-            lambda r: (np.cumsum(r.normal(size=(300, 3)), 0), event(r)),
-            lambda r: joined_clips(r)[:2],
+            (spread, 25, 0.12),
+            (sessions, 25, 0.12),
+            (repeated, 25, 0.12),
+            (video, 40, 0.15),  # nine in ten if single frames are permuted
+            (lambda r: (rhythm(r, 12), rhythm(r, 12)[:, 0] > 0), 20, 0.1),
+            (lambda r: (wave(r, 3), wave(r, 1)[:, 0]), 20, 0.1),
+            (lambda r: (np.cumsum(r.normal(size=(300, 3)), 0), event(r)), 20, 0.1),
+            (lambda r: joined_clips(r)[:2], 20, 0.1),
         ],
-        ids=["rhythms", "waves", "walk", "clips"],
     )
-    def test_series_go_with_nothing_by_chance(self, trial):
-        least = least_p(lambda seed: trial(rng_of(seed)), n_trials=20)
-        assert np.mean(least <= 0.05) <= 0.1
+    def test_labels_go_with_nothing_by_chance(self, trial, n_trials, level):
+        assert np.mean(least_p(trial, n_trials) <= 0.05) <= level
 
     def test_what_cannot_be_tested_is_said(self):
         rng = rng_of(0)
@@ -202,16 +206,14 @@ class TestAssociation:
         assert_allclose(found.statistic, expected.statistic)
         assert_allclose(found.p_value, expected.p_value, atol=0.06)
 
-    def test_labels_in_blocks_of_a_video_go_with_nothing_by_chance(self):
-        # Nine in ten are significant if single frames are permuted.
-        assert np.mean(least_p(video, n_trials=40) <= 0.05) < 0.15
+    def test_blocks_of_a_video_in_another_order_are_taken_for_frames(self):
         order = rng_of(0).permutation(200)
-        alone = least_p(lambda seed: [a[order] for a in video(seed)], n_trials=20)
+        alone = least_p(lambda rng: [a[order] for a in video(rng)], n_trials=20)
         assert np.mean(alone <= 0.05) > 0.5
 
     def test_a_real_effect_in_a_video_is_found(self):
-        def trial(seed):
-            alpha, y = video(seed, n=400)
+        def trial(rng):
+            alpha, y = video(rng, n=400)
             alpha[:, 1] += 2.0 * y
             return alpha, y
 
@@ -235,8 +237,7 @@ class TestAssociation:
 
     @pytest.mark.parametrize("effect", slow_after(1, [0.0, 1.0]))
     def test_labels_that_vary_within_people_of_many_and_few_frames(self, effect):
-        def trial(seed):
-            rng = rng_of(seed)
+        def trial(rng):
             person = np.repeat(np.arange(25), rng.integers(1, 12, 25))
             alpha = 2.0 * rng.normal(size=(25, 3))[person]
             alpha += rng.normal(size=alpha.shape)

@@ -135,9 +135,8 @@ class TestPerspective:
         x, y = scene.clean.T
         assert_allclose(x, 800 * X / Z + 640, rtol=0, atol=1e-9)
         assert_allclose(y, 800 * Y / Z + 360, rtol=0, atol=1e-9)
-        assert_allclose(
-            scene.rotations @ scene.rotations.mT, [np.eye(3)] * 60, atol=1e-12
-        )
+        gram = scene.rotations @ scene.rotations.mT
+        assert_allclose(gram, [np.eye(3)] * 60, atol=1e-12)
         assert_allclose(np.linalg.det(scene.rotations), 1)
 
     def test_cameras_are_weak_perspective_ones_at_the_same_place(self, kind):
@@ -168,9 +167,7 @@ class TestPerspective:
         scene = MAKERS[kind](30, missing=0.2, camera="perspective", random_state=4)
         for name in ("shapes", "mean_shape", "angles", "labels", "visible"):
             assert_array_equal(plain[name], scene[name])
-        noise = [
-            np.divide(s.tracks - s.clean, s.noise_variance**0.5) for s in (plain, scene)
-        ]
+        noise = ((s.tracks - s.clean) / s.noise_variance**0.5 for s in (plain, scene))
         assert_allclose(*noise, atol=1e-9)
         size = root_mean_square(centred(scene.clean))
         assert_allclose(np.sqrt(scene.noise_variance), 0.005 * size)

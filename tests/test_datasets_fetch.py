@@ -10,6 +10,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.testing import assert_array_equal
 from refusals import refused
@@ -21,6 +22,7 @@ from isa_nrsfm.datasets._remote import fetch_file
 CONTENT = bytes(range(256)) * 100
 PHOTOS = ["i000qa-fn", "i007rb-mg", "i201ve-m1", "ir000qa-fn"]
 TAGS = ["0", "22", "2", "0"]
+MUCT_POINTS = [f"{axis}{j:02d}" for j in range(7) for axis in "xy"]
 
 
 def described(content=CONTENT, url="http://256.0.0.0/thing.bin"):
@@ -83,10 +85,9 @@ def muct_file(put):
     values[0, 2:4] = 0  # not seen
     values[1, 4] = 0  # at the edge of the image
     values[2, 7] = 3.5
-    header = ["name", "tag", *(f"{a}{j:02d}" for j in range(7) for a in "xy")]
-    rows = zip(PHOTOS, TAGS, [[f"{v:g}" for v in row] for row in values], strict=True)
-    lines = [",".join([name, tag, *row]) for name, tag, row in rows]
-    content = "\n".join([",".join(header), *lines, ""]).encode()
+    table = pd.DataFrame(values, columns=MUCT_POINTS)
+    table = pd.concat([pd.DataFrame({"name": PHOTOS, "tag": TAGS}), table], axis=1)
+    content = table.to_csv(index=False, float_format="%g").encode()
     put(_muct, content, "http://127.0.0.1/muct76-opencv.csv")
     return values
 
@@ -130,20 +131,14 @@ class TestDownloads:
         assert fetch_file(*remote, folder) == path
         assert list(folder.iterdir()) == [path]
 
-    @pytest.mark.parametrize(
-        ("answer", "reason"),
-        [
-            (b"other bytes", "does not match the known hash"),
-            (CONTENT[:-1], "does not match the known hash"),
-            (None, "404"),
-        ],
-        ids=["corrupted", "too short", "not found"],
-    )
+    @pytest.mark.parametrize("answer", [b"other bytes", CONTENT[:-1], None])
     # pooch leaves the connections of failed downloads to the garbage collector.
     @pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")
-    def test_that_fail_leave_nothing(self, tmp_path, served, answer, reason):
+    def test_that_fail_leave_nothing(self, tmp_path, served, answer):
         folder, url = served
+        reason = "404"
         if answer is not None:
+            reason = "does not match the known hash"
             (folder / "thing.bin").write_bytes(answer)
         remote = described(url=url)
         message = str(refused(reason, fetch_file, *remote, tmp_path, error=OSError))
@@ -183,17 +178,15 @@ def test_every_fetcher(fetch, tmp_path, shark_file, muct_file):
     assert max(map(len, lines)) <= 88
 
 
-class TestShark:
-    def test_order_of_the_coordinates(self, tmp_path, shark_file):
-        shark = fetch_shark(data_home=tmp_path)
-        assert_array_equal(shark.shapes, np.moveaxis(shark_file.reshape(3, 4, 5), 0, 2))
-        assert_array_equal(shark.tracks, shark.shapes[:, :, :2])
-        assert_array_equal(shark.data, shark.tracks.reshape(4, 10))
-        names = [f"{axis}_{j}" for j in range(5) for axis in "xy"]
-        assert shark.feature_names == names
-        for name in ("data", "tracks", "shapes"):
-            assert shark[name].flags.c_contiguous
-            assert shark[name].flags.writeable
+def test_order_of_the_coordinates_of_the_shark(tmp_path, shark_file):
+    shark = fetch_shark(data_home=tmp_path)
+    assert_array_equal(shark.shapes, np.moveaxis(shark_file.reshape(3, 4, 5), 0, 2))
+    assert_array_equal(shark.tracks, shark.shapes[:, :, :2])
+    assert_array_equal(shark.data, shark.tracks.reshape(4, 10))
+    assert shark.feature_names == [f"{axis}_{j}" for j in range(5) for axis in "xy"]
+    for name in ("data", "tracks", "shapes"):
+        assert shark[name].flags.c_contiguous
+        assert shark[name].flags.writeable
 
 
 class TestMuct:
@@ -204,17 +197,14 @@ class TestMuct:
         assert_array_equal(faces.data, expected)
         assert_array_equal(faces.tracks, expected.reshape(3, 7, 2))
         assert_array_equal(np.argwhere(~faces.visible), [[0, 1]])
-        names = [f"{axis}{j:02d}" for j in range(7) for axis in "xy"]
-        assert faces.feature_names == names
+        assert faces.feature_names == MUCT_POINTS
         assert faces.filename == str(tmp_path / "muct76-opencv.csv")
 
     def test_labels(self, tmp_path, muct_file):
         faces = fetch_muct(data_home=tmp_path)
-        labels = {
-            **{"names": PHOTOS[:3], "tags": TAGS[:3], "subjects": [0, 7, 201]},
-            **{"lighting": [*"qrv"], "camera": [*"abe"], "sex": [*"fmm"]},
-            "glasses": [False, True, True],
-        }
+        labels = {"names": PHOTOS[:3], "tags": TAGS[:3], "subjects": [0, 7, 201]}
+        labels |= {"lighting": [*"qrv"], "camera": [*"abe"], "sex": [*"fmm"]}
+        labels |= {"glasses": [False, True, True]}
         for name, values in labels.items():
             assert faces[name].tolist() == values
         assert_array_equal(faces.target, faces.subjects)
