@@ -27,15 +27,8 @@ from isa_nrsfm.analysis._advice import (
     gross_residuals,
     verdict,  # noqa: F401  in refusals.txt
 )
-from isa_nrsfm.analysis._diagnostics import (
-    outlier_text,
-    pose_share,
-    weak_information,
-)
-from isa_nrsfm.datasets import (
-    make_face_tracks,
-    make_nonrigid_tracks,
-)
+from isa_nrsfm.analysis._diagnostics import outlier_text, pose_share, weak_information
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.skeletons import get_skeleton
 
 TABLE = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
@@ -303,9 +296,8 @@ class TestOutliers:
 
     @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
     def test_distances_are_those_of_fits_without_the_point(self, camera):
-        faces = make_face_tracks(
-            40, camera="weak_perspective", noise=0.01, random_state=0
-        )
+        options = {"camera": "weak_perspective", "noise": 0.01, "random_state": 0}
+        faces = make_face_tracks(40, **options)
         model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
         rows = faces.tracks[:6].mT.copy()
         rows[:, :, 9] += 30.0  # beyond the noise

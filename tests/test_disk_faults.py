@@ -1,9 +1,9 @@
 """A disk that fails and a process that is stopped leave the old files, or the new."""
 
-import itertools
 import os
 import shutil
 from functools import partial
+from itertools import count, product
 
 import numpy as np
 import pandas as pd
@@ -53,7 +53,7 @@ def every_fault(folder, strike, prepare, act, stride=1):
     what was raised, what the folder held before, and the operations.
     """
     first = 1 + list(STRIKES).index(strike) % stride
-    for at in itertools.count(first, stride):
+    for at in count(first, stride):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         prepare()
@@ -74,11 +74,7 @@ def every_fault(folder, strike, prepare, act, stride=1):
 # What was there decides which operations there are, not what a strike does to them.
 @pytest.mark.parametrize(
     ("strike", "exists"),
-    slow_after(
-        1,
-        [(strike, True) for strike in STRIKES]
-        + [(strike, False) for strike in ("disk full", "killed")],
-    ),
+    slow_after(1, [*product(STRIKES, [True]), ("disk full", False), ("killed", False)]),
 )
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
@@ -291,12 +287,10 @@ class TestFit:
 
 class TestRunsThatAreMixed:
     def warned(self, succeeds, folder, landmarks, model="model.npz"):
-        model = folder / model
-        _, err = succeeds(
-            "transform", model, landmarks, "-o", folder / "new.csv", "--force"
-        )
-        export = ["export", model, "-o", folder / "new.npz", "--force"]
-        assert succeeds(*export)[1] == err
+        new = ["-o", folder / "new.csv", "--force"]
+        err = succeeds("transform", folder / model, landmarks, *new)[1]
+        new[1] = folder / "new.npz"
+        assert succeeds("export", folder / model, *new)[1] == err
         return err
 
     def test_files_of_one_run(self, succeeds, folder, landmarks):

@@ -300,13 +300,17 @@ def test_tables_keep_options_of_their_own(tmp_path):
     path = tmp_path / "a.tsv"
     names = [f"{axis}{j}" for axis in "ab" for j in range(8)]
     table = pd.DataFrame(files.planar(TRACKS), columns=names)
-    table.iloc[2, [3, 11]] = 0
+    table.iloc[2, [3, 11]] = table.iloc[4, 5] = 0
     table.insert(0, "id", [f"{i:03d}" for i in range(12)])
     table.to_csv(path, sep="\t", index=False)
     landmarks = read_landmarks(path, columns="a#,b#", missing=0)
+    # Zeros are missing on request, and in pairs.
     expected = TRACKS.copy()
-    expected[2, 3] = np.nan
+    expected[2, 3], expected[4, 5, 0] = np.nan, 0
     assert_array_equal(tracks_of(landmarks), expected)
+    expected[2, 3] = 0
+    as_written = warned("exactly", read_landmarks, path, columns="a#,b#")
+    assert_array_equal(tracks_of(as_written), expected)
     assert list(landmarks.frames["id"])[:2] == ["000", "001"]
     refused(r"a\.tsv cannot be read as table", read_landmarks, path)
 

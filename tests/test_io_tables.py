@@ -52,18 +52,6 @@ def test_landmarks_and_other_columns_are_separated():
     assert points.columns[0] == "x0"
 
 
-def test_zeros_are_missing_only_on_request_and_only_in_pairs():
-    frame = random_frame()
-    frame.loc[0, ["x1", "y1"]] = 0.0
-    frame.loc[1, "x1"] = 0.0
-    assert not landmark_table(frame).points.isna().any(axis=None)
-    points = landmark_table(frame, missing=0.0).points
-    missing = np.zeros(points.shape, dtype=bool)
-    missing[0, 2:4] = True
-    assert_array_equal(points.isna(), missing)
-    pd.testing.assert_frame_equal(landmark_table(frame, missing=0).points, points)
-
-
 def points_of(name, values):
     """Return the landmarks of a column with other values, which are real numbers."""
     points = landmark_table(random_frame().assign(**{name: values})).points

@@ -21,8 +21,7 @@ FACES = make_nonrigid_tracks(40, 30, 2, amplitude=0.2, random_state=0).tracks
 def fit(X, n_components=1, **params):
     """Fit the paper's pipeline in one step."""
     params = {"refinement": None, "isa": FastISA(n_init=1), "random_state": 0} | params
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
+    with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):
         return AffineNRSfM(n_components, **params).fit(X)
 
 
