@@ -189,15 +189,7 @@ def write_deeplabcut(path, frame, *, how="table"):
 
 
 def write_sleap(
-    path,
-    tracks,
-    *,
-    order="txnf",
-    named=True,
-    scores=None,
-    names=("a", "b"),
-    nodes=BODYPARTS,
-    edges=None,
+    path, tracks, *, order="txnf", named=True, scores=None, names=("a", "b"), edges=None
 ):
     """Write an analysis file; tracks (frame, track, node, xy), order of the axes.
 
@@ -220,23 +212,23 @@ def write_sleap(
         put("instance_scores", scores.mean(axis=2), "ft")
         occupied = ~np.isnan(tracks).all(axis=(2, 3))
         file["track_occupancy"] = occupied.astype(np.uint8)
-        file["node_names"] = np.array([name.encode() for name in nodes])
-        file["track_names"] = np.array([name.encode() for name in names])
+        file["node_names"] = np.array(BODYPARTS, dtype="S")
+        file["track_names"] = np.array(names, dtype="S")
         file["provenance"] = "{}"
         if edges is not None:
             file["edge_names"] = np.array(edges, dtype="S")
     return path
 
 
-def write_sleap_csv(path, tracks, scores, *, names=("a", "b"), nodes=BODYPARTS):
-    """Write an analysis table, with a row for each track that a frame shows."""
+def write_sleap_csv(path, tracks, scores):
+    """Write an analysis table, with a row for each of two tracks in a frame."""
     rows = []
-    for frame, track in np.argwhere(~np.isnan(tracks).all(axis=(2, 3))):
-        row = {"track": names[track], "frame_idx": frame, "instance.score": 0.5}
-        for j, node in enumerate(nodes):
+    for frame, track in np.ndindex(tracks.shape[:2]):
+        row = {"track": "ab"[track], "frame_idx": frame, "instance.score": 0.5}
+        for j, node in enumerate(BODYPARTS):
             x, y = tracks[frame, track, j]
-            score = scores[frame, track, j]
-            row |= {f"{node}.score": score, f"{node}.x": x, f"{node}.y": y}
+            row[f"{node}.score"] = scores[frame, track, j]
+            row |= {f"{node}.x": x, f"{node}.y": y}
         rows.append(row)
     return saved(path, pd.DataFrame(rows))
 
@@ -323,9 +315,9 @@ def detection(points, **further):
     return known | further | {"keypoints": {"x": x, "y": y, "visible": [0.7] * len(x)}}
 
 
-def write_yolo(folder, tracks, *thirds, after=(), size=(500, 500)):
+def write_yolo(folder, tracks, *thirds, after=()):
     """Write labels as Ultralytics does, with the third number of a point, if any."""
-    for i, points in enumerate(tracks / size):
+    for i, points in enumerate(tracks / 500):
         middle, width = (points.max(0) + points.min(0)) / 2, np.ptp(points, axis=0)
         points = [n for point in points for n in (*point, *thirds)]
         numbers = [*middle, *width, *points, *after]
@@ -346,16 +338,14 @@ def write_labelme(path, i, points):
 
 def write_imglab(path, tracks):
     """Write parts of boxes as dlib's imglab does."""
-    images = [
-        f"<image file='{i}.jpg'><box top='1' left='2' width='3' height='4'>"
-        + "".join(
-            f"<part name='{j:02}' x='{x}' y='{y}'/>" for j, (x, y) in enumerate(p)
-        )
-        + "</box></image>"
-        for i, p in enumerate(tracks)
-    ]
-    head = "<?xml version='1.0' encoding='ISO-8859-1'?>", "<dataset><images>"
-    return write_text(path, *head, *images, "</images></dataset>")
+    lines = ["<?xml version='1.0' encoding='ISO-8859-1'?>", "<dataset><images>"]
+    for i, points in enumerate(tracks):
+        lines.append(f"<image file='{i}.jpg'>")
+        lines.append("<box top='1' left='2' width='3' height='4'>")
+        for j, (x, y) in enumerate(points):
+            lines.append(f"<part name='{j:02}' x='{x}' y='{y}'/>")
+        lines.append("</box></image>")
+    return write_text(path, *lines, "</images></dataset>")
 
 
 def write_trc(path, tracks, z=0.0):
@@ -367,10 +357,8 @@ def write_trc(path, tracks, z=0.0):
     head += ["Frame#\tTime\t" + "\t\t\t".join(BODYPARTS) + "\t\t"]
     head += ["\t\t" + "\t".join(f"X{j}\tY{j}\tZ{j}" for j in range(1, J + 1))]
     spatial = np.concatenate([tracks, np.broadcast_to(z, (n, J, 1))], axis=2)
-    rows = [
-        "\t".join(map(str, [i, i / 30, *each]))
-        for i, each in enumerate(spatial.reshape(n, -1).tolist())
-    ]
+    rows = enumerate(spatial.reshape(n, -1).tolist())
+    rows = ["\t".join(map(str, [i, i / 30, *row])) for i, row in rows]
     return write_text(path, f"PathFileType\t4\t(X/Y/Z)\t{path.name}", *head, *rows)
 
 

@@ -1,5 +1,6 @@
 """Tables that are read block by block, from files or on dask, fitted as in memory."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -174,17 +175,12 @@ def test_threads_make_no_difference(tmp_path, kind):
 def test_all_methods_read_blocks(tmp_path, kind):
     X = table(0.1).copy()
     X[7] = np.nan
-    model = in_memory()
-    blocks, calls = stored(X, tmp_path, kind), [("transform",), ("reproject",)]
-    calls += [
-        ("reconstruct", camera) for camera in ("orthographic", "weak_perspective")
-    ]
-    for name, *args in [*calls, ("reconstruct",)]:
-
-        def of_table(given, name=name, args=args):
-            return getattr(model, name)(given, *args)
-
-        got, expected = in_blocks(of_table, blocks), of_table(X)
+    model, blocks = in_memory(), stored(X, tmp_path, kind)
+    methods = [model.transform, model.reproject, model.reconstruct]
+    for camera in ("orthographic", "weak_perspective"):
+        methods.append(partial(model.reconstruct, camera=camera))
+    for method in methods:
+        got, expected = in_blocks(method, blocks), method(X)
         assert type(got) is (np.ndarray if kind == "memmap" else array.Array)
         assert_allclose(np.asarray(got), expected, rtol=1e-8, atol=1e-10)
     assert np.isnan(np.asarray(in_blocks(model.transform, blocks))[7]).all()

@@ -245,10 +245,9 @@ def test_who_is_who_is_a_column_of_images_in_their_order(tmp_path, kind):
         for i, each in enumerate(who):
             person = files.openpose_person(pose=files.SCORED[i]) | {kind: [each]}
             files.write_json(path / f"cam01.{i}.json", {"people": [person]})
-    for row, each in zip(
-        content["annotations"] if kind[0] in "tn" else (), who, strict=False
-    ):
-        row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
+    else:
+        for row, each in zip(content["annotations"], who, strict=True):
+            row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
     if kind != "person_id":
         files.write_json(path, content)
     found = read_landmarks(path)
@@ -341,12 +340,9 @@ def test_labels_of_sleap_io():
     a, b = (SimpleNamespace(name=name) for name in "ab")
     seen = [labelled(TRACKS[i], track=t, score=0.9) for i, t in enumerate((a, b, a))]
     seen.append(labelled(TRACKS[3], track=None, from_predicted=seen[2]))
-    frames = [
-        SimpleNamespace(
-            video=SimpleNamespace(filename="m.mp4"), frame_idx=t, instances=i
-        )
-        for t, i in ((9, seen[2:]), (2, seen[:2]), (4, []))
-    ]
+    frames, video = [], SimpleNamespace(filename="m.mp4")
+    for at, each in ((9, seen[2:]), (2, seen[:2]), (4, [])):
+        frames.append(SimpleNamespace(video=video, frame_idx=at, instances=each))
     found = from_sleap_io(frames)
     assert list(found.frames["frame"]) == [2, 2, 4, 9]
     assert list(found.frames["individual"].fillna("")) == ["a", "b", "", ""]
@@ -426,7 +422,7 @@ def option_named(folder, table, options, pattern, advised):
 
 def test_individuals_of_a_fit_are_named_to_transform(tmp_path, fits, fails, transforms):
     tables = [table_of(f"{{part}}_{who}_{{axis}}", POINTS + 9 * who) for who in (1, 2)]
-    pd.concat(tables, axis=1).to_csv(path := tmp_path / "a.csv", index=False)
+    path = files.saved(tmp_path / "a.csv", pd.concat(tables, axis=1))
     model = fits(path, *QUICK, "1", "--individuals", "1,2").path
     told = fails("transform", model, path, "-o", tmp_path / "b.csv")
     option = re.search("in one row: (.*)", told)[1].split()
