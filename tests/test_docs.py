@@ -111,26 +111,27 @@ def run(page):
     return names
 
 
-def test_figures_of_the_readme_are_those_of_the_benchmarks():
-    page = text("docs/benchmarks/truth.md").partition("convention='frame'")[2]
-    printed = [line.split(" | ") for line in page.splitlines() if line[:2] == "| "]
-    order = {"faces": "ICT-68", "drink": "drink", "pickup": "pickup"}
-    order |= {"yoga": "yoga", "shark": "Shark", "flag": "flag"}
-    columns = [
-        next(k for k, name in enumerate(printed[0]) if name.startswith(title))
-        for title in order.values()
+def table_in(page, start, end):
+    """Return the table between two texts of a page, by its first column."""
+    lines = text(page).partition(start)[2].partition(end)[0].splitlines()
+    rows = [
+        line.strip("| ").split(" | ") for line in lines if re.match(r"\| [^-]", line)
     ]
+    return pd.DataFrame(rows[1:], columns=rows[0]).set_index("method")
+
+
+def test_figures_of_the_readme_are_those_of_the_benchmarks():
+    readme = table_in("README.md", "## How accurate", "\n## ")
+    printed = table_in("docs/benchmarks/truth.md", "convention='frame'", "\n`")
+    sets = {"faces": "ICT-68", "drink": "drink", "pickup": "pickup"}
+    sets |= {"yoga": "yoga", "shark": "Shark", "flag": "flag"}
+    assert [*readme] == [*sets]
+    columns = [next(filter(re.compile(name).match, printed)) for name in sets.values()]
     methods = ["rigid mean shape", "BMM", "Kong-Lucey"]
     methods += ["ISA2, paper's refinement", "ISA, weak perspective"]
-    lines = text("README.md").partition("## How accurate")[2].partition("\n## ")[0]
-    rows = [line.strip("| ") for line in lines.splitlines() if line[:1] == "|"]
-    table = [re.split(r" \| ", row) for row in rows]
-    assert table[0][1:] == list(order)
-    for method, row in zip(methods, table[2:], strict=True):
-        cells = next(line for line in printed if line[0] == f"| {method}")
-        expected = [100 * float(cells[k].split()[0]) for k in columns]
-        found = [float(cell.strip("*")) for cell in row[1:]]
-        np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=method)
+    expected = printed.loc[methods, columns].map(lambda cell: float(cell.split()[0]))
+    found = readme.map(lambda cell: float(cell.strip("*")))
+    np.testing.assert_allclose(found, 100 * expected, rtol=1e-12)
 
 
 def test_the_paper_cites_its_references_and_prints_what_commands_wrote():

@@ -10,6 +10,7 @@ from layers import slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
+from scenes import table_of, with_gaps
 from sklearn import config_context
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
@@ -35,16 +36,13 @@ KRYLOV = ALL | {"dense": 300}
 @made_once
 def table(missing=0.0, n_points=20, n_frames=150, outliers=False, planar=False):
     scene = make_nonrigid_tracks(n_frames, n_points, K, noise=0.01, random_state=0)
-    tracks = scene.data.reshape(n_frames, n_points, 2)
-    if missing:
-        hidden = np.random.default_rng(0).random((n_frames, n_points)) < missing
-        tracks = np.where(hidden[..., None], np.nan, tracks)
+    tracks = with_gaps(scene.tracks, missing)
     if outliers:
         rng = np.random.default_rng(1)
         wrong = rng.random((n_frames, n_points, 1)) < 0.05
         tracks = np.where(wrong, tracks + rng.normal(size=tracks.shape), tracks)
         tracks[40, 0] = 1e6  # a point that is no part of its frame
-    return (tracks.swapaxes(1, 2) if planar else tracks).reshape(n_frames, -1)
+    return table_of(tracks, "planar" if planar else "interleaved")
 
 
 def estimator(limits=ALL, tol=1.0, **params):

@@ -19,6 +19,7 @@ from landmark_files import (
     write_text,
 )
 from refusals import refusals_of, refused, warned
+from scenes import table_of
 from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -286,13 +287,12 @@ PAPER, BASELINE = AffineNRSfM(**QUICKLY, refinement=None), PseudoInverseNRSfM(1)
 @pytest.mark.parametrize("layout", ["interleaved", "planar"])
 def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
     tracks = landmarks().to_numpy().reshape(N, 12, 2)
-    expected = tracks.swapaxes(1, 2) if layout == "planar" else tracks
     estimator = clone(estimator).set_params(layout=layout)
     for X in (tracks, tracks.swapaxes(1, 2)):
         told = str(refused(r"reshape\(len\(X\), -1\)", estimator.fit, X))
         way = told.rpartition("give ")[2]
         table = eval(way, {"X": X, "np": np})
-        np.testing.assert_array_equal(table, expected.reshape(N, -1))
+        np.testing.assert_array_equal(table, table_of(tracks, layout))
     for X in (tracks[None], np.zeros((30, 12, 5))):
         refused(r"one row per frame .* got the shape .*\)$", estimator.fit, X)
 
