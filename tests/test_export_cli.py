@@ -78,14 +78,16 @@ def test_options_reach_what_is_written(export):
 
     output, _ = export("a.glb", "--names", "jaw open, smile", "--edges", "none")
     assert Read(output).mesh["extras"]["targetNames"] == ["jaw open", "smile"]
-    assert len(Read(output).mesh["primitives"]) == 1
+    assert [each["mode"] for each in Read(output).mesh["primitives"]] == [0]  # points
 
 
 def test_edges_are_pairs_of_names_or_numbers_of_points(export, tmp_path):
     for name, text in (("a.glb", "\ufeff00,01\n 01, 02\n\n"), ("b.glb", "0,1\n1,02\n")):
         (tmp_path / "edges.csv").write_text(text, encoding="utf-8")
         read = Read(export(name, "--edges", tmp_path / "edges.csv")[0])
-        assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
+        points, lines = read.mesh["primitives"]
+        assert (points["mode"], lines["mode"]) == (0, 1)
+        assert read.array(lines["indices"]).tolist() == [0, 1, 1, 2]
 
 
 def test_the_viewer_of_a_flat_object_has_affine_shapes(fits, tmp_path, rng):

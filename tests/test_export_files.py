@@ -127,16 +127,6 @@ def test_the_animation_swings_each_basis_shape_in_turn(written):
     assert np.all(np.diff(firsts) > 0)
 
 
-def test_edges_are_lines_and_none_is_points(written):
-    edges = [[0, 1], [1, 2], [5, 9]]
-    read = written(face_model(), edges=edges)
-    points, lines = read.mesh["primitives"]
-    assert [points["mode"], lines["mode"]] == [0, 1]
-    assert read.array(lines["indices"]).reshape(-1, 2).tolist() == edges
-    alone = written(face_model(), edges=None).mesh["primitives"]
-    assert [p["mode"] for p in alone] == [0]
-
-
 QUICK = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
 
 
