@@ -8,7 +8,6 @@ import subprocess
 import sys
 import warnings
 from functools import cache
-from html import unescape
 
 import numpy as np
 import pandas as pd
@@ -180,11 +179,10 @@ def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     assert_array_equal(model.alpha_, alone.fit(X).alpha_)
     assert_array_equal(model.prior.basis_, prior.basis_)
     assert found.report["prior"] == {"name": str(path), "std": [*model.prior_std_]}
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
     width = f"{100 * model.prior_std_[0]:.2g} % of the size"
-    assert f"prior {path}: the mean shape differs by {width}" in text
-    assert "studies with the same prior can be compared" in text
-    assert "Choice" not in text
+    assert f"prior {path}: the mean shape differs by {width}" in found.page
+    assert "studies with the same prior can be compared" in found.page
+    assert "Choice" not in found.page
     alpha, *_ = transforms(found.path, table)
     assert_allclose(alpha[ALPHA], model.alpha_, atol=1e-9)
     off = np.random.default_rng(0).normal(size=X.shape[1]) * 0.02 * X.std()
@@ -242,7 +240,6 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     out, model, report = found.out, found.model, found.report["model"]
     assert found.err == ""
     assert all(len(line) <= 120 for line in out.splitlines())
-    page = unescape((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert f"tried    {camera.replace('_p', ' p')} cameras: " in out
     told = "perspective: held-out points do not show it" in " ".join(out.split())
     assert told == (camera == "weak_perspective")
@@ -255,11 +252,11 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     assert report["camera_noise_ratio"] == pytest.approx(model.camera_noise_ratio_)
     assert f"GOOD  known to {100 * model.depth_uncertainty_:.2g} %;" in out
     assert (report["fit"], report["depth"]) == ("good", "good")
-    assert report["camera_meaning"][1:] in page
+    assert report["camera_meaning"][1:] in found.page
     noise, scaled = np.sqrt(model.noise_variance_), camera == "weak_perspective"
     shown = f"{100 * noise:.3g} % of the frame's size"
     shown = shown if scaled else f"{noise:.3g} in the units"
-    assert f"noise in the fit {shown}" in page
+    assert f"noise in the fit {shown}" in found.page
     fitted = np.asarray(model.reproject(X))
     expected = inverse_snr(X, fitted, scale_frames=scaled)
     assert report["inverse_snr"] == pytest.approx(expected, rel=1e-6)
@@ -296,7 +293,7 @@ def test_perspective_cameras(fits, fails, transforms, webcam, tmp_path):
     model, report, cameras = found.model, found.report["model"], found.cameras
     assert found.err == ""
     assert all(len(line) <= 120 for line in found.out.splitlines())
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = found.page
     assert "focal length 900 (given), principal point (640, 360)" in page
     assert "positions in cameras.csv: points 36 and 45 of the mean shape are" in page
     assert "mirror image in depth: the one for which perspective fits" in page
@@ -538,7 +535,7 @@ def test_a_figure_that_fails_costs_no_results(
     assert "mode_covariance" not in found.out
     assert set(report["files"]) == set(report["sha256"]) == left - {"report.json"}
     assert report["warnings"] == [warning]
-    assert warning in (folder / "report.html").read_text()
+    assert warning in found.page
 
 
 def test_figures_are_not_written_to_another_run(
