@@ -17,7 +17,6 @@ from landmark_files import saved
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
-from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, FastISA, __version__
 from isa_nrsfm.cli import main
@@ -273,16 +272,10 @@ def test_calibrated_cameras(fits, tmp_path, camera):
 @pytest.fixture
 def webcam(tmp_path):
     """Return the path of a table of faces before a webcam, and their positions."""
-    faces = make_face_tracks(24, n_components=1, random_state=0)
-    rng = np.random.RandomState(0)
-    angles = rng.uniform(-25, 25, (24, 3))
-    R = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
-    T = rng.uniform((-90, -50, 350), (90, 50, 450), (24, 3))
-    points = faces.shapes @ R.mT + T[:, None]
-    images = 900.0 * points[..., :2] / points[..., 2:] + (640.0, 360.0)
-    images += 0.2 * rng.standard_normal(images.shape)
-    table = pd.DataFrame(images.reshape(24, -1), columns=LANDMARKS)
-    return saved(tmp_path / "faces.csv", table), T
+    near = {"camera": "perspective", "focal_length": 900.0, "distance": 300.0}
+    faces = make_face_tracks(24, n_components=1, noise=0.002, **near, random_state=0)
+    table = pd.DataFrame(faces.data, columns=LANDMARKS)
+    return saved(tmp_path / "faces.csv", table), faces.positions
 
 
 def test_perspective_cameras(fits, fails, transforms, webcam, tmp_path):
