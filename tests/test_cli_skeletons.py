@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from exported_files import Read, content_of
 from fit_runs import JOINT, Results
+from landmark_files import saved
 from layers import slow_after
 from refusals import refusals_of
 
@@ -20,9 +21,8 @@ QUICK = [*"--n-components 1 --refinement none --isa fast --n-init 2".split()]
 
 def write(scene, path, names=None):
     """Write a scene as a table, whose points have numbers or names."""
-    names = scene.feature_names if names is None else names
-    pd.DataFrame(scene.data.round(3), columns=names).to_csv(path, index=False)
-    return path
+    columns = names or scene.feature_names
+    return saved(path, pd.DataFrame(scene.data.round(3), columns=columns))
 
 
 def edges_of(path):
