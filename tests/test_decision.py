@@ -47,24 +47,24 @@ def walks():
     return 300 + rng.normal(size=(80, 16, 2)).cumsum(axis=0).reshape(80, -1)
 
 
-SEED = {"camera": "weak_perspective", "random_state": 0}
 GIVEN = {"n_components": 2, "random_state": 0}
+
+
+def points(*size, **options):
+    """Return a table of points, by default of two basis shapes."""
+    return make_nonrigid_tracks(*size, **GIVEN | options).data
+
+
+ORTHOGRAPHIC, WEAK = {"camera": "orthographic"}, {"camera": "weak_perspective"}
 TABLES = {
-    "one scale": lambda: (
-        make_nonrigid_tracks(60, 16, noise=0.02, camera="orthographic", **GIVEN).data
-    ),
+    "one scale": lambda: points(60, 16, noise=0.02, **ORTHOGRAPHIC),
     "walks": walks,
-    "stretched": lambda: (
-        make_nonrigid_tracks(
-            60, 16, noise=0.005, camera="weak_perspective", **GIVEN
-        ).data
-        * np.tile([1.0, 0.5], 16)
-    ),
-    "few frames": lambda: make_nonrigid_tracks(14, 24, noise=0.02, **GIVEN).data,
-    "outliers": lambda: with_outliers(make_nonrigid_tracks(40, 14, **GIVEN).data),
+    "stretched": lambda: points(60, 16, noise=0.005, **WEAK) * np.tile([1, 0.5], 16),
+    "few frames": lambda: points(14, 24, noise=0.02),
+    "outliers": lambda: with_outliers(points(40, 14)),
     "bodies": lambda: make_body_tracks(80, random_state=0).data,
     "frontal faces": frontal,
-    "few shapes": lambda: make_nonrigid_tracks(60, 14, 1, noise=0.05, **SEED).data,
+    "few shapes": lambda: points(60, 14, n_components=1, noise=0.05, **WEAK),
 }
 
 
@@ -153,7 +153,7 @@ def test_one_scale_is_found():
 
 
 def test_one_scale_is_found_from_a_sample():
-    X = make_nonrigid_tracks(80, 16, noise=0.02, camera="orthographic", **GIVEN).data
+    X = points(80, 16, noise=0.02, **ORTHOGRAPHIC)
     sampled = with_limits(sample=40, small_table=1000)
     auto = AutoNRSfM(sampled(random_state=0), loss="linear").fit(X)
     assert auto.best_estimator_.camera == "orthographic"
@@ -170,7 +170,7 @@ def test_perspective_needs_the_size_of_images():
 
 
 def test_given_settings_are_kept():
-    X = make_nonrigid_tracks(60, 20, **GIVEN).data
+    X = points(60, 20)
     given = {"camera": "affine", "loss": "huber", "n_components": 1}
     found, model = tried(X, **given, refinement="joint", prior=None)
     assert len(found) == 1
@@ -178,7 +178,7 @@ def test_given_settings_are_kept():
 
 
 def test_is_an_estimator_of_scikit_learn():
-    X = make_nonrigid_tracks(40, 16, noise=0.01, **GIVEN).data
+    X = points(40, 16, noise=0.01)
     auto = AutoNRSfM(AffineNRSfM(random_state=0), loss="linear")
     pipeline = make_pipeline(FunctionTransformer(), clone(auto))
     alpha = pipeline.fit_transform(X)
@@ -238,7 +238,7 @@ def test_two_views_in_a_row_of_a_tracker_are_asked_about(fits, fails, tmp_path):
 
 @pytest.mark.parametrize("option", [None, "--keep-zeros"])
 def test_zeros_to_one_side_of_all_points_are_missing(fits, tmp_path, option):
-    X = make_nonrigid_tracks(40, 16, noise=0.01, **GIVEN).data
+    X = points(40, 16, noise=0.01)
     X += 0.1 - X.min()  # nearer to (0, 0) than points are spread
     X[[3, 8, 20], 4:6] = 0.0
     names = [f"{axis}_{j}" for j in range(16) for axis in "xy"]
@@ -249,7 +249,7 @@ def test_zeros_to_one_side_of_all_points_are_missing(fits, tmp_path, option):
 
 
 def test_pages_are_shown_in_notebooks(tmp_path):
-    X = make_nonrigid_tracks(30, 16, noise=0.01, **GIVEN).data
+    X = points(30, 16, noise=0.01)
     model = AffineNRSfM(2, camera="weak_perspective", random_state=0).fit(X)
     page = write_viewer(model, tmp_path / "a.html")
     assert page == (tmp_path / "a.html").read_text(encoding="utf-8")

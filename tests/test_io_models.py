@@ -74,6 +74,7 @@ TABLES = {
 pytestmark = [
     may_not_converge,
     pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined"),
+    pytest.mark.filterwarnings("ignore:no point is visible in 1 of 20"),
 ]
 
 
@@ -94,9 +95,7 @@ def fitted(tmp_path_factory):
             faces = make_face_tracks(60, n_components=2, random_state=1)
             prior = AffineNRSfM(2, camera="weak_perspective", random_state=0)
             parameters["prior"] = prior.fit(faces.data[:, :28])
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "no point is visible in 1 of 20")
-            model = AffineNRSfM(**parameters).fit(table)
+        model = AffineNRSfM(**parameters).fit(table)
         return (model.mirrored() if mirror else model), table
 
     return fit

@@ -326,8 +326,10 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
     for i in range(1, 13):
         lines.append(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}")
     path = tmp_path / "config.yaml"
-    path.write_text("\n".join([*lines, "skeleton: [[NO, 1, x]]"]))
-    assert read_skeleton(path, ["NO", "1", "x"]).curves == ((0, 1), (1, 2))
+    path.write_text("\n".join([*lines, "skeleton:\n- - NO\n  - 1\n- [1, x, NO]\n"]))
+    found = read_skeleton(path, ["NO", "1", "x"])
+    assert found.name == "config.yaml"
+    assert found.edges.tolist() == [[0, 1], [1, 2], [2, 0]]
 
 
 WIDE = landmarks(2).round(1)
