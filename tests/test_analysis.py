@@ -107,6 +107,10 @@ def least_p(trial, n_trials):
     return np.array(least)
 
 
+# Random trials with an effect, and their number
+EFFECTS = [(partial(video, n=400, effect=2.0), 20), (partial(people, effect=1.0), 40)]
+
+
 class TestAssociation:
     def test_eta_squared_is_r_squared_on_the_classes(self):
         alpha, y = related()
@@ -219,16 +223,7 @@ class TestAssociation:
         alone = least_p(lambda rng: [a[order] for a in video(rng)], n_trials=20)
         assert np.mean(alone <= 0.05) > 0.5
 
-    @pytest.mark.parametrize(
-        ("trial", "n_trials"),
-        slow_after(
-            1,
-            [
-                (partial(video, n=400, effect=2.0), 20),
-                (partial(people, effect=1.0), 40),
-            ],
-        ),
-    )
+    @pytest.mark.parametrize(("trial", "n_trials"), slow_after(1, EFFECTS))
     def test_real_effects_are_found(self, trial, n_trials):
         assert np.mean(least_p(trial, n_trials) <= 0.05) > 0.8
 
