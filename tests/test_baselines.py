@@ -331,24 +331,20 @@ sparse = partial(CompressibleNRSfM, 1)
 
 # Of the shark, shapes of rank two: no sparse dictionary is unique, and the bounds are
 # the errors of the released code of the publication.
-@pytest.mark.parametrize(
-    ("name", "model", "inverse_snr", "error"),
-    [
-        (SHARK, BlockMatrixNRSfM(1), 0.00258, 0.244),
-        (YOGA, PseudoInverseNRSfM(9), 5.04e-4, 0.611),
-        (SHARK, sparse(n_atoms=1, sparsity=1, random_state=0), 0.0118, 0.25),
-        *slow_after(
-            0,
-            [
-                (YOGA, BlockMatrixNRSfM(9), 5.32e-5, 0.0342),
-                (DRINK, BlockMatrixNRSfM(11), 1.32e-5, 0.0227),
-                (PICKUP, PseudoInverseNRSfM(11), 2.67e-4, 0.547),
-                (SHARK, sparse(n_atoms=3, random_state=0), 0.27, 1.3),
-                (SHARK, sparse(n_atoms=20, random_state=0), 1.0, 2.6),
-            ],
-        ),
-    ],
-)
+SEQUENCES = [
+    (SHARK, BlockMatrixNRSfM(1), 0.00258, 0.244),
+    (YOGA, PseudoInverseNRSfM(9), 5.04e-4, 0.611),
+    (SHARK, sparse(n_atoms=1, sparsity=1, random_state=0), 0.0118, 0.25),
+    (YOGA, BlockMatrixNRSfM(9), 5.32e-5, 0.0342),
+    (DRINK, BlockMatrixNRSfM(11), 1.32e-5, 0.0227),
+    (PICKUP, PseudoInverseNRSfM(11), 2.67e-4, 0.547),
+    (SHARK, sparse(n_atoms=3, random_state=0), 0.27, 1.3),
+    (SHARK, sparse(n_atoms=20, random_state=0), 1.0, 2.6),
+]
+OF_SEQUENCES = ("name", "model", "inverse_snr", "error")
+
+
+@pytest.mark.parametrize(OF_SEQUENCES, slow_after(3, SEQUENCES))
 def test_public_sequences(load_data, name, model, inverse_snr, error):
     data = load_data(name)
     model.fit(table_of(data["W2d"]))

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import told
+from layers import slow_after
 from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
@@ -58,14 +59,10 @@ def write_openpose(folder):
     return path, options, {"file", "frame", "person"}, [EMPTY]
 
 
-@pytest.mark.parametrize(
-    "write",
-    [
-        write_openface,
-        write_openpose,
-        pytest.param(write_mediapipe, marks=pytest.mark.slow),
-    ],
-)
+FILES = [write_openface, write_openpose, write_mediapipe]
+
+
+@pytest.mark.parametrize("write", slow_after(2, FILES))
 def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
     path, options, kept, empty = write(tmp_path)
     found = fits(path, *options, *QUICK, folder=tmp_path / "results")

@@ -220,15 +220,11 @@ def test_frames_are_those_of_the_fit(page):
     assert data["labels"] == data["categories"] == []
 
 
-@pytest.mark.parametrize(
-    ("camera", "options"),
-    [
-        *((camera, {}) for camera in ("weak_perspective", "orthographic")),
-        ("affine", {}),
-        ("affine", {"origin": "lower"}),
-        ("orthographic", {"origin": "lower"}),
-    ],
-)
+CAMERAS = ["affine", "weak_perspective", "orthographic"]
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("options", [{}, {"origin": "lower"}])
 def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
     truth, model = faces(noise=0.0), face_model(noise=0.0)
     if camera != "affine":
@@ -258,7 +254,7 @@ def test_mirror_images_and_origins_change_signs(page):
     assert_allclose(shapes_of(lower), shapes * [1, -1, -1], atol=1e-6)
 
 
-@pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
+@pytest.mark.parametrize("camera", CAMERAS)
 def test_basis_shapes_are_those_of_the_frames(page, camera):
     # The model's, or the least squares fit to Euclidean shapes of affine cameras.
     model = face_model() if camera == "affine" else calibrated_model(camera)
