@@ -91,7 +91,7 @@ def saved_again(path, suffix):
 def saved(path, frame, **options):
     """Save a table with pandas, with options of texts."""
     if path.suffix == ".parquet":
-        frame.to_parquet(path, index=False)
+        frame.to_parquet(path)
     else:
         frame.to_csv(path, index=False, **options)
     return path
