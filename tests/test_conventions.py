@@ -66,23 +66,19 @@ def run(*command):
     return done.returncode, done.stdout + done.stderr
 
 
-@pytest.mark.lint
-@pytest.mark.parametrize("command", [["check"], ["format", "--check"]], ids=" ".join)
-def test_ruff_has_no_complaints(command):
-    status, output = run("-m", "ruff", *command, *FOLDERS)
-    assert status == 0, output
+LINTERS = {
+    "ruff": ["-m", "ruff", "check", *FOLDERS],
+    "format": ["-m", "ruff", "format", "--check", *FOLDERS],
+    "mypy": ["-m", "mypy"],
+    "imports": ["-c", "from importlinter.cli import lint_imports_command as f; f()"],
+}
+LINTERS["imports"].append("--no-cache")
 
 
 @pytest.mark.lint
-def test_mypy_has_no_complaints():
-    status, output = run("-m", "mypy")
-    assert status == 0, output
-
-
-@pytest.mark.lint
-def test_imports_go_down():
-    lint = "from importlinter.cli import lint_imports_command as run; run()"
-    status, output = run("-c", lint, "--no-cache")
+@pytest.mark.parametrize("linter", LINTERS)
+def test_linters_have_no_complaints(linter):
+    status, output = run(*LINTERS[linter])
     assert status == 0, output
 
 

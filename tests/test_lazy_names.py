@@ -32,7 +32,7 @@ PACKAGES = [
 ]
 # Those that wait until a name is used; the other folders import what they hold.
 WAITING = ["isa_nrsfm", "isa_nrsfm.cli", "isa_nrsfm.export", "isa_nrsfm.io"]
-HELP = [["--version"], ["--help"], ["fit", "--help"], ["export", "--help"]]
+HELP = ["--version", "--help", "fit --help", "export --help"]
 # All that is slow to import: NumPy is the least of it.
 SLOW = {"numpy", "scipy", "sklearn", "pandas", "joblib", "matplotlib"}
 
@@ -102,16 +102,16 @@ def test_a_name_is_asked_for_once(monkeypatch):
     assert vars(isa_nrsfm)["FastISA"] is FastISA
 
 
-@pytest.mark.subprocess
-@pytest.mark.parametrize("name", WAITING)
-def test_the_import_of_a_package_waits_for_nothing(name):
-    assert not loaded_by(f"import {name}; dir({name})", EAGER_IMPORT="") & SLOW
+# Programs, and what they do not wait for
+QUICK = {f"import {name}; dir({name})": SLOW for name in WAITING}
+QUICK |= {command(*words.split()): SLOW for words in HELP}
+QUICK["import isa_nrsfm.plotting"] = {"matplotlib"}
 
 
 @pytest.mark.subprocess
-def test_matplotlib_is_imported_only_to_draw():
-    loaded = loaded_by("import isa_nrsfm.plotting", EAGER_IMPORT="")
-    assert "matplotlib" not in loaded
+@pytest.mark.parametrize("code", QUICK)
+def test_imports_and_help_wait_for_nothing(code):
+    assert not loaded_by(code, EAGER_IMPORT="") & QUICK[code]
 
 
 @pytest.mark.subprocess
@@ -153,12 +153,6 @@ def test_what_is_not_installed_is_an_error_of_the_import():
         "else:\n    raise AssertionError\n"
     )
     loaded_by(code, EAGER_IMPORT="")
-
-
-@pytest.mark.subprocess
-@pytest.mark.parametrize("arguments", HELP, ids=" ".join)
-def test_help_waits_for_nothing(arguments):
-    assert not loaded_by(command(*arguments), EAGER_IMPORT="") & SLOW
 
 
 @pytest.mark.subprocess

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import tarfile
 import tomllib
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -77,10 +77,6 @@ def test_arrays_are_fitted_with_the_core_dependencies_alone():
     code = FIT_OF_AN_ARRAY.format(blocked=blocked)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_package_says_that_it_has_types():
-    assert resources.files("isa_nrsfm").joinpath("py.typed").is_file()
 
 
 @pytest.mark.slow
