@@ -70,11 +70,6 @@ def size_weights(model, table):
     return np.full_like(weights, 1 / np.mean(1 / weights))
 
 
-@pytest.fixture(scope="module")
-def model():
-    return fitted()
-
-
 VARIANTS = [
     {},
     {"scale_frames": False},
@@ -114,9 +109,6 @@ def variants(**required):
 def only(**required):
     """Return a decorator for tests of the variants with some values of parameters."""
     return pytest.mark.parametrize("variant", variants(**required), indirect=True)
-
-
-only_joint = only(refinement=["joint"])
 
 
 @made_once
@@ -181,14 +173,13 @@ def test_attributes_have_the_documented_shapes_and_types(dtype, refinement):
     assert not hasattr(model, "feature_names_in_")
 
 
-def test_every_attribute_is_documented(model):
-    fitted = {name for name in vars(model) if name.endswith("_")}
-    fitted |= {"stability_", "stable_sets_"}  # computed when they are asked for
+def test_every_attribute_is_documented():
+    model = fitted()
+    found = {name for name in vars(model) if name.endswith("_")}
+    found |= {"stability_", "stable_sets_"}  # computed when they are asked for
     text = inspect.getdoc(type(model))
     documented = {name for name in dir(model) if f"\n{name} : " in text}
-    assert fitted <= documented
-    documented = {name for name in documented if name.endswith("_")}
-    assert documented - fitted == set()
+    assert found == {name for name in documented if name.endswith("_")}
 
 
 def scaled_matrix(model, table):
@@ -249,13 +240,13 @@ def test_mode_covariance(variant):
                 tolerance = 1e-10 * np.abs(C).max()
                 assert_allclose(C[rows, columns], expected, atol=tolerance)
         return
-    # Block k has the trace ||W P_k||^2 / 2I with P_k the projector on the subspace that
-    # the three coordinates of basis shape k span.
+    # Block k is (W Q)^T (W Q) / 2I, in other axes, for an orthonormal basis Q of the
+    # subspace that the three coordinates of basis shape k span.
     W = scaled_matrix(model, table)
     for rows, shape in zip(blocks, model.basis_, strict=True):
-        Q = np.linalg.qr(shape)[0]
-        trace = np.trace(C[rows, rows])
-        assert_allclose(trace, np.sum((W @ Q) ** 2) / len(W), rtol=1e-6)
+        motion = W @ np.linalg.qr(shape)[0]
+        expected = np.linalg.eigvalsh(motion.T @ motion / len(W))
+        assert_allclose(np.linalg.eigvalsh(C[rows, rows]), expected, rtol=1e-6)
 
 
 def test_shapes_are_centred_and_pure(variant):
@@ -296,7 +287,7 @@ def test_coefficients_have_unit_variance_and_energy_decreases(variant):
     assert 0.9 < share.sum() < 1 + 1e-9
 
 
-@only_joint
+@only(refinement=["joint"])
 def test_objective_never_rises_and_deviations_are_below_the_prior(variant):
     model, *_ = variant
     history = model.objective_history_
@@ -390,7 +381,8 @@ def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
         assert_allclose(translation[i], best[-2:], rtol=1e-9)
 
 
-def test_inverse_transform_takes_the_mean_view_by_default(model):
+def test_inverse_transform_takes_the_mean_view_by_default():
+    model = fitted()
     sizes = 1 / np.sqrt(frame_weights(tracks_of(TABLE), True))
     mean_view = np.mean(model.motion_ / sizes[:, None, None], axis=0)
     expected = mean_view * np.sqrt(np.mean(sizes**2))
@@ -524,8 +516,8 @@ def test_too_few_basis_shapes_are_better_than_none(variant):
     "changed",
     [{"layout": "planar"}, {"scale_frames": False}, {"camera": "orthographic"}],
 )
-def test_parameters_set_after_the_fit_change_nothing(changed, model):
-    model = deepcopy(model)
+def test_parameters_set_after_the_fit_change_nothing(changed):
+    model = deepcopy(fitted())
     expected = model.transform(TABLE), model.reproject(TABLE), model.score(TABLE)
     model.set_params(**changed)
     found = model.transform(TABLE), model.reproject(TABLE), model.score(TABLE)
@@ -542,11 +534,12 @@ def test_threads_work_on_new_frames_to_the_bit():
     assert alone[1] == together[1]
 
 
-def test_refinement_that_is_cut_short_says_so():
+@pytest.mark.parametrize("refinement", ["joint", "alternating"])
+def test_refinement_that_is_cut_short_says_so(refinement):
     with pytest.warns(
         ConvergenceWarning, match="converge in max_iter=1 steps"
     ) as caught:
-        model = estimator(4, max_iter=1, tol=0).fit(TABLE)
+        model = estimator(4, max_iter=1, tol=0, refinement=refinement).fit(TABLE)
     assert model.n_iter_ == 1
     assert np.isfinite(model.inverse_snr_)
     assert {warning.filename for warning in caught} == {__file__}
