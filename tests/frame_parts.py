@@ -6,8 +6,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._linalg import centred
 
 # What a fitted model has of its shapes, and of each frame.
 OF_SHAPES = ("mean_shape_", "basis_", "singular_values_", "mode_covariance_")
@@ -74,6 +75,14 @@ def fit_posterior(tracks, shapes, noise, camera="affine", **given):
 def depth_deviations(frames, *args):
     """Return the standard deviations (n, J) of depths."""
     return np.sqrt(frames.point_covariances(*args)[..., 2, 2])
+
+
+def depth_errors(model, X, depths):
+    """Return centred depths less the true ones, of the better mirror image."""
+    rotations, scales = full_rotations(model.decompose(X).motion)
+    z = np.vecdot(model.reconstruct(X), rotations[:, 2][:, None])
+    z, depths = centred(scales[:, None] * z), centred(depths)
+    return np.sign(np.sum(z * depths)) * z - depths
 
 
 def assert_same_model(got, expected):

@@ -93,6 +93,14 @@ def with_gaps(tracks, share=0.3, seed=0):
     return pairs.reshape(tracks.shape)
 
 
+def with_outliers(tracks, size, share=0.05, seed=0):
+    """Return a copy of tracks or a table with errors of this size at random points."""
+    pairs, rng = tracks.reshape(len(tracks), -1, 2).copy(), np.random.default_rng(seed)
+    wrong = rng.random(pairs.shape[:2]) < share
+    pairs[wrong] += size * rng.normal(size=(wrong.sum(), 2))
+    return pairs.reshape(tracks.shape)
+
+
 def tracks_of(table, layout="interleaved"):
     """Return the points (I, J, 2) of a table."""
     pairs = table.reshape(len(table), *((2, -1) if layout == "planar" else (-1, 2)))
@@ -129,12 +137,6 @@ def structured_motion(seed, n_frames=25, n_blocks=3, noise=0.0):
     motion = blocks.reshape(2 * n_frames, -1)
     motion = motion + noise * rng.normal(size=motion.shape)
     return StructuredMotion(M_0.reshape(-1, 3), motion, alpha, E)
-
-
-def permute_frames(W, seed):
-    """Return W with its frames, pairs of rows, in another order, and the order."""
-    order = np.random.default_rng(seed).permutation(len(W) // 2)
-    return W.reshape(len(order), 2, -1)[order].reshape(W.shape), order
 
 
 def random_rotation(seed, n=3):

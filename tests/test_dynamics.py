@@ -7,7 +7,7 @@ from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose
 from refusals import refusals_of
-from scenes import waving_scene
+from scenes import table_of, tracks_of, waving_scene, with_gaps
 from scipy.linalg import block_diag
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
@@ -225,14 +225,10 @@ def test_steps_between_cameras_move_one_to_the_other(name):
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])
 @pytest.mark.parametrize("name", slow_after(1, CAMERAS))
 def test_likelihood_of_frames_is_linearised(name, loss):
-    rng = np.random.default_rng(0)
-    scene = make_nonrigid_tracks(
-        60, 12, n_components=2, camera=name, noise=0.02, random_state=0
-    )
-    tracks = scene.data.reshape(60, 12, 2) + 50
-    tracks[rng.random((60, 12)) < 0.2] = np.nan
-    table, rows, row = tracks.reshape(60, -1), tracks.mT, 7
-    options = {"camera": name, "loss": loss, "random_state": 0}
+    scene = make_nonrigid_tracks(60, 12, 2, camera=name, noise=0.02, random_state=0)
+    table = with_gaps(scene.data + 50, 0.2)
+    tracks, row = tracks_of(table), 7
+    rows, options = tracks.mT, {"camera": name, "loss": loss, "random_state": 0}
     model = AffineNRSfM(2, **options, scale_frames=False).fit(table)
     alone, frames = model._model.linearised(rows), model._model.frames
     points = np.isfinite(tracks[row, :, 0])
@@ -268,14 +264,8 @@ def waving_model():
     rng = np.random.default_rng(0)
     tracks = waving_scene(160, 20, [0.1, 0.07])[0].tracks
     tracks += 0.15 * tracks.std() * rng.normal(size=tracks.shape)
-    tracks[rng.random(tracks.shape[:2]) < 0.4] = np.nan
-    table = tracks.reshape(160, -1)
+    table = table_of(with_gaps(tracks, 0.4))
     return AffineNRSfM(2, random_state=0, scale_frames=False).fit(table), table
-
-
-@pytest.fixture
-def waving():
-    return waving_model()
 
 
 def smoothed_waves(**options):
@@ -305,16 +295,16 @@ class TestSmooth:
         smooth = model.smooth(table).decomposition
         assert error(smooth) < 0.7 * error(model.decompose(table))
 
-    def test_ordered_frames_are_smoothed(self, waving):
-        model, table = waving
+    def test_ordered_frames_are_smoothed(self):
+        model, table = waving_model()
         found = model.smooth(table)
         assert found.time_scales.shape == (2,)
         assert (found.alpha_std < 0.8 * model.alpha_std_).mean() > 0.9
         rough = np.abs(np.diff(model.alpha_, 2, axis=0)).mean()
         assert np.abs(np.diff(found.alpha, 2, axis=0)).mean() < 0.5 * rough
 
-    def test_shuffled_frames_stay_as_they_are(self, waving):
-        model, table = waving
+    def test_shuffled_frames_stay_as_they_are(self):
+        model, table = waving_model()
         order = np.random.default_rng(1).permutation(len(table))
         found = model.smooth(table[order])
         assert found.time_scales.shape == (0,)
@@ -322,8 +312,8 @@ class TestSmooth:
         assert_allclose(found.alpha, expected.alpha, atol=1e-12)
         assert_allclose(found.alpha_std, expected.alpha_std, atol=1e-12)
 
-    def test_times_or_dates_say_where_the_gaps_are(self, waving):
-        model, table = waving
+    def test_times_or_dates_say_where_the_gaps_are(self):
+        model, table = waving_model()
         kept = np.r_[0:60, 66:160]
         blank = table.copy()
         blank[60:66] = np.nan
@@ -336,38 +326,38 @@ class TestSmooth:
         assert np.isfinite(expected.alpha).all()
         assert (expected.alpha_std[63] > expected.alpha_std[30]).all()
 
-    def test_times_with_a_zone(self, waving):
-        model, table = waving
+    def test_times_with_a_zone(self):
+        model, table = waving_model()
         hours = pd.date_range("2024-03-30", periods=60, freq="h", tz="Europe/Berlin")
         expected = model.smooth(table[:60], time=3600.0 * np.arange(60), **FEW_STEPS)
         for times in (list(hours.to_pydatetime()), pd.Series(hours), hours):
             found = model.smooth(table[:60], time=times, **FEW_STEPS)
             assert_allclose(found.alpha, expected.alpha, atol=1e-12)
 
-    def test_uneven_times_are_rounded_but_stay_apart(self, waving):
-        model, table = waving
+    def test_uneven_times_are_rounded_but_stay_apart(self):
+        model, table = waving_model()
         time = np.r_[0.0, 0.9, 2.0, 2.2, 4.3 + np.arange(156)]
         found = model.smooth(table, time=time, **FEW_STEPS)
         expected = model.smooth(table, time=np.r_[0:4, 5:161], **FEW_STEPS)
         assert_allclose(found.alpha, expected.alpha, atol=1e-12)
 
-    def test_nothing_goes_from_group_to_group(self, waving):
-        model, table = waving
+    def test_nothing_goes_from_group_to_group(self):
+        model, table = waving_model()
         groups = np.repeat(["a", "b"], 80)
         found = model.smooth(table, groups=groups, **FEW_STEPS)
         mixed = np.argsort(np.tile(np.arange(80), 2), kind="stable")
         other = model.smooth(table[mixed], groups=groups[mixed], **FEW_STEPS)
         assert_allclose(other.alpha, found.alpha[mixed], atol=1e-10)
 
-    def test_frames_of_four_points_have_no_weight(self, waving):
-        model, table = waving
+    def test_frames_of_four_points_have_no_weight(self):
+        model, table = waving_model()
         few, blank = table.copy(), table.copy()
         few.reshape(160, 20, 2)[50, 4:], blank[50] = np.nan, np.nan
         found, expected = (model.smooth(X, **FEW_STEPS).alpha for X in (few, blank))
         assert_allclose(found, expected, atol=1e-12)
 
-    def test_groups_without_points_have_no_coefficients(self, waving):
-        model, table = waving
+    def test_groups_without_points_have_no_coefficients(self):
+        model, table = waving_model()
         groups = np.repeat([0, 1], [120, 40])
         unseen = np.where(groups[:, None] == 1, np.nan, table)
         found = model.smooth(unseen, groups=groups, **FEW_STEPS)
@@ -375,8 +365,8 @@ class TestSmooth:
         assert_allclose(np.isnan(found.alpha).any(axis=1), groups == 1)
 
     @pytest.mark.parametrize("n_seen", [0, 1])
-    def test_too_few_frames_stay_as_they_are(self, waving, n_seen):
-        model, table = waving
+    def test_too_few_frames_stay_as_they_are(self, n_seen):
+        model, table = waving_model()
         few = np.where(np.arange(4)[:, None] < n_seen, table[:4], np.nan)
         found = model.smooth(few)
         assert found.time_scales.shape == (0,)

@@ -10,6 +10,7 @@ from frame_parts import OF_FRAMES
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refusals_of, warned
+from scenes import with_gaps, with_outliers
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
@@ -65,7 +66,7 @@ def gross_scene(seed, size=0.0):
     minima of the loss and end in the wrong one (1.7 times the error is reached).
     """
     made = scene(seed, n_frames=120, n_points=60)
-    X = with_outliers(made, seed, size=size) if size else made.data
+    X = with_outliers(made.data, size * made.data.std(), seed=seed)
     fitted = estimator().fit(X)
     return made, X, fitted, error(fitted, X, made.shapes)
 
@@ -78,14 +79,9 @@ def frames_with_outliers(n_frames=12):
 
     There the loss has many minima, and rounding errors would decide between them.
     """
-    rng = np.random.default_rng(0)
-    options = {"noise": 1e-5, "random_state": 0}
-    X = make_nonrigid_tracks(26, 10, 1, **options).data
-    Y = np.resize(X, (n_frames, 20)).copy()
-    wrong = rng.random((n_frames, 10)) < 0.2
-    Y.reshape(n_frames, 10, 2)[wrong] += 3 * X.std() * rng.normal(size=(wrong.sum(), 2))
-    Y.reshape(n_frames, 10, 2)[rng.random((n_frames, 10)) < 0.05] = np.nan
-    return X, Y
+    X = make_nonrigid_tracks(26, 10, 1, noise=1e-5, random_state=0).data
+    Y = with_outliers(np.resize(X, (n_frames, 20)), 3 * X.std(), 0.2)
+    return X, with_gaps(Y, 0.05, 1)
 
 
 @pytest.mark.parametrize(
@@ -119,8 +115,7 @@ def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
 @EACH_LOSS
 def test_frames_that_the_model_does_not_explain_have_finite_fits(loss):
     """Without noise, the weights of their points fall until no camera is left."""
-    X = make_nonrigid_tracks(7, 7, 1, random_state=14).data.copy()
-    X.reshape(7, 7, 2)[np.random.default_rng(14).random((7, 7)) < 0.07] = np.nan
+    X = with_gaps(make_nonrigid_tracks(7, 7, 1, random_state=14).data, 0.07, 14)
     model = AffineNRSfM(1, loss=loss, random_state=0).fit(X)
     for fitted in (model.alpha_, model.alpha_std_, model.motion_, model.transform(X)):
         assert np.isfinite(fitted).all()
@@ -343,17 +338,6 @@ def test_shapes_of_tables_with_missing_points(seed):
         error(estimator().fit(each.data), each.data, each.shapes) for each in tables
     )
     assert holed < 1.4 * complete
-
-
-def with_outliers(made, seed, share=0.05, size=1.0):
-    """Return the table with gross errors of some points, as large as the frame."""
-    rng = np.random.default_rng(seed)
-    tracks = made.tracks.copy()
-    hit = rng.random(tracks.shape[:2]) < share
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
-    tracks += np.where(hit[..., None], size * sizes * rng.normal(size=tracks.shape), 0)
-    return tracks.reshape(len(tracks), -1)
 
 
 @pytest.mark.slow

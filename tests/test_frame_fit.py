@@ -6,18 +6,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from frame_parts import depth_deviations, fit_posterior
+from frame_parts import depth_deviations, depth_errors, fit_posterior
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, warned
-from scenes import with_gaps
+from scenes import random_scene, with_gaps
 from scipy.spatial.transform import Rotation
 
-from benchmarks.depth import animal
+from benchmarks.depth import animal, seen
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
-    compose,
     distances,
     full_rotations,
     project,
@@ -35,6 +34,7 @@ from isa_nrsfm._joint.uncertainty import (
     neighbours,
     shape_information,
 )
+from isa_nrsfm._linalg import centred
 from isa_nrsfm._parameters import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 from isa_nrsfm._tables import FrameBlocks
@@ -47,16 +47,6 @@ from isa_nrsfm.plotting import BasisShapeDisplay
 AS_USERS = ["error_steps"]
 
 
-def orthogonal_shapes(seed, n_components=2, n_points=20):
-    """Return a mean shape and basis shapes with ``B_k B_l^T = 0``, all centred."""
-    rng = np.random.default_rng(seed)
-    rows = rng.normal(size=(3 * n_components + 3, n_points))
-    rows -= rows.mean(axis=1, keepdims=True)
-    white = np.linalg.qr(rows.T)[0].T.reshape(n_components + 1, 3, n_points)
-    shapes = rng.normal(size=(n_components + 1, 3, 3)) @ white
-    return shapes[0].T, shapes[1:].mT
-
-
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
 GAPS = pytest.mark.parametrize("missing", [0.0, 0.3])
 EACH_LOSS = pytest.mark.parametrize("loss", slow_after(1, LOSSES[:0:-1]))
@@ -65,27 +55,21 @@ EACH_LOSS = pytest.mark.parametrize("loss", slow_after(1, LOSSES[:0:-1]))
 NOISE = 0.05
 
 
-def posterior_frames(seed, loss="linear"):
-    """Return a model of frames, and tracks of frames of size about one."""
-    rng = np.random.default_rng(seed)
-    mean_shape, basis = orthogonal_shapes(seed)
-    mean_shape, basis = np.sqrt(20) * mean_shape, 0.3 * np.sqrt(20) * basis
-    motion = np.eye(2, 3) + 0.3 * rng.normal(size=(12, 2, 3))
-    shapes = compose(mean_shape, basis, rng.normal(size=(12, 2)))
-    tracks = project(shapes, motion, rng.normal(size=(12, 2)))
-    tracks = tracks + NOISE * rng.normal(size=tracks.shape)
-    shapes = np.concatenate([mean_shape[None], basis]).mT
+def posterior_frames(loss="linear"):
+    """Return a model of frames, and tracks."""
+    scene = random_scene(0, 12, n_components=2, noise=NOISE)
     # Frames with an outlier have several minima: as the estimator does, start from more
     # places than zero.
     starts = np.random.default_rng(0).normal(size=(8, 2))
-    return FrameModel(shapes, NOISE**2, starts, loss, FrameMap.identity(2)), tracks
+    given = scene.shapes, NOISE**2, starts, loss, FrameMap.identity(2)
+    return FrameModel(*given), scene.tracks
 
 
 class TestFrameModel:
     @CAMERA
     @GAPS
     def test_fit_is_that_of_frames_of_size_one(self, camera, missing):
-        frames, tracks = posterior_frames(0)
+        frames, tracks = posterior_frames()
         frames, tracks = replace(frames, camera=camera), with_gaps(tracks, missing)
         sizes = np.linspace(0.5, 200.0, len(tracks))
         rows = (tracks * sizes[:, None, None]).mT
@@ -102,7 +86,7 @@ class TestFrameModel:
         assert_allclose(fitted.motion, motion, atol=1e-8 * np.abs(motion).max())
 
     def test_errors_of_shapes_lower_the_precision_of_the_images(self):
-        frames, tracks = posterior_frames(0)
+        frames, tracks = posterior_frames()
         rows, sizes = tracks.mT, np.ones(len(tracks))
         alone = frames.fit(rows, sizes, True, None)
         certainty = DepthCertainty(images=(1.5, 0.2))
@@ -118,7 +102,7 @@ class TestFrameModel:
     @GAPS
     @EACH_LOSS
     def test_weights_of_a_robust_loss_agree_with_the_fit(self, loss, missing):
-        frames, tracks = posterior_frames(0, loss)
+        frames, tracks = posterior_frames(loss)
         tracks = with_gaps(tracks, missing)
         tracks[:, 7] += 2.0
         fitted = frames.posterior(tracks.mT)
@@ -136,7 +120,7 @@ class TestFrameModel:
 
     @EACH_LOSS
     def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
-        frames, tracks = posterior_frames(0, loss)
+        frames, tracks = posterior_frames(loss)
         tracks[:, 7] = np.nan
         expected = frames.posterior(tracks.mT)
         for far in [1e3, 1e8, 1e16, 2e153]:
@@ -148,7 +132,7 @@ class TestFrameModel:
     @EACH_LOSS
     def test_points_far_from_the_others_count_where_these_tell_too_little(self, loss):
         # Three points near each other, and three far: no camera without the far ones.
-        frames, tracks = posterior_frames(0, loss)
+        frames, tracks = posterior_frames(loss)
         mean_shape = frames.shapes[0].T.copy()
         mean_shape[:6] *= 1e-3
         mean_shape -= mean_shape.mean(axis=0)
@@ -174,7 +158,7 @@ class TestDepthDeviations:
     @pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
     @GAPS
     def test_without_certainty_are_those_of_the_frame(self, camera, missing):
-        frames, tracks = posterior_frames(0)
+        frames, tracks = posterior_frames()
         certainty = DepthCertainty(residual=RESIDUAL)
         frames = replace(frames, camera=camera, certainty=certainty)
         tracks = with_gaps(tracks, missing)
@@ -205,7 +189,7 @@ class TestDepthDeviations:
             assert_allclose(found[i], expected, rtol=1e-5)
 
     def test_variances_of_points_grow_with_the_leverage_of_the_frame(self):
-        frames, tracks = posterior_frames(0)
+        frames, tracks = posterior_frames()
         frames = replace(frames, camera="weak_perspective")
         sizes = np.linspace(1.0, 2.0, len(tracks))
         rows = (sizes[:, None, None] * tracks).mT
@@ -231,33 +215,12 @@ def test_information_on_the_shapes(rng):
     assert_allclose(found, information, rtol=1e-12, atol=1e-12)
 
 
-def faces_turned_by(degrees, seed=0, n_frames=60, noise=0.01, missing=0.0):
+def faces_turned_by(degrees, n_frames=60):
     """Return a table of faces whose rotation vectors have this spread, and the truth.
 
     The truth are points in the axes of the camera, in pixels, and rotations.
     """
-    rng = np.random.default_rng(seed)
-    shapes = make_face_tracks(n_frames, random_state=seed).shapes
-    shapes = shapes - shapes.mean(axis=1, keepdims=True)
-    vectors = np.radians(degrees) * rng.normal(size=(n_frames, 3)) * [0.7, 1.0, 0.5]
-    rotations = Rotation.from_rotvec(np.clip(vectors, -1.4, 1.4)).as_matrix()
-    points = shapes @ rotations.mT
-    points *= np.exp(0.2 * rng.normal(size=(n_frames, 1, 1)))
-    tracks = points[:, :, :2]
-    size = np.sqrt(np.mean(tracks**2, axis=(1, 2), keepdims=True))
-    tracks = tracks + noise * size * rng.normal(size=tracks.shape)
-    tracks[rng.random(tracks.shape[:2]) < missing] = np.nan
-    return tracks.reshape(n_frames, -1), points, rotations
-
-
-def animal_seen_from_the_side(n_frames=150, noise=1.0):
-    """Return a table of a walking animal of 18 points, and points in camera axes."""
-    rng = np.random.default_rng(0)
-    vectors = np.radians(3) * rng.normal(size=(n_frames, 1)) * [0, 1, 0]
-    yaw = Rotation.from_rotvec(vectors).as_matrix()
-    points = animal(n_frames, rng) @ yaw.mT
-    tracks = points[:, :, :2] + noise * rng.normal(size=(*points.shape[:2], 2))
-    return tracks.reshape(n_frames, -1), points
+    return seen(make_face_tracks(n_frames, random_state=0).shapes, degrees, 0)
 
 
 def fitted(X, n_components=3, camera="weak_perspective", **options):
@@ -267,19 +230,10 @@ def fitted(X, n_components=3, camera="weak_perspective", **options):
         return model.fit(X)
 
 
-def depths_of(model, X):
-    """Return depths of the points (n_frames, n_points) in the units of the table."""
-    z = np.einsum("ijc,ic->ij", model.reconstruct(X), model.rotations_[:, 2])
-    z = model.scales_[:, None] * z
-    return z - z.mean(axis=1, keepdims=True)
-
-
 def error_of_depths(model, X, points):
-    """Return depths less the true ones, of the better mirror image, and their ratio."""
-    truth = points[:, :, 2] - points[:, :, 2].mean(axis=1, keepdims=True)
-    z = depths_of(model, X)
-    off = np.sign(np.sum(z * truth)) * z - truth
-    return off, np.sqrt(np.sum(off**2) / np.sum(truth**2))
+    """Return errors of depths, and their size relative to the depths."""
+    off = depth_errors(model, X, points[:, :, 2])
+    return off, np.linalg.norm(off) / np.linalg.norm(centred(points[:, :, 2]))
 
 
 @pytest.fixture(scope="module")
@@ -357,7 +311,7 @@ class TestFrontalFaces:
 
     def test_a_model_of_turned_faces_determines_them(self, turned):
         model = turned[3]
-        X, _, rotations = faces_turned_by(2, seed=0)
+        X, _, rotations = faces_turned_by(2)
         poses = frame_poses(model, X)
         yaw = np.degrees(Rotation.from_matrix(rotations).as_rotvec()[:, 1])
         assert np.isfinite(poses.yaw).all()
@@ -374,7 +328,7 @@ class TestTurnedFaces:
     def test_deviations_of_depths_are_the_errors(self, turned, missing):
         X, points, _, model = turned
         if missing:
-            X, points, _ = faces_turned_by(20, missing=missing)
+            X = with_gaps(X, missing)
             model = fitted(X)
         shapes, deviation = model.reconstruct(X, return_std=True)
         assert_allclose(shapes, model.reconstruct(X))
@@ -421,7 +375,10 @@ def of_consensus(points=None):
 
 
 def test_depth_of_an_animal_seen_from_the_side_is_withheld():
-    X, points = animal_seen_from_the_side(n_frames=50)
+    rng = np.random.default_rng(0)
+    yaw = Rotation.from_euler("y", 3 * rng.normal(size=(50, 1)), degrees=True)
+    points = animal(50, rng) @ yaw.as_matrix().mT
+    X = (points[:, :, :2] + rng.normal(size=(50, 18, 2))).reshape(50, -1)
     model = AffineNRSfM(4, camera="weak_perspective", random_state=0)
     with pytest.warns(UserWarning, match="deformation explains the images as well"):
         model.fit(X)

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from frame_parts import assert_calibrated
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_cameras, random_rotation
@@ -211,13 +212,8 @@ class TestCalibratedCameras:
         assert_allclose(result.images(), fit.images(), atol=1e-10)
         size = np.linalg.norm(space, axis=0)
         assert_allclose(space @ space.T, size[0] ** 2 * np.eye(3), atol=1e-10)
-        gram = result.motion @ result.motion.swapaxes(1, 2)
-        scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
-        unit_gram = np.broadcast_to(np.eye(2), gram.shape)
-        assert_allclose(gram / scale, unit_gram, atol=1e-10)
+        assert_calibrated(size[0] * result.motion, camera, 1e-10)
         assert_frontal(result)
-        if camera == "orthographic":
-            assert_allclose(scale, 1 / size[0] ** 2, rtol=1e-10)
         if unit is None:
             assert np.mean(result.shapes[0] ** 2) == pytest.approx(1.0)
         else:

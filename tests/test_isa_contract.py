@@ -168,12 +168,14 @@ class TestOptimality:
         G = -0.5 / np.sqrt(u + 0.1) * Y @ Y.T / 3000
         assert np.linalg.norm(G - G.T) < 1e-5 * np.linalg.norm(G)
 
-    def test_likelihood_is_that_of_the_sources(self):
-        signals = few_samples()
-        isa = FastISA(n_init=4, random_state=0).fit(signals)
-        u = np.sum(isa.transform(signals).reshape(68, 9, 3) ** 2, axis=2)
+    @pytest.mark.parametrize("kind", [FastISA, PooledFastICA])
+    def test_likelihood_is_that_of_the_sources(self, kind):
+        signals = spherical_sources(0, 300, 3)
+        isa = kind(n_init=4, random_state=0).fit(signals)
+        u = np.sum(isa.transform(signals).reshape(300, 3, 3) ** 2, axis=2)
         expected = -np.sqrt(u + 0.1).mean(axis=0).sum()
-        assert_allclose(isa.log_likelihood_, expected)
+        found = isa.log_likelihood_ if kind is FastISA else isa.criteria_.max()
+        assert_allclose(found, expected)
 
     def test_largest_likelihood_is_kept(self):
         isa = FastISA(n_init=12, random_state=0).fit(few_samples())
@@ -302,27 +304,19 @@ def pooled(factor=1.0):
     return PooledFastICA(n_init=2, random_state=0).fit(signals, covariance=factor * C)
 
 
-class TestLikelihood:
-    def test_criteria_are_likelihoods(self):
-        signals = spherical_sources(0, 300, 3)
-        isa = PooledFastICA(n_init=4, random_state=0).fit(signals)
-        u = np.sum(isa.transform(signals).reshape(300, 3, 3) ** 2, axis=2)
-        expected = -np.sqrt(u + 0.1).mean(axis=0).sum()
-        assert_allclose(isa.criteria_.max(), expected)
+@start_may_not_converge
+@pytest.mark.parametrize("seed", slow_after(3, range(8)))
+def test_likeliest_of_all_groupings(seed):
+    # So few samples that no grouping stands out.
+    signals = np.random.default_rng(seed).laplace(size=(40, 9))
+    isa = PooledFastICA(n_init=1, random_state=seed).fit(signals)
+    square = isa.transform(signals) ** 2
 
-    @start_may_not_converge
-    @pytest.mark.parametrize("seed", slow_after(3, range(8)))
-    def test_best_of_all_groupings(self, seed):
-        # So few samples that no grouping stands out.
-        signals = np.random.default_rng(seed).laplace(size=(40, 9))
-        isa = PooledFastICA(n_init=1, random_state=seed).fit(signals)
-        square = isa.transform(signals) ** 2
+    def likelihood(z):
+        u = np.stack([square[:, z == k].sum(axis=1) for k in range(3)])
+        return -np.sqrt(u + 0.1).mean(axis=1).sum()
 
-        def likelihood(z):
-            u = np.stack([square[:, z == k].sum(axis=1) for k in range(3)])
-            return -np.sqrt(u + 0.1).mean(axis=1).sum()
-
-        assert_allclose(likelihood(IN_ORDER), max(map(likelihood, GROUPINGS)))
+    assert_allclose(likelihood(IN_ORDER), max(map(likelihood, GROUPINGS)))
 
 
 class TestComponents:

@@ -11,7 +11,7 @@ from layers import may_not_converge, slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from scenes import random_scene, with_gaps
+from scenes import random_scene, table_of, with_gaps, with_outliers
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
@@ -60,10 +60,6 @@ def random_table(camera="weak_perspective", seed=0, deviation=DEVIATION, **optio
     truth = make_nonrigid_tracks(camera=camera, random_state=seed, **options)
     unit = camera == "orthographic"
     return noisy(truth.clean, deviation, seed, unit), truth.shapes
-
-
-def table_of(tracks):
-    return tracks.reshape(len(tracks), -1)
 
 
 def fitted(tracks, n_components=2, kind=AffineNRSfM, **params):
@@ -268,10 +264,7 @@ class TestRobustLoss:
     @pytest.mark.parametrize("loss", slow_after(1, LOSSES[:0:-1]))
     def test_tables_without_noise(self, loss):
         tracks, truth = random_table(deviation=0.0)
-        rng = np.random.default_rng(5)
-        where = rng.random(tracks.shape[:2]) < 0.05
-        moved = tracks.copy()
-        moved[where] += 2.0 * rng.normal(size=(where.sum(), 2))
+        moved = with_outliers(tracks, 2.0, seed=5)
         assert error_of(fitted(moved, loss=loss), tracks, truth) < 1e-3
 
     def test_tables_of_more_frames_than_settle_the_weights(self):

@@ -8,6 +8,7 @@ import pytest
 from layers import slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
+from scenes import with_gaps, with_outliers
 from scipy.spatial.transform import Rotation
 from sklearn import config_context
 
@@ -171,15 +172,11 @@ def test_a_camera_that_turns_about_its_centre(noisy):
 
 @pytest.mark.slow
 def test_focal_length_is_estimated_where_points_are_missing(noisy):
-    X, S = noisy.X, noisy.S
-    rng = np.random.RandomState(0)
-    holes = X.reshape(len(X), -1, 2).copy()
-    holes[rng.uniform(size=holes.shape[:2]) < 0.15] = np.nan
-    holes = holes.reshape(X.shape)
+    holes = with_gaps(noisy.X, 0.15)
     model = fitted(holes, focal_length=None)
     assert abs(model.focal_length_ / F - 1) < 0.03
     assert abs(model.focal_length_ - F) < 3 * model.focal_length_std_ < 0.1 * F
-    assert frame_error(model.reconstruct(holes), S) < 0.012
+    assert frame_error(model.reconstruct(holes), noisy.S) < 0.012
     assert np.isfinite(model.reproject(holes)).all()
     assert_array_equal(model.transform(holes), model.alpha_)
 
@@ -323,14 +320,9 @@ def test_a_camera_that_turns_about_its_axis_turns_the_axes(far):
 
 @pytest.mark.slow
 def test_outliers(noisy):
-    X, S = noisy.X, noisy.S
-    wrong = X.reshape(len(X), -1, 2).copy()
-    rng = np.random.RandomState(3)
-    where = rng.uniform(size=wrong.shape[:2]) < 0.03
-    wrong[where] += 400 * rng.standard_normal((where.sum(), 2))
-    wrong = wrong.reshape(X.shape)
+    wrong = with_outliers(noisy.X, 400, 0.03, seed=3)
     model = fitted(wrong, loss="cauchy")
-    assert frame_error(model.reconstruct(wrong), S) < 0.02
+    assert frame_error(model.reconstruct(wrong), noisy.S) < 0.02
 
 
 @pytest.mark.slow

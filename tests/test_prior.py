@@ -8,11 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from frame_parts import depth_errors
 from layers import slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
-from scenes import with_gaps
+from scenes import with_gaps, with_outliers
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.frozen import FrozenEstimator
@@ -147,10 +148,8 @@ def test_accuracy(degrees):
     reached = error(model, table.S, table.X)
     assert reached < 0.6 * of_prior
     assert reached < (0.8 if degrees == 3 else 1.2) * without
-    z = np.vecdot(model.reconstruct(table.X), model.rotations_[:, 2][:, None])
-    z = model.scales_[:, None] * z
-    square = min(np.mean((sign * z - table.depths) ** 2) for sign in (1, -1))
-    off = np.sqrt(square / np.mean(table.depths**2))
+    errors = depth_errors(model, table.X, table.depths)
+    off = np.linalg.norm(errors) / np.linalg.norm(table.depths)
     assert off / 3 < model.depth_uncertainty_ < 3 * off
     assert 0.03 < model.prior_std_[0] < 0.1
     assert_allclose(model.basis_, prior.basis_, atol=1e-12)
@@ -238,12 +237,8 @@ def test_deviations_have_the_width_of_the_prior_without_a_jackknife(turned, tmp_
 
 @pytest.mark.parametrize("loss", slow_after(1, ["cauchy", "huber"]))
 def test_outliers(frontal, loss):
-    rng = np.random.default_rng(3)
-    X = frontal.X.reshape(len(frontal.X), -1, 2).copy()
-    wrong = rng.random(X.shape[:2]) < 0.05
-    X[wrong] += 100 * rng.normal(size=(wrong.sum(), 2))
-    X[:, 5] = np.nan
-    X = X.reshape(frontal.X.shape)
+    X = with_outliers(frontal.X, 100, seed=3)
+    X[:, 10:12] = np.nan
     model = fitted(X, frontal.prior, loss=loss)
     assert error(model, frontal.S, frontal.X) < 1.5 * frontal.error
     assert model.prior_std_ == pytest.approx(frontal.model.prior_std_, rel=0.2)
@@ -332,19 +327,13 @@ def test_the_prior_of_real_photos_from_five_cameras(load_data):
 # --- other objects and images ---------------------------------------------------------
 
 
-def stated_ratio(model, table):
-    """Return the error of depths over its standard deviation."""
-    S, deviations = model.reconstruct(table.X, return_std=True)
-    z = model.scales_[:, None] * np.vecdot(S, model.rotations_[:, 2][:, None])
-    off = min((s * z - table.depths for s in (1, -1)), key=lambda x: np.sum(x**2))
-    return np.sqrt(np.mean((off / (model.scales_[:, None] * deviations)) ** 2))
-
-
 @pytest.mark.parametrize(("degrees", "factor"), slow_after(1, [(4, 0.7), (4, 1.4)]))
 def test_objects_of_other_depth(turned, degrees, factor):
     table = study(1, 40, degrees, change=0.04, depth=factor)
     model = fitted(table.X, turned.model, Thorough)
-    assert 0.4 < stated_ratio(model, table) < 2.5
+    stated = model.scales_[:, None] * model.reconstruct(table.X, return_std=True)[1]
+    off = depth_errors(model, table.X, table.depths)
+    assert 0.4 < np.sqrt(np.mean((off / stated) ** 2)) < 2.5
 
 
 def faces(n_frames=30, degrees=10, depth=1):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose
-from scipy.spatial.transform import Rotation
 
+from benchmarks.depth import rotation_ratio
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.metrics import mean_shape_error_3d
 
@@ -93,15 +93,6 @@ def test_true_shapes(fits, kind):
 def test_deviations_of_rotations_are_the_errors(fits, load_data, kind):
     X, _, model = fits(kind)
     true = load_data("ict_bu3dfe_like_68")["R"][:: 228 // len(X)]
-    errors = []
-    for mirror in (np.eye(3), np.diag([1.0, 1.0, -1.0])):
-        rotations = mirror @ model.rotations_ @ mirror
-        U, _, Vt = np.linalg.svd(np.einsum("iab,iac->bc", true, rotations))
-        common = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-        off = Rotation.from_matrix((true @ common).swapaxes(1, 2) @ rotations)
-        errors.append(off.as_rotvec() @ mirror)
-    w = min(errors, key=np.linalg.norm)
-    precision = np.linalg.inv(model.rotation_covariance(X))
-    ratio = np.sqrt(np.einsum("ia,iab,ib->i", w, precision, w).mean() / 3)
+    ratio, _ = rotation_ratio(model, X, true)
     # A few steps, as in these tests, overstate them by up to two. 100 give .62 to .75.
     assert 0.45 < ratio < 1.25
