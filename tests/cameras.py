@@ -14,9 +14,9 @@ def affinity(rng, *stretch):
     return left @ np.diag(stretch or [0.5, 1.0, 2.0]) @ right
 
 
-def weak_perspective(rng, n_frames=30, scales=None):
-    scales = rng.uniform(1, 5, n_frames) if scales is None else scales
-    return np.asarray(scales)[:, None, None] * rotations(rng, n_frames)[:, :2]
+def weak_perspective(rng, n_frames=30):
+    scales = rng.uniform(1, 5, (n_frames, 1, 1))
+    return scales * rotations(rng, n_frames)[:, :2]
 
 
 def lorentz_cameras(rng, n_frames=30):

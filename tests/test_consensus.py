@@ -395,13 +395,8 @@ X, SHAPES = articulated(60, n_points=4)
 
 def consensus_fit(table=X, n_components=8, kind=AffineNRSfM, **parameters):
     """Return the consensus of a table."""
-    settings = {
-        "camera": "orthographic",
-        "refinement": "consensus",
-        "random_state": 0,
-        **parameters,
-    }
-    return kind(n_components, **settings).fit(table)
+    given = {"camera": "orthographic", "refinement": "consensus", "random_state": 0}
+    return kind(n_components, **given | parameters).fit(table)
 
 
 def in_camera(model, table):

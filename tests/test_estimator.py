@@ -594,21 +594,16 @@ class Given(BaseEstimator):
         self.rows = rows
 
     def fit(self, signals):
-        self.shape_ = signals.shape
-        self.whiteness_ = signals.T @ signals / len(signals)
         n_signals = signals.shape[1]
         self.components_ = np.eye(self.rows or n_signals, n_signals)
         return self
 
 
 def test_strategies_of_others_can_be_used():
-    model = estimator(2, isa=Given()).fit(TABLE)
-    assert model.isa_.shape_ == (N_POINTS, 6)
-    assert_allclose(model.isa_.whiteness_, np.eye(6), atol=1e-5)
-    assert model.inverse_snr_ < 0.01
-    model = estimator(2, isa=FastICA(max_iter=2000)).fit(TABLE)
-    assert isinstance(model.isa_, FastICA)
-    assert model.inverse_snr_ < 0.01
+    for isa in (Given(), FastICA(max_iter=2000)):
+        model = estimator(2, isa=isa).fit(TABLE)
+        assert type(model.isa_) is type(isa)
+        assert model.inverse_snr_ < 0.01
 
 
 def test_verbose_prints_a_line_for_each_stage(capsys):

@@ -28,6 +28,7 @@ from hypothesis.stateful import (
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
+from scenes import with_gaps
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.utils.validation import check_is_fitted
@@ -41,14 +42,47 @@ PACKAGE = str(Path(isa_nrsfm.__file__).parent)
 ESTIMATOR = inspect.getsourcefile(AffineNRSfM)
 # Coefficients have unit variance.
 ROUNDING = 1e-8
-# What a fit takes as it is, and what it refuses.
-KINDS = (
-    *("plain", "missing", "noise", "integers", "rigid", "named", "single precision"),
-    *("far", "large", "small", "empty row", "equal frames", "low rank"),
-    *("one line", "same points", "one far point"),
-    *("infinite", "odd", "text", "constant frame", "few frames", "one point missing"),
-)
-tables = st.tuples(st.sampled_from(KINDS), st.integers(0, 2**16))
+
+
+def replaced(X, place, value):
+    """Return a copy of a table with a value at a place."""
+    X = X.copy()
+    X[place] = value
+    return X
+
+
+def names_of(X):
+    return [f"{axis}_{j}" for j in range(X.shape[1] // 2) for axis in "xy"]
+
+
+# What is done to tables that a fit takes as they are, and that it refuses.
+KINDS = {
+    "plain": lambda X, rng: X,
+    "missing": lambda X, rng: with_gaps(X, 0.1, rng),
+    "noise": lambda X, rng: rng.normal(size=X.shape),
+    "integers": lambda X, rng: rng.integers(0, 3, X.shape),
+    "rigid": lambda X, rng: X[0] + 0.01 * rng.normal(size=X.shape),
+    "named": lambda X, rng: pd.DataFrame(X, columns=names_of(X)),
+    "single precision": lambda X, rng: X.astype(np.float32),
+    "far": lambda X, rng: X + 1e6,
+    "large": lambda X, rng: X * 1e100,
+    "small": lambda X, rng: X * 1e-100,
+    "empty row": lambda X, rng: replaced(X, rng.integers(len(X)), np.nan),
+    "equal frames": lambda X, rng: np.repeat(X[:1], len(X), axis=0),
+    "low rank": lambda X, rng: X,  # without noise
+    "one line": lambda X, rng: np.repeat(X[:, ::2], 2, axis=1),
+    "same points": lambda X, rng: replaced(X, np.s_[:, 2:4], X[:, :2]),
+    "one far point": lambda X, rng: replaced(
+        X, np.s_[0, :2], 10.0 ** rng.integers(2, 141)
+    ),
+    "infinite": lambda X, rng: replaced(X, (rng.integers(len(X)), 3), np.inf),
+    "odd": lambda X, rng: X[:, 1:],
+    "text": lambda X, rng: replaced(X.astype(str).astype(object), (0, 0), "nose"),
+    "constant frame": lambda X, rng: replaced(X, rng.integers(len(X)), 1.0),
+    "few frames": lambda X, rng: X,
+    "one point missing": lambda X, rng: replaced(X, np.s_[:, :2], np.nan),
+}
+tables = st.tuples(st.sampled_from([*KINDS]), st.integers(0, 2**16))
 PARAMETERS = {
     "n_components": [1, 2, 0, "auto", True],
     "refinement": ["joint", "alternating", None],
@@ -72,47 +106,7 @@ def table(kind, seed):
     noise = 0.0 if kind == "low rank" else 0.02
     seed = int(rng.integers(2**16))
     tracks = make_nonrigid_tracks(n_frames, n_points, 1, noise=noise, random_state=seed)
-    X = tracks.data
-    pairs = X.reshape(n_frames, n_points, 2)
-    match kind:
-        case "missing":
-            pairs[rng.random((n_frames, n_points)) < 0.1] = np.nan
-        case "noise":
-            X = rng.normal(size=X.shape)
-        case "integers":
-            X = rng.integers(0, 3, X.shape)
-        case "rigid" | "equal frames":
-            X = np.repeat(X[:1], n_frames, axis=0)
-            X = X + (0.01 * rng.normal(size=X.shape) if kind == "rigid" else 0.0)
-        case "named":
-            names = [f"{axis}_{j}" for j in range(n_points) for axis in "xy"]
-            X = pd.DataFrame(X, columns=names)
-        case "single precision":
-            X = X.astype(np.float32)
-        case "far":
-            X = X + 1e6
-        case "large" | "small":
-            X = X * (1e100 if kind == "large" else 1e-100)
-        case "one line":
-            pairs[..., 1] = pairs[..., 0]
-        case "same points":
-            pairs[:, 1] = pairs[:, 0]
-        case "one far point":
-            pairs[0, 0] = 10.0 ** rng.integers(2, 141)
-        case "empty row":
-            X[rng.integers(n_frames)] = np.nan
-        case "infinite":
-            X[rng.integers(n_frames), 3] = np.inf
-        case "odd":
-            X = X[:, 1:]
-        case "text":
-            X = X.astype(str).astype(object)
-            X[0, 0] = "nose"
-        case "constant frame":
-            X[rng.integers(n_frames)] = 1.0
-        case "one point missing":
-            pairs[:, 0] = np.nan
-    return X
+    return KINDS[kind](tracks.data, rng)
 
 
 @contextlib.contextmanager

@@ -70,12 +70,16 @@ def remixed(alpha, mixing):
     return c[..., 1:] / c[..., :1], c[..., 0]
 
 
-def regauged(fit, seed=1, shift=0.05, mirrored=False):
-    """Return another fit that is as good: mixed, in a space that is sheared."""
-    mixing = random_mixing(seed, len(fit.shapes), shift)
-    rng = np.random.default_rng(seed)
-    space = random_rotation(seed) + 0.3 * rng.normal(size=(3, 3))
-    space[0] *= np.sign(np.linalg.det(space)) * (-1 if mirrored else 1)
+def regauged(fit, camera="affine", shift=0.05, mirrored=False):
+    """Return another fit that is as good: mixed, in a space that is sheared.
+
+    Of calibrated cameras space is turned, and orthographic ones absorb no scales.
+    """
+    shift = 0.0 if camera == "orthographic" else shift
+    mixing, space = random_mixing(1, len(fit.shapes), shift), random_rotation(1)
+    if camera == "affine":
+        space += 0.3 * np.random.default_rng(1).normal(size=(3, 3))
+        space[0] *= np.sign(np.linalg.det(space)) * (-1 if mirrored else 1)
     alpha, scale = remixed(fit.alpha, mixing)
     motion = scale[:, None, None] * fit.motion @ np.linalg.inv(space)
     return Fit(space @ np.tensordot(mixing, fit.shapes, 1), motion, alpha)
@@ -227,13 +231,7 @@ class TestCalibratedCameras:
 
     def test_another_fit_that_is_as_good_leads_to_the_same(self, camera, independence):
         fit = calibrated(random_fit(), camera)
-        mixing = random_mixing(1, 4, shift=0.01)
-        if camera == "orthographic":
-            mixing[1:, 0] = 0.0
-        space = random_rotation(1)
-        alpha, scale = remixed(fit.alpha, mixing)
-        motion = scale[:, None, None] * fit.motion @ space.T
-        other = Fit(space @ np.tensordot(mixing, fit.shapes, 1), motion, alpha)
+        other = regauged(fit, camera, shift=0.01)
         assert_allclose(other.images(), fit.images(), atol=1e-10)
         expected, _ = canonical(fit, independence, camera)
         assert_same(canonical(other, independence, camera)[0], expected)

@@ -110,23 +110,20 @@ def test_derivatives_of_the_density(energy):
     assert_allclose(dg, slope, rtol=1e-5)
 
 
+# Samples of a kind, from normal ones
+KINDS = {
+    "gaussian": lambda y, rng: y,
+    "product": lambda y, rng: y * rng.normal(size=(len(y), 1)),
+    "student": lambda y, rng: y / np.sqrt(rng.chisquare(3, size=(len(y), 1))),
+    "laplace": lambda y, rng: y * np.sqrt(rng.exponential(size=(len(y), 1))),
+    "uniform": lambda y, rng: rng.uniform(-1.0, 1.0, y.shape),
+}
+
+
 def sources(kinds, seed, n_samples, size):
     """Return centred sources of mean square 1, one of each kind."""
     rng = np.random.default_rng(seed)
-    drawn = []
-    for kind in kinds:
-        y = rng.normal(size=(n_samples, size))
-        if kind == "product":
-            y *= rng.normal(size=(n_samples, 1))
-        elif kind == "student":
-            y /= np.sqrt(rng.chisquare(3, size=(n_samples, 1)))
-        elif kind == "laplace":
-            y *= np.sqrt(rng.exponential(size=(n_samples, 1)))
-        elif kind == "uniform":
-            y = rng.uniform(-1.0, 1.0, size=(n_samples, size))
-        else:
-            assert kind == "gaussian"
-        drawn.append(y)
+    drawn = [KINDS[kind](rng.normal(size=(n_samples, size)), rng) for kind in kinds]
     return standardise(np.stack(drawn))
 
 

@@ -110,7 +110,7 @@ class TestStrategies:
     def test_white_signals_and_covariance_over_the_images(self, faces):
         isa = run(faces, 3, Recorder()).isa_
         signals = isa.signals_
-        assert_allclose(signals.T @ signals / len(signals), np.eye(9), atol=1e-4)
+        assert_allclose(signals.T @ signals / len(signals), np.eye(9), atol=1e-5)
         assert_allclose(signals.mean(axis=0), 0, atol=1e-5)
         # What three basis shapes explain beyond the rigid shape
         S = np.linalg.svd(faces, compute_uv=False)[3:12]
