@@ -406,6 +406,11 @@ def in_camera(model, table):
     return scales[:, None, None] * turned
 
 
+def error_of(model, table, truth):
+    """Return the error of shapes in the axes of the cameras."""
+    return mean_shape_error_3d(truth, in_camera(model, table), convention="camera")
+
+
 @pytest.fixture(scope="module")
 def body():
     """Return the consensus of a body."""
@@ -489,10 +494,8 @@ class TestEstimator:
     def test_missing_points(self, body):
         """Hidden points are found, nearly as well as from the complete table."""
         table = with_gaps(X, 0.2, 1)
-        model = consensus_fit(table)
-        convention = {"convention": "camera"}
-        error = mean_shape_error_3d(SHAPES, in_camera(model, table), **convention)
-        assert error < 2 * mean_shape_error_3d(SHAPES, in_camera(body, X), **convention)
+        error = error_of(consensus_fit(table), table, SHAPES)
+        assert error < 2 * error_of(body, X, SHAPES)
 
     @pytest.mark.slow
     @pytest.mark.xfail(reason="outliers double the errors: 0.065 in place of 0.034")
@@ -563,11 +566,7 @@ def test_articulated_shapes_become_truer(seed):
     """The consensus has a smaller error than the joint fit."""
     table, truth = articulated(seed=seed)
     joint, merged = (
-        mean_shape_error_3d(
-            truth,
-            in_camera(consensus_fit(table, 20, refinement=name), table),
-            convention="camera",
-        )
+        error_of(consensus_fit(table, 20, refinement=name), table, truth)
         for name in ("joint", "consensus")
     )
     assert merged < joint
@@ -580,13 +579,8 @@ def test_tables_whose_noise_is_at_the_floor_have_groups(load_data):
     axes = np.concatenate([first, np.cross(first[:, 0], first[:, 1])[:, None]], axis=1)
     truth, table = axes @ data["S3d"].mT, data["W2d"].reshape(len(first), -1)
     joint, merged = (
-        mean_shape_error_3d(truth.mT, in_camera(model, table), convention="camera")
-        for model in (
-            AffineNRSfM(
-                "auto", camera="orthographic", refinement=name, random_state=0
-            ).fit(table)
-            for name in ("joint", "consensus")
-        )
+        error_of(consensus_fit(table, "auto", refinement=name), table, truth.mT)
+        for name in ("joint", "consensus")
     )
     assert merged < 0.8 * joint
 

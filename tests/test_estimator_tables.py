@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from layers import may_not_converge, slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import table_of
+from scenes import images, random_scene, table_of
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
@@ -125,30 +125,9 @@ def test_shark_has_one_shape_of_rank_two(load_data, n_components, refinement, is
     assert_allclose(model.inverse_snr_, one.inverse_snr_, rtol=1e-6)
 
 
-def cameras(rng, n_frames):
-    return rng.normal(size=(n_frames, 2, 3))
-
-
-def seen(shapes, motion, rng):
-    """Return the tracks of shapes, at random positions."""
-    position = rng.normal(size=(len(motion), 1, 2))
-    return shapes @ motion.mT + position
-
-
 def rigid_tracks(flat=(1, 1, 1)):
     """Return the tracks of a rigid object."""
-    rng = np.random.default_rng(0)
-    return seen(rng.normal(size=(20, 3)) * flat, cameras(rng, 40), rng)
-
-
-def bending_tracks(motion=None, flat=(1, 1, 1), noise=0.0):
-    """Return the tracks of an object with one basis shape."""
-    rng = np.random.default_rng(0)
-    shape, basis = rng.normal(size=(2, 20, 3)) * flat
-    alpha = rng.normal(size=(40, 1, 1))
-    motion = cameras(rng, 40) if motion is None else motion
-    tracks = seen(shape + 0.2 * alpha * basis, motion, rng)
-    return tracks + noise * rng.normal(size=tracks.shape)
+    return random_scene(0, 40, 20, 0, extent=flat).tracks
 
 
 FLAT = pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
@@ -257,12 +236,11 @@ def test_joint_refinement_of_duplicated_points_and_frames():
 )
 def test_joint_refinement_of_flat_objects_or_views(n_components, n_cameras, noise):
     # All frames from one place, or from two: depth is seen in part or not at all.
-    if n_cameras is None:
-        tracks, kind = bending_tracks(flat=(1, 1, 0), noise=noise), AffineNRSfM
-    else:
-        motion = cameras(np.random.default_rng(1), n_cameras)
-        motion = np.repeat(motion, 40 // n_cameras, axis=0)
-        tracks, kind = bending_tracks(motion, noise=noise), AllStarts
+    extent, kind = ((1, 1, 1), AllStarts) if n_cameras else ((1, 1, 0), AffineNRSfM)
+    scene = random_scene(0, 40, 20, 1, deformation=0.2, extent=extent)
+    which = np.repeat(np.arange(n_cameras or 40), 40 // (n_cameras or 40))
+    tracks = images(scene.shapes, scene.motion[which], scene.translation, scene.alpha)
+    tracks += noise * np.random.default_rng(1).normal(size=tracks.shape)
     model = jointly(tracks, n_components, kind=kind)
     assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 

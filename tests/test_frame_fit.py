@@ -15,17 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.depth import animal, seen
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
-    distances,
-    full_rotations,
-    project,
-)
-from isa_nrsfm._frames.models import (
-    DepthCertainty,
-    FrameMap,
-    FrameModel,
-)
+from isa_nrsfm._frames.camera_models import CAMERAS, distances, full_rotations, project
+from isa_nrsfm._frames.models import DepthCertainty, FrameMap, FrameModel
 from isa_nrsfm._joint.likelihood import extent_penalty
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.uncertainty import (

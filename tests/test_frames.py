@@ -44,13 +44,7 @@ from isa_nrsfm._frames.search import (
     frame_sums,
     frame_tracks,
 )
-from isa_nrsfm._linalg import (
-    COLUMNS,
-    ROWS,
-    frames_first,
-    frames_last,
-    unpacked,
-)
+from isa_nrsfm._linalg import COLUMNS, ROWS, frames_first, frames_last, unpacked
 from isa_nrsfm._tables import block_slices  # noqa: F401  in refusals.txt
 
 AS_USERS = ["few_frames", "widths"]

@@ -16,7 +16,7 @@ from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from refusals import refusals_of, warned
-from scenes import waving_scene
+from scenes import table_of, tracks_of, waving_scene, with_gaps
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
@@ -70,6 +70,12 @@ def fitted(camera="affine"):
     return estimator(camera=camera).fit(table.X, point_weight=table.weights)
 
 
+def without_some():
+    """Return weights of one or zero, and the table without the points of zero."""
+    holed = with_gaps(noisy().X, 0.1, 1)
+    return 1.0 * np.isfinite(holed[:, ::2]), holed
+
+
 def assert_same_fit(found, expected):
     """Compare all numbers of two fitted models to the last bit."""
     names = [name for name in vars(expected) if name.endswith("_") and name != "isa_"]
@@ -91,13 +97,8 @@ class TestMeaning:
 
     @pytest.mark.parametrize("layout", ["interleaved", "planar"])
     def test_points_of_weight_zero_are_missing(self, layout):
-        X, weights = noisy().X.copy(), np.ones((N_FRAMES, N_POINTS))
-        weights[np.random.default_rng(1).random(weights.shape) < 0.1] = 0.0
-        tracks = X.reshape(N_FRAMES, -1, 2)
-        gaps = np.where(weights[..., None] == 0, np.nan, tracks)
-        if layout == "planar":
-            tracks, gaps = tracks.swapaxes(1, 2), gaps.swapaxes(1, 2)
-        X, holed = (each.reshape(N_FRAMES, -1) for each in (tracks, gaps))
+        weights, holed = without_some()
+        X, holed = (table_of(tracks_of(each), layout) for each in (noisy().X, holed))
         expected = estimator(layout=layout).fit(holed)
         assert_same_fit(estimator(layout=layout).fit(X, point_weight=weights), expected)
         assert expected.score(X, point_weight=weights) == expected.score(holed)
@@ -230,9 +231,7 @@ class TestMethods:
 
     def test_all_methods_leave_out_points_of_weight_zero(self):
         model, X = fitted("weak_perspective"), noisy().X
-        weights = np.ones((N_FRAMES, N_POINTS))
-        weights[np.random.default_rng(1).random(weights.shape) < 0.1] = 0.0
-        holed = np.where(np.repeat(weights, 2, axis=1) > 0, X, np.nan)
+        weights, holed = without_some()
         few = {"max_iter": 2, "tol": 0.0}
         for call in (
             model.rotation_covariance,

@@ -13,7 +13,7 @@ from layers import slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
-from scenes import with_gaps, with_outliers
+from scenes import table_of, tracks_of, with_gaps, with_outliers
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.frozen import FrozenEstimator
@@ -181,7 +181,7 @@ def test_cameras_of_few_views(load_data):
 def test_invariances(frontal):
     X, model, prior = frontal.X, frontal.model, frontal.prior
     order = np.random.default_rng(0).permutation(len(X))
-    planar = X.reshape(len(X), -1, 2).swapaxes(1, 2).reshape(X.shape)
+    planar = table_of(tracks_of(X), "planar")
     same = {
         "order": (fitted(X[order], prior), order),
         "units": (fitted(1000 * X, prior), slice(None)),
@@ -483,10 +483,7 @@ def test_foreign_tables_are_warned_of_once(turned, params, other):
         X = np.roll(X, 2, axis=1)
     own = study(0, 40, 30, focal=focal).X
     if "layout" in params:
-        X, own = (
-            table.reshape(len(table), -1, 2).swapaxes(1, 2).reshape(table.shape)
-            for table in (X, own)
-        )
+        X, own = (table_of(tracks_of(table), "planar") for table in (X, own))
     model = fitted(own, **params) if params else turned.model
     for method in (model.transform, model.decompose):
         with warnings.catch_warnings(record=True, action="always") as messages:

@@ -10,11 +10,7 @@ from layers import may_not_converge, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.model_selection import (
-    GridSearchCV,
-    LeaveOneGroupOut,
-    cross_val_score,
-)
+from sklearn.model_selection import GridSearchCV, LeaveOneGroupOut, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
