@@ -3,14 +3,12 @@
 import warnings
 from itertools import product
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from layers import may_not_converge, slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from scenes import random_scene, table_of, with_gaps, with_outliers
 from scipy.spatial.transform import Rotation
 
@@ -77,18 +75,12 @@ def euclidean_error(model, tracks, truth):
     return mean_shape_error_3d(truth, shapes, convention=convention, scale=True)
 
 
-class Fit(NamedTuple):
-    tracks: NDArray
-    truth: NDArray  # (n_frames, n_points, 3)
-    model: AffineNRSfM
-
-
 @made_once
 def fit_of(camera, gaps=False, deviation=DEVIATION):
-    """Return a table of a camera model, and its fit."""
+    """Return tracks of a camera model, the true shapes, and the fit."""
     tracks, truth = random_table(camera, deviation=deviation)
     tracks = with_gaps(tracks, 0.1) if gaps else tracks
-    return Fit(tracks, truth, fitted(tracks, camera=camera))
+    return tracks, truth, fitted(tracks, camera=camera)
 
 
 @may_not_converge

@@ -1,7 +1,6 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from frame_parts import assert_calibrated
 from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
@@ -21,19 +19,16 @@ DEVIATION = 0.03
 AFFINE = CAMERAS["affine"]
 
 
-class Scene(NamedTuple):
-    tracks: NDArray  # (n_frames, n_points, 2), centred where all points are seen
-    weights: NDArray | None
-    truth: JointState
-
-
 def random_scene(noise=DEVIATION, kind="complete", camera="affine", K=2):
-    """Return a table that follows the model, and what made it."""
+    """Return tracks that follow the model, their weights, and the state that made them.
+
+    Tracks (n_frames, n_points, 2) are centred where all points are seen.
+    """
     options = {"noise": noise, "kind": kind, "camera": camera, "deformation": 0.25}
     scene = scenes.random_scene(0, 30, 18, K, **options)
     truth = JointState(scene.shapes, scene.motion, max(noise, 1e-3) ** 2)
     tracks = scene.centred if scene.weights is None else scene.tracks
-    return Scene(tracks, scene.weights, truth)
+    return SimpleNamespace(tracks=tracks, weights=scene.weights, truth=truth)
 
 
 def moved(cameras, motion, step):
