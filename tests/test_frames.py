@@ -464,14 +464,13 @@ class TestDegenerate:
         assert fits.motion.shape == (0, 2, 3)
 
 
-class TestSpecial:
-    def test_flat_shapes_have_cameras_that_are_zero_across(self):
-        scene = scenes.random_scene(0, noise=NOISE)
-        scene.shapes[:, 2] = 0
-        R = random_rotation(0)
-        for n in (4, 1):
-            fits = fit_posterior(scene.tracks, (R @ scene.shapes)[:n], NOISE**2)
-            assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
+def test_flat_shapes_have_cameras_that_are_zero_across():
+    scene = scenes.random_scene(0, noise=NOISE)
+    scene.shapes[:, 2] = 0
+    R = random_rotation(0)
+    for n in (4, 1):
+        fits = fit_posterior(scene.tracks, (R @ scene.shapes)[:n], NOISE**2)
+        assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
 
 
 def test_large_motion_needs_further_starts(load_data):

@@ -223,21 +223,20 @@ class TestCalibratedCameras:
         assert_same(canonical(other, independence, camera)[0], expected)
 
 
-class TestStandardDeviations:
-    @EACH
-    def test_are_those_of_random_coefficients(self, independence):
-        fit = random_fit()
-        frames = independent_gauge(*fit, independence)[-1]
-        rng = np.random.default_rng(3)
-        root = 0.03 * rng.normal(size=(60, 3, 3))
-        covariance = root @ root.swapaxes(1, 2)
-        _, _, got = frames.apply(fit.motion, fit.alpha, covariance)
-        n_draws = 2000
-        noise = rng.normal(size=(n_draws, 60, 3))
-        drawn = fit.alpha + np.einsum("ikl,nil->nik", root, noise)
-        results = [frames.apply(fit.motion, each, covariance) for each in drawn]
-        alpha = np.array([result[1] for result in results])
-        assert_allclose(got, alpha.std(axis=0), rtol=5 / np.sqrt(2 * n_draws))
+@EACH
+def test_standard_deviations_are_those_of_random_coefficients(independence):
+    fit = random_fit()
+    frames = independent_gauge(*fit, independence)[-1]
+    rng = np.random.default_rng(3)
+    root = 0.03 * rng.normal(size=(60, 3, 3))
+    covariance = root @ root.swapaxes(1, 2)
+    _, _, got = frames.apply(fit.motion, fit.alpha, covariance)
+    n_draws = 2000
+    noise = rng.normal(size=(n_draws, 60, 3))
+    drawn = fit.alpha + np.einsum("ikl,nil->nik", root, noise)
+    results = [frames.apply(fit.motion, each, covariance) for each in drawn]
+    alpha = np.array([result[1] for result in results])
+    assert_allclose(got, alpha.std(axis=0), rtol=5 / np.sqrt(2 * n_draws))
 
 
 class TestDegenerate:

@@ -319,15 +319,14 @@ def test_likeliest_of_all_groupings(seed):
     assert_allclose(likelihood(IN_ORDER), max(map(likelihood, GROUPINGS)))
 
 
-class TestComponents:
-    def test_runs_that_are_not_kept_do_not_warn(self):
-        # Only the run that is kept has to converge.
-        signals = spherical_sources(3, 68, 3)
-        isa = PooledFastICA(n_init=10, max_iter=60, random_state=0)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            isa.fit(signals)
-        assert bool(caught) == (isa.n_iter_ == 60)
+def test_runs_that_are_not_kept_do_not_warn():
+    # Only the run that is kept has to converge.
+    signals = spherical_sources(3, 68, 3)
+    isa = PooledFastICA(n_init=10, max_iter=60, random_state=0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        isa.fit(signals)
+    assert bool(caught) == (isa.n_iter_ == 60)
 
 
 class TestCriterion:

@@ -181,24 +181,23 @@ class TestBestStarts:
             assert camera_error(state.motion, scene.motion) < 0.2
 
 
-class TestAffineStart:
-    def test_is_the_rigid_fit(self):
-        scene = random_scene(noise=0.02)
-        paper = paper_shapes(scene.factors)
-        state = affine_start(problem_of(scene), scene.W, paper)
-        assert_array_equal(state.shapes[0], paper[0])
-        left = 0.0
-        for i, W in enumerate(scene.rows):
-            M = W @ np.linalg.pinv(paper[0])
-            assert_allclose(state.motion[i], M, atol=1e-12)
-            left += np.sum((W - M @ paper[0]) ** 2)
-        assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
-        # Basis shapes are one deviation of their coefficients.
-        for before, after in zip(paper[1:], state.shapes[1:], strict=True):
-            images = state.motion @ before
-            norms = np.sum(images**2, axis=(1, 2))
-            alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
-            assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
+def test_affine_start_is_the_rigid_fit():
+    scene = random_scene(noise=0.02)
+    paper = paper_shapes(scene.factors)
+    state = affine_start(problem_of(scene), scene.W, paper)
+    assert_array_equal(state.shapes[0], paper[0])
+    left = 0.0
+    for i, W in enumerate(scene.rows):
+        M = W @ np.linalg.pinv(paper[0])
+        assert_allclose(state.motion[i], M, atol=1e-12)
+        left += np.sum((W - M @ paper[0]) ** 2)
+    assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
+    # Basis shapes are one deviation of their coefficients.
+    for before, after in zip(paper[1:], state.shapes[1:], strict=True):
+        images = state.motion @ before
+        norms = np.sum(images**2, axis=(1, 2))
+        alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
+        assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
 
 @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])

@@ -69,30 +69,29 @@ class TestIdentities:
         assert_allclose(norms, np.linalg.svd(W, compute_uv=False)[: 3 * K + 3])
 
 
-class TestMissingRank:
-    @pytest.mark.parametrize(
-        ("rank", "K"), [(1, 1), (3, 2), (4, 2), (7, 1), (8, 2), (12, 3)]
-    )
-    def test_only_directions_above_rounding_errors_are_used(self, rank, K):
-        W = low_rank(rank, rank)
-        f = factorise(W, K)
-        used = min(rank, 3 * K + 3)
-        n_signals = 3 * max(1, -(-(used - 3) // 3))
-        assert f.signals.shape == (n_signals, 20)
-        assert f.motion.shape == (60, n_signals)
+@pytest.mark.parametrize(
+    ("rank", "K"), [(1, 1), (3, 2), (4, 2), (7, 1), (8, 2), (12, 3)]
+)
+def test_only_directions_above_rounding_errors_are_used(rank, K):
+    W = low_rank(rank, rank)
+    f = factorise(W, K)
+    used = min(rank, 3 * K + 3)
+    n_signals = 3 * max(1, -(-(used - 3) // 3))
+    assert f.signals.shape == (n_signals, 20)
+    assert f.motion.shape == (60, n_signals)
 
-        # The motion of what is added is exactly zero, the signals stay white.
-        assert_array_equal(f.motion[:, max(used - 3, 0) :], 0)
-        assert np.all(np.linalg.norm(f.motion[:, : max(used - 3, 0)], axis=0) > 0)
-        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
-        assert_allclose(f.signals @ f.signals.T / 20, np.eye(n_signals), atol=1e-12)
-        assert_allclose(f.rigid_shape @ f.signals.T, 0, atol=1e-11)
+    # The motion of what is added is exactly zero, the signals stay white.
+    assert_array_equal(f.motion[:, max(used - 3, 0) :], 0)
+    assert np.all(np.linalg.norm(f.motion[:, : max(used - 3, 0)], axis=0) > 0)
+    assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
+    assert_allclose(f.signals @ f.signals.T / 20, np.eye(n_signals), atol=1e-12)
+    assert_allclose(f.rigid_shape @ f.signals.T, 0, atol=1e-11)
 
-        expected = np.diag(np.repeat([1.0, 0.0], [min(rank, 3), max(3 - rank, 0)]))
-        assert_allclose(f.rigid_shape @ f.rigid_shape.T / 20, expected, atol=1e-12)
-        assert_array_equal(f.rigid_shape[rank:], 0)
-        if rank <= 3 * K + 3:
-            assert_allclose(approximation(f), W, atol=1e-12)
+    expected = np.diag(np.repeat([1.0, 0.0], [min(rank, 3), max(3 - rank, 0)]))
+    assert_allclose(f.rigid_shape @ f.rigid_shape.T / 20, expected, atol=1e-12)
+    assert_array_equal(f.rigid_shape[rank:], 0)
+    if rank <= 3 * K + 3:
+        assert_allclose(approximation(f), W, atol=1e-12)
 
 
 class TestOrientations:

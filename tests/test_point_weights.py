@@ -341,35 +341,32 @@ def keypoints(folder):
     return path
 
 
-class TestCommandLine:
-    QUICK = ("-k", "2", *JOINT)
-
-    def test_all_results_of_some_points_are_weighted(self, tmp_path, succeeds):
-        results = keypoints(tmp_path)
-        options = ["--weights", "confidence"]
-        options += ["--points", "without:3,7", "--fps", 25, "--std"]
-        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
-        left, found = np.delete(np.arange(N_POINTS), [3, 7]), read_landmarks(results)
-        X = found.points.to_numpy().reshape(N_FRAMES, -1, 2)[:, left]
-        X = X.reshape(N_FRAMES, -1)
-        weights = {"point_weight": found.confidence.to_numpy()[:, left]}
-        model = estimator(camera="weak_perspective").fit(X, **weights)
-        cameras = pd.read_csv(tmp_path / "out" / "cameras.csv")
-        poses = frame_poses(model, X, **weights)
-        for name in ("yaw", "roll", "pitch_std"):
-            assert_allclose(cameras[name], getattr(poses, name), atol=1e-6)
-        table = pd.read_csv(tmp_path / "out" / "alpha.csv")
-        assert_allclose(table[["alpha_1", "alpha_2"]], model.alpha_, atol=1e-6)
-        report = json.loads((tmp_path / "out" / "report.json").read_text())["model"]
-        expected = -model.score(X, **weights)
-        assert report["held_out_error"] == pytest.approx(expected, rel=1e-4)
-        smooth = model.smooth(X, time=np.arange(N_FRAMES) / 25, **weights)
-        assert_allclose(table["alpha_1_smooth"], smooth.alpha[:, 0], atol=1e-6)
-        assert_allclose(frame_poses(model).yaw, poses.yaw, atol=1e-6)
-        saved, new = tmp_path / "out" / "model.npz", tmp_path / "new.csv"
-        succeeds("transform", saved, results, *options[:2], "-o", new)
-        again = pd.read_csv(new)[["alpha_1", "alpha_2"]]
-        assert_allclose(again, model.alpha_, atol=1e-6)
+def test_all_results_of_some_points_are_weighted(tmp_path, succeeds):
+    results = keypoints(tmp_path)
+    options = ["--weights", "confidence"]
+    options += ["--points", "without:3,7", "--fps", 25, "--std"]
+    succeeds("fit", results, *options, "-o", tmp_path / "out", "-k", 2, *JOINT)
+    left, found = np.delete(np.arange(N_POINTS), [3, 7]), read_landmarks(results)
+    X = found.points.to_numpy().reshape(N_FRAMES, -1, 2)[:, left]
+    X = X.reshape(N_FRAMES, -1)
+    weights = {"point_weight": found.confidence.to_numpy()[:, left]}
+    model = estimator(camera="weak_perspective").fit(X, **weights)
+    cameras = pd.read_csv(tmp_path / "out" / "cameras.csv")
+    poses = frame_poses(model, X, **weights)
+    for name in ("yaw", "roll", "pitch_std"):
+        assert_allclose(cameras[name], getattr(poses, name), atol=1e-6)
+    table = pd.read_csv(tmp_path / "out" / "alpha.csv")
+    assert_allclose(table[["alpha_1", "alpha_2"]], model.alpha_, atol=1e-6)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())["model"]
+    expected = -model.score(X, **weights)
+    assert report["held_out_error"] == pytest.approx(expected, rel=1e-4)
+    smooth = model.smooth(X, time=np.arange(N_FRAMES) / 25, **weights)
+    assert_allclose(table["alpha_1_smooth"], smooth.alpha[:, 0], atol=1e-6)
+    assert_allclose(frame_poses(model).yaw, poses.yaw, atol=1e-6)
+    saved, new = tmp_path / "out" / "model.npz", tmp_path / "new.csv"
+    succeeds("transform", saved, results, *options[:2], "-o", new)
+    again = pd.read_csv(new)[["alpha_1", "alpha_2"]]
+    assert_allclose(again, model.alpha_, atol=1e-6)
 
 
 SCORES = {f"c_{j}": "good" if j == 3 else 1.0 for j in range(N_POINTS)}
