@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from frame_parts import depth_deviations, depth_errors, fit_posterior
-from layers import slow_after
+from layers import slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, warned
 from scenes import random_scene, with_gaps
@@ -370,7 +370,7 @@ def test_depth_of_an_animal_seen_from_the_side_is_withheld():
     yaw = Rotation.from_euler("y", 3 * rng.normal(size=(50, 1)), degrees=True)
     points = animal(50, rng) @ yaw.as_matrix().mT
     X = (points[:, :, :2] + rng.normal(size=(50, 18, 2))).reshape(50, -1)
-    model = AffineNRSfM(4, camera="weak_perspective", random_state=0)
+    model = with_limits()(4, camera="weak_perspective", random_state=0)
     with pytest.warns(UserWarning, match="deformation explains the images as well"):
         model.fit(X)
     assert error_of_depths(model, X, points)[1] > 0.5

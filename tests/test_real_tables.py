@@ -77,8 +77,11 @@ def test_stated_errors_of_calibrated_cameras(fits):
     X, _, model = fits("calibrated")
     _, depth_std = model.reconstruct(X, return_std=True)
     covariance = model.rotation_covariance(X).mean(axis=0)
-    numbers = [model.depth_uncertainty_, depth_std.mean(), *np.diag(covariance)]
-    assert_allclose(numbers, STATED_ERRORS, rtol=1e-5)
+    depths = model.depth_uncertainty_, depth_std.mean()
+    assert_allclose(depths, STATED_ERRORS[:2], rtol=1e-5)
+    # Rounding errors of processors change the variances of rotations by 0.2 %: the
+    # fits without some of the points end early.
+    assert_allclose(np.diag(covariance), STATED_ERRORS[2:], rtol=0.01)
 
 
 @pytest.mark.parametrize("kind", slow_after(2, ERRORS))

@@ -45,6 +45,7 @@ from isa_nrsfm._joint.starts import (
     other_depths,
     reversed_groups,
     steadied,
+    unfolded,
     with_prior,
 )
 from isa_nrsfm._joint.whole import (
@@ -307,8 +308,14 @@ def steadiest(
             other = problem.turned_back(lifted(motion, n), problem.cameras, refined)
             compare(other, -least_gain)
     found.sort(key=itemgetter(0))
+    best, n_found = found[0][2], len(found)
     rivals = rival_depths(problem, [(value, fit) for value, _, fit in found])
-    return found[0][2]._replace(rivals=rivals)
+    # A flat object may have relief to both sides. All choices of a side for each frame
+    # are equally likely then.
+    compare(refined(unfolded(best.state)), HOPELESS)
+    sides = [(value - 2.0 * np.log(2.0), fit) for value, _, fit in found[n_found:]]
+    rivals += rival_depths(problem, [(evidence(problem, best), best), *sides])
+    return best._replace(rivals=rivals)
 
 
 def count_components(

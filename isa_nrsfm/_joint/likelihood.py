@@ -214,7 +214,7 @@ class MarginalLikelihood(NamedTuple):
     """
 
     frames: JointFrames
-    penalty: float = 0.0
+    penalty: NDArray | float = 0.0
     extent_weight: float = 0.0
     prior: ShapePrior | None = None
     n_unknowns: float = 0.0
@@ -279,14 +279,15 @@ class MarginalLikelihood(NamedTuple):
         tiny = noise * n_seen < 1e-7 * square
         posterior = coefficient_posterior((products, noise), M, refined=tiny)
         c, alpha = posterior.c, posterior.alpha
+        penalty = np.broadcast_to(self.penalty, posterior.image_energy.T.shape).T
         value = np.sum(posterior.objective / noise + posterior.log_determinant)
-        value += self.penalty * np.sum(posterior.image_energy)
+        value += np.vdot(penalty, posterior.image_energy)
         residual = float(posterior.residual(noise).sum())
         spread = float(posterior.spread(noise).sum())
 
         # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
         moments = posterior.second_moments(noise)
-        moments[linalg.diagonal_of(moments)[1:]] += noise * self.penalty
+        moments[linalg.diagonal_of(moments)[1:]] += noise * penalty
         cameras = camera_gram(M)
         # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
         motion_curvature = products.gram.moments(moments)

@@ -318,7 +318,8 @@ def depth_certainty(
             own = widths.of_points(int(kept.sum()), most)
             likelihood = own.likelihood(part, frames.camera)
             if any_depth:
-                likelihood = likelihood._replace(precisions=image_precisions(start))
+                free = image_penalty(whole)
+                likelihood = likelihood._replace(precisions=None, penalty=free)
         else:
             penalty = part.basis_penalty(limits.basis_std)
             likelihood = MarginalLikelihood(part, penalty)
@@ -399,16 +400,15 @@ def differences(
     return float(square), turns, np.mean(off**2, axis=0)
 
 
-def image_precisions(state: JointState) -> NDArray:
-    """Return precisions (K, 3, 3) of basis shapes by their images, not their depths.
+def image_penalty(state: JointState) -> NDArray:
+    """Return factors (K,) of the prior of basis shapes by their images, not depths.
 
     A prior that limits depths would make those of other explanations less likely.
     """
     C, basis = camera_moments(state.motion), state.shapes[1:]
     energy = np.einsum("ab,kaj,kbj->k", C, basis, basis, optimize=True)
     least = OF_DISTANCES * max(np.sum(state.shapes[0] ** 2), OF_DISTANCES)
-    variances = np.maximum(energy, least) / basis[0].size
-    return C / variances[:, None, None]
+    return basis[0].size / np.maximum(energy, least) / len(state.motion)
 
 
 def neighbours(points: NDArray) -> NDArray:

@@ -185,7 +185,7 @@ def rival_depths(problem: JointProblem, fits: list[tuple[float, JointFit]]) -> f
         other = depths_of(problem, fit)
         other *= np.copysign(1.0, np.sum(other * z))
         square = np.sum((other - z) ** 2) / np.sum(z**2)
-        total += np.exp(-FAR_FRAMES * (value - best)) * square
+        total += np.exp(-FAR_FRAMES * max(value - best, 0.0)) * square
     return float(total)
 
 
