@@ -229,7 +229,7 @@ def error_of_depths(model, X, points):
 
 @pytest.fixture(scope="module")
 def frontal():
-    X, *_ = faces_turned_by(2, n_frames=80)
+    X, *_ = faces_turned_by(1, n_frames=80)
     model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
     with pytest.warns(UserWarning, match="AutoNRSfM"):
         return X, model.fit(X)

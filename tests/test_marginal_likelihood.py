@@ -55,7 +55,9 @@ def with_few_basis_shapes(scene):
     return scene, *(scene._replace(shapes=each) for each in (scene.shapes[:1], zeros))
 
 
-PENALTIES = pytest.mark.parametrize("penalty", [0.0, PENALTY])
+PENALTIES = pytest.mark.parametrize(
+    "penalty", [0.0, PENALTY, np.array([0.5, 2.0, 7.0])]
+)
 
 
 def precisions():

@@ -515,9 +515,9 @@ def group_fit(
     refined = partial(refine_joint, least_noise=least, tol=tol)
     start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
-    likelihood = MarginalLikelihood(part, scene.price / len(frames))
-    alpha = free(*start).alpha
-    shapes = likely_basis(start.shapes, motion, alpha, likelihood.penalty)
+    penalty = scene.price / len(frames)
+    likelihood, alpha = MarginalLikelihood(part, penalty), free(*start).alpha
+    shapes = likely_basis(start.shapes, motion, alpha, penalty)
     start, orthographic = start._replace(shapes=shapes), CAMERAS["orthographic"]
     most = min(settings.max_iter, MOST_STEPS)
     state = refined(likelihood, start, orthographic, max_iter=most).state

@@ -207,7 +207,8 @@ class LikelihoodTerms(NamedTuple):
 class MarginalLikelihood(NamedTuple):
     """The objective and its derivatives, as a sum over blocks of frames.
 
-    penalty: factor of ``sum_i tr H_i``. precisions (K, 3, 3): P_k, if any.
+    penalty: factor of ``sum_i tr H_i``, or factors (K,) of its terms. precisions (K, 3,
+    3): P_k, if any.
     extent_weight: weight of the prior of the extents, for each coordinate.
     prior: that of the shapes, by a fitted model.
     n_unknowns: number of coordinates that determine parameters, not the noise.
@@ -279,9 +280,9 @@ class MarginalLikelihood(NamedTuple):
         tiny = noise * n_seen < 1e-7 * square
         posterior = coefficient_posterior((products, noise), M, refined=tiny)
         c, alpha = posterior.c, posterior.alpha
-        penalty = np.broadcast_to(self.penalty, posterior.image_energy.T.shape).T
+        penalty = np.reshape(self.penalty, (-1, 1))
         value = np.sum(posterior.objective / noise + posterior.log_determinant)
-        value += np.vdot(penalty, posterior.image_energy)
+        value += np.sum(penalty * posterior.image_energy)
         residual = float(posterior.residual(noise).sum())
         spread = float(posterior.spread(noise).sum())
 
