@@ -276,7 +276,7 @@ def _joint_fit(
     fit, tracks, alpha = known["joint"]
     settings = settings._replace(shape_prior=fit.prior)
     progress(JOINT_STAGE)
-    state, starts, widths = fit.state, spread_starts(alpha, 8), fit.widths
+    state, starts, widths = fit.state, spread_starts(alpha), fit.widths
     n_directions = len(state.shapes) - 1
     kind = settings.loss, FrameMap.identity(n_directions), settings.camera
     model = FrameModel(state.shapes, state.noise, starts, *kind)

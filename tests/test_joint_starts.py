@@ -9,6 +9,7 @@ import pytest
 from frame_parts import assert_calibrated
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
+from refusals import warned
 from scenes import random_scene as random_model, with_gaps
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +30,7 @@ from isa_nrsfm._joint.starts import (
     reversed_groups,
     rigid_start,
     steadied,
+    unfolded,
 )
 from isa_nrsfm._joint.whole import (
     determined,
@@ -359,6 +361,38 @@ def test_frames_of_flat_objects_may_be_reversed(camera):
         depths = state.depths(problem.likelihood(*state).alpha)
         error = problem.reversal_error(state, depths)
         assert_allclose(error, expected, atol=0.02)
+
+
+def test_unfolded_shapes_lie_on_both_sides_alike():
+    scene = random_scene(n_frames=30)
+    state = unfolded(JointState(centred(scene.shapes), scene.motion, 0.01), 5)
+    axes, extents, _ = np.linalg.svd(state.shapes[0])
+    assert extents[2] < 1e-12 * extents[0]
+    across = axes[:, 2:]
+    mirror = np.eye(3) - 2 * across @ across.T
+    left = np.abs(state.motion - scene.motion).max(axis=(1, 2)) == 0
+    assert left.sum() == 15
+    assert_allclose(state.motion[~left], scene.motion[~left] @ mirror)
+    problem = problem_of(scene)
+    values = [
+        problem.likelihood(*state._replace(motion=M)).value
+        for M in (state.motion, state.motion @ mirror)
+    ]
+    assert values[1] == pytest.approx(values[0], rel=1e-12)
+
+
+@pytest.mark.slow
+def test_depths_of_a_ring_that_bends_to_both_sides_are_withheld():
+    """Each frame has two depths, and all choices of them are equally likely."""
+    rng, angle = np.random.default_rng(0), 2 * np.pi * np.arange(24) / 24
+    waves = np.stack([np.cos(2 * angle), np.sin(2 * angle)])
+    across, along = 0.2 * rng.normal(size=(2, 150, 2)) @ waves
+    flat = [(1 + along) * np.cos(angle), (1 + along) * np.sin(angle)]
+    for degrees in (15, 60):
+        X, points, _ = seen(np.stack([*flat, across], axis=2), degrees, 0)
+        model = AffineNRSfM(4, camera="weak_perspective", random_state=0)
+        warned("depth of the shapes is not determined", model.fit, X)
+        assert depth_error(model, X, points)[1] > 1.0
 
 
 @pytest.mark.parametrize("reversed_share", [0.0, 0.25, 0.5])

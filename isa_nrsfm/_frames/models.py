@@ -498,7 +498,7 @@ class FrameModel:
         return fitted(rows, weights=weights, initial=fit.alpha)
 
 
-def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
+def spread_starts(alpha: NDArray, n_starts: int = 8) -> NDArray:
     """Return at most n_starts rows of alpha (n, K) by farthest point sampling."""
     alpha = alpha[np.isfinite(alpha).all(axis=1)]
     # Squared distance from zero and from the rows chosen so far

@@ -413,8 +413,8 @@ def _product(packed: NDArray, vectors: NDArray) -> NDArray:
     return np.einsum("kli,li->ki", unpacked(packed), vectors)
 
 
-# Largest numbers of steps of a search, and of one for rough cameras.
-MAX_STEPS, ROUGH_STEPS = 60, 3
+# Largest number of steps of a search.
+MAX_STEPS = 60
 # The search of a frame ends at this damping: its steps no longer move it.
 LARGEST_DAMPING = 1e8
 # Objectives with a smaller relative difference are equal.
@@ -567,26 +567,22 @@ class FrameSearch:
         initial: NDArray | None = None,
         starts: NDArray | None = None,
         covariances: bool = True,
-        rough: bool = False,
     ) -> FramePosterior:
         """Return the most probable camera, position and coefficients of each frame.
 
         The shapes are by points or directions, as the frames. `initial` (I, K) is zero
         by default. If the residuals of a frame are much larger than the noise, it
-        starts again from each of `starts` (n_starts, K). `rough`: end after few steps.
+        starts again from each of `starts` (n_starts, K).
 
         Frames are independent. They are NaN if their points do not determine a camera.
         If only the mean shape is flat, zero can be a saddle point: further starts help.
         """
         n_frames, n_components = len(frames.weight), len(self.shared.shapes) - 1
         noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
-        length, max_steps = frames.n_together, ROUGH_STEPS if rough else MAX_STEPS
+        length = frames.n_together
 
         def minima(chosen: NDArray, initial: NDArray) -> FramePosterior:
-            """Return the minima that frames reach from coefficients (n_chosen, K).
-
-            Rough cameras may belong to a higher minimum.
-            """
+            """Return the minima that frames reach from coefficients (n_chosen, K)."""
             fits = FramePosterior.unknown(len(chosen), n_components, covariances)
             for first in range(0, len(chosen), length):
                 block = padded(np.arange(first, min(first + length, len(chosen))))
@@ -598,9 +594,8 @@ class FrameSearch:
                         block, products = block[usable], of_frames(products, usable)
                 problem = self.problem(products, noise[chosen[block]])
                 start = self.evaluate(problem, self.start(problem, initial[block].T))
-                M, converged = self.descend(problem, start, max_steps)
-                if not rough:
-                    M = self._unreversed(problem, M, converged)
+                M, converged = self.descend(problem, start, MAX_STEPS)
+                M = self._unreversed(problem, M, converged)
                 posterior = coefficient_posterior(problem, M)
                 covariance, turns = fits.covariance[block], fits.turn_covariance[block]
                 if covariances:
@@ -616,7 +611,7 @@ class FrameSearch:
 
         initial = np.zeros((n_frames, n_components)) if initial is None else initial
         fits = minima(np.arange(n_frames), initial)
-        if rough or starts is None or not len(starts):
+        if starts is None or not len(starts):
             return fits
         # Further starts for frames with large residuals, all starts at once. At the
         # minimum, f / s2 is the squared Mahalanobis distance of a frame from the model.

@@ -116,7 +116,7 @@ def bagged(
     state, widths = determined(problem, state, None)
     alpha = replace(problem, widths=widths).likelihood(*state).alpha
     gauge = FrameMap.identity(len(state.shapes) - 1)
-    starts, noise = spread_starts(alpha, 8), noise + rest
+    starts, noise = spread_starts(alpha), noise + rest
     model = replace(
         model, shapes=state.shapes, noise_variance=noise, starts=starts, gauge=gauge
     )

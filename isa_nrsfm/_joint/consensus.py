@@ -311,7 +311,7 @@ def consensus(
     def modelled(S: NDArray, noise: float) -> FrameModel:
         """Return the model of shapes (I, 3, J): their principal components."""
         found, alpha, rest = principal_shapes(S, most, LEFT * noise)
-        starts, gauge = spread_starts(alpha, 8), FrameMap.identity(len(found) - 1)
+        starts, gauge = spread_starts(alpha), FrameMap.identity(len(found) - 1)
         noise += rest
         return replace(
             model, shapes=found, noise_variance=noise, starts=starts, gauge=gauge

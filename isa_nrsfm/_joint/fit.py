@@ -23,7 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, residuals
-from isa_nrsfm._frames.models import LEAST_POINTS, FrameModel, derivatives
+from isa_nrsfm._frames.models import (
+    LEAST_POINTS,
+    FrameModel,
+    derivatives,
+    spread_starts,
+)
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.prior import SETTLED_WIDTH, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
@@ -164,10 +169,11 @@ def fit_jointly(
         tol = 0.1**2 * settings.tol
         fit = problem.refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames; for robust losses see `reweighted`
+    starts = spread_starts(problem.likelihood(*fit.state).alpha)
     for larger in problems:
         problem = of_all(larger)
         if table.outliers is None:
-            state = problem.aligned(fit.state, problem.cameras)
+            state = problem.aligned(fit.state, problem.cameras, starts)
             fit = problem.refined(state, least_noise=least_noise)
     noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
     if table.outliers is not None:
@@ -312,7 +318,7 @@ def steadiest(
     rivals = rival_depths(problem, [(value, fit) for value, _, fit in found])
     # A flat object may have relief to both sides. All choices of a side for each frame
     # are equally likely then.
-    compare(refined(unfolded(best.state)), HOPELESS)
+    compare(refined(unfolded(best.state, n)), HOPELESS)
     sides = [(value - 2.0 * np.log(2.0), fit) for value, _, fit in found[n_found:]]
     rivals += rival_depths(problem, [(evidence(problem, best), best), *sides])
     return best._replace(rivals=rivals)

@@ -149,12 +149,12 @@ def reversed_groups(
     return motion
 
 
-def unfolded(state: JointState) -> JointState:
+def unfolded(state: JointState, n: int) -> JointState:
     """Return a state of a flat object with relief to both sides of its plane.
 
-    The mean shape is flat, its relief one of the basis shapes, which lie in the plane
-    or across it. Shapes and cameras reflected in the plane give the same images. They
-    replace those of half of the frames, at random.
+    The mean shape is flat, its relief one of at most n basis shapes, which lie in the
+    plane or across it. Shapes and cameras reflected in the plane give the same images.
+    They replace those of half of the frames, at random.
     """
     mean, *basis = state.shapes
     normal = np.linalg.eigh(mean @ mean.T)[1][:, :1]
@@ -162,7 +162,7 @@ def unfolded(state: JointState) -> JointState:
     along = np.eye(3) - across
     parts = np.concatenate([(across @ mean)[None], across @ basis, along @ basis])
     _, sizes, axes = np.linalg.svd(parts.reshape(len(parts), -1), full_matrices=False)
-    parts = (sizes[:, None] * axes).reshape(-1, *mean.shape)
+    parts = (sizes[:, None] * axes)[:n].reshape(-1, *mean.shape)
     motion = state.motion.copy()
     motion[np.random.RandomState(0).permutation(len(motion)) % 2 > 0] @= along - across
     return state._replace(shapes=np.stack([along @ mean, *parts]), motion=motion)

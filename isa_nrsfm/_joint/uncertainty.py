@@ -299,13 +299,13 @@ def depth_certainty(
         start: JointState | None = None,
         extents: float = 0.0,
         prior: ShapePrior | None = prior,
-        any_depth: bool = False,
+        of_images: NDArray | None = None,
     ) -> tuple[JointState, NDArray, NDArray, float]:
         """Fit the kept points by a few steps, by default from the fit of all points.
 
         Returns the state, rotations (I, 3, 3), centred depths (I, n_kept) and the
-        objective for each frame, without the prior of the extents. With any depth the
-        prior of the directions is one of their images.
+        objective for each frame, without the prior of the extents. of_images: factors
+        of a prior of the images of the directions, in place of that of their points.
         """
         part = of_points(kept)
         n_numbers, energy = part.totals
@@ -317,9 +317,8 @@ def depth_certainty(
         elif widths is not None:
             own = widths.of_points(int(kept.sum()), most)
             likelihood = own.likelihood(part, frames.camera)
-            if any_depth:
-                free = image_penalty(whole)
-                likelihood = likelihood._replace(precisions=None, penalty=free)
+            if of_images is not None:
+                likelihood = likelihood._replace(precisions=None, penalty=of_images)
         else:
             penalty = part.basis_penalty(limits.basis_std)
             likelihood = MarginalLikelihood(part, penalty)
@@ -340,8 +339,9 @@ def depth_certainty(
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
         far = (stretched(state, camera, FAR)[0] for state in (whole, still))
-        starts = whole, *far
-        value, *others = (refit(every, start, any_depth=True)[-1] for start in starts)
+        free = image_penalty(whole)
+        fits = [refit(every, start, of_images=free) for start in (whole, *far)]
+        value, *others = (fit[-1] for fit in fits)
         rise = min(others) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:
