@@ -554,10 +554,11 @@ default="affine"
                 ConvergenceWarning,
             )
         left_out = fitted.pop("_left_out", None)
+        number = int(model.n_components)  # that of users may be one of numpy
         attributes: dict[str, Any] = fitted | {
             "_model": model,
-            "_n_features_out": model.n_components,
-            "n_components_": model.n_components,
+            "_n_features_out": number,
+            "n_components_": number,
             "camera_": self.camera if model.pinhole is not None else settings.camera,
             "frames_scaled_": bool(settings.scale_frames),
         }
