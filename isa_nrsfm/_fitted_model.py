@@ -580,7 +580,8 @@ def adapting_errors(
 ) -> tuple[float, ...]:
     """Return the inverse SNR of held-out points of every other row (n, 2, J).
 
-    Without and with adapting the model to the rows between them.
+    Without and with adapting the model to the rows between them. NaN if these are
+    refused: half the rows, many of whose points are wrong, can look like other points.
     """
     layout, pinhole = estimator._model.layout, estimator._model.pinhole
     given = {"layout": layout, "focal_length": pinhole and pinhole.focal_length}
@@ -588,7 +589,10 @@ def adapting_errors(
     adapted = clone(estimator).set_params(**given, keep_frames=False)
     of_points = weights[0][::2] if weights else None
     with warnings.catch_warnings(action="ignore"):
-        adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)
+        try:
+            adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)
+        except ValueError:
+            return np.nan, np.nan
     others = [each[1::2] for each in (rows, *weights)]
     parts = [each._model.held_out_sums(*others)[0] for each in (estimator, adapted)]
     return tuple(float(noise / signal) for noise, signal in parts)

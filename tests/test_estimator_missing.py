@@ -9,7 +9,7 @@ import pytest
 from frame_parts import OF_FRAMES
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
-from refusals import refusals_of, warned
+from refusals import refusals_of, refused, warned
 from scenes import with_gaps, with_outliers
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
@@ -67,7 +67,8 @@ def gross_scene(seed, size=0.0):
     """
     made = scene(seed, n_frames=120, n_points=60)
     X = with_outliers(made.data, size * made.data.std(), seed=seed)
-    fitted = estimator().fit(X)
+    fit = estimator().fit
+    fitted = warned("the table has outliers", fit, X) if size else fit(X)
     return made, X, fitted, error(fitted, X, made.shapes)
 
 
@@ -113,6 +114,16 @@ def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     # Alone but for the last step, the change to the public shapes.
     alone = np.concatenate([model.transform(row[None]) for row in Y[:6]])
     assert_allclose(alone, together[:6], rtol=1e-12, atol=1e-12)
+
+
+def test_rows_that_look_like_other_points_are_not_refused():
+    """The fit that would adapt the model to half of them is refused."""
+    X, _ = frames_with_outliers()
+    model = AffineNRSfM(1, loss="cauchy", camera="weak_perspective", random_state=0)
+    Y = with_outliers(X[:12], X.std(), share=0.3, seed=2)
+    Y = with_gaps(Y, 0.05, seed=2)
+    warned("wrong. Fit X separately", model.fit(X).transform, Y)
+    refused("does not show the points", clone(model).set_params(prior=model).fit, Y[::2])
 
 
 @EACH_LOSS
