@@ -240,7 +240,7 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     assert found.err == ""
     assert all(len(line) <= 120 for line in out.splitlines())
     assert f"tried    {camera.replace('_p', ' p')} cameras: " in out
-    told = "perspective: held-out points do not show it" in " ".join(out.split())
+    told = "perspective (held-out points do not show it)" in " ".join(out.split())
     assert told == (camera == "weak_perspective")
     assert "time     frames 0 to 39 by row: " in out
     time = found.report["time"]
@@ -473,7 +473,7 @@ def test_transform_knows_missing_points(
     other, out, err = transforms(fit.path, path)
     assert "count as missing" not in out
     # Without the report nothing but a warning is left.
-    assert ("--zeros-missing" in err) == (number == 0)
+    assert ("--missing-value 0" in err) == (number == 0)
     assert not np.allclose(other["alpha_1"], alpha["alpha_1"])
     pd.testing.assert_frame_equal(alpha, transforms(fit.path, path, *option)[0])
 
