@@ -290,8 +290,9 @@ def mirrored_rows(model: Any, prior: Any, motion: NDArray) -> tuple[NDArray, str
     axes = _across_and_up(model, prior)
     if axes is None:
         return np.zeros(0, dtype=int), ""
-    images = motion @ axes.T / np.linalg.norm(motion, axis=(1, 2), keepdims=True)
-    area = np.linalg.det(images)  # negative from the front, if y points down
+    with np.errstate(invalid="ignore"):  # images without extent have no side
+        images = motion @ axes.T / np.linalg.norm(motion, axis=(1, 2), keepdims=True)
+        area = np.linalg.det(images)  # negative from the front, if y points down
     threshold = LEAST_AREA * np.nanquantile(np.abs(area), 0.9)
     rows, n = np.flatnonzero(area > threshold), np.count_nonzero(np.isfinite(area))
     alike = not (area < -threshold).any()
