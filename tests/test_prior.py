@@ -269,13 +269,19 @@ def test_perspective_cameras(turned, focal_length):
 @pytest.mark.slow
 @pytest.mark.parametrize("certainty", [0.5, 1.0])
 def test_prior_and_perspective_decide_the_mirror_image(turned, certainty):
-    table, same = study(1, 20, 10, focal=4000), []
+    table, same, told = study(1, 20, 10, focal=4000), [], []
     for prior in (copy.copy(turned.model), turned.model.mirrored()):
         prior.mirror_certainty_ = certainty
-        model = fitted(table.X, prior, focal_length=4000, **PERSPECTIVE)
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            model = fitted(table.X, prior, focal_length=4000, **PERSPECTIVE)
+        told += [str(each.message) for each in caught]
+        assert model.camera_ == ("weak_perspective" if caught else "perspective")
         same.append(np.vdot(model.mean_shape_[:, 2], prior.mean_shape_[:, 2]) > 0)
         assert model.mirror_certainty_ > 0.9
     assert sum(same) == (2 if certainty == 1 else 1)
+    # Only a certain prior is believed if perspective shows the other image.
+    assert len(told) == (1 if certainty == 1 else 0)
+    assert all("perspective predicts held-out points no better" in t for t in told)
     weak = fitted(table.X, prior)
     assert weak.mirror_certainty_ == certainty
 
