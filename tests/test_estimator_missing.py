@@ -123,7 +123,8 @@ def test_rows_that_look_like_other_points_are_not_refused():
     Y = with_outliers(X[:12], X.std(), share=0.3, seed=2)
     Y = with_gaps(Y, 0.05, seed=2)
     warned("wrong. Fit X separately", model.fit(X).transform, Y)
-    refused("does not show the points", clone(model).set_params(prior=model).fit, Y[::2])
+    adapted = clone(model).set_params(prior=model)
+    refused("does not show the points", adapted.fit, Y[::2])
 
 
 @EACH_LOSS
