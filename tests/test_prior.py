@@ -110,7 +110,7 @@ def problem_of(table):
     start, settings = prior_start(scaled, settings, checked=True)
     frames = JointFrames.from_points(scaled.rows, True)
     problem = JointProblem(frames, settings._replace(tol=1e-4), True)
-    return problem, problem.aligned(start, problem.cameras)
+    return problem, problem.aligned(start)
 
 
 def test_a_width_of_zero_gives_the_shapes_of_the_prior(frontal):

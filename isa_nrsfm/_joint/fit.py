@@ -107,7 +107,7 @@ def fit_jointly(
     if start is not None:
         start = start._replace(shapes=first.frames.coordinates(start.shapes))
         if not len(start.motion):
-            start = first.aligned(start, first.cameras)
+            start = first.aligned(start)
         elif table.parts:
             start = start._replace(motion=start.motion[table.parts[0]])
         if settings.prior is None:  # a fit without the prior has larger basis shapes
@@ -173,7 +173,7 @@ def fit_jointly(
     for larger in problems:
         problem = of_all(larger)
         if table.outliers is None:
-            state = problem.aligned(fit.state, problem.cameras, starts)
+            state = problem.aligned(fit.state, starts)
             fit = problem.refined(state, least_noise=least_noise)
     noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
     if table.outliers is not None:
@@ -373,7 +373,7 @@ def _first_fit(
     # shapes vanish.
     free, tol = replace(problem, penalty=0.0), problem.settings.tol
     state = free.refined(rigid, affine, max_iter=FIXED_STEPS, tol=tol).state
-    states = [problem.aligned(fit.state, affine), with_prior(problem, state)]
+    states = [fit.state, with_prior(problem, state)]
     refined = partial(problem.refined, cameras=affine)
     max_iter = problem.settings.max_iter
     if cameras.calibrated:  # only compared
@@ -532,7 +532,7 @@ def reweighted(
 
     problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
     if table.parts:  # of a sample with other frames
-        state = problem.aligned(state, problem.cameras)
+        state = problem.aligned(state)
     else:
         state = state._replace(motion=state.motion[few])
     fit = fit._replace(state=state)
@@ -557,7 +557,7 @@ def reweighted(
     if len(few) < rows.n_frames:
         weighted = rows.derive(without, left_out)
         problem = part(weighted)
-        fit = fit._replace(state=problem.aligned(fit.state, problem.cameras))
+        fit = fit._replace(state=problem.aligned(fit.state))
         for limits in {"max_iter": 1}, {}:  # one step before the last weights
             shapes, motion, _ = fit.state
             alpha = problem.likelihood(*fit.state).alpha

@@ -222,16 +222,14 @@ class JointProblem:
         prior = self.settings.shape_prior
         return MarginalLikelihood(self.frames, self.penalty, prior=prior)
 
-    def aligned(
-        self, state: JointState, cameras: CameraModel, starts: NDArray | None = None
-    ) -> JointState:
+    def aligned(self, state: JointState, starts: NDArray | None = None) -> JointState:
         """Return a state with the best cameras of these frames for its centred shapes.
 
         Frames that none fits start again from coefficients `starts` (n_starts, K).
         Shapes would follow frames at a wrong minimum.
         """
         shapes, noise = self.frames.centred(state.shapes), state.noise
-        search = FrameSearch(shapes, cameras)
+        search = FrameSearch(shapes, self.cameras)
         fit = partial(search.fit, noise=noise, starts=starts, covariances=False)
         motion = self.frames.blocks.joined(lambda block: fit(block).motion)
         return JointState(shapes, motion, noise)
