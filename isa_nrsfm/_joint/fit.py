@@ -169,7 +169,9 @@ def fit_jointly(
         tol = 0.1**2 * settings.tol
         fit = problem.refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames; for robust losses see `reweighted`
-    starts = spread_starts(problem.likelihood(*fit.state).alpha)
+    starts = None
+    if table.parts and table.outliers is None:
+        starts = spread_starts(problem.likelihood(*fit.state).alpha)
     for larger in problems:
         problem = of_all(larger)
         if table.outliers is None:
@@ -319,8 +321,9 @@ def steadiest(
     # A flat object may have relief to both sides. All choices of a side for each frame
     # are equally likely then.
     compare(refined(unfolded(best.state, n)), HOPELESS)
-    sides = [(value - 2.0 * np.log(2.0), fit) for value, _, fit in found[n_found:]]
-    rivals += rival_depths(problem, [(evidence(problem, best), best), *sides])
+    for value, _, flat in found[n_found:]:
+        sides = [(evidence(problem, best), best), (value - 2.0 * np.log(2.0), flat)]
+        rivals += rival_depths(problem, sides)
     return best._replace(rivals=rivals)
 
 

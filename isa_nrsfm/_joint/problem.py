@@ -225,8 +225,8 @@ class JointProblem:
     def aligned(self, state: JointState, starts: NDArray | None = None) -> JointState:
         """Return a state with the best cameras of these frames for its centred shapes.
 
-        Frames that none fits start again from coefficients `starts` (n_starts, K).
-        Shapes would follow frames at a wrong minimum.
+        Shapes would follow frames at a wrong minimum, so frames with large residuals
+        start again from each of the coefficients `starts` (n_starts, K).
         """
         shapes, noise = self.frames.centred(state.shapes), state.noise
         search = FrameSearch(shapes, self.cameras)

@@ -157,8 +157,8 @@ def unfolded(state: JointState, n: int) -> JointState:
     They replace those of half of the frames, at random.
     """
     mean, *basis = state.shapes
-    normal = np.linalg.eigh(mean @ mean.T)[1][:, :1]
-    across = normal @ normal.T
+    normal = np.linalg.eigh(mean @ mean.T)[1][:, 0]
+    across = np.outer(normal, normal)
     along = np.eye(3) - across
     parts = np.concatenate([(across @ mean)[None], across @ basis, along @ basis])
     _, sizes, axes = np.linalg.svd(parts.reshape(len(parts), -1), full_matrices=False)

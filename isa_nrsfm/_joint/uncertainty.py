@@ -339,9 +339,8 @@ def depth_certainty(
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
         far = (stretched(state, camera, FAR)[0] for state in (whole, still))
-        free = image_penalty(whole)
-        fits = [refit(every, start, of_images=free) for start in (whole, *far)]
-        value, *others = (fit[-1] for fit in fits)
+        starts, free = (whole, *far), image_penalty(whole)
+        value, *others = (refit(every, start, of_images=free)[-1] for start in starts)
         rise = min(others) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:
