@@ -230,7 +230,7 @@ class MarginalLikelihood(NamedTuple):
         def over_block(block: FrameTracks, motion: NDArray) -> Terms:
             """Return the sums over pieces whose matrices fit the cache."""
             M, parts = linalg.frames_last(motion), []
-            for frames, piece in block.pieces():
+            for frames, piece in block.pieces(len(shapes)):
                 parts.append(self._terms(piece, M[:, :, frames], products, noise))
             return _joined(parts)
 

@@ -310,7 +310,7 @@ class JointProblem:
 
         def of_block(block: FrameTracks, motion: NDArray) -> Any:
             parts = []
-            for frames, piece in block.pieces():
+            for frames, piece in block.pieces(len(state.shapes)):
                 sums = frame_sums(piece, search.shared)
                 problem = search.problem(sums, np.full(len(sums.weight), state.noise))
                 parts.append(method(problem, motion[frames]))
