@@ -37,7 +37,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from isa_nrsfm import _linalg as linalg
 from isa_nrsfm._compat.lazy import cached_property
@@ -257,8 +256,9 @@ class MarginalLikelihood(NamedTuple):
             slope = shares * (self.precisions @ shapes[1:])
             value += np.vdot(slope, shapes[1:])
             shape_gradient[1:] += 2.0 * slope
-            penalties = block_diag(np.zeros((3, 3)), *self.precisions)
-            curvature = curvature + noise * shares[:, None, None] * penalties
+            blocks = curvature.reshape(-1, len(shapes), 3, len(shapes), 3)
+            blocks = np.einsum("jkakb->jkab", blocks)[:, 1:]  # a view
+            blocks += noise * shares[:, None, None, None] * self.precisions
         if self.prior is not None:
             term, slope = self.prior.term(shapes)
             value, shape_gradient = value + term, shape_gradient + slope
