@@ -13,7 +13,7 @@ from refusals import warned
 from scenes import random_scene as random_model, with_gaps
 from scipy.spatial.transform import Rotation
 
-from benchmarks.depth import bird, depth_error, seen
+from benchmarks.depth import bird, depth_error, seen, sheet
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import LARGEST_SHARE
@@ -24,6 +24,8 @@ from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
+    both_sides,
+    flat_cameras,
     lifted_shapes,
     likely_basis,
     mixed_cameras,
@@ -379,6 +381,40 @@ def test_unfolded_shapes_lie_on_both_sides_alike():
         for M in (state.motion, state.motion @ mirror)
     ]
     assert values[1] == pytest.approx(values[0], rel=1e-12)
+
+
+def test_flat_cameras_do_not_follow_the_relief_of_the_mean_shape():
+    scene = random_scene(n_frames=30)
+    axes = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    plane, across = axes[:, :2] @ axes[:, :2].T, axes[:, 2]
+    mean, *basis = centred(scene.shapes)
+    rows = scene.motion @ plane @ mean
+    problem = problem_of(scene._replace(rows=rows))
+    # Relief across the plane that is no slope of it
+    relief = 0.1 * across @ mean
+    relief -= relief @ np.linalg.pinv(plane @ mean) @ (plane @ mean)
+    relief = np.outer(across, relief)
+    state = JointState(np.stack([plane @ mean + relief, *basis]), scene.motion, 1e-4)
+    motion = flat_cameras(problem, state)
+    assert_calibrated(motion, "weak_perspective")
+    assert_allclose(motion @ plane, scene.motion @ plane, atol=1e-6)
+    assert both_sides(state)
+    assert not both_sides(
+        state._replace(shapes=np.stack([mean, *(0.01 * b for b in basis)]))
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_depths_of_sheets_that_wave_to_both_sides_are_withheld(seed):
+    X, points, _ = seen(sheet(200, seed), 40, seed)
+    model = AffineNRSfM(2, camera="weak_perspective", random_state=0)
+    warned("depth of the shapes is not determined", model.fit, X)
+    # Each frame is right, or its mirror image is.
+    z = np.einsum("ijc,ic->ij", model.reconstruct(X), model.rotations_[:, 2])
+    z *= model.scales_[:, None]
+    off = np.abs(z)[:, None] - np.abs(points[:, None, :, 2])
+    assert np.sum(off**2) < 0.05**2 * np.sum(points[:, :, 2] ** 2)
 
 
 @pytest.mark.slow

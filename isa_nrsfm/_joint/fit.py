@@ -45,6 +45,8 @@ from isa_nrsfm._joint.starts import (
     FIXED_STEPS,
     affine_start,
     best_starts,
+    both_sides,
+    flat_cameras,
     held_fit,
     lifted_shapes,
     other_depths,
@@ -56,6 +58,7 @@ from isa_nrsfm._joint.starts import (
 from isa_nrsfm._joint.whole import (
     FAR_FRAMES,
     FEW_DIRECTIONS,
+    FIRST_NOISE,
     LEAST_NOISE,
     evidence,
     extended,
@@ -73,6 +76,8 @@ FIRST_COMPONENTS = 3, 1, 12
 # Those of further fits, from whose cameras the consensus starts, and least weight of
 # these: docs/benchmarks/consensus.md.
 OTHER_COMPONENTS, LEAST_WEIGHT = (2, 3, 5, 8), 0.01
+# Those from which the best fit starts again: docs/depth.md, "How it is estimated".
+AGAIN = 3, 5
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains of a coordinate are within the error of the noise variance.
 HOPELESS, LEAST_GAIN = 5.0, 0.02
@@ -267,12 +272,13 @@ def steadiest(
 
     The others start from cameras that turn less: wings that beat look like a bird that
     rolls. The objective counts coefficients, but not rotations, and its minima lead
-    there; `evidence` counts both. The last ones have groups of frames turned back in
-    depth (`reversed_groups`).
+    there; `evidence` counts both. Further ones start from a flat mean shape, or have
+    groups of frames turned back in depth (`reversed_groups`).
     """
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
     n = min(len(first.state.shapes) - 1, FEW_DIRECTIONS)
+    few, rough = min(FIRST_COMPONENTS[0], n), replace(problem, penalty=0.0)
     before = evidence(problem, first)
     fit, widths = whole_distribution(problem, first)
     fit = fit._replace(widths=widths)
@@ -282,12 +288,18 @@ def steadiest(
     least_gain = LEAST_GAIN * problem.frames.totals[0] / problem.frames.n_frames
     found, latest = [(evidence(problem, fit) - least_gain, before, fit)], fit
 
+    def expanded(state: JointState) -> JointFit:
+        """Return the fit of n directions from a state, first with its own."""
+        if len(state.shapes) <= n:
+            limits = {"least_noise": FIRST_NOISE, "max_iter": 200}
+            tol = 0.2 * problem.settings.tol
+            state = rough.refined(state, tol=tol, **limits).state
+        return extended(problem, fit._replace(state=state), n)
+
     def lifted(motion: NDArray, k: int) -> JointFit:
         """Return the fit of n directions from cameras, first with k of them."""
         shapes = lifted_shapes(rows, motion, k)
-        state = held_fit(problem, rows, motion, shapes).state
-        other = extended(problem, fit._replace(state=state), k)
-        return extended(problem, other, n) if k < n else other
+        return expanded(held_fit(problem, rows, motion, shapes).state)
 
     def compare(other: JointFit, margin: float) -> None:
         """Add a fit, if it may be the most evident one."""
@@ -299,11 +311,19 @@ def steadiest(
 
     for _ in range(4):
         motion, tried = steadied(latest.state.motion), len(found)
-        for k in {min(FIRST_COMPONENTS[0], n), n}:
+        for k in {few, n}:
             compare(lifted(motion, k), HOPELESS)
         if len(found) == tried:
             break
         latest = min(found[tried:], key=itemgetter(0))[2]
+
+    best = min(found, key=itemgetter(0))[2]
+    if both_sides(best.state):
+        compare(lifted(flat_cameras(problem, best.state), few), HOPELESS)
+        # Few directions lead out of minima where others explain wrong cameras.
+        for k in AGAIN:
+            _, before, best = min(found, key=itemgetter(0))
+            compare(lifted(best.state.motion, min(k, n)), 0.0)
 
     def refined(state: JointState) -> JointFit:
         return extended(problem, fit._replace(state=state), n)
@@ -320,7 +340,7 @@ def steadiest(
     rivals = rival_depths(problem, [(value, fit) for value, _, fit in found])
     # A flat object may have relief to both sides. All choices of a side for each frame
     # are equally likely then.
-    compare(refined(unfolded(best.state, n)), HOPELESS)
+    compare(expanded(unfolded(best.state, n)), HOPELESS)
     for value, _, flat in found[n_found:]:
         sides = [(evidence(problem, best), best), (value - 2.0 * np.log(2.0), flat)]
         rivals += rival_depths(problem, sides)

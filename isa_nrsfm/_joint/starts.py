@@ -149,6 +149,32 @@ def reversed_groups(
     return motion
 
 
+def across_plane(mean_shape: NDArray) -> NDArray:
+    """Return the projection (3, 3) on the axis of least extent of a shape (3, J)."""
+    normal = np.linalg.eigh(mean_shape @ mean_shape.T)[1][:, 0]
+    return np.outer(normal, normal)
+
+
+def both_sides(state: JointState) -> bool:
+    """Return whether an object can bend to both sides of the plane of its mean shape.
+
+    The relief of the mean shape is below three standard deviations of deformation.
+    """
+    across = across_plane(state.shapes[0])
+    relief, *deviations = np.sum((across @ state.shapes) ** 2, axis=(1, 2))
+    return bool(relief < 3.0**2 * np.sum(deviations))
+
+
+def flat_cameras(problem: JointProblem, state: JointState) -> NDArray:
+    """Return the best cameras (I, 2, 3) for the mean shape without its relief.
+
+    If an object bends to both sides of a plane, this relief distorts them all.
+    """
+    mean = state.shapes[0]
+    flat = mean - across_plane(mean) @ mean
+    return problem.aligned(state._replace(shapes=flat[None])).motion
+
+
 def unfolded(state: JointState, n: int) -> JointState:
     """Return a state of a flat object with relief to both sides of its plane.
 
@@ -157,8 +183,7 @@ def unfolded(state: JointState, n: int) -> JointState:
     They replace those of half of the frames, at random.
     """
     mean, *basis = state.shapes
-    normal = np.linalg.eigh(mean @ mean.T)[1][:, 0]
-    across = np.outer(normal, normal)
+    across = across_plane(mean)
     along = np.eye(3) - across
     parts = np.concatenate([(across @ mean)[None], across @ basis, along @ basis])
     _, sizes, axes = np.linalg.svd(parts.reshape(len(parts), -1), full_matrices=False)
