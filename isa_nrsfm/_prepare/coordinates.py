@@ -26,9 +26,9 @@ FEW = 0.05
 LEAST = 0.2
 # Largest median of centred coordinates.
 CENTRED = 0.03
-# Relative difference of the spreads of columns scaled one by one, at most: in all rows
-# and in some of them.
-EQUAL, SIMILAR = 0.01, 0.3
+# Difference of the spreads of columns scaled one by one, at most: in all rows, relative
+# to the movement of points apart from their centroid; in some rows, to the spread.
+EQUAL, SIMILAR = 0.03, 0.3
 # Largest movement of points that stand still, relative to the others' centroid, which
 # moves by at least half of their size.
 STILL, LEAST_WAY = 0.05, 0.5
@@ -108,7 +108,8 @@ def warn_of_places(
 def warn_of_scaled_columns(tracks: NDArray) -> bool:
     """Warn, and return True, if the columns of tracks were scaled one by one."""
     step = -(-len(tracks) // MOST_ROWS) or 1
-    if not (are_scaled(tracks[::step], SIMILAR) and are_scaled(tracks, EQUAL)):
+    some = tracks[::step]
+    if not (are_scaled(some, SIMILAR) and are_scaled(tracks, EQUAL, apart=True)):
         return False
     warn_caller(
         "all columns have the same spread, as after z-scores, StandardScaler or "
@@ -120,18 +121,26 @@ def warn_of_scaled_columns(tracks: NDArray) -> bool:
     return True
 
 
-def are_scaled(tracks: NDArray, tol: float) -> bool:
+def are_scaled(tracks: NDArray, tol: float, apart: bool = False) -> bool:
     """Return whether all columns of tracks have the same spread, up to `tol` of it.
 
     That is the standard deviation with n or n - 1, smallest and largest value, the
-    largest magnitude, or median and quartiles.
+    largest magnitude, or median and quartiles. With `apart`, `tol` is relative to the
+    movement of points apart from their centroid: columns of an object that moves far
+    are alike, as it moves as a whole.
     """
-    X = tracks.reshape(len(tracks), 2 * tracks.shape[1])
-    X = X[:, np.isfinite(X).sum(axis=0) > max(len(X) / 2, 9)].astype(np.float64)
-    largest = np.nanmax(np.abs(X), initial=0.0)
-    if X.shape[1] < 6 or not largest:  # fewer are alike by chance
+    seen = np.isfinite(tracks).sum(axis=0).min(axis=1) > max(len(tracks) / 2, 9)
+    tracks = tracks[:, seen].astype(np.float64)
+    largest = np.nanmax(np.abs(tracks), initial=0.0)
+    if tracks.shape[1] < 3 or not largest:  # fewer are alike by chance
         return False
-    X /= largest  # squares stay in range
+    tracks /= largest  # squares stay in range
+    if apart:
+        moves = tracks - np.nanmean(tracks, axis=0)
+        n_seen = np.isfinite(moves).sum(axis=1, keepdims=True)
+        own = moves - np.nansum(moves, axis=1, keepdims=True) / np.maximum(n_seen, 1)
+        tol *= np.nanstd(own) / (np.nanstd(moves) or 1.0)
+    X = tracks.reshape(len(tracks), -1)
     low, first, median, third, high = np.nanpercentile(X, [0, 25, 50, 75, 100], axis=0)
     spreads = [[np.nanstd(X, axis=0)], [np.nanstd(X, axis=0, ddof=1)]]
     spreads += [[high - low, low], [np.fmax(high, -low)], [third - first, median]]
