@@ -84,6 +84,9 @@ HOPELESS, LEAST_GAIN = 5.0, 0.02
 # Numbers of groups of similar frames that may be reversed in depth:
 # docs/benchmarks/README.md, "Thresholds".
 GROUPS = 2, 4
+# Largest noise variance of a fit without floor, over the floor, if directions explain
+# a table: docs/benchmarks/README.md, "Thresholds".
+RELEASED = 0.01
 # Largest error variance of a point that others predict, over that of the noise, in
 # frames with missing points: docs/benchmarks/README.md, "Thresholds".
 LARGEST_SPREAD = 5.0
@@ -145,13 +148,11 @@ def fit_jointly(
         # Points that were filled in have errors: room for three directions more
         # (docs/benchmarks/README.md, "Thresholds").
         n_known = len(widths.variances) + (0 if every_point else 3)
-        if table.explained_by(n_known, LEAST_NOISE):
-            least_noise = NOISE_FLOOR
-            shapes = fit.state.shapes[: 1 + widths.n_relevant]
-            fit = unregularised(first, fit.state._replace(shapes=shapes))
-            free = replace(first, penalty=0.0)
-            fit = free.refined(fit.state, least_noise=least_noise, tol=settings.tol)
-            widths = widths.of_points(paper_shapes.shape[2], len(shapes) - 1)
+        exact = explained(first, table, fit, widths.n_relevant, n_known)
+        if exact is not None:
+            fit, least_noise = exact, NOISE_FLOOR
+            n = len(fit.state.shapes) - 1
+            widths = widths.of_points(paper_shapes.shape[2], n)
         else:
             least_noise = LEAST_NOISE
             problem = replace(first, widths=widths)
@@ -454,6 +455,25 @@ def judged(
             if released.state.noise < threshold:
                 return released, NOISE_FLOOR, True
     return fit, least_noise, False
+
+
+def explained(
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, K: int, n_known: int
+) -> JointFit | None:
+    """Return the fit of K directions without floor, if these leave no more than noise.
+
+    None if not: parts that turn may have images of low rank, but are no sums of few
+    shapes. n_known directions leave the noise of the spectrum.
+    """
+    if not table.explained_by(n_known, LEAST_NOISE):
+        return None
+    state = fit.state._replace(shapes=fit.state.shapes[: K + 1])
+    state = unregularised(problem, state).state
+    level = problem.settings.limits.right * table.noise_level(n_known)
+    if state.noise > max(level, RELEASED * LEAST_NOISE) * problem.mean_square:
+        return None
+    free, tol = replace(problem, penalty=0.0), problem.settings.tol
+    return free.refined(state, least_noise=NOISE_FLOOR, tol=tol)
 
 
 def unregularised(problem: JointProblem, state: JointState) -> JointFit:
