@@ -88,6 +88,9 @@ STEPWISE = JOINT_STAGE, CONSENSUS_STAGE, PERSPECTIVE_STAGE
 # Depths and fit agree if a repeat changes depths by less than SETTLED, with the default
 # tolerance. If MOST_REPEATS end with larger changes than UNSETTLED, they never will.
 SETTLED, UNSETTLED, MOST_REPEATS = 2e-3, 0.05, 8
+# The same for the last fits, which have all directions, and number of these at most:
+# docs/benchmarks/README.md, "Thresholds".
+LAST_CHANGE, MOST_LAST = 0.01, 4
 # Factor of the tolerance of all fits but the last one, and of SETTLED for focal lengths
 # that are only compared.
 ROUGH, COMPARED = 4.0, 5.0
@@ -847,9 +850,11 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
     last = partial(table.fit, last=True)
     if not why:
         n_last = n_components or best.model.n_components
-        fit = last(best.pinhole, n_last, best)
-        if fit.changes[-1] > UNSETTLED:  # all directions show more than a few
+        fit, largest = best, LAST_CHANGE * settings.tol / JOINT_TOL
+        for _ in range(MOST_LAST):  # all directions show more than a few
             fit = last(best.pinhole, n_last, fit)
+            if fit.changes[-1] < largest:
+                break
     plain = partial(last, None, n_components or 1, free=n_components is None)
     weights = () if table.weights is None else (table.weights,)
     if not why and settings.start is None:

@@ -228,9 +228,10 @@ def test_bodies_that_turn_round(refinement):
     s = scene(1, 60, 180.0, 5.0, 0.002, n_points=14, deformation=0.3)
     model = fitted(s.X, refinement=refinement)
     assert model.camera_ == "perspective"
-    weak = fitted(s.X, camera="weak_perspective", refinement=refinement)
+    given = {"camera": "weak_perspective", "refinement": refinement}
+    weak = warned("depth of the shapes is not determined", fitted, s.X, **given)
     ours, theirs = (each.reconstruct(s.X) for each in (model, weak))
-    assert frame_error(ours, s.S) < 0.05
+    assert frame_error(ours, s.S) < 0.003
     assert min(frame_error(theirs * (1, 1, z), s.S) for z in (-1, 1)) > 0.1
 
 
