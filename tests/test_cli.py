@@ -330,7 +330,9 @@ def test_perspective_is_found_unless_another_camera_is_given(fits, webcam, camer
     assert ("perspective" in tried) == (camera is None)
     if camera is None:
         weak, near = tried["weak perspective cameras"], tried["perspective"]
-        assert near["held_out_error"] < 0.5 * weak["held_out_error"]
+        # Perspective leaves the noise, .002 of the size, and other cameras more.
+        noise = 1.05 * 0.002**2
+        assert near["held_out_error"] < noise < weak["held_out_error"]
         assert (weak["result"], near["result"]) == ("less good", "used")
 
 
