@@ -483,7 +483,6 @@ class TestEstimator:
         assert_array_equal(other.alpha_, body.alpha_)
 
     @pytest.mark.slow
-    @pytest.mark.xfail(reason="sums in another order end elsewhere in a flat valley")
     def test_order_of_frames_does_not_matter(self, body):
         """Permuted rows have permuted shapes."""
         other = consensus_fit(X[np.random.default_rng(0).permutation(len(X))])
