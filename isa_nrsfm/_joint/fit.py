@@ -463,13 +463,13 @@ def explained(
     """Return the fit of K directions without floor, if these leave no more than noise.
 
     None if not: parts that turn may have images of low rank, but are no sums of few
-    shapes. n_known directions leave the noise of the spectrum.
+    shapes. K directions have to leave the noise of the spectrum.
     """
     if not table.explained_by(n_known, LEAST_NOISE):
         return None
     state = fit.state._replace(shapes=fit.state.shapes[: K + 1])
     state = unregularised(problem, state).state
-    level = problem.settings.limits.right * table.noise_level(n_known)
+    level = problem.settings.limits.right * table.noise_level(K)
     if state.noise > max(level, RELEASED * LEAST_NOISE) * problem.mean_square:
         return None
     free, tol = replace(problem, penalty=0.0), problem.settings.tol
