@@ -76,7 +76,8 @@ FIRST_COMPONENTS = 3, 1, 12
 # Those of further fits, from whose cameras the consensus starts, and least weight of
 # these: docs/benchmarks/consensus.md.
 OTHER_COMPONENTS, LEAST_WEIGHT = (2, 3, 5, 8), 0.01
-# Those from which the best fit starts again: docs/depth.md, "How it is estimated".
+# Those with which the best fit of an object that bends to both sides starts again:
+# docs/depth.md, "How it is estimated".
 AGAIN = 3, 5
 # Differences of `evidence`, on the same page: starts that are further off are not
 # refined; smaller gains of a coordinate are within the error of the noise variance.
@@ -292,7 +293,7 @@ def steadiest(
     def expanded(state: JointState) -> JointFit:
         """Return the fit of n directions from a state, first with its own."""
         if len(state.shapes) <= n:
-            limits = {"least_noise": FIRST_NOISE, "max_iter": 200}
+            limits: Any = {"least_noise": FIRST_NOISE, "max_iter": 200}
             tol = 0.2 * problem.settings.tol
             state = rough.refined(state, tol=tol, **limits).state
         return extended(problem, fit._replace(state=state), n)

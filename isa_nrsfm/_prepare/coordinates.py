@@ -132,7 +132,8 @@ def are_scaled(tracks: NDArray, tol: float, apart: bool = False) -> bool:
     seen = np.isfinite(tracks).sum(axis=0).min(axis=1) > max(len(tracks) / 2, 9)
     tracks = tracks[:, seen].astype(np.float64)
     largest = np.nanmax(np.abs(tracks), initial=0.0)
-    if tracks.shape[1] < 3 or not largest:  # fewer are alike by chance
+    different = np.unique(tracks.reshape(len(tracks), -1), axis=1)
+    if different.shape[1] < 6 or not largest:  # fewer are alike by chance
         return False
     tracks /= largest  # squares stay in range
     if apart:
