@@ -242,7 +242,7 @@ def other_fits(
 ) -> list[tuple[float, JointState]]:
     """Return the states of fits from other starts, at the first noise, by points.
 
-    With their weights, the evidence of two frames relative to that of the joint fit, if
+    With their weights, the evidence of a frame relative to that of the joint fit, if
     they count. None without all directions. Other arguments as in `fit_jointly`.
     """
     states: list[tuple[float, JointState]] = []
@@ -260,7 +260,7 @@ def other_fits(
         part, cameras = paper[: k + 1], problem.cameras
         fit, _ = _calibrated_fit(problem, table, part, cameras, **limits)
         fit = extended(problem, fit, n)
-        weight = float(np.exp(min(best - evidence(problem, fit), 0.0)))
+        weight = float(np.exp(min(best - evidence(problem, fit), 0.0) / 2.0))
         if weight > LEAST_WEIGHT:
             shapes = centred(problem.frames.points(fit.state.shapes))
             states.append((weight, fit.state._replace(shapes=shapes)))
