@@ -852,7 +852,8 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         n_last = n_components or best.model.n_components
         fit, largest = best, LAST_CHANGE * settings.tol / JOINT_TOL
         for _ in range(MOST_LAST):  # all directions show more than a few
-            fit = last(best.pinhole, n_last, fit)
+            with warnings.catch_warnings(record=True, action="always") as caught:
+                fit = last(best.pinhole, n_last, fit)
             if fit.changes[-1] < largest:
                 break
     plain = partial(last, None, n_components or 1, free=n_components is None)
@@ -867,6 +868,8 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
     if why:
         warn_caller(f"{why}. {WEAK}")
         return plain()
+    for each in caught:
+        warn_caller(str(each.message), each.category)
     model, attributes, f = fit.model, fit.attributes, best.pinhole.focal_length
     if errors:
         certainty = model.frames.certainty
