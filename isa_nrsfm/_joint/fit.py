@@ -327,15 +327,12 @@ def steadiest(
             _, before, best = min(found, key=itemgetter(0))
             compare(lifted(best.state.motion, min(k, n)), 0.0)
 
-    def refined(state: JointState) -> JointFit:
-        return extended(problem, fit._replace(state=state), n)
-
     for n_groups in GROUPS:
         _, before, best = min(found, key=itemgetter(0))
         alpha = replace(problem, widths=best.widths).likelihood(*best.state).alpha
         motion = reversed_groups(problem, rows, best.state.motion, alpha, n_groups)
         if np.any(motion != best.state.motion):
-            other = problem.turned_back(lifted(motion, n), problem.cameras, refined)
+            other = problem.turned_back(lifted(motion, n), problem.cameras, expanded)
             compare(other, -least_gain)
     found.sort(key=itemgetter(0))
     best, n_found = found[0][2], len(found)
