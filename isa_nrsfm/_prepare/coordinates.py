@@ -132,16 +132,17 @@ def are_scaled(tracks: NDArray, tol: float, apart: bool = False) -> bool:
     seen = np.isfinite(tracks).sum(axis=0).min(axis=1) > max(len(tracks) / 2, 9)
     tracks = tracks[:, seen].astype(np.float64)
     largest = np.nanmax(np.abs(tracks), initial=0.0)
-    different = np.unique(tracks.reshape(len(tracks), -1), axis=1)
-    if different.shape[1] < 6 or not largest:  # fewer are alike by chance
+    if not largest:
         return False
     tracks /= largest  # squares stay in range
+    X = tracks.reshape(len(tracks), -1)
+    if np.unique(X, axis=1).shape[1] < 6:  # fewer are alike by chance
+        return False
     if apart:
         moves = tracks - np.nanmean(tracks, axis=0)
         n_seen = np.isfinite(moves).sum(axis=1, keepdims=True)
         own = moves - np.nansum(moves, axis=1, keepdims=True) / np.maximum(n_seen, 1)
         tol *= np.nanstd(own) / (np.nanstd(moves) or 1.0)
-    X = tracks.reshape(len(tracks), -1)
     low, first, median, third, high = np.nanpercentile(X, [0, 25, 50, 75, 100], axis=0)
     spreads = [[np.nanstd(X, axis=0)], [np.nanstd(X, axis=0, ddof=1)]]
     spreads += [[high - low, low], [np.fmax(high, -low)], [third - first, median]]
