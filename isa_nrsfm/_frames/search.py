@@ -79,8 +79,7 @@ from isa_nrsfm._tables import BLOCK_FRAMES, seen_points
 # Multiplicity of the entries of packed symmetric 3x3 matrices in ``<S, Q>``: those off
 # the diagonal count twice.
 TWICE = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
-# Numbers that fit the cache. With 24 coefficients, 800 frames take .4 of the time of
-# 8,192; with nine, pieces of 5,000 frames are as fast.
+# Numbers that fit the cache: docs/benchmarks/README.md, "Thresholds".
 IN_CACHE = 2**18
 # Shapes are flat along a direction if their extent is below this share of the largest.
 FLAT = 1e-10

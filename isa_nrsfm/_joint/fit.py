@@ -58,7 +58,6 @@ from isa_nrsfm._joint.starts import (
 from isa_nrsfm._joint.whole import (
     FAR_FRAMES,
     FEW_DIRECTIONS,
-    FIRST_NOISE,
     LEAST_NOISE,
     evidence,
     extended,
@@ -152,8 +151,7 @@ def fit_jointly(
         exact = explained(first, table, fit, widths.n_relevant, n_known)
         if exact is not None:
             fit, least_noise = exact, NOISE_FLOOR
-            n = len(fit.state.shapes) - 1
-            widths = widths.of_points(paper_shapes.shape[2], n)
+            widths = widths.of_points(paper_shapes.shape[2], widths.n_relevant)
         else:
             least_noise = LEAST_NOISE
             problem = replace(first, widths=widths)
@@ -280,7 +278,7 @@ def steadiest(
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
     n = min(len(first.state.shapes) - 1, FEW_DIRECTIONS)
-    few, rough = min(FIRST_COMPONENTS[0], n), replace(problem, penalty=0.0)
+    few = min(FIRST_COMPONENTS[0], n)
     before = evidence(problem, first)
     fit, widths = whole_distribution(problem, first)
     fit = fit._replace(widths=widths)
@@ -292,11 +290,10 @@ def steadiest(
 
     def expanded(state: JointState) -> JointFit:
         """Return the fit of n directions from a state, first with its own."""
-        if len(state.shapes) <= n:
-            limits: Any = {"least_noise": FIRST_NOISE, "max_iter": 200}
-            tol = 0.2 * problem.settings.tol
-            state = rough.refined(state, tol=tol, **limits).state
-        return extended(problem, fit._replace(state=state), n)
+        other, k = fit._replace(state=state), len(state.shapes) - 1
+        if k < n:
+            other = extended(problem, other, k, max_iter=200, tol=0.2)
+        return extended(problem, other, n)
 
     def lifted(motion: NDArray, k: int) -> JointFit:
         """Return the fit of n directions from cameras, first with k of them."""

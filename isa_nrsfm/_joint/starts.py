@@ -158,7 +158,8 @@ def across_plane(mean_shape: NDArray) -> NDArray:
 def both_sides(state: JointState) -> bool:
     """Return whether an object can bend to both sides of the plane of its mean shape.
 
-    The relief of the mean shape is below three standard deviations of deformation.
+    The relief of the mean shape is below three standard deviations of deformation:
+    docs/benchmarks/README.md, "Thresholds".
     """
     across = across_plane(state.shapes[0])
     relief, *deviations = np.sum((across @ state.shapes) ** 2, axis=(1, 2))

@@ -65,8 +65,13 @@ def n_directions(problem: JointProblem, n_points: int, few: bool) -> int:
     return max(min(3 * n_points - 7, most, int(n_shapes) - 1), 1)
 
 
-def extended(problem: JointProblem, fit: JointFit, n: int) -> JointFit:
-    """Return the fit of n directions with the first noise, from one with less."""
+def extended(
+    problem: JointProblem, fit: JointFit, n: int, max_iter: int = 40, tol: float = 1.0
+) -> JointFit:
+    """Return the fit of n directions with the first noise, from one with less.
+
+    `tol` is a factor of the tolerance.
+    """
     state = fit.state
     n_more = n + 1 - len(state.shapes)
     if n_more > 0:
@@ -77,8 +82,8 @@ def extended(problem: JointProblem, fit: JointFit, n: int) -> JointFit:
         more *= size / np.linalg.norm(more, axis=(1, 2))[:, None, None]
         state = state._replace(shapes=np.concatenate([state.shapes, more]))
     free = replace(problem, penalty=0.0, widths=None)
-    tol = problem.settings.tol
-    return free.refined(state, least_noise=FIRST_NOISE, max_iter=40, tol=tol)
+    tol *= problem.settings.tol
+    return free.refined(state, least_noise=FIRST_NOISE, max_iter=max_iter, tol=tol)
 
 
 def whole_distribution(problem: JointProblem, fit: JointFit) -> tuple[JointFit, Widths]:

@@ -136,8 +136,6 @@ def are_scaled(tracks: NDArray, tol: float, apart: bool = False) -> bool:
         return False
     tracks /= largest  # squares stay in range
     X = tracks.reshape(len(tracks), -1)
-    if np.unique(X, axis=1).shape[1] < 6:  # fewer are alike by chance
-        return False
     if apart:
         moves = tracks - np.nanmean(tracks, axis=0)
         n_seen = np.isfinite(moves).sum(axis=1, keepdims=True)
@@ -148,7 +146,9 @@ def are_scaled(tracks: NDArray, tol: float, apart: bool = False) -> bool:
     spreads += [[high - low, low], [np.fmax(high, -low)], [third - first, median]]
     ranges = [max(np.ptp(each) for each in spread) for spread in spreads]
     limits = [tol * spread[0].max() for spread in spreads]
-    return any(r <= limit > 0 for r, limit in zip(ranges, limits, strict=True))
+    alike = any(r <= limit > 0 for r, limit in zip(ranges, limits, strict=True))
+    # Fewer columns are alike by chance.
+    return alike and np.unique(X, axis=1).shape[1] >= 6
 
 
 def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
