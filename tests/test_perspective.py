@@ -77,9 +77,13 @@ def noisy():
     return table
 
 
-@pytest.mark.parametrize("seed", slow_after(1, range(20)))
-def test_without_noise_the_fit_is_exact(seed):
-    s = scene(seed, 40, 40.0, 2.4 * (2.5 + 0.25 * seed))  # radii
+@pytest.mark.parametrize(
+    ("seed", "size"), slow_after(1, [(0, (25, 12)), *((n, (40, 16)) for n in range(20))])
+)
+def test_without_noise_the_fit_is_exact(seed, size):
+    n_frames, n_points = size
+    distance = 2.4 * (2.5 + 0.25 * seed)  # radii
+    s = scene(seed, n_frames, 40.0, distance, n_points=n_points)
     X, S, R = s.X, s.S, s.R
     model = fitted(X, tol=1e-3)
     assert frame_error(model.reconstruct(X), S) < 1e-4
