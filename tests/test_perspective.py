@@ -78,7 +78,8 @@ def noisy():
 
 
 @pytest.mark.parametrize(
-    ("seed", "size"), slow_after(1, [(0, (25, 12)), *((n, (40, 16)) for n in range(20))])
+    ("seed", "size"),
+    slow_after(1, [(0, (25, 12)), *((n, (40, 16)) for n in range(20))]),
 )
 def test_without_noise_the_fit_is_exact(seed, size):
     n_frames, n_points = size
