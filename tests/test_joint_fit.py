@@ -293,7 +293,7 @@ class TestDegenerate:
     @CALIBRATED
     @pytest.mark.parametrize("deviation", slow_after(1, [0.0, DEVIATION]))
     def test_flat_objects_seen_by_calibrated_cameras(self, camera, deviation):
-        truth = make_nonrigid_tracks(40, 25, 2, camera=camera, random_state=0)
+        truth = make_nonrigid_tracks(20, 25, 2, camera=camera, random_state=0)
         flat = truth.shapes * [1.0, 1.0, 0.0]
         tracks = noisy(flat @ truth.motion.swapaxes(1, 2), deviation, unit=True)
         with warnings.catch_warnings(action="ignore"):  # each frame may be reversed
