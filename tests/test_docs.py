@@ -254,8 +254,8 @@ def test_tables_and_variables_of_matlab_are_the_same(sequence):
 # Of these pages each runs in a test of its own.
 WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
 REFERENCE = (
-    *("conventions", "export", "formats", "index", "large_tables", "skeletons"),
-    *("two_studies", "depth", "perspective"),  # slow
+    *("export", "formats", "index", "large_tables", "skeletons"),
+    *("conventions", "two_studies", "depth", "perspective"),  # slow
 )
 # Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
 OF_OTHERS = ("from_movement", "dask")
@@ -274,7 +274,7 @@ def fitted():
 
 
 @pytest.mark.usefixtures("video")
-@pytest.mark.parametrize("page", slow_after(6, REFERENCE))
+@pytest.mark.parametrize("page", slow_after(5, REFERENCE))
 def test_code_of_reference_pages_runs(page, fitted):
     faces, model, bodies, mice = fitted
     Path("landmarks").mkdir()
