@@ -116,10 +116,12 @@ def test_imports_and_help_wait_for_nothing(code):
 
 @pytest.mark.subprocess
 def test_the_estimator_brings_only_what_every_fit_needs():
-    codes = "import sklearn.decomposition", "from isa_nrsfm import AffineNRSfM"
-    before = loaded_by(codes[0])
-    options = {"EAGER_IMPORT": "", "PYTHONWARNINGS": "error"}
-    modules = loaded_by("\n".join(codes), **options) - before
+    code = (
+        "import sys, sklearn.decomposition\nbefore = {*sys.modules}\n"
+        "from isa_nrsfm import AffineNRSfM\n"
+        "print(*({*sys.modules} - before))\nsys.exit()"
+    )
+    modules = loaded_by(code, EAGER_IMPORT="", PYTHONWARNINGS="error")
     packages = {module.partition(".")[0] for module in modules}
     packages -= {*sys.stdlib_module_names, "isa_nrsfm"}
     assert packages <= {"numpy", "scipy", "sklearn", "joblib", "threadpoolctl"}
