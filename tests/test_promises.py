@@ -56,7 +56,7 @@ def test_commands_replace_files_only_by_force(table, succeeds, fails, tmp_path):
 
 
 @pytest.mark.subprocess
-@pytest.mark.parametrize("streams", ["2>&- <&-", "2>/dev/full"])
+@pytest.mark.parametrize("streams", slow_after(1, ["2>&- <&-", "2>/dev/full"]))
 def test_commands_need_no_standard_error(streams, table, tmp_path):
     argv = f"fit {table} {' '.join(QUICK)} 1 -o {tmp_path}/o {streams} >&-"
     run = subprocess.run(" ".join([*PROGRAM, argv]), shell=True, check=False)
