@@ -202,7 +202,7 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
 
 
 @pytest.mark.parametrize(
-    "case", slow_after(2, ["prior", "not refined", "names", "alternating"])
+    "case", slow_after(1, ["not refined", "prior", "names", "alternating"])
 )
 def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     model, table = fitted(case)
