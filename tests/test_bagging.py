@@ -25,7 +25,7 @@ def shape_error(tracks, **settings):
     ("kind", "seed", "n_frames"),
     slow_after(
         1,
-        [("hands", 0, 80), *((kind, seed, 200) for kind in MAKE for seed in range(3))],
+        [("hands", 0, 50), *((kind, seed, 200) for kind in MAKE for seed in range(3))],
     ),
 )
 def test_the_mean_is_nearer_to_the_truth_than_the_joint_fit(kind, seed, n_frames):
