@@ -176,17 +176,20 @@ class TestAssociation:
 
     @pytest.mark.parametrize(
         ("trial", "n_trials", "level"),
-        [
-            (spread, 25, 0.12),
-            (sessions, 25, 0.12),
-            (repeated, 25, 0.12),
-            (people, 40, 0.125),
-            (video, 40, 0.125),  # nine in ten if single frames are permuted
-            (lambda r: (rhythm(r, 12), rhythm(r, 12)[:, 0] > 0), 20, 0.1),
-            (lambda r: (wave(r, 3), wave(r, 1)[:, 0]), 20, 0.1),
-            (lambda r: (np.cumsum(r.normal(size=(300, 3)), 0), event(r)), 20, 0.1),
-            (lambda r: joined_clips(r)[:2], 20, 0.1),
-        ],
+        slow_after(
+            5,
+            [
+                (spread, 25, 0.12),
+                (sessions, 25, 0.12),
+                (repeated, 25, 0.12),
+                (people, 40, 0.125),
+                (video, 40, 0.125),  # nine in ten if single frames are permuted
+                (lambda r: (rhythm(r, 12), rhythm(r, 12)[:, 0] > 0), 20, 0.1),
+                (lambda r: (wave(r, 3), wave(r, 1)[:, 0]), 20, 0.1),
+                (lambda r: (np.cumsum(r.normal(size=(300, 3)), 0), event(r)), 20, 0.1),
+                (lambda r: joined_clips(r)[:2], 20, 0.1),
+            ],
+        ),
     )
     def test_labels_go_with_nothing_by_chance(self, trial, n_trials, level):
         assert np.mean(least_p(trial, n_trials) <= 0.05) <= level
