@@ -43,14 +43,14 @@ WRONG = pd.DataFrame({"status": ["error"], "message": "ValueError: no"})
 @pytest.mark.subprocess
 @pytest.mark.parametrize(
     ("x", "status", "values", "message"),
-    [
-        (3, "ok", {"square": 9}, ""),
-        (-1, "over time", {}, "over 0.5 s"),
-        pytest.param(
-            *("a", "error", {}, "TypeError: '<' not supported between instances of"),
-            marks=pytest.mark.slow,
-        ),
-    ],
+    slow_after(
+        1,
+        [
+            (-1, "over time", {}, "over 0.5 s"),
+            (3, "ok", {"square": 9}, ""),
+            ("a", "error", {}, "TypeError: '<' not supported between instances of"),
+        ],
+    ),
 )
 def test_runs_in_a_process_of_their_own_end(x, status, values, message):
     record = run_isolated(measured_square, {"x": x}, time_limit=0.5)
