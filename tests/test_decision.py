@@ -152,6 +152,7 @@ def test_one_scale_is_found():
     assert np.isnan(no_outliers.held_out_error)
 
 
+@pytest.mark.slow
 def test_one_scale_is_found_from_a_sample():
     X = points(80, 16, noise=0.02, **ORTHOGRAPHIC)
     sampled = with_limits(sample=40, small_table=1000)
