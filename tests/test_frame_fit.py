@@ -365,6 +365,7 @@ def of_consensus(points=None):
     return jackknife.of_consensus(np.array([0.1, 0.3]), np.array([1.0, 3.0]), 0.5)
 
 
+@pytest.mark.slow
 def test_depth_of_an_animal_seen_from_the_side_is_withheld():
     rng = np.random.default_rng(0)
     yaw = Rotation.from_euler("y", 3 * rng.normal(size=(50, 1)), degrees=True)
