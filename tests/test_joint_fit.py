@@ -223,6 +223,7 @@ class TestLargeTables:
         assert set(sizes) == {40, 200}
         assert sizes.index(200) == len(sizes) - 1
 
+    @pytest.mark.slow
     def test_bodies_that_the_sample_does_not_have(self):
         """No frame at a wrong minimum bends the shapes: depth errors were 0.27."""
         kind = with_limits(**ONE_START, small_table=1000, sample=150)
