@@ -35,7 +35,7 @@ sys.meta_path.insert(0, Blocked)
 import numpy as np
 from isa_nrsfm import AffineNRSfM
 
-X = np.random.default_rng(0).normal(size=(40, 24))
+X = np.random.default_rng(0).normal(size=(20, 16))
 for refinement in (None, "joint"):
     model = AffineNRSfM(1, refinement=refinement, max_iter=3, random_state=0).fit(X)
     assert model.transform(X[:3]).shape == (3, 1)
