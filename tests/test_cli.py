@@ -147,10 +147,11 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
             | {"independence": None, "scale_frames": False, "hidden_points": False}
             | {"random_state": 7, "n_jobs": 1},
         ),
-        (
+        pytest.param(
             "--n-init 1 --independence coefficients --loss huber",
             {"isa__n_init": 1, "independence": "coefficients", "loss": "huber"}
             | {"camera": "weak_perspective"},
+            marks=pytest.mark.slow,
         ),
     ],
 )
