@@ -94,7 +94,7 @@ sys.exit(main(sys.argv[2:]))
 @pytest.mark.subprocess
 @pytest.mark.parametrize(
     "module",
-    slow_after(2, ["argparse", "isa_nrsfm._estimator", "isa_nrsfm.cli._main", "numpy"]),
+    slow_after(1, ["argparse", "isa_nrsfm._estimator", "isa_nrsfm.cli._main", "numpy"]),
 )
 def test_interruption_while_modules_are_imported(faces, tmp_path, module):
     faces.to_csv(tmp_path / "faces.csv", index=False)
