@@ -76,6 +76,22 @@ def test_a_stopped_fit_leaves_no_folder(name, table, tmp_path):
     assert not folder.parent.exists()
 
 
+@pytest.mark.subprocess
+def test_a_stopped_command_that_loses_the_exception_says_that_it_was_stopped():
+    code = """
+import os, signal, sys
+from isa_nrsfm.cli import _entry, _main
+def run(argv):
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    except SystemExit:
+        return 1
+_main.run = run
+sys.exit(_entry.main())
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 143
+
+
 @pytest.mark.parametrize("read", [read_landmarks, read_table, load_model, open_table])
 def test_pipes_and_devices_are_refused_at_once(read, tmp_path):
     pipe, link, name = tmp_path / "a.parquet", tmp_path / "b.parquet", "a.pts"

@@ -10,11 +10,6 @@ from typing import Any, NoReturn
 STOPPING = ("SIGTERM", "SIGHUP")
 
 
-def _stop(number: int, _frame: Any) -> NoReturn:
-    """End the process as shells report its signal."""
-    raise SystemExit(128 + number)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run the command line.
@@ -43,15 +38,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed, as in services
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+    codes: list[int] = []
+
+    def stop(number: int, _frame: Any) -> NoReturn:
+        """End the process as shells report its signal."""
+        codes.append(128 + number)
+        raise SystemExit(codes[0])
+
     if argv is None:  # the process is this program
         for number in filter(None, (getattr(signal, n, None) for n in STOPPING)):
             if signal.getsignal(number) is signal.SIG_DFL:
-                signal.signal(number, _stop)
+                signal.signal(number, stop)
     try:
         # Within the try block: an interruption may come while modules are imported.
         from isa_nrsfm.cli._main import run
 
-        return run(argv)
+        code = run(argv)
+        # Code in C may lose the exception of a signal, and fail for the lack of it.
+        return codes[0] if code and codes else code
     except KeyboardInterrupt:
         print("isa-nrsfm: interrupted", file=sys.stderr, flush=True)
         return 130
