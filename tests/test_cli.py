@@ -611,6 +611,7 @@ def test_demo_writes_a_table_and_finds_its_faces(succeeds, tmp_path, monkeypatch
     assert (demo.folder / "alpha.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.subprocess
 def test_progress_is_shown_on_a_terminal(table, tmp_path):
     reading, writing = pty.openpty()

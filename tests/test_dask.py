@@ -7,7 +7,7 @@ import joblib
 import numpy as np
 import pytest
 from frame_parts import assert_same_model
-from layers import slow_after, with_limits
+from layers import with_limits
 from numpy.testing import assert_allclose
 from scenes import with_gaps
 from sklearn.model_selection import GridSearchCV
@@ -42,7 +42,8 @@ SampledNRSfM = with_limits(small_table=1000, sample=40, restarts=False)
 @pytest.mark.cluster
 class TestCluster:
     # A worker that is killed does not change the result.
-    @pytest.mark.parametrize("missing", slow_after(1, [0.1, 0.0]))
+    @pytest.mark.slow
+    @pytest.mark.parametrize("missing", [0.1, 0.0])
     def test_fit_is_that_in_memory(self, cluster, monkeypatch, missing):
         X, compute, maps = table(missing), dask.compute, []
 

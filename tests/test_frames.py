@@ -470,6 +470,7 @@ def test_flat_shapes_have_cameras_that_are_zero_across():
         assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_large_motion_needs_further_starts(load_data):
     tracks = load_data("akhter_yoga")["W2d"]
     model = AffineNRSfM(2, random_state=0).fit(tracks.reshape(len(tracks), -1))

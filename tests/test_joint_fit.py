@@ -271,6 +271,7 @@ class TestRobustLoss:
         moved = with_outliers(tracks, 2.0, seed=5)
         assert error_of(fitted(moved, loss=loss), tracks, truth) < 1e-3
 
+    @pytest.mark.slow
     def test_tables_of_more_frames_than_settle_the_weights(self):
         # 2,000 frames do, also of tables that are too small for a sample.
         table = make_nonrigid_tracks(2100, 12, 1, noise=0.02, random_state=0).data

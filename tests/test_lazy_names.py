@@ -130,6 +130,7 @@ def test_the_estimator_brings_only_what_every_fit_needs():
     assert not modules & parts
 
 
+@pytest.mark.slow
 @pytest.mark.subprocess
 def test_folders_of_the_package_need_no_import_of_their_own():
     code = (
@@ -140,6 +141,7 @@ def test_folders_of_the_package_need_no_import_of_their_own():
     loaded_by(f"import sys\n{code}", EAGER_IMPORT="")
 
 
+@pytest.mark.slow
 @pytest.mark.subprocess
 def test_all_names_are_imported_at_once_where_that_is_asked_for():
     loaded = loaded_by("import isa_nrsfm", EAGER_IMPORT="1")

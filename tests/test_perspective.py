@@ -202,6 +202,7 @@ def test_focal_lengths_of_frames(request, kind, tol):
     refused("one for each of the 5 rows", other.transform, zoomed[:5])
 
 
+@pytest.mark.slow
 def test_tables_without_perspective_say_so():
     s = scene(n_frames=25, noise=0.005)
     X, S, R = s.X, s.S, s.R
@@ -240,6 +241,7 @@ def test_bodies_that_turn_round(refinement):
     assert min(frame_error(theirs * (1, 1, z), s.S) for z in (-1, 1)) > 0.1
 
 
+@pytest.mark.slow
 def test_perspective_that_held_out_points_do_not_prefer_is_not_taken(tmp_path):
     s = scene(distance=200.0, noise=0.02)
     given = {"focal_length": 0.1 * F}

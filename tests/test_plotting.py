@@ -285,7 +285,8 @@ def test_shapes_are_those_of_the_estimator_in_natural_proportions(faces, estimat
         assert (alike if axis < 2 else abs(alike)) > least
 
 
-@pytest.mark.parametrize("camera", slow_after(1, ["weak_perspective", "orthographic"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 def test_shapes_of_calibrated_cameras_are_only_turned(camera):
     faces = make_face_tracks(n_frames=40, n_components=2, camera=camera, random_state=0)
     model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)

@@ -536,6 +536,7 @@ def test_a_table_that_is_held_is_opened_once(turned):
     assert model._opened(X, np.ones((len(X), N_POINTS))) is not opened
 
 
+@pytest.mark.slow
 def test_weights_of_points_and_other_tables():
     rng, table = np.random.default_rng(0), study(0, 30, 30, noise=0)
     weights = np.exp(3 * rng.normal(size=(30, N_POINTS)))

@@ -108,6 +108,7 @@ def test_all_results_have_the_same_coefficients(model, table, tmp_path):
     assert not hasattr(single.fit(table), "pose_effect_")
 
 
+@pytest.mark.slow
 def test_a_prior_keeps_its_origin(plain):
     new, _ = faces(30, seed=5)
     fit = AffineNRSfM("auto", prior=plain, **CALIBRATED)

@@ -43,6 +43,7 @@ def test_what_noise_decides_is_less_stable():
     assert noisy.stability_.min() < fitted().stability_.min() - 0.02
 
 
+@pytest.mark.slow
 def test_groups_jobs_and_files(tmp_path):
     table, groups = faces(), np.repeat(np.arange(40), 6)
     model = AffineNRSfM(3, random_state=0).fit(table, groups=groups)
