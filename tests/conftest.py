@@ -25,9 +25,8 @@ from isa_nrsfm import AffineNRSfM
 
 matplotlib.use("Agg")
 gc.disable()  # while tests are collected, which stay
-# Joint fits have one start, and few steps for the mean and the errors of their depths.
-QUICK = {"few_frames": 0, "widths": (), "restarts": False}
-QUICK |= {"error_steps": 3, "mean_steps": 3}
+# Joint fits have one start, and few steps for the errors of their depths.
+QUICK = {"few_frames": 0, "widths": (), "error_steps": 3, "restarts": False}
 AffineNRSfM._limits = LIMITS._replace(**QUICK)
 
 # The same examples each time

@@ -9,8 +9,6 @@ from tests.layers import slow_after
 
 MAKE = {"hands": make_hand_tracks, "bodies": make_body_tracks}
 
-AS_USERS = ["mean_steps"]
-
 pytestmark = pytest.mark.filterwarnings("ignore:the depth of the shapes")
 
 

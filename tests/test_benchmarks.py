@@ -170,6 +170,7 @@ def test_command_measures_writes_and_rewrites(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.glob("*.md")) == ["truth.md"]
 
 
+@pytest.mark.slow
 def test_stored_results_give_every_page():
     folder = ROOT / "docs" / "benchmarks"
     stored = read(folder / "results.json")

@@ -130,6 +130,7 @@ class TestInside:
             assert recorder.tasks().count(task) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.subprocess
 def test_before_callbacks_lines_tell_of_the_progress():
     code = (

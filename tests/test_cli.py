@@ -166,6 +166,7 @@ def test_options_reach_the_estimator(fits, tmp_path, options, expected):
     assert found == default | isa | {"n_components": 1} | expected
 
 
+@pytest.mark.slow
 def test_a_prior_of_another_table(fits, fails, transforms, tmp_path):
     options = {"n_components": 2, "camera": "weak_perspective", "random_state": 0}
     prior = AffineNRSfM(**options).fit(make_face_tracks(40, **options).data)

@@ -40,7 +40,7 @@ from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
-AS_USERS = ["few_frames", "widths", "error_steps", "mean_steps", "restarts"]
+AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
 AllStarts = with_limits(few_frames=0, widths=(), error_steps=3)
 Quick = with_limits(few_frames=0, widths=(), error_steps=3, restarts=False)

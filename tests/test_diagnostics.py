@@ -250,6 +250,7 @@ class TestOutliers:
         assert share == energy == 0
         assert found.shape == (0, 2)
 
+    @pytest.mark.slow
     def test_are_named_and_stand_for_what_they_cause(self):
         faces = make_face_tracks(60, n_components=2, noise=0.01, random_state=0)
         table, wrong = with_outliers(faces, 0.05)

@@ -35,7 +35,7 @@ from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 from isa_nrsfm.plotting import BasisShapeDisplay
 
-AS_USERS = ["error_steps", "mean_steps"]
+AS_USERS = ["error_steps"]
 
 
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)

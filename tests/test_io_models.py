@@ -314,7 +314,7 @@ def test_files_that_unpack_to_more_than_they_have_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "case", slow_after(1, ["prior", "alternating", "weak perspective"])
+    "case", slow_after(1, ["alternating", "prior", "weak perspective"])
 )
 def test_damaged_contents_with_a_right_digest_are_refused(case, fitted, tmp_path):
     model, _ = fitted(case)

@@ -341,6 +341,7 @@ def keypoints(folder):
     return path
 
 
+@pytest.mark.slow
 def test_all_results_of_some_points_are_weighted(tmp_path, succeeds):
     results = keypoints(tmp_path)
     options = ["--weights", "confidence"]

@@ -15,7 +15,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.export import frame_points, write_points
 
-AS_USERS = ["error_steps", "mean_steps"]
+AS_USERS = ["error_steps"]
 MAKE = {
     "faces": lambda **k: make_face_tracks(50, n_components=3, noise=0.02, **k),
     "bodies": lambda **k: make_body_tracks(150, noise=0.02, **k),

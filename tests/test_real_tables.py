@@ -11,7 +11,7 @@ from benchmarks.depth import rotation_ratio
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.metrics import mean_shape_error_3d
 
-AS_USERS = ["few_frames", "widths", "error_steps", "mean_steps", "restarts"]
+AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 FITS = {
     "calibrated": {"camera": "weak_perspective", "n_components": 4},
     "missing": {"n_components": 4},

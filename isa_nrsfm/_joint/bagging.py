@@ -42,9 +42,9 @@ from isa_nrsfm._linalg import centred
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables import FEWEST_POINTS, FrameBlocks, spread
 
-# Largest numbers of frames and directions, and largest squared error of the depths by
-# other explanations: docs/benchmarks/README.md, "Thresholds".
-MOST_FRAMES, MOST_DIRECTIONS = 600, 24
+# Largest numbers of frames and directions, and steps, and largest squared error of the
+# depths by other explanations: docs/benchmarks/README.md, "Thresholds".
+MOST_FRAMES, MOST_DIRECTIONS, MOST_STEPS = 600, 24, 50
 MOST_DEFORMATION = 0.01
 
 
@@ -80,7 +80,7 @@ def bagged(
         problem = replace(problem, widths=own)
         shapes = centred(model.shapes[: n_directions + 1, :, points])
         state = JointState(shapes, fit.motion[frames], model.noise_variance)
-        limits: Any = {"max_iter": settings.limits.mean_steps, "tol": settings.tol}
+        limits: Any = {"max_iter": MOST_STEPS, "tol": settings.tol}
         state = problem.refined(state, least_noise=LEAST_NOISE, **limits).state
         depths = centred(state.depths(problem.likelihood(*state).alpha))
         return frames, depths

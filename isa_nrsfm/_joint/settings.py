@@ -54,8 +54,6 @@ class Limits(NamedTuple):
     # Largest number of steps of a fit that estimates errors of depths. 30 steps
     # understate those of undetermined depths.
     error_steps: int = 100
-    # Largest number of steps of the fits whose mean is taken
-    mean_steps: int = 50
     # Whether calibrated cameras have further starts: from more or fewer basis shapes,
     # from cameras that turn less, and from groups of frames reversed in depth
     restarts: bool = True
