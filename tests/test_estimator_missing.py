@@ -116,7 +116,6 @@ def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     assert_allclose(alone, together[:6], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_rows_that_look_like_other_points_are_not_refused():
     """The fit that would adapt the model to half of them is refused."""
     X, _ = frames_with_outliers()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layers import slow_after, start_may_not_converge
+from layers import slow_after, start_may_not_converge, with_limits
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from sklearn.base import BaseEstimator, TransformerMixin, clone
@@ -31,7 +31,7 @@ COLUMNS += [{"camera": "weak_perspective"} | each for each in SCALED]
 COLUMNS.append({"camera": "orthographic"})
 OF_JOINT_FIT = {
     *("alpha_std_", "noise_variance_", "camera_noise_ratio_", "depth_uncertainty_"),
-    *("reliability_", "objective_history_", "gradient_norm_"),
+    *("reliability_", "objective_history_", "gradient_norm_", "stability_"),
 }
 # What is different with orthographic cameras where there is no joint refinement: it is
 # the covariance of what multiplies white signals, not shapes in the units of the table.
@@ -90,7 +90,9 @@ def second_table(X):
 def models(**settings):
     """Return models of the two tables, to be left as they are."""
     X = table(settings["camera"])
-    model = AffineNRSfM(2, random_state=0, **settings)
+    # More steps amplify rounding errors.
+    limited = with_limits(few_frames=0, widths=(), error_steps=3, restarts=False)
+    model = limited(2, random_state=0, **settings)
     return clone(model).fit(X), model.fit(second_table(X))
 
 
