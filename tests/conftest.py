@@ -18,16 +18,14 @@ import pandas as pd
 import pytest
 from estimator_contract import widen
 from hypothesis import settings
-from layers import LIMITS
+from layers import LIMITS, QUICK_LIMITS
 from sklearn.utils import estimator_checks
 
 from isa_nrsfm import AffineNRSfM
 
 matplotlib.use("Agg")
 gc.disable()  # while tests are collected, which stay
-# Joint fits have one start, and few steps for the errors of their depths.
-QUICK = {"few_frames": 0, "widths": (), "error_steps": 3, "restarts": False}
-AffineNRSfM._limits = LIMITS._replace(**QUICK)
+AffineNRSfM._limits = LIMITS._replace(**QUICK_LIMITS)
 
 # The same examples each time
 settings.register_profile("same", deadline=None, derandomize=True, database=None)

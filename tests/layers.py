@@ -5,6 +5,9 @@ import pytest
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._joint.settings import LIMITS
 
+# Of quick tests: joint fits have one start, and few steps for the errors of depths.
+QUICK_LIMITS = {"few_frames": 0, "widths": (), "error_steps": 3, "restarts": False}
+
 # The run of FastICA or FastISA that is kept may go round in a cycle; it says so.
 may_not_converge = pytest.mark.filterwarnings(
     "ignore::sklearn.exceptions.ConvergenceWarning"

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from frame_parts import depth_errors
-from layers import with_limits
+from layers import QUICK_LIMITS, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
 from scenes import with_gaps
@@ -42,8 +42,8 @@ from isa_nrsfm.metrics import mean_shape_error_3d
 
 AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
-AllStarts = with_limits(few_frames=0, widths=(), error_steps=3)
-Quick = with_limits(few_frames=0, widths=(), error_steps=3, restarts=False)
+AllStarts = with_limits(**QUICK_LIMITS | {"restarts": True})
+Quick = with_limits(**QUICK_LIMITS)
 
 
 def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):

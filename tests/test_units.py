@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layers import slow_after, start_may_not_converge, with_limits
+from layers import QUICK_LIMITS, slow_after, start_may_not_converge, with_limits
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from sklearn.base import BaseEstimator, TransformerMixin, clone
@@ -91,8 +91,7 @@ def models(**settings):
     """Return models of the two tables, to be left as they are."""
     X = table(settings["camera"])
     # More steps amplify rounding errors.
-    limited = with_limits(few_frames=0, widths=(), error_steps=3, restarts=False)
-    model = limited(2, random_state=0, **settings)
+    model = with_limits(**QUICK_LIMITS)(2, random_state=0, **settings)
     return clone(model).fit(X), model.fit(second_table(X))
 
 
