@@ -23,6 +23,9 @@ that a fit leaves to its basis shapes, with points as samples and d = 3. With d 
 is plain ICA, as for coefficients.
 """
 
+from functools import cache
+from operator import itemgetter
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
@@ -302,7 +305,7 @@ def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
     # go astray where signals are Gaussian, and magnify rounding errors.
     few = _few_samples(Z)
     ends = _fixed_point(_starts(few, n_starts), few, 8)
-    W = max(ends, key=lambda end: _fit_densities(end, few)[0])
+    W = max(zip(_fit_densities(ends, few)[0], ends, strict=True), key=itemgetter(0))[1]
     # The maximum of the likelihood, for many samples first that of a part of them
     for samples in [few] if few is Z else [few, Z]:
         W, of_signals = _maximise(W, samples)
@@ -406,6 +409,7 @@ def _slopes(u: NDArray, tail: NDArray, size: int) -> tuple[NDArray, NDArray]:
     return g - 0.5 * TEMPER, dg
 
 
+@cache
 def _log_integral(tail: float, size: int) -> float:
     """Return the logarithm of the integral of ``exp F(||y||^2)`` over all vectors y."""
     # In the logarithm of the radius the trapezoidal rule is accurate to rounding.
@@ -416,34 +420,39 @@ def _log_integral(tail: float, size: int) -> float:
     return float(sphere + np.log(radial))
 
 
-def _fit_densities(W: NDArray, Z: NDArray) -> tuple[float, NDArray, NDArray, NDArray]:
+def _fit_densities(W: NDArray, Z: NDArray) -> tuple[NDArray, ...]:
     """Return the likelihood of the signals ``y = W z`` with their likeliest densities.
 
     Also returns for each signal its density, one of `TAILS`, its squared scale, and ``E
     log p_k(||y_k||)``. The likelihood adds ``size * log |det W|`` to the sum of these.
+    W (..., n, n) may be a stack of mixings.
     """
     size = Z.shape[2]
-    Y = np.tensordot(W, Z, 1)
-    u = np.einsum("kjc,kjc->kj", Y, Y)
-    log_variance = np.log(u.mean(axis=1) / size)
+    products = [np.tensordot(mixing, Z, 1) for mixing in W.reshape(-1, *W.shape[-2:])]
+    u = np.array([np.einsum("kjc,kjc->kj", Y, Y) for Y in products])
+    u = u.reshape(*W.shape[:-1], -1)
+    log_variance = np.log(u.mean(axis=-1) / size)
     variances, values = [], []
     for tail in TAILS:
         for _ in range(5):
-            v = u * np.exp(-log_variance)[:, None]
+            v = u * np.exp(-log_variance)[..., None]
             g, dg = _slopes(v, np.array(tail), size)
             # Newton step for the scale. The likelihood is largest where
             # E[-2 g(v) v] = size, with v = u / variance.
-            excess = -2.0 * np.mean(g * v, axis=1) - size
-            slope = 2.0 * np.mean((g + dg * v) * v, axis=1)
+            excess = -2.0 * np.mean(g * v, axis=-1) - size
+            slope = 2.0 * np.mean((g + dg * v) * v, axis=-1)
             log_variance = log_variance - np.clip(excess / slope, -1.0, 1.0)
-        v = u * np.exp(-log_variance)[:, None]
-        F = _log_density(v, np.array(tail), size).mean(axis=1)
+        v = u * np.exp(-log_variance)[..., None]
+        F = _log_density(v, np.array(tail), size).mean(axis=-1)
         variances.append(np.exp(log_variance))
         values.append(F - _log_integral(tail, size) - size / 2 * log_variance)
-    best = np.argmax(values, axis=0), np.arange(len(W))
-    of_signals = np.array(values)[best]
-    total = float(of_signals.sum() + size * np.linalg.slogdet(W)[1])
-    return total, np.array(TAILS)[best[0]], np.array(variances)[best], of_signals
+    best = np.argmax(values, axis=0)
+    variance, of_signals = (
+        np.take_along_axis(np.array(each), best[None], axis=0)[0]
+        for each in (variances, values)
+    )
+    total = of_signals.sum(axis=-1) + size * np.linalg.slogdet(W)[1]
+    return total, np.array(TAILS)[best], variance, of_signals
 
 
 def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, NDArray]:
