@@ -318,15 +318,17 @@ class FrameModel:
         if self.joint:
             unit = rows / sizes[:, None, None]
             return self.shown(self.posterior(unit, deviations, weights), sizes)
-        K, complete = len(self.shapes) - 1, seen_points(rows).all(axis=1)
+        K, seen = len(self.shapes) - 1, seen_points(rows)
         empty = (np.full((len(rows), *n), np.nan) for n in ((2, 3), (2,), (K,), (K,)))
         fit = Decomposition(*empty)
-        # Complete frames together, others one by one
-        single = np.flatnonzero(~complete)[:, None]
-        for frames in (np.flatnonzero(complete), *single):
-            if len(frames):
-                part = rigid_fit(rows[frames], self.shapes, self.camera)
-                fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
+        # Frames that show the same points together
+        _, numbers, counts = np.unique(
+            seen, axis=0, return_inverse=True, return_counts=True
+        )
+        order = np.argsort(numbers.ravel(), kind="stable")
+        for frames in np.split(order, np.cumsum(counts))[:-1]:
+            part = rigid_fit(rows[frames], self.shapes, self.camera)
+            fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
         return fit._replace(motion=fit.motion @ np.linalg.inv(self.gauge.space))
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
