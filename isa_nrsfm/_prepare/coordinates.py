@@ -141,7 +141,9 @@ def are_scaled(tracks: NDArray, tol: float, apart: bool = False) -> bool:
         n_seen = np.isfinite(moves).sum(axis=1, keepdims=True)
         own = moves - np.nansum(moves, axis=1, keepdims=True) / np.maximum(n_seen, 1)
         tol *= np.nanstd(own) / (np.nanstd(moves) or 1.0)
-    low, first, median, third, high = np.nanpercentile(X, [0, 25, 50, 75, 100], axis=0)
+    # The one for missing points goes through the columns one by one.
+    percentile = np.percentile if np.isfinite(X).all() else np.nanpercentile
+    low, first, median, third, high = percentile(X, [0, 25, 50, 75, 100], axis=0)
     spreads = [[np.nanstd(X, axis=0)], [np.nanstd(X, axis=0, ddof=1)]]
     spreads += [[high - low, low], [np.fmax(high, -low)], [third - first, median]]
     ranges = [max(np.ptp(each) for each in spread) for spread in spreads]
