@@ -7,7 +7,6 @@ os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before scipy is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
-import re
 import signal
 from collections import Counter
 from pathlib import Path
@@ -121,21 +120,11 @@ def interruptible():
 
 
 @pytest.fixture
-def run(capsys):
-    """Return a function that runs a command: exit code, output and errors.
+def run():
+    """Return a function that runs a command: exit code, output and errors."""
+    from fit_runs import ran
 
-    Errors are without the progress of slow runs.
-    """
-
-    def run_command(*argv):
-        from isa_nrsfm.cli import main
-
-        code = main([str(word) for word in argv])
-        captured = capsys.readouterr()
-        progress = re.compile(r"^isa-nrsfm: \d+ s: .*\n", re.MULTILINE)
-        return code, captured.out, progress.sub("", captured.err)
-
-    return run_command
+    return ran
 
 
 @pytest.fixture

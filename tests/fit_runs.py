@@ -73,14 +73,27 @@ def fit(table, folder, seed, *options):
     return main([str(word) for word in argv])
 
 
-def told(*argv):
-    """Raise the message of a command that fails, which is the last line it shows."""
-    out, err = io.StringIO(), io.StringIO()
+def ran(*argv):
+    """Run a command; return exit code, output and errors.
+
+    Errors are without the progress of slow runs. Both are UTF-8, as on a terminal.
+    """
+    options = {"encoding": "utf-8", "newline": ""}
+    out, err = (io.TextIOWrapper(io.BytesIO(), **options) for _ in range(2))
     with redirect_stdout(out), redirect_stderr(err):
         code = main([str(word) for word in argv])
-    assert (code, out.getvalue()) == (1, ""), err.getvalue()
-    assert "Traceback" not in err.getvalue()
-    raise ValueError(err.getvalue().splitlines()[-1].partition("isa-nrsfm: error: ")[2])
+    for stream in (out, err):
+        stream.seek(0)
+    progress = re.compile(r"^isa-nrsfm: \d+ s: .*\n", re.MULTILINE)
+    return code, out.read(), progress.sub("", err.read())
+
+
+def told(*argv):
+    """Raise the message of a command that fails, which is the last line it shows."""
+    code, out, err = ran(*argv)
+    assert (code, out) == (1, ""), err
+    assert "Traceback" not in err
+    raise ValueError(err.splitlines()[-1].partition("isa-nrsfm: error: ")[2])
 
 
 def told_of_fit(table, options):
@@ -93,7 +106,6 @@ def told_of_fit(table, options):
 
 def begun(table, *options):
     """Read a table up to its fit; return what is told until then."""
-    out, err = io.StringIO(), io.StringIO()
     argv = ["fit", table, "-o", Path(table).parent / "no results", "-k", 1, *options]
     argv += ["--refinement", "none", "--no-figures"]
 
@@ -102,10 +114,9 @@ def begun(table, *options):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(AffineNRSfM, "fit", stop)
-        with redirect_stdout(out), redirect_stderr(err):
-            code = main([str(word) for word in argv])
-    before, last = err.getvalue()[:-1].rpartition("\n")[::2]
-    assert (code, out.getvalue()) == (1, ""), err.getvalue()
+        code, out, err = ran(*argv)
+    before, last = err[:-1].rpartition("\n")[::2]
+    assert (code, out) == (1, ""), err
     assert last == "isa-nrsfm: error: here the fit begins"
     return before
 

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import FIGURES, FILES, JOINT, MODEL, Results, told, write_landmarks
+from fit_runs import FIGURES, FILES, JOINT, MODEL, Results, ran, told, write_landmarks
 from landmark_files import saved
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
@@ -60,15 +60,15 @@ def table(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(table, tmp_path_factory):
-    """Return the results of a fit without figures."""
-    folder = tmp_path_factory.mktemp("fit") / "results"
-    assert main(["fit", str(table), "--output", str(folder), *NO_FIGURES]) == 0
-    return Results(folder)
+    """Return the results of a fit with figures."""
+    folder = tmp_path_factory.mktemp("fit") / "new" / "results"
+    code, out, err = ran("fit", table, "--output", folder, *QUICK)
+    assert code == 0, err
+    return Results(folder, out, err)
 
 
-def test_fit_writes_all_that_its_report_lists(fits, table, tmp_path):
-    folder = tmp_path / "new" / "results"
-    found = fits(table, *QUICK, folder=folder)
+def test_fit_writes_all_that_its_report_lists(fitted):
+    found, folder = fitted, fitted.folder
     out, report, listed = found.out, found.report, FILES | FIGURES
     assert found.err == ""
     assert {path.name for path in folder.iterdir()} == listed
