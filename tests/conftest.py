@@ -43,8 +43,9 @@ def _data_folder():
 
 
 def pytest_collection_finish():
-    """Look for garbage from now on, but not among the collected tests."""
+    """Look for garbage from now on, but seldom, and not among the collected tests."""
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
     gc.enable()
 
 

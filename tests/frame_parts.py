@@ -32,9 +32,10 @@ class Regression(NamedTuple):
         w = np.isfinite(points[:, 0]) * 1.0
         w *= 1.0 if scene.weights is None else scene.weights[i]
         seen = w > 0
-        w, points = w[seen], points[seen] - np.average(points[seen], 0, w[seen])
+        w, points = w[seen], points[seen]
+        points = points - w @ points / w.sum()
         shapes = (scene.shapes if shapes is None else shapes)[..., seen]
-        shapes = np.sqrt(w) * (shapes - np.average(shapes, 2, w)[..., None])
+        shapes = np.sqrt(w) * (shapes - (shapes @ w / w.sum())[..., None])
         columns = (M @ shapes).reshape(len(shapes), -1)
         y = (np.sqrt(w) * points.T).ravel()
         return cls(y, columns[0], columns[1:].T, shapes)
