@@ -65,7 +65,7 @@ def write_faces(n_frames, n_components, **others):
 def tables(tmp_path, monkeypatch):
     """Write tables of faces, and go where they are."""
     monkeypatch.chdir(tmp_path)
-    write_faces(60, 8)
+    write_faces(60, 3)
 
 
 @pytest.fixture
