@@ -145,30 +145,33 @@ def linearised(
     basis = strain_basis(camera)
     # exp(E_0 / 2) exp(E) exp(E_0 / 2) changes to first order by the symmetric part of
     # E_0 exp(E), where E = sum_k alpha_ik E_k.
-    values, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
-    seen = MQ @ axes
-    grown = (seen * np.exp(values)[:, None]) @ axes.mT  # M_i Q exp(E)
+    grown, own = MQ, list[NDArray]()
+    if len(strain):
+        values, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
+        seen = MQ @ axes
+        grown = (seen * np.exp(values)[:, None]) @ axes.mT  # M_i Q exp(E)
+        # In the axes of E its exponential changes by dE times, entry by entry, the
+        # divided differences of exp at two eigenvalues, which are exp((a + b) / 2)
+        # sinh((a - b) / 2) / ((a - b) / 2).
+        a, b = values[:, :, None] / 2, values[:, None] / 2
+        divided = np.exp(a + b) * np.sinc(1j * (a - b) / np.pi).real
+        weights = np.einsum("ipa,pqc,iqb->icab", seen, ROW_PRODUCTS, seen)
+        weights = axes[:, None] @ (divided[:, None] * weights) @ axes[:, None].mT
+        own = [np.tensordot(weights, basis, ((2, 3), (1, 2)))]
     rows = (MQ @ np.hstack([*basis])).reshape(len(MQ), -1, 3)
     products = (rows @ grown.mT).reshape(len(MQ), 2, -1, 2)
     common = np.tensordot(products, ROW_PRODUCTS, ((1, 3), (0, 1))).mT  # (I, c, n)
-    # In the axes of E its exponential changes by dE times, entry by entry, the divided
-    # differences of exp at two eigenvalues, which are exp((a + b) / 2) sinh((a - b) /
-    # 2) / ((a - b) / 2).
-    a, b = values[:, :, None] / 2, values[:, None] / 2
-    divided = np.exp(a + b) * np.sinc(1j * (a - b) / np.pi).real
-    weights = np.einsum("ipa,pqc,iqb->icab", seen, ROW_PRODUCTS, seen)
-    weights = axes[:, None] @ (divided[:, None] * weights) @ axes[:, None].mT
-    own = np.tensordot(weights, basis, ((2, 3), (1, 2)))
     entries = np.tensordot(grown @ MQ.mT, ROW_PRODUCTS)
-    changes = np.concatenate([common, own], axis=2)
+    changes = np.concatenate([common, *own], axis=2)
     if camera == "orthographic":
         residuals, slopes = (entries - [0, 0, 2]) / np.sqrt(2), changes / np.sqrt(2)
     else:  # a quotient
         residuals = entries[:, :2] / entries[:, 2:]
         slopes = changes[:, :2] - changes[:, 2:] * residuals[:, :, None]
         slopes /= entries[:, 2:, None]
-    common, own = np.split(slopes[:, :, None], 2, axis=3)
-    J = np.concatenate([common, alpha[:, None, :, None] * own], axis=2)
+    common, *own = np.split(slopes[:, :, None], 1 + len(own), axis=3)
+    own = [alpha[:, None, :, None] * each for each in own]
+    J = np.concatenate([common, *own], axis=2)
     return residuals.ravel(), J.reshape(residuals.size, -1)
 
 
