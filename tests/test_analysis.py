@@ -107,6 +107,8 @@ def least_p(trial, n_trials):
     return np.array(least)
 
 
+# Options where the number of permutations makes no difference
+FEW = {"n_permutations": 99, "random_state": 0}
 # Random trials with an effect, and their number
 EFFECTS = [(partial(video, n=400, effect=2.0), 20), (partial(people, effect=1.0), 40)]
 
@@ -232,10 +234,10 @@ class TestAssociation:
 
     def test_blocks_follow_time(self):
         alpha, y = video(0)
-        expected = association(alpha, y, random_state=0)
+        expected = association(alpha, y, **FEW)
         assert expected.permuted == "frequencies"
         mixed = rng_of(0).permutation(len(y))
-        found = association(alpha[mixed], y[mixed], time=mixed / 25, random_state=0)
+        found = association(alpha[mixed], y[mixed], time=mixed / 25, **FEW)
         assert found.permuted == expected.permuted
         assert_allclose(found.p_value, expected.p_value)
 
@@ -248,9 +250,9 @@ class TestAssociation:
 
     def test_frames_without_coefficients_are_left_out_and_counted(self):
         alpha, y = related()
-        expected = association(alpha[10:], y[10:], random_state=0)
+        expected = association(alpha[10:], y[10:], **FEW)
         alpha[:10] = np.nan
-        found = association(alpha, y, random_state=0)
+        found = association(alpha, y, **FEW)
         assert found.n_frames == len(y) - 10
         assert_array_equal(found.statistic, expected.statistic)
         assert_array_equal(found.p_value, expected.p_value)
@@ -273,7 +275,7 @@ class TestAssociation:
         assert found.p_value[strength[-1]] == last
 
     def test_table(self):
-        found = association(*related(), random_state=0)
+        found = association(*related(), **FEW)
         frame = found.to_frame()
         assert list(frame.columns) == ["eta_squared", "p_value"]
         assert list(frame.index) == [1, 2, 3]

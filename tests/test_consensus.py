@@ -440,9 +440,15 @@ class TestEstimator:
         assert change[0] < 1e-3 * change[1]
 
     def test_frames_of_the_fit_are_those_of_transform(self):
-        """`alpha_` and `motion_` are the results of `decompose`."""
-        few = X[:30]
-        body = consensus_fit(few, kind=AllStarts, tol=0.5)
+        """`alpha_` and `motion_` are the results of `decompose`.
+
+        A number of basis shapes is that of the result, beyond the joint fit's.
+        """
+        few = X[:40]
+        body = consensus_fit(few, 14, AllStarts, tol=1.0)
+        assert body.basis_.shape == (14, 16, 3)
+        assert body.alpha_.shape == (40, 14)
+        assert len(body.get_feature_names_out()) == 14
         found = body.decompose(few)
         assert_allclose(found.alpha, body.alpha_, atol=1e-9)
         assert_allclose(found.motion, body.motion_, atol=1e-9 * np.abs(few).max())
@@ -450,13 +456,6 @@ class TestEstimator:
         alpha = model.decompose(few.reshape(len(few), -1, 2).mT).alpha
         shapes = model.mean_shape + np.tensordot(alpha, model.basis, 1)
         assert_allclose(body.reconstruct(few), shapes, atol=1e-9)
-
-    def test_number_of_components_as_given(self):
-        """A number of basis shapes is that of the result, beyond the joint fit's."""
-        found = consensus_fit(X[:40], 14, Quick, tol=1.0)
-        assert found.basis_.shape == (14, 16, 3)
-        assert found.alpha_.shape == (40, 14)
-        assert len(found.get_feature_names_out()) == 14
 
     @pytest.mark.slow
     def test_automatic_number_of_components(self):
