@@ -18,7 +18,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
 TESTS = ROOT / "tests"
 FOLDERS = ["isa_nrsfm", "tests", "benchmarks", "docs"]
-OPTIONAL = "h5py matplotlib pandas polars pooch pyarrow yaml".split()
 MODULES = [
     module.name for module in pkgutil.walk_packages(isa_nrsfm.__path__, "isa_nrsfm.")
 ]
@@ -145,19 +144,6 @@ def test_modules_have_docstrings_no_state_and_public_names_of_each_other():
         tree = ast.parse(file.read_text(encoding="utf-8"))
         for faults_of in (undocumented, state_of, private_imports):
             assert not [*faults_of(tree)], file
-
-
-@pytest.mark.subprocess
-def test_every_module_can_be_imported_without_optional_libraries():
-    modules = [name for name in MODULES if not name.endswith("__main__")]
-    code = (
-        "import importlib, sys\n"
-        f"sys.modules.update(dict.fromkeys({OPTIONAL}))\n"
-        f"for name in {modules}:\n"
-        "    importlib.import_module(name)\n"
-    )
-    status, output = run("-W", "error", "-c", code)
-    assert status == 0, output
 
 
 def test_the_top_of_the_package_and_modules_are_short():

@@ -17,6 +17,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 
 dask, array = pytest.importorskip("dask"), pytest.importorskip("dask.array")
 distributed = pytest.importorskip("distributed")
+cloudpickle = pytest.importorskip("cloudpickle")
 
 K = 2
 FRAMES = (70, 150, 0, 80)
@@ -39,41 +40,42 @@ def cluster():
 SampledNRSfM = with_limits(small_table=1000, sample=40, restarts=False)
 
 
+@pytest.mark.slow
 @pytest.mark.cluster
-class TestCluster:
-    # A worker that is killed does not change the result.
-    @pytest.mark.slow
-    @pytest.mark.parametrize("missing", [0.1, 0.0])
-    def test_fit_is_that_in_memory(self, cluster, monkeypatch, missing):
-        X, compute, maps = table(missing), dask.compute, []
+@pytest.mark.parametrize("missing", [0.1, 0.0])
+def test_fit_is_that_in_memory(cluster, monkeypatch, missing):
+    """A worker that is killed does not change the result."""
+    X, compute, maps = table(missing), dask.compute, []
 
-        def compute_and_kill(*tasks):
-            maps.append(len(tasks))
-            if len(maps) == 20:
-                first = next(iter(cluster.workers.values()))
-                os.kill(first.pid, signal.SIGKILL)
-            return compute(*tasks)
+    def compute_and_kill(*tasks):
+        maps.append(len(tasks))
+        if len(maps) == 20:
+            first = next(iter(cluster.workers.values()))
+            os.kill(first.pid, signal.SIGKILL)
+        return compute(*tasks)
 
-        monkeypatch.setattr(dask, "compute", compute_and_kill)
-        blocks = array.from_array(X, chunks=(FRAMES, 40))
-        model = SampledNRSfM(K, random_state=0).fit(blocks)
-        assert len(maps) > 20
-        assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
+    monkeypatch.setattr(dask, "compute", compute_and_kill)
+    blocks = array.from_array(X, chunks=(FRAMES, 40))
+    model = SampledNRSfM(K, random_state=0).fit(blocks)
+    assert len(maps) > 20
+    assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
 
-    def test_nothing_as_large_as_the_table_comes_back(self, cluster, monkeypatch):
-        compute, largest = dask.compute, []
 
-        def measured(*tasks):
-            found = compute(*tasks)
-            largest.append(size_of(found))
-            return found
+def test_nothing_as_large_as_the_table_comes_back(monkeypatch):
+    """Tasks are pickled, as they are for workers."""
+    compute, largest = dask.compute, []
 
-        monkeypatch.setattr(dask, "compute", measured)
-        X = np.tile(table(), (4, 1))
-        blocks = array.from_array(X, chunks=(400, 40))
-        SampledNRSfM(K, random_state=0, max_iter=5, tol=1e3).fit(blocks)
-        # Cameras, their gradients and curvatures, coefficients: 24 numbers a frame.
-        assert max(largest) < 0.7 * X.size
+    def measured(*tasks):
+        found = compute(*cloudpickle.loads(cloudpickle.dumps(tasks)))
+        largest.append(size_of(found))
+        return found
+
+    monkeypatch.setattr(dask, "compute", measured)
+    X = np.tile(table(), (4, 1))
+    blocks = array.from_array(X, chunks=(400, 40))
+    SampledNRSfM(K, random_state=0, max_iter=5, tol=1e3).fit(blocks)
+    # Cameras, their gradients and curvatures, coefficients: 24 numbers a frame.
+    assert max(largest) < 0.7 * X.size
 
 
 def size_of(found):

@@ -32,9 +32,16 @@ class Blocked:
             raise ModuleNotFoundError(name, name=name)
 
 sys.meta_path.insert(0, Blocked)
+import importlib, pkgutil, warnings
+import isa_nrsfm
+for module in pkgutil.walk_packages(isa_nrsfm.__path__, "isa_nrsfm."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+
 import numpy as np
 from isa_nrsfm import AffineNRSfM
 
+warnings.simplefilter("ignore")
 X = np.random.default_rng(0).normal(size=(20, 16))
 for refinement in (None, "joint"):
     model = AffineNRSfM(1, refinement=refinement, max_iter=3, random_state=0).fit(X)
@@ -71,11 +78,13 @@ def built(kind, folder, monkeypatch):
 
 @pytest.mark.subprocess
 def test_arrays_are_fitted_with_the_core_dependencies_alone():
+    """All modules can be imported with them, too."""
     assert {*lowest_versions(PROJECT["project"]["dependencies"])} == CORE
     blocked = installed_besides(CORE) - {"isa_nrsfm"}
     assert {"pandas", "matplotlib", "yaml", "pytest"} <= blocked
     code = FIT_OF_AN_ARRAY.format(blocked=blocked)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    program = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(program, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
