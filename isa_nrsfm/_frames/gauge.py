@@ -447,12 +447,9 @@ def _fit_densities(W: NDArray, Z: NDArray) -> tuple[NDArray, ...]:
         variances.append(np.exp(log_variance))
         values.append(F - _log_integral(tail, size) - size / 2 * log_variance)
     best = np.argmax(values, axis=0)
-    variance, of_signals = (
-        np.take_along_axis(np.array(each), best[None], axis=0)[0]
-        for each in (variances, values)
-    )
+    of_signals = np.choose(best, values)
     total = of_signals.sum(axis=-1) + size * np.linalg.slogdet(W)[1]
-    return total, np.array(TAILS)[best], variance, of_signals
+    return total, np.array(TAILS)[best], np.choose(best, variances), of_signals
 
 
 def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, NDArray]:
