@@ -231,12 +231,12 @@ def test_likelihood_of_frames_is_linearised(name, loss):
     rows, options = tracks.mT, {"camera": name, "loss": loss, "random_state": 0}
     model = AffineNRSfM(2, **options, scale_frames=False).fit(table)
     alone, frames = model._model.linearised(rows), model._model.frames
-    points = np.isfinite(tracks[row, :, 0])
+    points, k = np.isfinite(tracks[row, :, 0]), len(frames.shapes) - 1
     start = np.append(alone.alpha[row], np.zeros(CAMERAS[name].n_parameters))
 
     def images(x):
-        shape = frames.shapes[0] + np.tensordot(x[:2], frames.shapes[1:], 1)
-        M = CAMERAS[name].moved(frames_last(alone.motion[[row]]), x[2:, None])
+        shape = frames.shapes[0] + np.tensordot(x[:k], frames.shapes[1:], 1)
+        M = CAMERAS[name].moved(frames_last(alone.motion[[row]]), x[k:, None])
         return (frames_first(M)[0] @ shape)[:, points]
 
     T = np.array(
@@ -253,8 +253,8 @@ def test_likelihood_of_frames_is_linearised(name, loss):
         noise *= constant + slope * (1 + np.sum(alone.alpha[row] ** 2))
         assert_allclose(alone.precision[row], T @ T.T / noise, rtol=1e-5, atol=1e-2)
     # The posterior covariance has the Hessian, the precision that of Gauss-Newton.
-    whole = alone.precision[row] + np.diag(np.arange(len(start)) < 2)
-    ratio = np.linalg.solve(alone.covariance[row], np.linalg.inv(whole)[:2, :2])
+    whole = alone.precision[row] + np.diag(np.arange(len(start)) < k)
+    ratio = np.linalg.solve(alone.covariance[row], np.linalg.inv(whole)[:k, :k])
     assert_allclose(np.linalg.eigvals(ratio), 1.0, atol=0.2)
 
 
