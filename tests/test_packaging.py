@@ -19,9 +19,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 CORE = {"numpy", "scipy", "scikit-learn", "joblib"}
 # Files of the package that are no Python code.
-DATA = "py.typed cli/options.toml cli/report.html datasets/face_model.csv"
-DATA += " datasets/face_prior.npz export/viewer.html export/viewer.js io/formats.toml"
-DATA += " skeletons/layouts.toml"
+DATA = "py.typed analysis/texts.toml cli/options.toml cli/report.html"
+DATA += " datasets/face_model.csv datasets/face_prior.npz datasets/figures.toml"
+DATA += " datasets/sources.toml export/scene.gltf export/viewer.html export/viewer.js"
+DATA += " io/formats.toml io/keypoints.toml io/model_file.toml skeletons/layouts.toml"
+DATA += " skeletons/words.toml"
 DATA = {f"isa_nrsfm/{name}" for name in DATA.split()}
 FIT_OF_AN_ARRAY = """
 import sys
