@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import may_not_converge, slow_after, with_limits
+from layers import QUICK_LIMITS, may_not_converge, slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose
 from scenes import random_scene, table_of, with_gaps, with_outliers
@@ -38,8 +38,7 @@ KINDS = pytest.mark.parametrize(
 )
 # Errors of depths are tested in test_frame_fit.py. The first steps are made on few
 # frames, as of large tables.
-ONE_START = {"error_steps": 3, "few_frames": 0, "widths": (), "restarts": False}
-SampledNRSfM = with_limits(**ONE_START, small_table=1000, sample=40)
+SampledNRSfM = with_limits(**QUICK_LIMITS, small_table=1000, sample=40)
 
 
 def noisy(tracks, deviation, seed=0, unit=False):
@@ -226,7 +225,7 @@ class TestLargeTables:
     @pytest.mark.slow
     def test_bodies_that_the_sample_does_not_have(self):
         """No frame at a wrong minimum bends the shapes: depth errors were 0.27."""
-        kind = with_limits(**ONE_START, small_table=1000, sample=150)
+        kind = with_limits(**QUICK_LIMITS, small_table=1000, sample=150)
         X, points, _ = seen(make_body_tracks(1200, random_state=0).shapes, 40, 0)
         model = kind(9, camera="weak_perspective", random_state=0).fit(X)
         assert depth_error(model, X, points)[1] < 0.11
