@@ -318,7 +318,7 @@ class FrameModel:
         if self.joint:
             unit = rows / sizes[:, None, None]
             return self.shown(self.posterior(unit, deviations, weights), sizes)
-        K, seen = len(self.shapes) - 1, seen_points(rows)
+        K, seen = len(self.shapes) - 1, np.packbits(seen_points(rows), axis=1)
         empty = (np.full((len(rows), *n), np.nan) for n in ((2, 3), (2,), (K,), (K,)))
         fit = Decomposition(*empty)
         # Frames that show the same points together
