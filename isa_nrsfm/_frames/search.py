@@ -597,10 +597,9 @@ class FrameSearch:
                         usable = padded(np.flatnonzero(determined))
                         block, products = block[usable], of_frames(products, usable)
                 problem = self.problem(products, noise[chosen[block]])
-                start = self.evaluate(problem, self.start(problem, initial[block].T))
+                start = self.start(problem, initial[block].T)
                 M, converged = self.descend(problem, start, MAX_STEPS)
-                M = self._unreversed(problem, M, converged)
-                posterior = coefficient_posterior(problem, M)
+                M, posterior = self._unreversed(problem, M, converged)
                 covariance, turns = fits.covariance[block], fits.turn_covariance[block]
                 if covariances:
                     spreads = self._covariances(problem, M, posterior)
@@ -671,17 +670,20 @@ class FrameSearch:
         rise = (posterior.value(problem[1]) - value) / problem[1]
         return frames_first(M) @ self.space, posterior.alpha.T, rise
 
-    def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
-        """Return cameras (2, 3, n) near the affine ones for alpha (K, n).
+    def start(self, problem: FrameProblem, alpha: NDArray) -> State:
+        """Return the state at cameras near the affine ones for alpha (K, n).
 
         If calibrated, the better of the nearest and the `_completed` camera is taken.
         """
         M = affine_cameras(problem[0], with_one(alpha))
         if not self.model.calibrated:
-            return M
+            return self.evaluate(problem, M)
         starts = calibrated_starts(self.model, M)
-        values = [coefficient_posterior(problem, M).value(problem[1]) for M in starts]
-        return np.where(values[1] < values[0], *starts[::-1])
+        found = [coefficient_posterior(problem, M) for M in starts]
+        first, second = (posterior.value(problem[1]) for posterior in found)
+        better = partial(np.where, second < first)
+        posterior = CoefficientPosterior(*map(better, *found[::-1]))
+        return self._derivatives(problem, better(*starts[::-1]), posterior)[0]
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
@@ -706,19 +708,21 @@ class FrameSearch:
 
     def _unreversed(
         self, problem: FrameProblem, M: NDArray, converged: NDArray
-    ) -> NDArray:
+    ) -> tuple[NDArray, CoefficientPosterior]:
         """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
 
-        Sets where the search for the latter has converged.
+        With their posterior. Sets where the search for the latter has converged.
         """
-        if not self.model.calibrated:
-            return M
         posterior = coefficient_posterior(problem, M)
+        if not self.model.calibrated:
+            return M, posterior
         value, rise = posterior.value(problem[1]), _rise(problem, M, posterior)
         tried = np.flatnonzero(~(rise > LARGE_RISE * value))
         M, better, reached = self._better_reversed(problem, M, value, tried, MAX_STEPS)
-        converged[better] = reached[better]
-        return M
+        if better.any():
+            converged[better] = reached[better]
+            posterior = coefficient_posterior(problem, M)
+        return M, posterior
 
     def _covariances(
         self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
