@@ -37,9 +37,8 @@ OF_RANKS = 1e-10
 # Square roots of such remainders, such as distances.
 OF_DISTANCES = 1e-9
 
-# Row and column of the packed entries of a 3x3 matrix, the way back, and the diagonal.
-ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
-UNPACKED = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+# Row and column of the packed entries of a 3x3 matrix, and the diagonal.
+ROWS, COLUMNS = np.triu_indices(3)
 DIAGONAL = [0, 3, 5]
 
 # Number of rows up to which elimination is as fast as LAPACK:
@@ -49,7 +48,7 @@ SMALL = 30
 
 def unpack3(packed: NDArray) -> NDArray:
     """Return packed symmetric matrices (..., 6, n) as (..., 3, 3, n)."""
-    return packed[..., UNPACKED, :]
+    return packed.take(_places(3), -2)
 
 
 def inverse3(packed: NDArray) -> NDArray:
@@ -82,7 +81,10 @@ def pair_indices(k: int) -> tuple[NDArray, NDArray]:
 @cache
 def _places(k: int) -> NDArray:
     """Return the places (k, k) of entries in packed symmetric k x k matrices."""
-    return unpacked(np.arange(k * (k + 1) // 2))
+    first, second = pair_indices(k)
+    places = np.empty((k, k), dtype=int)
+    places[first, second] = places[second, first] = np.arange(len(first))
+    return places
 
 
 def packed_rows(packed: NDArray) -> list[NDArray]:
@@ -96,18 +98,12 @@ def packed_rows(packed: NDArray) -> list[NDArray]:
 
 def unpacked(packed: NDArray) -> NDArray:
     """Return packed symmetric matrices (n_pairs, ...) as (k, k, ...)."""
-    k = math.isqrt(2 * len(packed))
-    first, second = pair_indices(k)
-    full = np.empty((k, k, *packed.shape[1:]), packed.dtype)
-    full[first, second] = full[second, first] = packed
-    return full
+    return packed.take(_places(math.isqrt(2 * len(packed))), 0)
 
 
 def diagonal_of(packed: NDArray) -> NDArray:
     """Return the indices (k,) of the diagonal in packed matrices (n_pairs, ...)."""
-    k = math.isqrt(2 * len(packed))
-    rows = np.arange(k)
-    return rows * (2 * k + 1 - rows) // 2
+    return _places(math.isqrt(2 * len(packed))).diagonal()
 
 
 def packed_products(A: NDArray, B: NDArray) -> NDArray:

@@ -187,7 +187,7 @@ def with_one(alpha: NDArray) -> NDArray:
 
 def camera_gram(M: NDArray) -> NDArray:
     """Return ``M^T M`` (6, n_frames) of cameras (2, 3, n_frames), packed."""
-    return np.einsum("rpi,rpi->pi", M[:, ROWS], M[:, COLUMNS])
+    return np.einsum("rpi,rpi->pi", M.take(ROWS, 1), M.take(COLUMNS, 1))
 
 
 def affine_cameras(products: FrameSums, c: NDArray) -> NDArray:
@@ -367,11 +367,10 @@ class CoefficientPosterior(NamedTuple):
     def second_moments(self, noise: NDArray | float) -> NDArray:
         """Return ``E = c c^T + diag(0, s2 Q)``, packed (n_pairs, n_frames)."""
         n_shapes = len(self.c)
-        moments = np.empty_like(self.inverse)
-        moments[:n_shapes] = 0.0
-        np.multiply(self.inverse[n_shapes:], -noise, out=moments[n_shapes:])
-        for k, row in enumerate(packed_rows(moments)):
-            row += self.c[k] * self.c[k:]
+        first, second = pair_indices(n_shapes)
+        moments = self.c.take(first, 0)
+        moments *= self.c.take(second, 0)
+        moments[n_shapes:] -= noise * self.inverse[n_shapes:]
         return moments
 
 
