@@ -114,6 +114,8 @@ class Gram:
 
     def moments(self, C: NDArray) -> NDArray:
         """Return ``sum_kl C_kl G_kl`` (6, n), packed; C (n_pairs, n) is packed."""
+        if self.pairs.ndim == 2:
+            return (self._multiplicity * self.pairs).T @ C
         return self._times(self.pairs.swapaxes(0, 1), self._multiplicity * C)
 
     def energies(self, Q: NDArray) -> NDArray:
@@ -407,7 +409,8 @@ def coefficient_posterior(
         objective -= np.einsum("ki,ki->i", alpha, left)
     objective = np.maximum(objective, 0.0)  # less is rounding errors
     log_determinant = log_determinant - len(alpha) * np.log(noise)
-    c = with_one(alpha)
+    c = H[:n_shapes].copy()
+    c[0] = 1.0
     return CoefficientPosterior(c, H, objective, log_determinant, image_energy)
 
 

@@ -357,9 +357,9 @@ def extent_penalty(
     # Second elementary symmetric function of the squared extents
     pairs = (trace**2 - np.sum(G**2)) / 2 + FLAT * trace**2
     ratio = trace**2 / (3.0 * pairs) * (1 + 3 * FLAT)
-    slope = (2.0 / trace) * np.eye(3)
-    slope = slope - (trace * np.eye(3) - G + 2 * FLAT * trace * np.eye(3)) / pairs
-    gradient = np.tensordot(ratio * slope, B, axes=(1, 1)).swapaxes(0, 1)
+    one = np.eye(3)
+    slope = (2.0 / trace) * one - (trace * one - G + 2 * FLAT * trace * one) / pairs
+    gradient = (ratio * slope) @ B
     if shares is not None:
         gradient = np.sqrt(shares) * gradient
     return ratio - 1.0, 2.0 * gradient
