@@ -175,19 +175,18 @@ def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
     across, own = places[:first, first:], places[first:, first:]
     G, A = packed[across], np.ascontiguousarray(packed[own].T)
     X, upper = np.moveaxis(G, 2, 0).copy(), np.triu_indices(len(own))
-    # Copies of a frame (`padded`) are solved once.
-    new = np.append(True, (packed[:, 1:] != packed[:, :-1]).any(axis=0))
-    A, X, lanes = A[new], X[new], new.cumsum() - 1
+    # Copies of the last frame (`padded`) are solved once.
+    last = np.append(True, (packed != packed[:, -1:]).any(axis=0)).nonzero()[0][-1]
+    lanes, A, X = np.minimum(np.arange(len(A)), last), A[: last + 1], X[: last + 1]
     failed = [dposv(a.T, x.T, 1, 1, 1)[2] for a, x in zip(A, X, strict=True)]
-    pivots, least = A.diagonal(axis1=1, axis2=2).T ** 2, OF_STEPS * packed[np.diag(own)]
-    pivots = pivots[:, lanes]
+    pivots = A.diagonal(axis1=1, axis2=2)[lanes].T ** 2
+    least = OF_STEPS * packed[np.diag(own)]
     positive = (np.array(failed)[lanes] == 0) & (pivots > least).all(axis=0)
     others = np.flatnonzero(~positive)
     left, X = packed.take(others, -1), np.moveaxis(X[lanes], 0, 2)
     for a in A:
         dpotri(a.T, 1, 1)
-    A = A[lanes]
-    packed[own[upper]], packed[across] = -A[:, *upper].T, X
+    packed[own[upper]], packed[across] = -A[lanes][:, *upper].T, X
     packed[places[:first, :first]] -= np.einsum("rcn,scn->rsn", G, X)
     log_determinant = np.log(np.where(positive, pivots, 1.0)).sum(axis=0)
     if len(others):

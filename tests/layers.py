@@ -31,3 +31,7 @@ def slow_after(n_quick, values):
 def with_limits(**limits):
     """Return a class of estimators with other limits than those of users."""
     return limited(LIMITS._replace(**limits))
+
+
+# One start of a fit, with the errors of depths of users.
+OneStart = with_limits(few_frames=0, widths=(), restarts=False)

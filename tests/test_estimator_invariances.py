@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from layers import may_not_converge, slow_after, start_may_not_converge, with_limits
+from layers import OneStart, may_not_converge, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
 from scenes import table_of
 from sklearn.base import clone
@@ -31,7 +31,6 @@ SHAPE_TOLERANCE = 1e-6
 
 
 # Many starts are those of test_default_strategies_are_invariant.
-OneStart = with_limits(few_frames=0, widths=(), restarts=False)
 
 
 def estimator(params, scale_frames=True):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from frame_parts import depth_errors
-from layers import slow_after, with_limits
+from layers import OneStart, slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
@@ -432,8 +432,7 @@ def test_other_points_are_refused(turned, frontal):
     refused("the same points in the same order", fitted, other, turned.model)
     message = "depth of the shapes is not determined"
     hardly = study(1, 30, 1).X
-    some = with_limits(few_frames=0, widths=(), restarts=False)
-    calibrated = some(2, camera="weak_perspective", random_state=0)
+    calibrated = OneStart(2, camera="weak_perspective", random_state=0)
     undetermined = warned(message, calibrated.fit, hardly)
     refused("depth of the prior is not determined", fitted, X, undetermined)
 

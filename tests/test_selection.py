@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import sklearn
-from layers import may_not_converge, with_limits
+from layers import OneStart, may_not_converge
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
 from sklearn.exceptions import ConvergenceWarning
@@ -19,7 +19,6 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0).data
 PERSON = np.arange(len(X)) % 6
-OneStartNRSfM = with_limits(few_frames=0, widths=(), restarts=False)
 
 
 def inner(**parameters):
@@ -28,7 +27,7 @@ def inner(**parameters):
 
 def quick(**parameters):
     """Return an estimator with one start, for tests of what a search does with it."""
-    return OneStartNRSfM(random_state=0, **parameters)
+    return OneStart(random_state=0, **parameters)
 
 
 def mean_abs_alpha(estimator, X, y=None):

@@ -369,9 +369,8 @@ class CoefficientPosterior(NamedTuple):
     def second_moments(self, noise: NDArray | float) -> NDArray:
         """Return ``E = c c^T + diag(0, s2 Q)``, packed (n_pairs, n_frames)."""
         n_shapes = len(self.c)
-        first, second = pair_indices(n_shapes)
-        moments = self.c.take(first, 0)
-        moments *= self.c.take(second, 0)
+        moments, other = (self.c.take(side, 0) for side in pair_indices(n_shapes))
+        moments *= other
         moments[n_shapes:] -= noise * self.inverse[n_shapes:]
         return moments
 
@@ -409,8 +408,7 @@ def coefficient_posterior(
         objective -= np.einsum("ki,ki->i", alpha, left)
     objective = np.maximum(objective, 0.0)  # less is rounding errors
     log_determinant = log_determinant - len(alpha) * np.log(noise)
-    c = H[:n_shapes].copy()
-    c[0] = 1.0
+    c = with_one(alpha)
     return CoefficientPosterior(c, H, objective, log_determinant, image_energy)
 
 
@@ -682,10 +680,10 @@ class FrameSearch:
             return self.evaluate(problem, M)
         starts = calibrated_starts(self.model, M)
         found = [coefficient_posterior(problem, M) for M in starts]
-        first, second = (posterior.value(problem[1]) for posterior in found)
-        better = partial(np.where, second < first)
-        posterior = CoefficientPosterior(*map(better, *found[::-1]))
-        return self._derivatives(problem, better(*starts[::-1]), posterior)[0]
+        lower = found[1].value(problem[1]) < found[0].value(problem[1])
+        parts = (np.where(lower, b, a) for a, b in zip(*found, strict=True))
+        M, posterior = np.where(lower, *starts[::-1]), CoefficientPosterior(*parts)
+        return self._derivatives(problem, M, posterior)[0]
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
@@ -721,10 +719,8 @@ class FrameSearch:
         value, rise = posterior.value(problem[1]), _rise(problem, M, posterior)
         tried = np.flatnonzero(~(rise > LARGE_RISE * value))
         M, better, reached = self._better_reversed(problem, M, value, tried, MAX_STEPS)
-        if better.any():
-            converged[better] = reached[better]
-            posterior = coefficient_posterior(problem, M)
-        return M, posterior
+        converged[better] = reached[better]
+        return M, coefficient_posterior(problem, M) if better.any() else posterior
 
     def _covariances(
         self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior

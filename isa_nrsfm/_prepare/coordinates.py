@@ -3,7 +3,7 @@
 Columns may have been scaled one by one. Some points stand still while the object moves.
 """
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import numpy as np
@@ -58,7 +58,7 @@ def warn_of_rows(rows: FrameBlocks, model: Any, attrs: dict[Hashable, Any]) -> N
         )
     if attrs.get(TOLD):
         return
-    if are_scaled(tracks, SIMILAR) and warn_of_scaled_columns(rows.whole().mT):
+    if warn_of_scaled_columns(tracks, lambda: rows.whole().mT):
         return
     every = len(sample) == rows.n_frames
     warn_of_codes(tracks, "rows" if every else "rows of a sample")
@@ -98,18 +98,20 @@ def warn_of_places(
     Trackers place points that they do not see beyond the image. Return whether there
     are any.
     """
-    warned = warn_of_scaled_columns(tracks) or warn_of_codes(tracks)
+    some = tracks[:: -(-len(tracks) // MOST_ROWS) or 1]
+    warned = warn_of_scaled_columns(some, lambda: tracks) or warn_of_codes(tracks)
     unsure = np.asarray(confidence, dtype=float)[..., None] < UNSURE
     if 0 < unsure.mean() < 0.5:  # scores of some programs are all lower
         tracks = np.where(unsure, np.nan, tracks)
     return warn_of_shares(tracks, format) or warned
 
 
-def warn_of_scaled_columns(tracks: NDArray) -> bool:
-    """Warn, and return True, if the columns of tracks were scaled one by one."""
-    step = -(-len(tracks) // MOST_ROWS) or 1
-    some = tracks[::step]
-    if not (are_scaled(some, SIMILAR) and are_scaled(tracks, EQUAL, apart=True)):
+def warn_of_scaled_columns(some: NDArray, every: Callable[[], NDArray]) -> bool:
+    """Warn, and return True, if the columns of tracks were scaled one by one.
+
+    All tracks are only read if some of them look like it.
+    """
+    if not (are_scaled(some, SIMILAR) and are_scaled(every(), EQUAL, apart=True)):
         return False
     warn_caller(
         "all columns have the same spread, as after z-scores, StandardScaler or "

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._fitted_model import frames_of
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
@@ -477,17 +478,14 @@ class ModeCovarianceDisplay:
         ValueError
             If `ax` holds several axes.
         """
+        colors = import_optional("matplotlib.colors", extra="plot")
+        ticker = import_optional("matplotlib.ticker", extra="plot")
         options: dict[str, Any] = {"figsize": (4.4, 3.6), "layout": "compressed"}
         (self.ax_,) = _views.flat_axes(ax, 1, "the matrix", **options)
         self.figure_ = self.ax_.figure
-
-        from matplotlib.collections import LineCollection
-        from matplotlib.colors import AsinhNorm
-        from matplotlib.ticker import SymmetricalLogLocator
-
         values = self.mode_covariance
         largest = np.abs(values).max() or 1.0
-        norm = AsinhNorm(LINEAR_SHARE * largest, vmin=-largest, vmax=largest)
+        norm = colors.AsinhNorm(LINEAR_SHARE * largest, vmin=-largest, vmax=largest)
         style = {"cmap": "RdBu_r", "norm": norm, "interpolation": "nearest"}
         self.im_ = self.ax_.imshow(values, **style)
 
@@ -498,8 +496,8 @@ class ModeCovarianceDisplay:
         ends = [-0.5, n_modes - 0.5]
         lines = [[(cut, end) for end in ends] for cut in cuts]
         lines += [[(end, cut) for end in ends] for cut in cuts]
-        boundaries = LineCollection(lines, colors="0.35", linewidths=0.6 / step)
-        self.boundaries_ = self.ax_.add_collection(boundaries)
+        style = {"colors": "0.35", "linewidths": 0.6 / step, "capstyle": "butt"}
+        self.boundaries_ = _views.draw_segments(self.ax_, np.array(lines), **style)
         centres = np.arange(0, len(names), step) * BLOCK + (BLOCK - 1) / 2
         for axis in (self.ax_.xaxis, self.ax_.yaxis):
             axis.set_ticks(centres, labels=names[::step])
@@ -510,7 +508,8 @@ class ModeCovarianceDisplay:
         if max(map(len, names)) > 3:
             self.ax_.tick_params("x", rotation=90)
         # In the linear part, numbers beside zero would overlap.
-        ticks = SymmetricalLogLocator(base=10, linthresh=10 * LINEAR_SHARE * largest)
+        linear = 10 * LINEAR_SHARE * largest
+        ticks = ticker.SymmetricalLogLocator(base=10, linthresh=linear)
         bar = self.figure_.colorbar(
             self.im_, ax=self.ax_, label="covariance", ticks=ticks
         )
