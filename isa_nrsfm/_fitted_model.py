@@ -581,7 +581,8 @@ def adapting_errors(
     """Return the inverse SNR of held-out points of every other row (n, 2, J).
 
     Without and with adapting the model to the rows between them. NaN if these are
-    refused: half the rows, many of whose points are wrong, can look like other points.
+    refused: rows without a fit are, and half the rows, many of whose points are wrong,
+    can look like other points.
     """
     layout, pinhole = estimator._model.layout, estimator._model.pinhole
     given = {"layout": layout, "focal_length": pinhole and pinhole.focal_length}

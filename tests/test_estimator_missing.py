@@ -117,7 +117,10 @@ def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
 
 
 def test_rows_that_look_like_other_points_are_not_refused():
-    """The fit that would adapt the model to half of them is refused."""
+    """The fit that would adapt the model to half of them is refused.
+
+    It also is if points of a row determine no camera, which has no fit then.
+    """
     X, _ = frames_with_outliers()
     model = AffineNRSfM(1, loss="cauchy", camera="weak_perspective", random_state=0)
     Y = with_outliers(X[:12], X.std(), share=0.3, seed=2)
@@ -125,6 +128,8 @@ def test_rows_that_look_like_other_points_are_not_refused():
     warned("wrong. Fit X separately", model.fit(X).transform, Y)
     adapted = clone(model).set_params(prior=model)
     refused("does not show the points", adapted.fit, Y[::2])
+    Y[2, 6:] = np.nan
+    warned("wrong. Fit X separately", model.transform, Y)
 
 
 @EACH_LOSS
