@@ -35,8 +35,8 @@ def complete_rows(
     """
     # With many points, fewer frames are enough.
     n_sample = int(np.clip(300 * model_frames // n_points, 200, model_frames))
-    some = rows.take(representative_frames(rows, n_sample))
-    model = completion_model(some, 3 * n_components + 3)
+    sample = rows.take(representative_frames(rows, n_sample))
+    model = completion_model(sample, 3 * n_components + 3)
     return rows.derive(partial(filled_in, model=model))
 
 
@@ -89,11 +89,11 @@ def _principal_axes(rows: NDArray, rank: int) -> Model:
     values, axes = eigh(moment, subset_by_index=[max(size - rank, 0), size - 1])
     if is_wide:
         axes = W.T @ (axes / np.sqrt(n_rows * np.maximum(values, OF_STEPS)))
-    rest = (np.trace(moment) - values.sum()) / n_points
+    remainder = (np.trace(moment) - values.sum()) / n_points
     # EM cannot move directions of zero variance.
     variances = np.maximum(values, 1e-3 * max(values[-1], OF_STEPS))
     B = (axes * np.sqrt(variances)).T
-    noise = max(rest, 1e-6 * values[-1], OF_STEPS)
+    noise = max(remainder, 1e-6 * values[-1], OF_STEPS)
     return centred(B), noise
 
 

@@ -98,20 +98,20 @@ def warn_of_places(
     Trackers place points that they do not see beyond the image. Return whether there
     are any.
     """
-    some = tracks[:: -(-len(tracks) // MOST_ROWS) or 1]
-    warned = warn_of_scaled_columns(some, lambda: tracks) or warn_of_codes(tracks)
+    sample = tracks[:: -(-len(tracks) // MOST_ROWS) or 1]
+    warned = warn_of_scaled_columns(sample, lambda: tracks) or warn_of_codes(tracks)
     unsure = np.asarray(confidence, dtype=float)[..., None] < UNSURE
     if 0 < unsure.mean() < 0.5:  # scores of some programs are all lower
         tracks = np.where(unsure, np.nan, tracks)
     return warn_of_shares(tracks, format) or warned
 
 
-def warn_of_scaled_columns(some: NDArray, every: Callable[[], NDArray]) -> bool:
+def warn_of_scaled_columns(sample: NDArray, every: Callable[[], NDArray]) -> bool:
     """Warn, and return True, if the columns of tracks were scaled one by one.
 
     All tracks are only read if some of them look like it.
     """
-    if not (are_scaled(some, SIMILAR) and are_scaled(every(), EQUAL, apart=True)):
+    if not (are_scaled(sample, SIMILAR) and are_scaled(every(), EQUAL, apart=True)):
         return False
     warn_caller(
         "all columns have the same spread, as after z-scores, StandardScaler or "
@@ -141,8 +141,8 @@ def are_scaled(tracks: NDArray, tol: float, apart: bool = False) -> bool:
     if apart:
         moves = tracks - np.nanmean(tracks, axis=0)
         n_seen = np.isfinite(moves).sum(axis=1, keepdims=True)
-        own = moves - np.nansum(moves, axis=1, keepdims=True) / np.maximum(n_seen, 1)
-        tol *= np.nanstd(own) / (np.nanstd(moves) or 1.0)
+        shifts = moves - np.nansum(moves, axis=1, keepdims=True) / np.maximum(n_seen, 1)
+        tol *= np.nanstd(shifts) / (np.nanstd(moves) or 1.0)
     # The one for missing points goes through the columns one by one.
     percentile = np.percentile if np.isfinite(X).all() else np.nanpercentile
     low, first, median, third, high = percentile(X, [0, 25, 50, 75, 100], axis=0)
@@ -168,9 +168,9 @@ def warn_of_codes(tracks: NDArray, rows: str = "rows") -> bool:
     sample = places.ravel()[finite[:: -(-len(finite) // 1_000_000) or 1]]
     sample += 0  # -0.0 + 0.0 is 0.0
     found, warned = {0j}, False
-    for some in (sample, sample[sample.real == sample.imag]):
-        if len(some):
-            values, counts = np.unique(some, return_counts=True)
+    for subset in (sample, sample[sample.real == sample.imag]):
+        if len(subset):
+            values, counts = np.unique(subset, return_counts=True)
             found |= {*values[[0, int(counts.argmax()), -1]]}
     for place in sorted(found, key=lambda place: (place.real, place.imag)):
         there = places == place

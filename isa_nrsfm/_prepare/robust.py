@@ -145,9 +145,9 @@ def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
     `robustly_centred`, is many times the typical one of the table and of the point.
     Frames with many such points have no outliers.
     """
-    some = representative_frames(rows, model_frames)
-    hidden, axes, limit = _rigid_object(rows.take(some))
-    if len(some) < rows.n_frames:
+    sample = representative_frames(rows, model_frames)
+    hidden, axes, limit = _rigid_object(rows.take(sample))
+    if len(sample) < rows.n_frames:
         hidden = rows.joined(partial(_far_points, axes=axes, limit=limit))
     return rows.joined(_unless_many, hidden)
 
@@ -193,8 +193,8 @@ def _unless_many(rows: NDArray, hidden: NDArray) -> NDArray:
     """Return the seen ones of hidden points (n, J); none if a frame has too many."""
     visible = seen_points(rows)
     gross = hidden & visible
-    few = gross.sum(axis=1) <= 0.4 * visible.sum(axis=1)
-    return gross & few[:, None]
+    frame_mask = gross.sum(axis=1) <= 0.4 * visible.sum(axis=1)
+    return gross & frame_mask[:, None]
 
 
 def _rigid_part(

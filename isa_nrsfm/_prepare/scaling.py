@@ -89,15 +89,15 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
     said = names_layout(names)
     if said in (None, layout):
         return
-    others = [
+    other_names = [
         str(name)
         for name in names
         if (coordinate := parse_coordinate(name)) is None or coordinate[0] > 1
     ]
-    if others:
+    if other_names:
         raise ValueError(
-            f"{len(others)} of the {len(names)} columns are not named as the x or "
-            f"y of a point (first: {others[0]!r}). {ONLY_POINTS}"
+            f"{len(other_names)} of the {len(names)} columns are not named as the x or "
+            f"y of a point (first: {other_names[0]!r}). {ONLY_POINTS}"
         )
     examples = ", ".join(map(str, names[:4]))
     order: str = said
@@ -161,9 +161,9 @@ def check_size(
                 f"is {largest}"
             )
         if largest > 0 and camera == "affine":
-            most = largest_n_components(n_points, "weak_perspective")
+            n_max = largest_n_components(n_points, "weak_perspective")
             possible += (
-                f" with affine cameras, and {most} with calibrated ones "
+                f" with affine cameras, and {n_max} with calibrated ones "
                 f"({named('camera', 'weak_perspective')})"
             )
         of_affine = camera in (None, "affine")
@@ -175,8 +175,8 @@ def check_size(
     smallest = smallest_n_frames(n_components, n_points)
     if n_frames < smallest:
         possible = ""
-        if most := most_components(n_frames, n_points, camera):
-            possible = f"; the largest possible {named('n_components')} is {most}"
+        if n_max := most_components(n_frames, n_points, camera):
+            possible = f"; the largest possible {named('n_components')} is {n_max}"
         raise ValueError(
             f"{named('n_components', n_components)} needs at least {smallest} frames "
             f"(rows), the table has n_samples={n_frames}{possible}"
@@ -200,13 +200,13 @@ def check_points(
     seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)
     n_frames, n_shapes = counts @ seen, n_components + 1
     minimum = -(-3 * n_shapes // 2)
-    few = n_frames < minimum
-    if few.any():
-        point = int(few.argmax())
+    rare_points = n_frames < minimum
+    if rare_points.any():
+        point = int(rare_points.argmax())
         raise ValueError(
             f"{named('n_components', n_components)} needs every point in at least "
-            f"{minimum} frames; fewer show {few.sum()} of {n_points} points (first: "
-            f"{describe_point(point, *columns)}, in {n_frames[point]} of "
+            f"{minimum} frames; fewer show {rare_points.sum()} of {n_points} points "
+            f"(first: {describe_point(point, *columns)}, in {n_frames[point]} of "
             f"{counts.sum()} frames). Leave out these points, or take fewer basis "
             "shapes"
         )
@@ -247,18 +247,18 @@ def check_arrangement(
         return
     # Some frames, evenly spread
     enough = max(min(1000, 1_000_000 // n_points), 100)
-    given = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
-    X = tracks_to_table(given.transpose(0, 2, 1), layout)
+    sample = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
+    X = tracks_to_table(sample.transpose(0, 2, 1), layout)
     other = next(name for name in LAYOUTS if name != layout)
     swapped = table_to_rows(X, other)
-    rigid = _noise_ratio(given, swapped, scale_frames, 3)
+    rigid = _noise_ratio(sample, swapped, scale_frames, 3)
     for n in [] if named else [3, 4]:
         if X.shape[1] % n == 0:
             parts = X.reshape(len(X), n, -1)
             if layout == "interleaved":
                 parts = X.reshape(len(X), -1, n).transpose(0, 2, 1)
             certain = 0.1 if n == 3 else _visibility(parts)
-            ratio = _noise_ratio(given, parts[:, :2], scale_frames, 3)
+            ratio = _noise_ratio(sample, parts[:, :2], scale_frames, 3)
             # docs/benchmarks/README.md, "Thresholds"
             if certain > 0.5 or (certain > 0.05 and ratio < min(0.65, rigid)):
                 raise ValueError(
@@ -267,7 +267,7 @@ def check_arrangement(
                 )
     # On real tables the right layout leaves 0.05 to 0.61 of the energy of the wrong
     # one, and the wrong one at least 0.72 of that of the right one.
-    with_basis = _noise_ratio(given, swapped, scale_frames, 6)
+    with_basis = _noise_ratio(sample, swapped, scale_frames, 6)
     if with_basis < 0.65:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
@@ -281,20 +281,18 @@ def _visibility(parts: NDArray) -> float:
     They are from 0 to 1, some above 0.5: the share of the others that are not. 1 if
     all are equal.
     """
-    others, fourth = parts[:, :3], parts[:, 3]
+    values, fourth = parts[:, :3], parts[:, 3]
     if not (np.isnan(fourth) | ((fourth >= 0) & (fourth <= 1))).all():
         return 0.0
     smallest, largest = np.nanmin(fourth), np.nanmax(fourth)
     if smallest < largest < 0.5:  # y of points in a row
         return 0.0
-    return 1.0 if smallest == largest else float(np.mean((others < 0) | (others > 1)))
+    return 1.0 if smallest == largest else float(np.mean((values < 0) | (values > 1)))
 
 
-def _noise_ratio(
-    given: NDArray, other: NDArray, scale_frames: bool, rank: int
-) -> float:
+def _noise_ratio(rows: NDArray, other: NDArray, scale_frames: bool, rank: int) -> float:
     """Return the noise of other rows over that of given ones; inf for small tables."""
-    both = [given, without_half_points(other)[0]]
+    both = [rows, without_half_points(other)[0]]
     # Points that few frames show are left out first, then frames that show few points
     # in one of the orders.
     both = [r[:, :, seen_points(r).sum(axis=0) >= FEWEST_POINTS] for r in both]
@@ -439,11 +437,11 @@ def scaled_table(
     if determines:
         check_size(blocks.n_frames, n_points, n_components, camera)
     examined = blocks.joined(partial(_examine, robust=robust))
-    n_half, first, visible, largest, *rest = examined
+    n_half, first, visible, largest, *parts = examined
     if n_half.any():
         warn_of_half_points(n_half, first, layout, names)
         blocks = blocks.derive(lambda rows: without_half_points(rows)[0])
-    report = FrameReport(*rest)
+    report = FrameReport(*parts)
     check_frames(report, n_points)
     usable = report.n_seen > 0
     if not usable.all():
@@ -460,7 +458,7 @@ def scaled_table(
         if determines:
             check_size(int(usable.sum()), n_points, n_components, camera)
         blocks = blocks.subset(usable)
-        visible, largest, *rest = (part[usable] for part in (visible, largest, *rest))
+        visible, largest, *parts = (part[usable] for part in (visible, largest, *parts))
         weights = None if weights is None else weights[usable]
     if determines:
         check_points(visible, n_points, n_components, layout, names)
@@ -468,7 +466,7 @@ def scaled_table(
             check_weights(weights, n_components, camera)
     named = names is not None and names_layout(names) == layout
     check_arrangement(blocks, n_points, layout, scale_frames, named)
-    translation, size, n_seen, *_ = rest
+    translation, size, n_seen, *_ = parts
     if weights is not None:
         size = blocks.joined(weighted_sizes, weights)
     if robust:
