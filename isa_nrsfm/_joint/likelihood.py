@@ -317,11 +317,11 @@ def _joined(parts: Iterable[Terms]) -> Terms:
     """Add the sums of consecutive frames, and concatenate the terms of each frame."""
     sums: Any = ()
     by_frame: list[Any] = []
-    for added, own in parts:
+    for added, terms in parts:
         sums = tuple(map(add, sums, added)) if by_frame else added
-        by_frame.append(own)
+        by_frame.append(terms)
     if len(by_frame) == 1:
-        return sums, own
+        return sums, terms
     join = partial(np.concatenate, axis=-1)
     return sums, tuple(map(join, zip(*by_frame, strict=True)))
 

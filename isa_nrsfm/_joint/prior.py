@@ -130,8 +130,8 @@ class ShapePrior(NamedTuple):
     def projected(self, steps: NDArray) -> NDArray:
         """Return steps (K + 1, 3, J) of the shapes without similarities of A_0."""
         axes = self.similarities()
-        own = np.tensordot(axes, np.tensordot(self.changes, steps, 1), 2)
-        change = np.tensordot(own, axes, 1) / np.vdot(self.changes, self.changes)
+        components = np.tensordot(axes, np.tensordot(self.changes, steps, 1), 2)
+        change = np.tensordot(components, axes, 1) / np.vdot(self.changes, self.changes)
         return steps - np.multiply.outer(self.changes, change)
 
     def term(self, shapes: NDArray) -> tuple[float, NDArray]:
@@ -144,8 +144,8 @@ class ShapePrior(NamedTuple):
     def covariance(self, curvature: NDArray, noise: float) -> NDArray:
         """Return covariances of E (m, 3, 3) of points, for curvatures without prior."""
         along = self.along
-        known = along.T @ curvature @ along / noise
-        return np.linalg.inv(known + np.linalg.inv(self.variance))
+        precision = along.T @ curvature @ along / noise
+        return np.linalg.inv(precision + np.linalg.inv(self.variance))
 
     def inverse(self, curvature: NDArray, noise: float) -> NDArray:
         """Return inverses of curvatures (m, 3 (K + 1), 3 (K + 1)) with the prior."""
@@ -178,9 +178,9 @@ class ShapePrior(NamedTuple):
         variances[0] += max(self.width, OF_DISTANCES) ** 2
         variances[:, 2] += self.depth_error
         along = np.kron(self.gauge.mixing.T, self.gauge.rotation.T)
-        known = along.T @ information @ along / noise
-        known[3:] = known[:, 3:] = 0.0
-        covariance = np.linalg.inv(known + np.diag(1.0 / variances.ravel()))
+        precision = along.T @ information @ along / noise
+        precision[3:] = precision[:, 3:] = 0.0
+        covariance = np.linalg.inv(precision + np.diag(1.0 / variances.ravel()))
         size = np.cbrt(abs(np.linalg.det(self.gauge.space)))
         X = size * stacked_motion(sight[:, None], alpha)
         return np.vecdot(X @ covariance, X)

@@ -70,8 +70,8 @@ class FactorisedTable(NamedTuple):
     def rest_share(self, n: int) -> float:
         """Return the share of the energy outside of the n leading singular values."""
         squares = self.singular_values**2
-        rest = np.sum(squares[n:]) + self.rest
-        return float(rest / (np.sum(squares) + self.rest))
+        remainder = np.sum(squares[n:]) + self.rest
+        return float(remainder / (np.sum(squares) + self.rest))
 
     def noise_level(self, n_components: int) -> float:
         """Return the noise variance of the spectrum as a share of the mean square.
@@ -92,8 +92,8 @@ class FactorisedTable(NamedTuple):
 
         False if they would explain any table.
         """
-        known = 3 * n_directions + 3 < np.mean(self.scaled.n_seen) - 1
-        return known and self.noise_level(n_directions) < 2.0 * noise
+        n_others = np.mean(self.scaled.n_seen) - 1 - (3 * n_directions + 3)
+        return n_others > 0 and self.noise_level(n_directions) < 2.0 * noise
 
 
 class JointState(NamedTuple):
@@ -239,13 +239,13 @@ class JointProblem:
     ) -> JointFit:
         """Refine a state jointly, within the limits of the settings or other ones."""
         cameras, settings = cameras or self.cameras, self.settings
-        given = {
+        options = {
             "least_noise": settings.limits.least_noise,
             "max_iter": settings.max_iter,
             "tol": settings.tol * (0.1 if self.thorough else 1.0),
             "on_step": settings.on_step,
         }
-        return refine_joint(self.objective(cameras), state, cameras, **given | limits)
+        return refine_joint(self.objective(cameras), state, cameras, **options | limits)
 
     def objective(self, cameras: CameraModel) -> MarginalLikelihood:
         """Return the objective with the prior of the extents, if it is needed."""
@@ -341,8 +341,8 @@ def refine_joint(
     evaluated = partial(_Iterate, likelihood, cameras, floor)
     iterate = evaluated(start)
     # At most 20 pairs, fewer if they would exceed 2^25 numbers, but never less than 3
-    most = 2**25 // (2 * iterate.gradient.size)
-    memory: Memory = deque(maxlen=max(min(most, 20), 3))
+    n_pairs = 2**25 // (2 * iterate.gradient.size)
+    memory: Memory = deque(maxlen=max(min(n_pairs, 20), 3))
     history, small_steps = [iterate.value], 0
     while len(history) <= max_iter and small_steps < 2:
         if on_step is not None:

@@ -69,11 +69,11 @@ def mixed_cameras(
     rank = P.shape[2]
     if rank < 3:
         return
-    few = P[chosen].reshape(2 * len(chosen), -1)
+    sample = P[chosen].reshape(2 * len(chosen), -1)
     # Each width starts from the mixture of the previous width.
-    mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=20)
+    mixing, _ = orthonormal_mixture(sample[:, :3], np.eye(3), max_iter=20)
     for n in sorted({min(n, rank) for n in widths if n < rank + 3}):
-        mixing, _ = orthonormal_mixture(few[:, :n], mixing, max_iter=20)
+        mixing, _ = orthonormal_mixture(sample[:, :n], mixing, max_iter=20)
         cameras, sizes = nearest_calibrated(P[..., :n] @ mixing)
         yield cameras if scales is None else (scales * sizes)[:, None, None] * cameras
 
@@ -99,8 +99,8 @@ def extended_shapes(
     (I, 2, J), lifted to space parallel to the image plane, as long as the standard
     deviation of their coefficients. Zeros if there are fewer.
     """
-    rest = rows - motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
-    lifted = (np.linalg.pinv(motion) @ np.nan_to_num(rest)).reshape(len(rows), -1)
+    residual = rows - motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
+    lifted = (np.linalg.pinv(motion) @ np.nan_to_num(residual)).reshape(len(rows), -1)
     # Principal components, from the smaller Gram matrix
     tall = len(lifted) > lifted.shape[1]
     square, axes = np.linalg.eigh(lifted.T @ lifted if tall else lifted @ lifted.T)
@@ -138,14 +138,14 @@ def reversed_groups(
     """
     group = fcluster(linkage(alpha, "ward"), n_groups, "maxclust")
     for number in range(1, group.max() + 1):
-        own, rest = group == number, np.flatnonzero(group != number)
-        if 2 * own.sum() > len(own):
+        members, other_frames = group == number, np.flatnonzero(group != number)
+        if 2 * members.sum() > len(members):
             continue
-        others = problem.part(rest, problem.settings.tol)
-        shapes = lifted_shapes(rows[rest], motion[rest], alpha.shape[1])
-        state = held_fit(others, rows[rest], motion[rest], shapes).state
+        part = problem.part(other_frames, problem.settings.tol)
+        shapes = lifted_shapes(rows[other_frames], motion[other_frames], alpha.shape[1])
+        state = held_fit(part, rows[other_frames], motion[other_frames], shapes).state
         state, _ = problem.reversed_back(state._replace(motion=motion), problem.cameras)
-        motion = np.where(own[:, None, None], state.motion, motion)
+        motion = np.where(members[:, None, None], state.motion, motion)
     return motion
 
 
@@ -235,31 +235,31 @@ def best_starts(
     # Frames for the comparison, spread evenly from the most to the least rigid
     rows = frames.coordinates(table.W).reshape(frames.n_frames, 2, -1)
     order = np.argsort(rigid_energy(rows, frames.coordinates(factors.rigid_shape)))
-    few = np.sort(spread(order, 400 if thorough else 200))
+    sample = np.sort(spread(order, 400 if thorough else 200))
     # No prior: with the large noise of a start it would make basis shapes vanish.
-    part = replace(problem.part(few, tol=limits.compared_tol), penalty=0.0)
-    seen, n_components = rows[few], len(paper) - 1
+    part = replace(problem.part(sample, tol=limits.compared_tol), penalty=0.0)
+    seen, n_components = rows[sample], len(paper) - 1
     trials: list[tuple[float, JointState, NDArray]] = []
 
     def compare(motion: NDArray, shapes: NDArray | None = None) -> None:
         """Refine shapes, or lifted ones, with fixed cameras, and add the trial."""
         if shapes is None:
-            shapes = lifted_shapes(seen, motion[few], n_components)
-        fit = held_fit(part, seen, motion[few], shapes)
+            shapes = lifted_shapes(seen, motion[sample], n_components)
+        fit = held_fit(part, seen, motion[sample], shapes)
         trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
     motion, shapes = rigid_start(factors, frames.coordinates(paper), cameras.scaled)
-    compare(motion, _scaled(seen, motion[few], shapes))
+    compare(motion, _scaled(seen, motion[sample], shapes))
     compare(motion)
     # Mixtures of more and more columns, until the objective rises. Small tables use all
     # mixtures, without and with scales, because a few steps do not identify the best
     # one.
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
     families = [scales, None] if thorough else [scales]
-    for given in families if cameras.scaled else [None]:
+    for divisors in families if cameras.scaled else [None]:
         before = np.inf
-        for mixed in mixed_cameras(rows, given, few, limits.widths):
+        for mixed in mixed_cameras(rows, divisors, sample, limits.widths):
             compare(mixed)
             if not thorough and trials[-1][0] > before:
                 break
@@ -270,7 +270,7 @@ def best_starts(
     for _, state, motion in trials if thorough else trials[:1]:
         fit = part.refined(state, cameras, max_iter=30)
         motion = motion.copy()
-        motion[few] = fit.state.motion
+        motion[sample] = fit.state.motion
         freed.append((fit.history[-1], fit.state._replace(motion=motion)))
     freed.sort(key=itemgetter(0))
     return [with_prior(problem, state) for _, state in freed[:3]]
@@ -326,8 +326,8 @@ def likely_basis(
     mean = alpha.mean(axis=0)
     mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
     # Coefficients of covariance one
-    rest = alpha - mean
-    covariance = rest.T @ rest / len(motion)
+    deviations = alpha - mean
+    covariance = deviations.T @ deviations / len(motion)
     # A ridge, as the covariance can be singular
     covariance += (OF_PRODUCTS * np.trace(covariance) or 1.0) * np.eye(len(mean))
     basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)

@@ -59,10 +59,10 @@ def n_directions(problem: JointProblem, n_points: int, few: bool) -> int:
 
     At least half of the coordinates have to be left for the noise.
     """
-    most = FEW_DIRECTIONS if few else MOST_DIRECTIONS
+    n_max = FEW_DIRECTIONS if few else MOST_DIRECTIONS
     n_pose = (2 + problem.cameras.n_parameters) * problem.frames.n_frames
     n_shapes = (problem.frames.totals[0] / 2 - n_pose) / (3 * n_points)
-    return max(min(3 * n_points - 7, most, int(n_shapes) - 1), 1)
+    return max(min(3 * n_points - 7, n_max, int(n_shapes) - 1), 1)
 
 
 def extended(
@@ -116,8 +116,8 @@ def determined(
     energy, axes = np.maximum(energy[::-1], 0.0), axes[:, ::-1]
     basis = np.tensordot(axes.T, basis, 1)
     state = state._replace(shapes=np.concatenate([state.shapes[:1], basis]))
-    least = 1e-9 * max(energy.max(), OF_DISTANCES * problem.mean_square) / n_numbers
-    variances = np.maximum(energy / n_numbers, least)
+    floor = 1e-9 * max(energy.max(), OF_DISTANCES * problem.mean_square) / n_numbers
+    variances = np.maximum(energy / n_numbers, floor)
     if widths is not None:  # of the same directions, nearly in the same order
         variances = widths.variances[: len(energy)]
     # Posterior covariance of each point: half the Hessian is curvature / s2.
@@ -133,7 +133,7 @@ def determined(
     uncertain = np.einsum("kaka->k", total)[1:] / prior
     of_images = np.einsum("ab,kakb->k", 3 * C / np.trace(C), total)[1:] / prior
     shares = np.clip(1.0 - uncertain, 1e-9, 1.0)
-    variances = np.maximum(energy / (n_numbers * shares), least)
+    variances = np.maximum(energy / (n_numbers * shares), floor)
     # The large noise of the first round hides directions.
     kept = (shares > 0.02) | (widths is None)
     kept[0] = True
@@ -171,10 +171,10 @@ def evidence(problem: JointProblem, fit: JointFit) -> float:
     if not np.isfinite(price):  # images without extent
         return np.inf
     if widths is not None:
-        known = np.linalg.slogdet(regular(terms.shape_curvature) / noise)[1].mean()
-        known = known / 3 + np.log(widths.variances).sum()
-        known += np.log(np.sum(shapes[0] ** 2) / widths.n_numbers)
-        price += widths.n_numbers * known / len(motion)
+        cost = np.linalg.slogdet(regular(terms.shape_curvature) / noise)[1].mean()
+        cost = cost / 3 + np.log(widths.variances).sum()
+        cost += np.log(np.sum(shapes[0] ** 2) / widths.n_numbers)
+        price += widths.n_numbers * cost / len(motion)
     return float(terms.value / len(motion) + price)
 
 
@@ -184,9 +184,9 @@ def rival_depths(problem: JointProblem, fits: list[tuple[float, JointFit]]) -> f
     Relative to the mean square, each with its probability ``exp(-m (e - e_0))`` by the
     evidence e of m = `FAR_FRAMES` frames, and mirrored if that is nearer.
     """
-    (best, first), *others = fits
+    (best, first), *other_fits = fits
     z, total = depths_of(problem, first), 0.0
-    for value, fit in others:
+    for value, fit in other_fits:
         other = depths_of(problem, fit)
         other *= np.copysign(1.0, np.sum(other * z))
         square = np.sum((other - z) ** 2) / np.sum(z**2)
