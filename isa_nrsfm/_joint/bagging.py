@@ -76,8 +76,8 @@ def bagged(
         seen = np.isfinite(part[:, 0, points]).sum(axis=1)
         frames = np.flatnonzero(seen >= FEWEST_POINTS)
         problem = _problem(part, w, settings, frames, points)
-        own = widths.of_points(len(points), n_directions)
-        problem = replace(problem, widths=own)
+        part_widths = widths.of_points(len(points), n_directions)
+        problem = replace(problem, widths=part_widths)
         shapes = centred(model.shapes[: n_directions + 1, :, points])
         state = JointState(shapes, fit.motion[frames], model.noise_variance)
         limits: Any = {"max_iter": MOST_STEPS, "tol": settings.tol}
@@ -97,9 +97,9 @@ def bagged(
         kept = np.flatnonzero(groups != group)
         frames, depths = fitted(chosen[kept])
         at = np.ix_(frames, kept)
-        own = centred(z[at])
-        size = np.sum(depths * own) / (np.sum(depths**2) or 1.0)
-        change[at] += size * depths - own
+        reference = centred(z[at])
+        size = np.sum(depths * reference) / (np.sum(depths**2) or 1.0)
+        change[at] += size * depths - reference
         count[at] += 1
     change = centred(change / np.maximum(count, 1))
     counted = count.any(axis=1, keepdims=True)
@@ -109,14 +109,14 @@ def bagged(
     # The model of the changed shapes
     noise = model.noise_variance
     R = aligning_rotations(centred(S[:, :, chosen]), noise)
-    most = min(3 * n_points - 7, MOST_COMPONENTS)
-    shapes, _, rest = principal_shapes(centred(R.mT @ S), most, LEFT * noise)
+    n_max = min(3 * n_points - 7, MOST_COMPONENTS)
+    shapes, _, remainder = principal_shapes(centred(R.mT @ S), n_max, LEFT * noise)
     problem = _problem(part, w, settings, np.arange(len(part)), np.arange(n_points))
     state = JointState(shapes, fit.motion @ R, noise)
     state, widths = determined(problem, state, None)
     alpha = replace(problem, widths=widths).likelihood(*state).alpha
     gauge = FrameMap.identity(len(state.shapes) - 1)
-    starts, noise = spread_starts(alpha), noise + rest
+    starts, noise = spread_starts(alpha), noise + remainder
     model = replace(
         model, shapes=state.shapes, noise_variance=noise, starts=starts, gauge=gauge
     )
@@ -133,6 +133,6 @@ def _problem(
     """Return the problem of some frames and points of rows (n, 2, J)."""
     rows = rows[np.ix_(frames, np.arange(2), points)]
     blocks = FrameBlocks.of_array(rows, len(rows))
-    own = None if weights is None else weights[np.ix_(frames, points)]
+    counts = None if weights is None else weights[np.ix_(frames, points)]
     complete = bool(np.isfinite(rows).all())
-    return JointProblem(JointFrames.from_points(blocks, complete, own), settings)
+    return JointProblem(JointFrames.from_points(blocks, complete, counts), settings)

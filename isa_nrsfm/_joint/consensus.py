@@ -125,10 +125,10 @@ def common_coordinates(
             weights = weights[pair_indices(n)].reshape(-1, 9)
             own_places = places[np.ix_(points, points)][pair_indices(n)]
             for axis, total in zip(axes, precisions, strict=True):
-                own = weights @ (R[axis, :, None] * R[axis]).reshape(9, -1)
+                group_precision = weights @ (R[axis, :, None] * R[axis]).reshape(9, -1)
                 following = np.einsum("kli,jli->jki", inverse, mixed[axis])
-                own -= packed_products(mixed[axis], following)
-                total[own_places] += own
+                group_precision -= packed_products(mixed[axis], following)
+                total[own_places] += group_precision
         change = np.zeros_like(Y)
         for axis, total in zip(axes, precisions, strict=True):
             free = unknown[:, axis]
@@ -177,32 +177,32 @@ def _principal(shapes: NDArray, s2: float) -> tuple[NDArray, NDArray]:
     3n) is ``(I - U (1 - s2 / v) U^T) / s2``. The deviations (n, 3, I) are those of the
     mean from the shapes. Shapes of zeros do not count.
     """
-    n, shown = len(shapes), shapes.any(axis=(0, 1))
-    n_frames = np.count_nonzero(shown)
+    n, mask = len(shapes), shapes.any(axis=(0, 1))
+    n_frames = np.count_nonzero(mask)
     mean = shapes.sum(axis=2, keepdims=True) / n_frames
-    off = (shown * mean - shapes).reshape(3 * n, -1)
-    values, vectors = np.linalg.eigh(off @ off.T / n_frames)
+    deviations = (mask * mean - shapes).reshape(3 * n, -1)
+    values, vectors = np.linalg.eigh(deviations @ deviations.T / n_frames)
     kept = values > s2
     U = vectors[:, kept]
     centring = (np.eye(n) - 1.0 / n)[:, None, :, None] * np.eye(3)[:, None]
     model = (U * (1.0 - s2 / values[kept])) @ U.T
     precision = (centring.reshape(model.shape) - model) / s2
-    return precision, (precision @ off).reshape(shapes.shape)
+    return precision, (precision @ deviations).reshape(shapes.shape)
 
 
 def _of_group(Y: NDArray, points: NDArray) -> NDArray:
     """Return the centred coordinates (n, 3, I) of the points of a group."""
-    own = Y[points]
-    return np.asarray(own - own.mean(axis=0))
+    coordinates = Y[points]
+    return np.asarray(coordinates - coordinates.mean(axis=0))
 
 
-def _aligning(own: NDArray) -> NDArray:
+def _aligning(shapes: NDArray) -> NDArray:
     """Return rotations (3, 3, n_frames) that align shapes (n, 3, n_frames)."""
-    own = own.transpose(2, 1, 0)
-    mean = own[0]
+    shapes = shapes.transpose(2, 1, 0)
+    mean = shapes[0]
     for _ in range(5):
-        R = procrustes(own @ mean.T)
-        mean = (R.mT @ own).mean(axis=0)
+        R = procrustes(shapes @ mean.T)
+        mean = (R.mT @ shapes).mean(axis=0)
     return frames_last(R)
 
 
@@ -306,13 +306,13 @@ def consensus(
             settings.on_step()
         if result is not None:
             groups.append(Group(points, weight, *result)._replace(start=start))
-    most = min(3 * n_points - 7, MOST_COMPONENTS)
+    n_max = min(3 * n_points - 7, MOST_COMPONENTS)
 
     def modelled(S: NDArray, noise: float) -> FrameModel:
         """Return the model of shapes (I, 3, J): their principal components."""
-        found, alpha, rest = principal_shapes(S, most, LEFT * noise)
+        found, alpha, remainder = principal_shapes(S, n_max, LEFT * noise)
         starts, gauge = spread_starts(alpha), FrameMap.identity(len(found) - 1)
-        noise += rest
+        noise += remainder
         return replace(
             model, shapes=found, noise_variance=noise, starts=starts, gauge=gauge
         )
@@ -326,28 +326,28 @@ def consensus(
     noise -= (1.0 - LAST_SHARE) * scene.floor
     weights = interpolation(model.shapes[0], chosen)
     left_out = np.setdiff1d(np.arange(n_points), chosen)
-    off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
+    image_changes = (1.0 - share) * np.nan_to_num(part - first[:, :2])
 
     def merged(joined: NDArray) -> FrameModel:
         """Return the model of coordinates (I, 3, n) in the axes of the cameras."""
         change = (joined - scene.first) @ weights
-        change[:, :2, left_out] = off[:, :, left_out]
+        change[:, :2, left_out] = image_changes[:, :, left_out]
         S = shapes + rotations.mT @ centred(change) / scales[:, None, None]
         R = aligning_rotations(centred(S[:, :, chosen]), noise)
         return modelled(R.mT @ S, noise)
 
     # The joint fit has a share of the depths.
-    some = spread(np.arange(len(part)), HIDDEN_FRAMES)
+    sample = spread(np.arange(len(part)), HIDDEN_FRAMES)
     result = merged(joined)
-    own = share_of_first(model, result, part[some])
-    joined[:, 2] += own * (centred(scene.first[:, 2]) - centred(joined[:, 2]))
+    joint_share = share_of_first(model, result, part[sample])
+    joined[:, 2] += joint_share * (centred(scene.first[:, 2]) - centred(joined[:, 2]))
     depths = centred(joined[:, 2] @ weights)
     squares = disagreements(groups, joined[:, 2])
     # Groups start from one fit and share a part of its errors.
     nearer = squares.sum() / disagreements(groups, scene.first[:, 2]).sum()
     squares, depths = squares @ weights, np.mean(depths**2, axis=0)
     certainty = certainty.of_consensus(squares, depths, min(nearer, 1.0))
-    result = merged(joined) if own else result
+    result = merged(joined) if joint_share else result
     return replace(result, certainty=certainty)
 
 
@@ -369,13 +369,13 @@ def hidden_residuals(model: FrameModel, rows: NDArray) -> NDArray:
 
     Every fifth point of rows (n, 2, J) is left out at a time.
     """
-    rest = np.full(rows.shape, np.nan)
+    errors = np.full(rows.shape, np.nan)
     for first in range(5):
         hidden = np.arange(rows.shape[2]) % 5 == first
         fit = model.posterior_without(rows, hidden)
-        off = residuals(rows, model.shapes, fit.motion, fit.alpha)
-        rest[:, :, hidden] = (off - fit.translation[:, :, None])[:, :, hidden]
-    return rest
+        residual = residuals(rows, model.shapes, fit.motion, fit.alpha)
+        errors[:, :, hidden] = (residual - fit.translation[:, :, None])[:, :, hidden]
+    return errors
 
 
 def together(
@@ -405,10 +405,10 @@ def disagreements(groups: list[Group], depths: NDArray) -> NDArray:
     """Return mean squared differences (n,) of the groups from the depths (I, n)."""
     squares, weight = np.zeros((2, depths.shape[1]))
     for group in groups:
-        own = depths[np.ix_(group.frames, group.points)]
-        off = centred(group.coordinates[:, 2]) - centred(own)
-        squares[group.points] += group.weight * np.sum(off**2, axis=0)
-        weight[group.points] += group.weight * len(off)
+        reference = depths[np.ix_(group.frames, group.points)]
+        difference = centred(group.coordinates[:, 2]) - centred(reference)
+        squares[group.points] += group.weight * np.sum(difference**2, axis=0)
+        weight[group.points] += group.weight * len(difference)
     # Points of no fitted group have the mean error of the others.
     mean = squares.sum() / weight.sum()
     return np.divide(squares, weight, out=np.full_like(weight, mean), where=weight > 0)
@@ -474,15 +474,15 @@ def neighbourhoods(distances: NDArray, size: int) -> list[tuple[NDArray, int]]:
     """
     n_points = len(distances)
     nearest = np.sort(np.argsort(distances, axis=1, kind="stable")[:, :size], axis=1)
-    most = min(-(-COVER * n_points // size), n_points)
+    n_first = min(-(-COVER * n_points // size), n_points)
     centres = [int(np.argmin(distances.sum(axis=1)))]
     covered = np.zeros(n_points, dtype=bool)
-    while len(centres) < most or not covered.all():
+    while len(centres) < n_first or not covered.all():
         covered[nearest[centres[-1]]] = True
         if len(centres) == n_points:
             break
         left = distances[:, centres].min(axis=1)
-        if len(centres) >= most:
+        if len(centres) >= n_first:
             left = np.where(covered, -1.0, left)
         centres.append(int(np.argmax(left)))
     groups, counts = np.unique(nearest[centres], axis=0, return_counts=True)
@@ -511,23 +511,23 @@ def group_fit(
     blocks = FrameBlocks.of_array(tracks, len(tracks))
     part = JointFrames.from_points(blocks, bool(seen.all()))
     free, (n_seen, square) = MarginalLikelihood(part), part.totals
-    least, tol = scene.floor * n_seen / square, 0.3 * settings.tol
-    refined = partial(refine_joint, least_noise=least, tol=tol)
+    least_noise, tol = scene.floor * n_seen / square, 0.3 * settings.tol
+    refined = partial(refine_joint, least_noise=least_noise, tol=tol)
     start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
     penalty = scene.price / len(frames)
     likelihood, alpha = MarginalLikelihood(part, penalty), free(*start).alpha
     shapes = likely_basis(start.shapes, motion, alpha, penalty)
     start, orthographic = start._replace(shapes=shapes), CAMERAS["orthographic"]
-    most = min(settings.max_iter, MOST_STEPS)
-    state = refined(likelihood, start, orthographic, max_iter=most).state
+    max_iter = min(settings.max_iter, MOST_STEPS)
+    state = refined(likelihood, start, orthographic, max_iter=max_iter).state
     alpha = likelihood(*state).alpha
     rotations, scales = full_rotations(state.motion)
     turned = scales[:, None, None] * rotations
     S = turned @ (state.shapes[0] + np.tensordot(alpha, state.shapes[1:], 1))
     # Positions from the visible points, and the mirror image nearest to the joint fit
-    off = np.where(seen[:, None], tracks - S[:, :2], 0.0).sum(axis=2)
-    S[:, :2] += (off / seen.sum(axis=1)[:, None])[:, :, None]
+    sums = np.where(seen[:, None], tracks - S[:, :2], 0.0).sum(axis=2)
+    S[:, :2] += (sums / seen.sum(axis=1)[:, None])[:, :, None]
     if np.sum(centred(first[:, 2]) * S[:, 2]) < 0:
         S[:, 2] *= -1.0
     return frames, S, state.noise
@@ -553,8 +553,8 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
             kind = [group for group in same if group.start == start]
             squares = []
             for group in kind:
-                own = merged[np.ix_(group.frames, group.points)]
-                squares.append(np.mean(centred(group.coordinates[:, 2] - own) ** 2))
+                depths = merged[np.ix_(group.frames, group.points)]
+                squares.append(np.mean(centred(group.coordinates[:, 2] - depths) ** 2))
             square = np.average(squares, weights=[group.weight for group in kind])
             factor = 1.0 / (size * (square + rounding))
             weighted_groups += [g._replace(weight=factor * g.weight) for g in kind]

@@ -137,13 +137,13 @@ def fit_jointly(
     widths: Widths | None = None
     if whole:
         few = bool(table.parts) or not every_point or table.outliers is not None
-        most = n_directions(first, paper_shapes.shape[2], few)
+        n_max = n_directions(first, paper_shapes.shape[2], few)
         fit = steadiest(first, table, fit)
         widths, rivals = fit.widths, fit.rivals
         assert widths is not None
         # More directions, if the table supports all of the first ones
-        if len(widths.variances) == FEW_DIRECTIONS < most:
-            fit, widths = whole_distribution(first, extended(first, fit, most))
+        if len(widths.variances) == FEW_DIRECTIONS < n_max:
+            fit, widths = whole_distribution(first, extended(first, fit, n_max))
         # Directions that explain the table up to rounding leave no noise.
         # Points that were filled in have errors: room for three directions more
         # (docs/benchmarks/README.md, "Thresholds").
@@ -213,11 +213,11 @@ def _likeliest_fit(
 ) -> JointFit:
     """Return the fit of few basis shapes from which all directions fit best."""
     n = n_directions(problem, paper_shapes.shape[2], few=True)
-    most = min(len(paper_shapes) - 1, n)
-    few, *more = dict.fromkeys(min(k, most) for k in FIRST_COMPONENTS)
+    n_max = min(len(paper_shapes) - 1, n)
+    n_first, *more = dict.fromkeys(min(k, n_max) for k in FIRST_COMPONENTS)
     more = more if problem.settings.limits.restarts else []
     rough, cameras = {"tol": problem.settings.tol}, problem.cameras
-    fits = [_first_fit(problem, table, paper_shapes[: few + 1], **rough)[0]]
+    fits = [_first_fit(problem, table, paper_shapes[: n_first + 1], **rough)[0]]
     for k in more:
         paper = paper_shapes[: k + 1]
         fits.append(_calibrated_fit(problem, table, paper, cameras, **rough)[0])
@@ -226,11 +226,11 @@ def _likeliest_fit(
     # The noise variances of both camera models, each for its degrees of freedom, of few
     # basis shapes: more of them explain what wrong cameras leave.
     size, n_seen = fits[0].state.shapes.shape, table.scaled.n_seen
-    own, affine = (
+    correction, affine_correction = (
         _freedom_correction(n_seen, size, 2 + c.n_parameters, None)
         for c in (problem.cameras, CAMERAS["affine"])
     )
-    ratio = max(fits[0].camera_noise_ratio * own / affine, 1.0)
+    ratio = max(fits[0].camera_noise_ratio * correction / affine_correction, 1.0)
     # With as many steps again, as only the best one is refined further
     return extended(problem, best, n)._replace(camera_noise_ratio=ratio)
 
@@ -253,8 +253,8 @@ def other_fits(
     if table.parts:
         state = state._replace(motion=state.motion[table.parts[0]])
     best = evidence(problem, extended(problem, joint._replace(state=state), n))
-    most, limits = min(len(paper) - 1, n), {"tol": settings.tol}
-    for k in dict.fromkeys(min(k, most) for k in OTHER_COMPONENTS):
+    n_max, limits = min(len(paper) - 1, n), {"tol": settings.tol}
+    for k in dict.fromkeys(min(k, n_max) for k in OTHER_COMPONENTS):
         part, cameras = paper[: k + 1], problem.cameras
         fit, _ = _calibrated_fit(problem, table, part, cameras, **limits)
         fit = extended(problem, fit, n)
@@ -278,7 +278,7 @@ def steadiest(
     W = problem.frames.coordinates(table.W)
     rows = W.reshape(problem.frames.n_frames, 2, -1)
     n = min(len(first.state.shapes) - 1, FEW_DIRECTIONS)
-    few = min(FIRST_COMPONENTS[0], n)
+    n_first = min(FIRST_COMPONENTS[0], n)
     before = evidence(problem, first)
     fit, widths = whole_distribution(problem, first)
     fit = fit._replace(widths=widths)
@@ -310,7 +310,7 @@ def steadiest(
 
     for _ in range(4):
         motion, tried = steadied(latest.state.motion), len(found)
-        for k in {few, n}:
+        for k in {n_first, n}:
             compare(lifted(motion, k), HOPELESS)
         if len(found) == tried:
             break
@@ -318,7 +318,7 @@ def steadiest(
 
     best = min(found, key=itemgetter(0))[2]
     if both_sides(best.state):
-        compare(lifted(flat_cameras(problem, best.state), few), HOPELESS)
+        compare(lifted(flat_cameras(problem, best.state), n_first), HOPELESS)
         # Few directions lead out of minima where others explain wrong cameras.
         for k in AGAIN:
             _, before, best = min(found, key=itemgetter(0))
@@ -552,9 +552,9 @@ def reweighted(
     tol = (1e-2 if problem.thorough else 1.0) * problem.settings.tol
     rows, left_out = table.scaled.rows, table.outliers
     assert left_out is not None
-    few = representative_frames(rows, 2000)
-    points = rows.take(few)
-    weights, sizes = without(points, left_out[few])[1], robust_sizes(points)
+    sample = representative_frames(rows, 2000)
+    points = rows.take(sample)
+    weights, sizes = without(points, left_out[sample])[1], robust_sizes(points)
     state = fit.state._replace(shapes=problem.frames.points(fit.state.shapes))
 
     def part(weighted: FrameBlocks) -> JointProblem:
@@ -568,31 +568,31 @@ def reweighted(
         limits |= {"least_noise": least_noise, "tol": tol}
         return problem.refined(fit.state, **limits)
 
-    problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
+    problem = part(FrameBlocks.of_blocks([(points, weights)], [len(sample)]))
     if table.parts:  # of a sample with other frames
         state = problem.aligned(state)
     else:
-        state = state._replace(motion=state.motion[few])
+        state = state._replace(motion=state.motion[sample])
     fit = fit._replace(state=state)
     for _ in range(20):
         shapes, motion, _ = fit.state
         alpha = problem.likelihood(*fit.state).alpha
         distance = _distances((points, weights), shapes, motion, alpha)
         # Enough frames for the median of the residuals
-        some = slice(None, None, max(distance.size // 150_000, 1))
-        state = fit.state._replace(motion=motion[some])
-        typical = distance[some] / residual_deviations(
-            state, alpha[some], weights[some], problem.cameras
+        subset = slice(None, None, max(distance.size // 150_000, 1))
+        state = fit.state._replace(motion=motion[subset])
+        typical = distance[subset] / residual_deviations(
+            state, alpha[subset], weights[subset], problem.cameras
         )
         deviation = max(median_noise(typical[np.isfinite(typical)]), OF_DISTANCES)
         before, weights = weights, frame_weights(loss, distance, deviation, sizes)
         if np.mean((weights - before) ** 2) < 2.5e-5:
             break
-        problem = part(FrameBlocks.of_blocks([(points, weights)], [len(few)]))
+        problem = part(FrameBlocks.of_blocks([(points, weights)], [len(sample)]))
         fit = refined(problem, fit)
     if fit.prior is not None:
         fit = deepened(problem, fit)
-    if len(few) < rows.n_frames:
+    if len(sample) < rows.n_frames:
         weighted = rows.derive(without, left_out)
         problem = part(weighted)
         fit = fit._replace(state=problem.aligned(fit.state))
@@ -659,16 +659,16 @@ def left_out_distances(model: FrameModel, rows: NDArray) -> NDArray:
     """
     fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
     state = JointState(model.shapes, fit.motion, model.noise_variance)
-    rest = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
+    residual = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
     distance = np.full(w.shape, np.nan)
     for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, model.camera):
         Z, Y = (x.reshape(len(x), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
         left = (1.0 + OF_DIFFERENCES) * np.eye(2) - np.einsum("iprj,ipsj->ijrs", Y, Z)
         spread = np.linalg.inv(left)  # covariance of the errors over that of the noise
-        error = np.linalg.norm(spread @ rest[part].mT[..., None], axis=(2, 3))
-        known = np.trace(spread, axis1=2, axis2=3) < 2 * LARGEST_SPREAD
-        known |= w[part].all(axis=1, keepdims=True)
-        distance[part] = np.where(known, error, np.nan)
+        error = np.linalg.norm(spread @ residual[part].mT[..., None], axis=(2, 3))
+        mask = np.trace(spread, axis1=2, axis2=3) < 2 * LARGEST_SPREAD
+        mask |= w[part].all(axis=1, keepdims=True)
+        distance[part] = np.where(mask, error, np.nan)
     enough = w.sum(axis=1, keepdims=True) > LEAST_POINTS
     return np.where((w > 0) & enough, distance, np.nan)
 
@@ -678,11 +678,11 @@ def _distances(
 ) -> NDArray:
     """Return distances (n, J) of frames from a model whose weighted mean is theirs."""
     rows, weights = block
-    rest = residuals(rows, shapes, motion, alpha)
+    residual = residuals(rows, shapes, motion, alpha)
     total = weights.sum(axis=1)[:, None]  # zero where no point counts
-    position = np.einsum("ij,icj->ic", weights, np.nan_to_num(rest))
-    rest -= (position / np.where(total > 0, total, 1.0))[..., None]
-    return lengths(rest)
+    position = np.einsum("ij,icj->ic", weights, np.nan_to_num(residual))
+    residual -= (position / np.where(total > 0, total, 1.0))[..., None]
+    return lengths(residual)
 
 
 def _weighted(

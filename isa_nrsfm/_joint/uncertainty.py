@@ -105,11 +105,11 @@ def inlying_rows(
     weights = None if weights is None else weights[chosen]
     fit = model.posterior(part, covariances=False, weights=weights)
     if model.loss != "linear":
-        off = distances(part, model.shapes, *fit[:3])
-        outlying = off > OUTLYING * np.sqrt(model.noise_variance)
+        distance = distances(part, model.shapes, *fit[:3])
+        outlying = distance > OUTLYING * np.sqrt(model.noise_variance)
         part = np.where(outlying[:, None], np.nan, part)
-    known = np.isfinite(fit.motion).all(axis=(1, 2))
-    return part[known], fit.take(known), None if weights is None else weights[known]
+    mask = np.isfinite(fit.motion).all(axis=(1, 2))
+    return part[mask], fit.take(mask), None if weights is None else weights[mask]
 
 
 def fitted_frames(
@@ -208,8 +208,8 @@ def shown_frames(
     mean = weight / n_seen
     freedom = np.maximum(n_seen * (2.0 - mean * leverage) - n_pose, 1.0)
     noise = posterior.objective / mean / freedom
-    own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
-    shift = np.einsum("i,ikl,il->ik", weight * noise, posterior.covariance, own)
+    traces = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
+    shift = np.einsum("i,ikl,il->ik", weight * noise, posterior.covariance, traces)
     return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
 
 
@@ -232,25 +232,25 @@ def reliabilities(
     and vectors of low rank perturbations of large rectangular random matrices", 2012).
     Here ``y = 1 / (1 - share)``; gamma is y times the share of S that is chance.
     """
-    known = alpha / np.sqrt(len(alpha))  # known.T @ known is S
-    variance, axes = np.linalg.eigh(known.T @ known + covariance)
+    root = alpha / np.sqrt(len(alpha))  # root.T @ root is S
+    variance, axes = np.linalg.eigh(root.T @ root + covariance)
     kept = variance > 1e-14 * variance[-1]  # others are rounding errors
     white = axes[:, kept] / np.sqrt(variance[kept])
     # Squared singular values are the eigenvalues, with less rounding error.
-    _, deviations, turn = np.linalg.svd(known @ white, full_matrices=False)
-    own = white @ turn.T
+    _, deviations, turn = np.linalg.svd(root @ white, full_matrices=False)
+    directions = white @ turn.T
     share = deviations**2
-    left = np.einsum("kd,kl,ld->d", own, covariance, own)  # 1 / y
-    caused = np.einsum("kd,kl,ld->d", own, moments, own) / (noise or 1.0)
+    left = np.einsum("kd,kl,ld->d", directions, covariance, directions)  # 1 / y
+    caused = np.einsum("kd,kl,ld->d", directions, moments, directions) / (noise or 1.0)
     # The factor is a margin for chance. With it all reliabilities are zero on tables of
     # rigid objects (60 to 1,000 frames, 68 to 478 points, one to four basis shapes).
     # Without it some are 0.9 (``python -m benchmarks.recovery rigid``).
     gamma = 1.5 * np.maximum(caused, 0.0)  # gamma share / y
     gamma = np.divide(gamma, share, where=share > 0, out=np.ones_like(share))
-    rest = share - gamma
-    real = (rest > 0) & (rest**2 > 4 * gamma * left)
-    rest, gamma, left = rest[real], gamma[real], left[real]
-    signal = (rest + np.sqrt(rest**2 - 4 * gamma * left)) / 2  # l / y
+    excess = share - gamma
+    real = (excess > 0) & (excess**2 > 4 * gamma * left)
+    excess, gamma, left = excess[real], gamma[real], left[real]
+    signal = (excess + np.sqrt(excess**2 - 4 * gamma * left)) / 2  # l / y
     correlation = (signal**2 - gamma * left) / (signal * (signal + left))
     shares = np.zeros(len(kept))
     shares[: len(signal)] = np.sort(correlation)[::-1]
@@ -271,18 +271,18 @@ def depth_certainty(
     n_points = frames.shapes.shape[2]
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     # Directions are sorted by their size, and as many as these frames determine.
-    most = MOST_DIRECTIONS if settings.shape_prior is None else len(frames.shapes)
+    n_max = MOST_DIRECTIONS if settings.shape_prior is None else len(frames.shapes)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     groups = neighbours(mean_shape)
     parts = [groups != group for group in range(N_GROUPS)]
     seen = np.asarray(np.isfinite(part).all(axis=1))
-    least = np.min([seen[:, kept].sum(axis=1) for kept in parts], axis=0)
-    known = least >= FEWEST_POINTS
-    if known.sum() < 2:
+    n_seen = np.min([seen[:, kept].sum(axis=1) for kept in parts], axis=0)
+    mask = n_seen >= FEWEST_POINTS
+    if mask.sum() < 2:
         return NOT_ESTIMATED
-    w = None if w is None else w[np.ix_(known, points)]
-    shapes, motion = frames.shapes[: most + 1, :, points], fit.motion[known]
-    tracks, camera = part[known], CAMERAS[frames.camera]
+    w = None if w is None else w[np.ix_(mask, points)]
+    shapes, motion = frames.shapes[: n_max + 1, :, points], fit.motion[mask]
+    tracks, camera = part[mask], CAMERAS[frames.camera]
     prior, extents = settings.shape_prior, EXTENT_WEIGHT
     if prior is not None:  # which does not let depths grow
         prior, extents = prior.of_points(points), 0.0
@@ -315,17 +315,17 @@ def depth_certainty(
         if prior is not None:
             likelihood = MarginalLikelihood(part, prior=prior.of_points(kept))
         elif widths is not None:
-            own = widths.of_points(int(kept.sum()), most)
-            likelihood = own.likelihood(part, frames.camera)
+            part_widths = widths.of_points(int(kept.sum()), n_max)
+            likelihood = part_widths.likelihood(part, frames.camera)
             if of_images is not None:
                 likelihood = likelihood._replace(precisions=None, penalty=of_images)
         else:
             penalty = part.basis_penalty(limits.basis_std)
             likelihood = MarginalLikelihood(part, penalty)
         likelihood = likelihood._replace(extent_weight=extents)
-        least = min(noise * n_numbers / energy, limits.least_noise)
+        floor = min(noise * n_numbers / energy, limits.least_noise)
         start = start._replace(noise=noise)
-        ends: Any = {"least_noise": least, "max_iter": limits.error_steps, "tol": TOL}
+        ends: Any = {"least_noise": floor, "max_iter": limits.error_steps, "tol": TOL}
         state = refine_joint(likelihood, start, camera, **ends).state
         terms = likelihood._replace(extent_weight=0.0)(*state)
         rotations, _ = full_rotations(state.motion)
@@ -338,10 +338,10 @@ def depth_certainty(
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
-        far = (stretched(state, camera, FAR)[0] for state in (whole, still))
-        starts, free = (whole, *far), image_penalty(whole)
-        value, *others = (refit(every, start, of_images=free)[-1] for start in starts)
-        rise = min(others) - value
+        deep_states = (stretched(state, camera, FAR)[0] for state in (whole, still))
+        starts, free = (whole, *deep_states), image_penalty(whole)
+        value, *minima = (refit(every, start, of_images=free)[-1] for start in starts)
+        rise = min(minima) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:
         costs, stretches = [0.5 * prior.cost], [0.0]
@@ -387,7 +387,7 @@ def differences(
     """
     z = centred(whole_depths)
     mirror = np.array([1.0, 1.0, np.copysign(1.0, np.sum(depths * z))])
-    off = mirror[2] * depths - z
+    difference = mirror[2] * depths - z
     # Rotations up to a common rotation of the object
     turned = Rotation.from_matrix(mirror[:, None] * rotations * mirror)
     whole = Rotation.from_matrix(whole_rotations)
@@ -395,8 +395,8 @@ def differences(
     turns = w.T @ w / len(w)
     turns[2, :2] = turns[:2, 2] = 0.0  # the mirror image has the other sign
     # Without any depths the difference is as large as they are.
-    square = np.sum(off**2) / np.sum(z**2) if z.any() else 1.0
-    return float(square), turns, np.mean(off**2, axis=0)
+    square = np.sum(difference**2) / np.sum(z**2) if z.any() else 1.0
+    return float(square), turns, np.mean(difference**2, axis=0)
 
 
 def image_penalty(state: JointState) -> NDArray:
@@ -406,8 +406,8 @@ def image_penalty(state: JointState) -> NDArray:
     """
     C, basis = camera_moments(state.motion), state.shapes[1:]
     energy = np.einsum("ab,kaj,kbj->k", C, basis, basis, optimize=True)
-    least = OF_DISTANCES * max(np.sum(state.shapes[0] ** 2), OF_DISTANCES)
-    return basis[0].size / np.maximum(energy, least) / len(state.motion)
+    floor = OF_DISTANCES * max(np.sum(state.shapes[0] ** 2), OF_DISTANCES)
+    return basis[0].size / np.maximum(energy, floor) / len(state.motion)
 
 
 def neighbours(points: NDArray) -> NDArray:
@@ -466,22 +466,22 @@ def half_tables(
     shapes, n_shapes = model.shapes, len(model.shapes)
 
     def scores(
-        rows: NDArray, part: NDArray, motion: NDArray, alpha: NDArray, *given: NDArray
+        rows: NDArray, part: NDArray, motion: NDArray, alpha: NDArray, *weights: NDArray
     ) -> NDArray:
         """Return ``sum_i X_i^T r_i`` over the frames of each part."""
         seen = seen_points(rows)
-        w = given[0] if given else seen.astype(float)
-        rest = residuals(rows, shapes, motion, alpha)
-        rest[~np.broadcast_to(seen[:, None], rest.shape)] = 0.0
-        mean = np.einsum("irj,ij->ir", rest, w) / w.sum(axis=1)[:, None]
+        w = weights[0] if weights else seen.astype(float)
+        residual = residuals(rows, shapes, motion, alpha)
+        residual[~np.broadcast_to(seen[:, None], residual.shape)] = 0.0
+        mean = np.einsum("irj,ij->ir", residual, w) / w.sum(axis=1)[:, None]
         if model.loss != "linear":
-            off = distances(rows, shapes, motion, mean, alpha)
-            deviation = np.sqrt(model.noise_variance)
-            w = seen * frame_weights(model.loss, off, deviation, robust_sizes(rows))
-        rest = (rest - mean[:, :, None]) * w[:, None]
-        X = stacked_motion(motion, alpha).reshape(*rest.shape[:2], -1)
+            distance = distances(rows, shapes, motion, mean, alpha)
+            deviation, sizes = np.sqrt(model.noise_variance), robust_sizes(rows)
+            w = seen * frame_weights(model.loss, distance, deviation, sizes)
+        residual = (residual - mean[:, :, None]) * w[:, None]
+        X = stacked_motion(motion, alpha).reshape(*residual.shape[:2], -1)
         chosen = [part == number for number in range(len(SIGNS))]
-        parts = ((X[frames], rest[frames]) for frames in chosen)
+        parts = ((X[frames], residual[frames]) for frames in chosen)
         return np.stack([np.tensordot(x, r, axes=((0, 1), (0, 1))) for x, r in parts])
 
     weights = () if table.weights is None else (table.weights,)
