@@ -123,16 +123,16 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     positive.
     """
     k, n = b.shape
-    least, positive = OF_STEPS * A[diagonal_of(A)], np.ones(n, dtype=bool)
+    floors, positive = OF_STEPS * A[diagonal_of(A)], np.ones(n, dtype=bool)
     # D L and, in the last column, L^-T b, for A = L^T D L with L unit upper triangular
     rows, inverses = np.empty((k, k + 1, n)), np.empty((k, n))
     for i, row in enumerate(packed_rows(A)):
-        rest = rows[i, i:]
-        rest[:-1], rest[-1] = row, b[i]
+        tail = rows[i, i:]
+        tail[:-1], tail[-1] = row, b[i]
         if i:
             # The sum over all rows before at once: one pass over the numbers.
-            rest -= np.einsum("jn,jcn->cn", rows[:i, i] * inverses[:i], rows[:i, i:])
-        inverses[i] = _inverse_pivot(rest[0], least[i], positive)
+            tail -= np.einsum("jn,jcn->cn", rows[:i, i] * inverses[:i], rows[:i, i:])
+        inverses[i] = _inverse_pivot(tail[0], floors[i], positive)
     # Back substitution, column by column
     x = rows[:, k].copy()
     for i in range(k - 1, -1, -1):
@@ -172,26 +172,26 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
 def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
     """Sweep each matrix by its Cholesky factor, or by `_eliminated` without one."""
     places = _places(math.isqrt(2 * len(packed)))
-    across, own = places[:first, first:], places[first:, first:]
-    G, A = packed[across], np.ascontiguousarray(packed[own].T)
-    X, upper = np.moveaxis(G, 2, 0).copy(), np.triu_indices(len(own))
+    across, block = places[:first, first:], places[first:, first:]
+    G, A = packed[across], np.ascontiguousarray(packed[block].T)
+    X, upper = np.moveaxis(G, 2, 0).copy(), np.triu_indices(len(block))
     # Copies of the last frame (`padded`) are solved once.
     last = np.append(True, (packed != packed[:, -1:]).any(axis=0)).nonzero()[0][-1]
     lanes, A, X = np.minimum(np.arange(len(A)), last), A[: last + 1], X[: last + 1]
     failed = [dposv(a.T, x.T, 1, 1, 1)[2] for a, x in zip(A, X, strict=True)]
     pivots = A.diagonal(axis1=1, axis2=2)[lanes].T ** 2
-    least = OF_STEPS * packed[np.diag(own)]
-    positive = (np.array(failed)[lanes] == 0) & (pivots > least).all(axis=0)
-    others = np.flatnonzero(~positive)
-    left, X = packed.take(others, -1), np.moveaxis(X[lanes], 0, 2)
+    floors = OF_STEPS * packed[np.diag(block)]
+    positive = (np.array(failed)[lanes] == 0) & (pivots > floors).all(axis=0)
+    failures = np.flatnonzero(~positive)
+    left, X = packed.take(failures, -1), np.moveaxis(X[lanes], 0, 2)
     for a in A:
         dpotri(a.T, 1, 1)
-    packed[own[upper]], packed[across] = -A[lanes][:, *upper].T, X
+    packed[block[upper]], packed[across] = -A[lanes][:, *upper].T, X
     packed[places[:first, :first]] -= np.einsum("rcn,scn->rsn", G, X)
     log_determinant = np.log(np.where(positive, pivots, 1.0)).sum(axis=0)
-    if len(others):
-        log_determinant[others], positive[others] = _eliminated(left, first)
-        packed[:, others] = left
+    if len(failures):
+        log_determinant[failures], positive[failures] = _eliminated(left, first)
+        packed[:, failures] = left
     return log_determinant, positive
 
 
@@ -200,12 +200,12 @@ def _eliminated(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
     rows, n = packed_rows(packed), packed.shape[1]
     k = len(rows)
     places, (first_of, second_of) = _places(k), pair_indices(k)
-    least = OF_STEPS * packed[diagonal_of(packed)]
+    floors = OF_STEPS * packed[diagonal_of(packed)]
     inverses = np.empty((k - first, n))
     positive = np.ones(n, dtype=bool)
     product, factor = np.empty((2, *packed.shape))  # new ones cost more than calls
     for i in range(first, k):
-        inverse = _inverse_pivot(rows[i][0], least[i], positive)
+        inverse = _inverse_pivot(rows[i][0], floors[i], positive)
         inverses[i - first] = inverse
         column = packed.take(places[i], 0)
         scaled = column * inverse
@@ -219,13 +219,13 @@ def _eliminated(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
     return -logarithms.sum(axis=0), positive
 
 
-def _inverse_pivot(pivot: NDArray, least: NDArray, positive: NDArray) -> NDArray:
+def _inverse_pivot(pivot: NDArray, floor: NDArray, positive: NDArray) -> NDArray:
     """Return inverse pivots (n,), zero where left out; clear `positive` there.
 
-    Smaller pivots than the least ones, relative to the entry before elimination, are
-    rounding errors.
+    Pivots below the floor, relative to the entry before elimination, are rounding
+    errors.
     """
-    kept = pivot > least
+    kept = pivot > floor
     if np.count_nonzero(kept) == len(kept):
         return 1.0 / pivot
     positive &= kept

@@ -173,8 +173,8 @@ def centred_frames(rows: NDArray) -> tuple[NDArray, FrameReport]:
     if hidden is not None:
         np.copyto(centred, 0.0, where=hidden)
     translation = np.full((len(rows), 2), np.nan)
-    total, shown = centred.sum(axis=2), n_seen[:, None] > 0
-    np.divide(total, n_seen[:, None], where=shown, out=translation)
+    total, visible = centred.sum(axis=2), n_seen[:, None] > 0
+    np.divide(total, n_seen[:, None], where=visible, out=translation)
     centred -= translation[:, :, None]
     if hidden is not None:
         np.copyto(centred, 0.0, where=hidden)
@@ -185,10 +185,10 @@ def centred_frames(rows: NDArray) -> tuple[NDArray, FrameReport]:
     on_line = np.zeros(len(rows), dtype=bool)
     if hidden is not None:
         # Twice the square of the distances from the principal axis, roughly
-        off = square - np.hypot(xx - yy, 2.0 * np.vecdot(x, y))
-        near = off <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
-        some = near & ~seen.all(axis=1)
-        on_line[some] = _collinear(centred[some], place[some], n_seen[some], eps)
+        scatter = square - np.hypot(xx - yy, 2.0 * np.vecdot(x, y))
+        near = scatter <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
+        part = near & ~seen.all(axis=1)
+        on_line[part] = _collinear(centred[part], place[part], n_seen[part], eps)
         np.copyto(centred, np.nan, where=hidden)
     size = np.sqrt(square / (2 * np.maximum(n_seen, 1)))
     return centred, FrameReport(translation, size, n_seen, in_one_place, on_line)
@@ -211,11 +211,11 @@ def _collinear(
 def check_frames(report: FrameReport, n_points: int) -> None:
     """Raise an error if frames with points do not determine a camera."""
     n_seen, n_frames = report.n_seen, len(report.n_seen)
-    few = (n_seen > 0) & (n_seen < min(FEWEST_POINTS, n_points))
-    if few.any():
-        row = few.argmax()
+    failures = (n_seen > 0) & (n_seen < min(FEWEST_POINTS, n_points))
+    if failures.any():
+        row = failures.argmax()
         raise ValueError(
-            f"fewer than {FEWEST_POINTS} points are visible in {few.sum()} of "
+            f"fewer than {FEWEST_POINTS} points are visible in {failures.sum()} of "
             f"{n_frames} frames (first: row {row}, with {n_seen[row]}), too few to "
             "determine a camera. Leave out these rows"
         )
@@ -249,8 +249,8 @@ def weighted_sizes(rows: NDArray, weights: NDArray) -> NDArray:
     centred, report = centred_frames(rows)
     rows, shares = np.nan_to_num(centred), weights / weights.sum(axis=1)[:, None]
     place = np.vecdot(rows, shares[:, None])
-    off = np.where(weights[:, None] > 0, rows - place[..., None], 0.0)
-    square = np.vecdot(shares, (off**2).sum(axis=1)) / 2
+    offsets = np.where(weights[:, None] > 0, rows - place[..., None], 0.0)
+    square = np.vecdot(shares, (offsets**2).sum(axis=1)) / 2
     enough = square > (4 * np.finfo(float).eps * report.size) ** 2
     return np.where(enough, np.sqrt(square), report.size)
 
@@ -531,8 +531,8 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     order = np.argsort(rows.joined(_share_of_x), kind="stable")
     chosen = np.isin(np.arange(rows.n_frames), spread(order, most))
     fewest = min(200, most // 5)
-    shown = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))
-    for point in np.flatnonzero(shown < fewest).tolist():
+    counts = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))
+    for point in np.flatnonzero(counts < fewest).tolist():
         shows = rows.joined(lambda block, j=point: ~np.isnan(block[:, 0, j]))
         chosen[spread(order[shows[order]], fewest)] = True
     return np.flatnonzero(chosen)
@@ -587,13 +587,13 @@ def open_table(
         # A block needs at most eight times its own memory, copies included.
         memory = 2**20 * get_config()["working_memory"]
         numbers = memory / (8 * np.dtype(float).itemsize)
-        most = max(int(numbers // n_columns), 1)
+        limit = max(int(numbers // n_columns), 1)
         if isinstance(X, np.memmap):
-            most = min(most, length)
+            limit = min(limit, length)
         else:  # row groups of parquet files are read whole for each block
             n_threads = 1
         read = partial(read_rows, X)
-        blocks = FrameBlocks.read_later(read, X.shape[0], most, n_threads)
+        blocks = FrameBlocks.read_later(read, X.shape[0], limit, n_threads)
     blocks = blocks.derive(partial(_rows, layout=layout, counted=counted))
     blocks.empty = empty
     return blocks
@@ -601,13 +601,13 @@ def open_table(
 
 def _rows(X: Any, layout: Layout, counted: bool) -> NDArray:
     """Return the rows (n, 2, n_points) of a block, as `open_table` describes."""
-    given = table_to_rows(checked_rows(X), layout)
-    rows, n_half, _ = without_half_points(given)
+    original = table_to_rows(checked_rows(X), layout)
+    rows, n_half, _ = without_half_points(original)
     if n_half.any() and not counted:
         warn_caller(
             "some points have only one of their two coordinates. They count as missing"
         )
-    return given if counted else rows
+    return original if counted else rows
 
 
 def is_read_later(X: Any) -> bool:
