@@ -266,17 +266,17 @@ def view_angles(rotations: ArrayLike) -> ViewAngles:
         raise ValueError(
             f"rotations must be of the shape (n_frames, 3, 3); got {R.shape}"
         )
-    known = np.isfinite(R).all(axis=(1, 2))
-    off = np.abs(R[known] @ R[known].swapaxes(1, 2) - np.eye(3)).max(initial=0.0)
-    if off > 1e-3:
+    mask = np.isfinite(R).all(axis=(1, 2))
+    error = np.abs(R[mask] @ R[mask].swapaxes(1, 2) - np.eye(3)).max(initial=0.0)
+    if error > 1e-3:
         raise ValueError(
             "rotations must be orthogonal matrices R without a scale; R R^T differs "
-            f"from the identity by up to {off:.2g}"
+            f"from the identity by up to {error:.2g}"
         )
     angles = np.full((3, len(R)), np.nan)
-    if known.any():
-        turns = Rotation.from_matrix(R[known]).as_euler("ZXY", degrees=True)
-        angles[:, known] = turns[:, ::-1].T * [[-1], [-1], [1]] + 0.0  # no minus zeros
+    if mask.any():
+        turns = Rotation.from_matrix(R[mask]).as_euler("ZXY", degrees=True)
+        angles[:, mask] = turns[:, ::-1].T * [[-1], [-1], [1]] + 0.0  # no minus zeros
     return ViewAngles(*angles)
 
 
@@ -317,15 +317,15 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
     """
     C = np.asarray(covariance, dtype=np.float64)
     deviations = np.full((3, len(C)), np.nan)
-    known = np.isfinite(angles.yaw) & np.isfinite(C).all(axis=(1, 2))
-    if known.any():
-        Y = Rotation.from_euler("y", -angles.yaw[known, None], degrees=True)
-        X = Rotation.from_euler("x", -angles.pitch[known, None], degrees=True)
+    mask = np.isfinite(angles.yaw) & np.isfinite(C).all(axis=(1, 2))
+    if mask.any():
+        Y = Rotation.from_euler("y", -angles.yaw[mask, None], degrees=True)
+        X = Rotation.from_euler("x", -angles.pitch[mask, None], degrees=True)
         along_x, along_z = Y.as_matrix()[:, 0], (X * Y).as_matrix()[:, 2]
         along_y = np.broadcast_to([0.0, 1.0, 0.0], along_x.shape)
         # w = slope (dy, dx, d roll)
         slope = np.stack([along_y, along_x, along_z], axis=2)
         inverse = np.linalg.pinv(slope)
-        variance = np.einsum("nab,nbc,nac->an", inverse, C[known], inverse)
-        deviations[:, known] = np.degrees(np.sqrt(variance))
+        variance = np.einsum("nab,nbc,nac->an", inverse, C[mask], inverse)
+        deviations[:, mask] = np.degrees(np.sqrt(variance))
     return ViewAngles(*deviations)

@@ -234,8 +234,8 @@ def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
         # complement), and the effective number of strain parameters from it.
         mixed = curvature[:size, size:]
         inverse = np.linalg.pinv(curvature[:size, :size], hermitian=True)
-        own = curvature[size:, size:] - mixed.T @ inverse @ mixed
-        values = np.maximum(np.linalg.eigvalsh(own), ridge)
+        strain_curvature = curvature[size:, size:] - mixed.T @ inverse @ mixed
+        values = np.maximum(np.linalg.eigvalsh(strain_curvature), ridge)
         n_effective = float(np.sum(1.0 - ridge / values))
         # The two variances: sums of squares over effective numbers (MacKay).
         freedom = max(n_equations - size - n_effective, 0.1 * n_equations)

@@ -145,7 +145,7 @@ def linearised(
     basis = strain_basis(camera)
     # exp(E_0 / 2) exp(E) exp(E_0 / 2) changes to first order by the symmetric part of
     # E_0 exp(E), where E = sum_k alpha_ik E_k.
-    grown, own = MQ, list[NDArray]()
+    grown, strain_terms = MQ, list[NDArray]()
     if len(strain):
         values, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
         seen = MQ @ axes
@@ -157,21 +157,21 @@ def linearised(
         divided = np.exp(a + b) * np.sinc(1j * (a - b) / np.pi).real
         weights = np.einsum("ipa,pqc,iqb->icab", seen, ROW_PRODUCTS, seen)
         weights = axes[:, None] @ (divided[:, None] * weights) @ axes[:, None].mT
-        own = [np.tensordot(weights, basis, ((2, 3), (1, 2)))]
+        strain_terms = [np.tensordot(weights, basis, ((2, 3), (1, 2)))]
     rows = (MQ @ np.hstack([*basis])).reshape(len(MQ), -1, 3)
     products = (rows @ grown.mT).reshape(len(MQ), 2, -1, 2)
     common = np.tensordot(products, ROW_PRODUCTS, ((1, 3), (0, 1))).mT  # (I, c, n)
     entries = np.tensordot(grown @ MQ.mT, ROW_PRODUCTS)
-    changes = np.concatenate([common, *own], axis=2)
+    changes = np.concatenate([common, *strain_terms], axis=2)
     if camera == "orthographic":
         residuals, slopes = (entries - [0, 0, 2]) / np.sqrt(2), changes / np.sqrt(2)
     else:  # a quotient
         residuals = entries[:, :2] / entries[:, 2:]
         slopes = changes[:, :2] - changes[:, 2:] * residuals[:, :, None]
         slopes /= entries[:, 2:, None]
-    common, *own = np.split(slopes[:, :, None], 1 + len(own), axis=3)
-    own = [alpha[:, None, :, None] * each for each in own]
-    J = np.concatenate([common, *own], axis=2)
+    common, *strain_terms = np.split(slopes[:, :, None], 1 + len(strain_terms), axis=3)
+    strain_terms = [alpha[:, None, :, None] * each for each in strain_terms]
+    J = np.concatenate([common, *strain_terms], axis=2)
     return residuals.ravel(), J.reshape(residuals.size, -1)
 
 

@@ -262,8 +262,8 @@ def quality(
     """
     size = len(curvature) // len(metric)
     values = np.linalg.eigvalsh(curvature[:size, :size])
-    known = values[0] > OF_PRODUCTS * values[-1]
-    condition = float(np.sqrt(values[-1] / values[0])) if known else np.inf
+    definite = values[0] > OF_PRODUCTS * values[-1]
+    condition = float(np.sqrt(values[-1] / values[0])) if definite else np.inf
     if condition > LARGEST_CONDITION:
         warn_caller(
             f"the cameras hardly determine the metric of space: its condition number "

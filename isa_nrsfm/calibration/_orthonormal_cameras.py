@@ -120,14 +120,14 @@ def orthonormal_cameras(
     kept, basis, inverse = _orthonormal_columns(P)
     price = NOISE_PRICE * noise_variance
     n_columns = basis.shape[1]
-    mixing, least = np.eye(3), np.inf
+    mixing, lowest_cost = np.eye(3), np.inf
     for n in range(3, n_columns + STEP, STEP):
         n = min(n, n_columns)
         roots = np.sqrt(price) * inverse[:n, :n]
         wider, cost = orthonormal_mixture(basis[:, :n], mixing, roots, max_iter)
-        if not cost < least:
+        if not cost < lowest_cost:
             break
-        mixing, least = wider, cost
+        mixing, lowest_cost = wider, cost
     n = len(mixing)
     cameras = (basis[:, :n] @ mixing).reshape(-1, 2, 3)
     Q = np.zeros((P.shape[1], 3))

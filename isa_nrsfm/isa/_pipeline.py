@@ -92,8 +92,8 @@ def factorise(
     signals = Vt[3:]
     n_missing = 3 * max(1, -(-(rank - 3) // 3)) - len(signals)
     if n_missing:  # completed by centred, orthonormal rows, orthogonal to Vt
-        others = null_space(np.vstack([np.ones((1, n_points)), Vt])).T
-        signals = np.vstack([signals, others[:n_missing]])
+        completion = null_space(np.vstack([np.ones((1, n_points)), Vt])).T
+        signals = np.vstack([signals, completion[:n_missing]])
     B = root * signals
     M = W @ B.T / n_points
     M[:, max(rank - 3, 0) :] = 0.0
@@ -161,13 +161,13 @@ def block_triplets(
         V = np.linalg.qr(np.hstack(krylov))[0]
         _, S, rotation = np.linalg.svd(_triangle(blocks, V.shape[1], V))
         S, Vt = S[:k], rotation[:k] @ V.T
-        rest = max(energy - S @ S, 0.0)
+        residual = max(energy - S @ S, 0.0)
     else:
         tall = n_rows > n_columns
         matrix = _triangle(blocks, n_columns) if tall else _matrix(blocks.whole())
         _, S, Vt = np.linalg.svd(matrix, full_matrices=False)
-        S, Vt, rest = S[:k], Vt[:k], np.sum(S[k:] ** 2)
-    return S, Vt, float(rest)
+        S, Vt, residual = S[:k], Vt[:k], np.sum(S[k:] ** 2)
+    return S, Vt, float(residual)
 
 
 def _matrix(block: NDArray) -> NDArray:
@@ -229,8 +229,8 @@ def run_paper_pipeline(
     n_iter, converged = 1, True
     if settings.refinement:
         # The joint refinement only starts from this result.
-        joint_start, own = (200, 1e-5), (settings.max_iter, settings.tol)
-        max_iter, tol = joint_start if settings.joint else own
+        start_limits, limits = (200, 1e-5), (settings.max_iter, settings.tol)
+        max_iter, tol = start_limits if settings.joint else limits
         lifted = leading_blocks(moments, components.reshape(len(E), 3, -1))
         plain = np.broadcast_to(np.eye(3), (len(E), 1, 3, 3))
         starts = np.concatenate([E[:, None], lifted, plain], axis=1)
@@ -259,8 +259,8 @@ def _independent_subspaces(
     `structure_energies`.
     """
     criterion = partial(structure_energies, moments)
-    given: dict[str, Any] = {"covariance": covariance, "criterion": criterion}
-    accepted = {name: given[name] for name in given if has_fit_parameter(isa, name)}
+    options: dict[str, Any] = {"covariance": covariance, "criterion": criterion}
+    accepted = {name: options[name] for name in options if has_fit_parameter(isa, name)}
     # Fixed-point iterations from random starts magnify rounding errors, so that another
     # order of frames or points could lead to another optimum. Five decimals are far
     # coarser than rounding errors, and far finer than the errors of the signals.

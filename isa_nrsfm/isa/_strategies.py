@@ -50,8 +50,8 @@ class BaseSubspaceAnalysis(
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals, size = unmasked(signals), self.subspace_size
-        least = {"ensure_min_samples": 2, "ensure_min_features": size}
-        signals = validate_data(self, signals, dtype=float, **least)
+        limits = {"ensure_min_samples": 2, "ensure_min_features": size}
+        signals = validate_data(self, signals, dtype=float, **limits)
         n_signals = signals.shape[1]
         if n_signals % size:
             raise ValueError(
@@ -238,14 +238,14 @@ def swap_until_best(groupings: Sequence[NDArray], value: Values) -> list[NDArray
             mates = grouping[:, None] == grouping
             changed = (mates != mates_before).any(axis=1, keepdims=True)
             a, b = np.nonzero(changed & (~mates | itself))
-            rest = np.nonzero(mates & ~itself)[1].reshape(n_signals, -1)
-            with_b[a, b] = value(np.column_stack([rest[a], b]))
+            partners = np.nonzero(mates & ~itself)[1].reshape(n_signals, -1)
+            with_b[a, b] = value(np.column_stack([partners[a], b]))
             mates_before = mates
-            own = np.diag(with_b)
-            gain = with_b - own[:, None]
+            values = np.diag(with_b)
+            gain = with_b - values[:, None]
             gain = np.where(mates, 0.0, gain + gain.T)
             pair = np.array(np.unravel_index(np.argmax(gain), gain.shape))
-            if not gain[tuple(pair)] > OF_DIFFERENCES * np.abs(own).sum():
+            if not gain[tuple(pair)] > OF_DIFFERENCES * np.abs(values).sum():
                 break
             grouping[pair] = grouping[pair[::-1]]
         _, first, group = np.unique(grouping, return_index=True, return_inverse=True)
