@@ -132,9 +132,9 @@ class CalibratedCameras:
 
     def steps_between(self, first: NDArray, second: NDArray) -> NDArray:
         """Return the steps (n, p) that move cameras (n, 2, 3) to others."""
-        (R, scales), (turned, others) = map(full_rotations, (first, second))
-        turns = Rotation.from_matrix(R.swapaxes(1, 2) @ turned).as_rotvec()
-        return np.column_stack([turns, np.log(others / scales)])[:, : self.n_parameters]
+        (R_1, s_1), (R_2, s_2) = map(full_rotations, (first, second))
+        turns = Rotation.from_matrix(R_1.swapaxes(1, 2) @ R_2).as_rotvec()
+        return np.column_stack([turns, np.log(s_2 / s_1)])[:, : self.n_parameters]
 
     def tangents(self, M: NDArray) -> NDArray:
         """Return ``M hat(e_c)``, and M itself where there are scales."""
@@ -176,11 +176,11 @@ class CalibratedCameras:
         # By the Schur complement d - c^T B^-1 c in [[B, c], [c^T, d]]
         across, scale = C[:3, 3], C[3, 3]
         turn = np.einsum("abn,bn->an", inverse, across)
-        rest = np.maximum(scale - np.einsum("an,an->n", across, turn), 1e-9 * scale)
-        rest = np.divide(1.0, rest, where=rest > 0, out=np.zeros_like(rest))
-        C[:3, :3] = inverse + rest * turn[:, None] * turn
-        C[:3, 3] = C[3, :3] = -rest * turn
-        C[3, 3] = rest
+        pivot = np.maximum(scale - np.einsum("an,an->n", across, turn), 1e-9 * scale)
+        inverse_pivot = np.divide(1.0, pivot, where=pivot > 0, out=np.zeros_like(pivot))
+        C[:3, :3] = inverse + inverse_pivot * turn[:, None] * turn
+        C[:3, 3] = C[3, :3] = -inverse_pivot * turn
+        C[3, 3] = inverse_pivot
         return C
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
@@ -327,9 +327,9 @@ def pose_effect(motion: NDArray, alpha: NDArray) -> NDArray:
 
     Predictions have mean zero over the frames.
     """
-    known = np.isfinite(alpha).all(axis=1)
-    terms = _yaw_terms(motion[known])
-    effect = np.linalg.lstsq(terms.T, alpha[known])[0]
+    mask = np.isfinite(alpha).all(axis=1)
+    terms = _yaw_terms(motion[mask])
+    effect = np.linalg.lstsq(terms.T, alpha[mask])[0]
     effect[0] -= effect.T @ terms.mean(axis=1)
     return np.asarray(effect)
 
@@ -375,8 +375,8 @@ class Pinhole(NamedTuple):
         rows = rows.astype(np.float64, copy=False)
         middle = centred_frames(rows)[1].translation
         if self.robust:
-            shown = np.isfinite(middle[:, 0])
-            middle[shown] = spatial_median(rows[shown])
+            mask = np.isfinite(middle[:, 0])
+            middle[mask] = spatial_median(rows[mask])
         return turns_to(self.rays(middle[..., None])[..., 0])
 
     def virtual(self, rows: NDArray) -> NDArray:
@@ -417,9 +417,9 @@ class Pinhole(NamedTuple):
         R, scales = full_rotations(motion)
         place = np.column_stack([translation, np.full(len(translation), f)])
         place = (turns.mT @ place[..., None])[..., 0]  # s T
-        far = f / place[:, 2:]
-        R = far[..., None] * scales[:, None, None] * (turns.mT @ R)[:, :2]
-        return R, far * place[:, :2] + self.centre[:, 0]
+        ratio = f / place[:, 2:]
+        R = ratio[..., None] * scales[:, None, None] * (turns.mT @ R)[:, :2]
+        return R, ratio * place[:, :2] + self.centre[:, 0]
 
     def positions(self, motion: NDArray, translation: NDArray) -> NDArray:
         """Return the shapes' origins (n, 3) in the axes of the real camera."""

@@ -303,11 +303,11 @@ def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
 
     # The likeliest of the starts. A few steps lead to a basin of attraction. More would
     # go astray where signals are Gaussian, and magnify rounding errors.
-    few = _few_samples(Z)
-    ends = _fixed_point(_starts(few, n_starts), few, 8)
-    W = max(zip(_fit_densities(ends, few)[0], ends, strict=True), key=itemgetter(0))[1]
+    part = _few_samples(Z)
+    ends = _fixed_point(_starts(part, n_starts), part, 8)
+    W = max(zip(_fit_densities(ends, part)[0], ends, strict=True), key=itemgetter(0))[1]
     # The maximum of the likelihood, for many samples first that of a part of them
-    for samples in [few] if few is Z else [few, Z]:
+    for samples in [part] if part is Z else [part, Z]:
         W, of_signals = _maximise(W, samples)
 
     # Scale, sign and order. Of all signals of unit mean square, Gaussian ones are the
@@ -545,7 +545,7 @@ def _ascent(
     if min(diagonal.min(), determinant.min()) <= 0:
         return None
     E, residual = np.zeros_like(gradient), gradient
-    direction, least = np.zeros_like(gradient), SOLVED**2 * np.vdot(gradient, gradient)
+    direction, limit = np.zeros_like(gradient), SOLVED**2 * np.vdot(gradient, gradient)
     product = 1.0
     for _ in range(gradient.size):
         step = (diagonal.T * residual - coupling * residual.T) / determinant
@@ -557,6 +557,6 @@ def _ascent(
             return None
         E = E + product / curvature * direction
         residual = residual - product / curvature * change
-        if np.vdot(residual, residual) <= least:
+        if np.vdot(residual, residual) <= limit:
             break
     return E

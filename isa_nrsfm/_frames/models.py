@@ -91,8 +91,8 @@ class DepthCertainty(NamedTuple):
         Errors that groups share are those of the joint fit, times `nearer`: the mean
         square distance of the groups from the consensus over that from the joint fit.
         """
-        own = 0.0 if self.points is None else self.points
-        shared = np.maximum(own - self.deformation * depths, 0.0)
+        joint_errors = 0.0 if self.points is None else self.points
+        shared = np.maximum(joint_errors - self.deformation * depths, 0.0)
         points = np.maximum(errors, nearer * shared) + self.deformation * depths
         total = float(np.sqrt(points.sum() / depths.sum()))
         return self._replace(total=total, points=points, leverage=1.0)
@@ -240,9 +240,9 @@ def rigid_fit(
     motion = rigid_cameras(W.reshape(-1, W.shape[2]), shapes[0].T)
     motion = CAMERAS[camera].nearest(motion)
     images = (motion[:, None] @ shapes[1:]).reshape(len(rows), len(shapes) - 1, -1)
-    rest = (W - motion @ shapes[0]).reshape(len(rows), -1, 1)
+    residuals = (W - motion @ shapes[0]).reshape(len(rows), -1, 1)
     # Smaller images are rounding errors.
-    alpha = (np.linalg.pinv(images.mT, rcond=OF_PRODUCTS) @ rest)[..., 0]
+    alpha = (np.linalg.pinv(images.mT, rcond=OF_PRODUCTS) @ residuals)[..., 0]
     middle = middles[0] + alpha @ middles[1:]
     return motion, centre - (motion @ middle[..., None])[..., 0], alpha
 
@@ -334,8 +334,8 @@ class FrameModel:
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""
         motion, translation, alpha, covariance, *_ = posterior
-        known = covariance.shape[1] == len(self.shapes) - 1
-        widened = self.widened(alpha, covariance)[0] if known else None
+        has_covariance = covariance.shape[1] == len(self.shapes) - 1
+        widened = self.widened(alpha, covariance)[0] if has_covariance else None
         motion, alpha, deviation = self.gauge.apply(motion, alpha, widened)
         motion = motion * sizes[:, None, None]
         return Decomposition(motion, translation * sizes[:, None], alpha, deviation)
@@ -349,8 +349,8 @@ class FrameModel:
         """
         constant, slope = self.certainty.images
         ratio = (constant + slope * leverages(alpha))[:, None, None]
-        rest = np.eye(alpha.shape[1]) + (ratio - 1.0) * covariance
-        return np.linalg.solve(rest, ratio * covariance), ratio
+        matrix = np.eye(alpha.shape[1]) + (ratio - 1.0) * covariance
+        return np.linalg.solve(matrix, ratio * covariance), ratio
 
     def linearised(
         self, rows: NDArray, sizes: NDArray, weights: NDArray | None = None
@@ -395,11 +395,11 @@ class FrameModel:
         covariances = np.full((*weights.shape, 3, 3), np.nan)
         rotations, scales = full_rotations(fit.motion)
         motion = scales[:, None, None] * rotations
-        known = np.flatnonzero(np.isfinite(scales))
+        indices = np.flatnonzero(np.isfinite(scales))
         # Few frames at a time: their derivatives take much memory.
         length = max(2**17 // self.shapes.size, 1)
-        for first in range(0, len(known), length):
-            frames = known[first : first + length]
+        for first in range(0, len(indices), length):
+            frames = indices[first : first + length]
             w = weights[frames, None, None]
             Z = derivatives(self.shapes, motion[frames], fit.alpha[frames], self.camera)
             Z -= (Z * w).sum(axis=3, keepdims=True) / w.sum(axis=3, keepdims=True)

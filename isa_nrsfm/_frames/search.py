@@ -548,8 +548,8 @@ class FrameSearch:
         """
         n_frames, n_components = len(rows), len(self.shared.shapes) - 1
         noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
-        given = 1.0 if weights is None else weights
-        weights = np.where(seen_points(rows), given, 0.0)
+        point_weights = 1.0 if weights is None else weights
+        weights = np.where(seen_points(rows), point_weights, 0.0)
         complete = (weights == 1.0).all(axis=1)
         fits = FramePosterior.unknown(n_frames, n_components, covariances)
         fit = partial(self.fit, starts=starts, covariances=covariances)
@@ -557,9 +557,9 @@ class FrameSearch:
         for chosen in np.flatnonzero(complete), np.flatnonzero(~complete):
             if len(chosen):
                 frames = padded(chosen)
-                own = None if complete[frames[0]] else weights[frames]
+                frame_weights = None if complete[frames[0]] else weights[frames]
                 first = None if initial is None else initial[frames]
-                tracks = frame_tracks(rows[frames], own)
+                tracks = frame_tracks(rows[frames], frame_weights)
                 fits.put(frames, fit(tracks, noise[frames], initial=first))
         return fits
 
@@ -620,18 +620,18 @@ class FrameSearch:
         # minimum, f / s2 is the squared Mahalanobis distance of a frame from the model.
         # It is chi-squared distributed, with two degrees of freedom per point minus the
         # eight of camera and position. The threshold is three times its expectation.
-        most = 3.0 * noise * np.maximum(2.0 * frames.weight - 8.0, 1.0)
-        poor = np.flatnonzero(fits.objective > most)
+        limit = 3.0 * noise * np.maximum(2.0 * frames.weight - 8.0, 1.0)
+        poor = np.flatnonzero(fits.objective > limit)
         if len(poor):
             initial = np.repeat(starts, len(poor), axis=0)
-            others = minima(np.tile(poor, len(starts)), initial)
+            restarts = minima(np.tile(poor, len(starts)), initial)
             # Of equal minima, keep the first.
-            objective = others.objective.reshape(len(starts), -1)
+            objective = restarts.objective.reshape(len(starts), -1)
             best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
             best = best * len(poor) + np.arange(len(poor))
-            gain = fits.objective[poor] - others.objective[best]
+            gain = fits.objective[poor] - restarts.objective[best]
             better = gain > EQUAL * fits.objective[poor]
-            fits.put(poor[better], others.take(best[better]))
+            fits.put(poor[better], restarts.take(best[better]))
         return fits
 
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
@@ -762,8 +762,8 @@ class FrameSearch:
             start = self.evaluate(problem, M * REVERSED)
             # The reversed camera and M differ in the third column.
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
-            known = M, limit, radius
-            other, converged[tried] = self.descend(problem, start, max_steps, known)
+            minima = M, limit, radius
+            other, converged[tried] = self.descend(problem, start, max_steps, minima)
             reached = coefficient_posterior(problem, other).value(problem[1])
             better[tried] = lower = reached < limit
             cameras[..., tried] = np.where(lower, other, M)
@@ -774,7 +774,7 @@ class FrameSearch:
         problem: FrameProblem,
         state: State,
         max_steps: int,
-        known: Minima | None = None,
+        minima: Minima | None = None,
     ) -> tuple[NDArray, NDArray]:
         """Minimise the objectives; return iterates (..., n) and convergence (n,).
 
@@ -790,8 +790,8 @@ class FrameSearch:
             gain = np.einsum("pi,pi->i", state.slope, step)
             small = (damping == 0) & (gain <= 1e-12 * scale_of(problem))
             leaving = small | (damping >= LARGEST_DAMPING)
-            if known is not None:
-                minimum, value, radius = known
+            if minima is not None:
+                minimum, value, radius = minima
                 square = (state.position - minimum).reshape(-1, len(gain)) ** 2
                 near = square.sum(axis=0) < radius**2
                 leaving |= near | (state.value - 10.0 * gain > value)
@@ -803,8 +803,8 @@ class FrameSearch:
                 if leaving.all():
                     return ends, converged
                 left = padded(np.flatnonzero(~leaving))
-                problem, state, step, running, damping, known = of_frames(
-                    (problem, state, step, running, damping, known), left
+                problem, state, step, running, damping, minima = of_frames(
+                    (problem, state, step, running, damping, minima), left
                 )
             if not n_left:
                 break
