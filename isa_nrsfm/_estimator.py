@@ -619,13 +619,13 @@ default="affine"
 
     def _focal_shares(self, table: tables.FrameBlocks) -> tuple[NDArray, ...]:
         """Return the mean focal length over those of frames (n, 1), if they differ."""
-        given = getattr(self, "focal_length_", self.focal_length)
-        return camera_models.focal_shares(given, table.n_frames)
+        focal_lengths = getattr(self, "focal_length_", self.focal_length)
+        return camera_models.focal_shares(focal_lengths, table.n_frames)
 
     def _forget(self) -> None:
         """Remove all results of an earlier fit at once."""
-        own = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
-        names = [n for n in vars(self) if not (n.startswith(own) or n.endswith("_"))]
+        prefix = "_model", "_frame_s", "_halves", "_stability", "_trials", "_n_feature"
+        names = [n for n in vars(self) if not (n.startswith(prefix) or n.endswith("_"))]
         self.__dict__ = {name: vars(self)[name] for name in names}
 
     def __sklearn_clone__(self) -> Any:
@@ -871,8 +871,8 @@ default="affine"
         not rotated: `scales_` and `rotations_` are those of their cameras.
         """
         check_is_fitted(self)
-        known = (None, self.camera_, *choices.CALIBRATED_CAMERAS)
-        if camera == "affine" or camera not in known:
+        cameras = (None, self.camera_, *choices.CALIBRATED_CAMERAS)
+        if camera == "affine" or camera not in cameras:
             raise ValueError(
                 f"camera must be None or one of {choices.CALIBRATED_CAMERAS}; got "
                 f"{camera!r}"
@@ -1112,9 +1112,9 @@ default="affine"
                 return self._held[2]
             check_is_fitted(self)
             layout, frames = self._model.layout, self._model.frames
-            known = "joint" if frames.joint else None
-            given = {"point_weight": point_weight, "refinement": known}
-            choices.check_requirements(given | {"loss": frames.loss})
+            refinement = "joint" if frames.joint else None
+            parameters = {"point_weight": point_weight, "refinement": refinement}
+            choices.check_requirements(parameters | {"loss": frames.loss})
         if tables.is_read_later(X):
             scaling.check_table(X, layout)
             validate_data(

@@ -157,21 +157,21 @@ class TableFit(NamedTuple):
         """
         pairs = (np.nan_to_num([fit.depths(p) for fit in (self, other)]) for p in parts)
         products = sum(np.einsum("aij,bij->ab", pair, pair) for pair in pairs)
-        (own, common), (_, others) = np.asarray(products)
-        square = max(own - 2.0 * abs(common) + others, 0.0) / (own or 1.0)
+        (power, common), (_, other_power) = np.asarray(products)
+        square = max(power - 2.0 * abs(common) + other_power, 0.0) / (power or 1.0)
         return float(np.copysign(np.sqrt(square), common))
 
     def ends(self, tol: float, best: float) -> bool:
         """Return whether further repeats would not help: for the best E of others."""
         n_repeats, change = len(self.changes), self.changes[-1]
-        most = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
-        most = 2 if self.energy > WORSE * best else most
-        return change < tol or n_repeats >= most
+        n_max = MOST_REPEATS if change > UNSETTLED else 2 * MOST_REPEATS
+        n_max = 2 if self.energy > WORSE * best else n_max
+        return change < tol or n_repeats >= n_max
 
     def mirrored(self) -> "TableFit":
         """Return the mirror image in depth."""
-        known = self.attributes | {"motion_": self.frames.motion}
-        attributes = known | self.model.mirrored_attributes(known)
+        attributes = self.attributes | {"motion_": self.frames.motion}
+        attributes |= self.model.mirrored_attributes(attributes)
         model, motion = attributes.pop("_model"), attributes.pop("motion_")
         frames = self.frames._replace(motion=motion)
         return self._replace(model=model, frames=frames, attributes=attributes)
@@ -213,13 +213,13 @@ def fit_table(
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
-    given = None
+    start = None
     if settings.prior is not None:
         # Perspective images are right for the last fit, which has errors.
-        given, settings = prior_start(table, settings, checked=settings.errors)
+        start, settings = prior_start(table, settings, checked=settings.errors)
     if settings.start is not None:
-        given = _started(table, settings, n_components)
-    if given is None:
+        start = _started(table, settings, n_components)
+    if start is None:
         isa, factors = clone(isa), factorised.factors
         shapes, covariance, n_iter, converged = pipeline.run_paper_pipeline(
             factors.leading(3 * wanted), wanted, isa, settings, progress
@@ -229,10 +229,10 @@ def fit_table(
             images = factorised.W.reshape(len(rigid), 2, -1)
             shapes = lifted_shapes(images, rigid, n_components)
     else:
-        isa, shapes = None, given.shapes
+        isa, shapes = None, start.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
-        fit = _joint_fit(factorised, shapes, given, settings, wanted, progress)
+        fit = _joint_fit(factorised, shapes, start, settings, wanted, progress)
         # Down-weighted outliers, for example, look like basis shapes at first.
         supported = max(uncertainty.n_reliable(fit.attributes["reliability_"]), 1)
         falls = settings.free and not settings.all_directions
@@ -262,7 +262,7 @@ def fit_table(
 def _joint_fit(
     factorised: FactorisedTable,
     shapes: NDArray,
-    given: JointState | None,
+    start: JointState | None,
     settings: FitSettings,
     n_components: int,
     progress: Progress,
@@ -273,10 +273,10 @@ def _joint_fit(
     that are shown, some attributes are lacking.
     """
     table, settings = factorised.scaled, settings._replace(on_step=progress.step)
-    known = {} if settings.known is None else settings.known
-    if "joint" not in known:
-        known["joint"] = fit_jointly(factorised, shapes, given, settings)
-    fit, tracks, alpha = known["joint"]
+    cache = {} if settings.known is None else settings.known
+    if "joint" not in cache:
+        cache["joint"] = fit_jointly(factorised, shapes, start, settings)
+    fit, tracks, alpha = cache["joint"]
     settings = settings._replace(shape_prior=fit.prior)
     progress(JOINT_STAGE)
     state, starts, widths = fit.state, spread_starts(alpha), fit.widths
@@ -295,18 +295,18 @@ def _joint_fit(
             n_unknowns = widths.n_unknowns(len(table.sizes), settings.camera)
             noise *= n_numbers / (n_numbers - n_unknowns)
         grouped = fit.misfit > noise
-    if errors and calibrated and not grouped and "certainty" not in known:
-        known["certainty"] = uncertainty.depth_certainty(model, table, fit, settings)
-    if errors and calibrated and "certainty" in known:
-        model = replace(model, certainty=known["certainty"])
+    if errors and calibrated and not grouped and "certainty" not in cache:
+        cache["certainty"] = uncertainty.depth_certainty(model, table, fit, settings)
+    if errors and calibrated and "certainty" in cache:
+        model = replace(model, certainty=cache["certainty"])
     if errors and widths is not None and not grouped:
         mean = bagged(model, table, settings, widths)
         if mean is not None:
             model, widths = mean
             tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
-        others = partial(other_fits, factorised, shapes, settings, fit)
-        model, widths = consensus(model, table, settings, fit, others), None
+        alternatives = partial(other_fits, factorised, shapes, settings, fit)
+        model, widths = consensus(model, table, settings, fit, alternatives), None
         tracks = JointFrames.from_points(table.rows, table.complete)
     if settings.refinement == "consensus":
         progress(CONSENSUS_STAGE)
@@ -317,9 +317,9 @@ def _joint_fit(
         "n_iter_": len(fit.history) - 1,
     }
     if errors and settings.loss == "linear" and table.weights is None:
-        some = spread(np.arange(len(table.sizes)), 100)
-        distance = left_out_distances(model, table.rows.take(some))
-        attributes["_left_out"] = distance, np.flatnonzero(table.shown)[some]
+        sample = spread(np.arange(len(table.sizes)), 100)
+        distance = left_out_distances(model, table.rows.take(sample))
+        attributes["_left_out"] = distance, np.flatnonzero(table.shown)[sample]
     if (n_more := n_components + 1 - len(model.shapes)) > 0:
         # Coefficients beyond the directions that a table supports are zero.
         shapes = np.pad(model.shapes, ((0, n_more), (0, 0), (0, 0)))
@@ -343,11 +343,11 @@ def supported_components(
 ) -> int:
     """Return the number of relevant basis shapes of affine cameras, at most twelve."""
     possible = most_components(len(table.sizes), table.n_points, settings.camera)
-    most = min(MOST_FIRST, possible)
+    K = min(MOST_FIRST, possible)
     quiet = NoProgress()
-    factorised = _factorised(table, most, settings, quiet)
+    factorised = _factorised(table, K, settings, quiet)
     factors = factorised.factors
-    shapes, *_ = pipeline.run_paper_pipeline(factors, most, clone(isa), settings, quiet)
+    shapes, *_ = pipeline.run_paper_pipeline(factors, K, clone(isa), settings, quiet)
     progress("number of basis shapes")
     return count_components(factorised, shapes, settings)
 
@@ -368,8 +368,8 @@ def _factorised(
     if complete:  # kept, because the factorisation reads it up to ten times
         completed = completed.derive(np.asarray)
     else:
-        most = limits.model_frames
-        completed = complete_rows(completed, n_points, n_components, most)
+        model_frames = limits.model_frames
+        completed = complete_rows(completed, n_points, n_components, model_frames)
     report("table")
     shape = 2 * len(table.sizes), n_points
     triplets = pipeline.block_triplets(completed, shape, n_triplets, limits.dense)
@@ -385,8 +385,8 @@ def _factorised(
         W, parts = completed.whole().reshape(shape), []
     factors = pipeline.factorise(W, n_components, table.precision, triplets)
     compressed = None
-    few = max(24 * (n_components + 1), limits.many_points)
-    if settings.joint and settings.prior is None and n_points > few:
+    threshold = max(24 * (n_components + 1), limits.many_points)
+    if settings.joint and settings.prior is None and n_points > threshold:
         directions = np.concatenate([factors.rigid_shape, factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         compressed = JointFrames.from_directions(completed, directions)
@@ -403,9 +403,9 @@ def _started(
     model lacks are directions of the residuals of at most 200 frames.
     """
     model, placed = settings.start, settings.placed
-    frames, (own, other) = model.frames, (model.unit, table.unit)
+    frames = model.frames
     # Frames have size one, unless all have one scale.
-    unit = own / other if own and other else 1.0
+    unit = model.unit / table.unit if model.unit and table.unit else 1.0
     n_more = max(n_components + 1 - len(frames.shapes), 0)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance
     if n_more:
@@ -457,8 +457,8 @@ def _paper_fit(
         model, frames = fitted()
         # Coefficients scale with the basis shapes. If a frame does not determine its
         # coefficients, their solution of minimum norm changes.
-        off = gauge.coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
-        if np.abs(off).max(initial=0.0) <= 1e-6:
+        deviations = gauge.coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
+        if np.abs(deviations).max(initial=0.0) <= 1e-6:
             break
     index = (3 * order[:, None] + np.arange(3)).ravel()
     covariance = (table.unit or 1.0) ** 2 * covariance[np.ix_(index, index)]
@@ -513,8 +513,8 @@ def _joint_frames(
         )
     else:
         inverse = prior.inverse(information[None], noise)[0]
-    known = prior or widths
-    unknowns = float(model.shapes.size) if known is None else known.n_determined
+    penalty = prior or widths
+    unknowns = float(model.shapes.size) if penalty is None else penalty.n_determined
     certainty = uncertainty.frame_certainty(model, fits, table.n_seen, weight, unknowns)
     certainty = certainty._replace(weighted=table.weights is not None)
     model = replace(model, gauge=frame_map, certainty=certainty)
@@ -624,9 +624,9 @@ class Images(NamedTuple):
         if pinhole is not None:
             rows = rows.derive(pinhole.virtual, kept=fit is None)
             if fit is not None:
-                depths, known = fit.model.depths, (fit.frames.motion, fit.frames.alpha)
+                depths, arrays = fit.model.depths, (fit.frames.motion, fit.frames.alpha)
                 straight = pinhole.straight
-                rows = rows.derive(lambda r, *f: straight(r, depths(*f)), *known)
+                rows = rows.derive(lambda r, *f: straight(r, depths(*f)), *arrays)
         return scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
@@ -877,22 +877,22 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         total = float(np.hypot(certainty.total, error))
         certainty = certainty._replace(total=total)
         model = model._replace(frames=replace(model.frames, certainty=certainty))
-        least = min(abs(g) for g in fits if g < 0)
-        probability = float(expit(table.log_odds(fits[least], fits[-least])))
+        place = min(abs(g) for g in fits if g < 0)
+        probability = float(expit(table.log_odds(fits[place], fits[-place])))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
     # Frames as new tables have them
     decompose = partial(model.decompose, dtype=np.float64)
     frames: Decomposition = table.source.joined(decompose, *weights)
     dtype = table.source.empty.dtype
-    sizes, known = attributes["_frame_sizes"], model.frames.certainty.determined
-    shown = np.isfinite(sizes)
-    seen = Decomposition(*(values[shown] for values in frames))
-    view = mean_camera(seen, sizes[shown], "perspective")
+    sizes, has_depth = attributes["_frame_sizes"], model.frames.certainty.determined
+    mask = np.isfinite(sizes)
+    seen = Decomposition(*(values[mask] for values in frames))
+    view = mean_camera(seen, sizes[mask], "perspective")
     attributes |= {name: value.astype(dtype) for name, value in view.items()}
     attributes |= {
         "isa_": best.attributes["isa_"],
         "focal_length_": f if given is None else np.array(given, dtype=float)[()],
-        "focal_length_std_": deviation * f**2 if known or not deviation else np.inf,
+        "focal_length_std_": deviation * f**2 if has_depth or not deviation else np.inf,
     }
     frames = Decomposition(*(part.astype(dtype) for part in frames))
     return fit._replace(model=model, frames=frames)
