@@ -96,10 +96,10 @@ class TableModel(NamedTuple):
 
     def in_table_cameras(self, rows: NDArray, *fit: NDArray) -> Decomposition:
         """Return fits of rows in virtual cameras with the cameras of the table."""
-        motion, translation, *rest = fit
+        motion, translation, *coefficients = fit
         if self.pinhole is not None:
             motion, translation = self.pinhole.real(rows, motion, translation)
-        return Decomposition(motion, translation, *rest)
+        return Decomposition(motion, translation, *coefficients)
 
     def in_camera_axes(self, motion: NDArray, translation: NDArray) -> NDArray:
         """Return cameras (n, 2, 3) whose rotations lead to the axes of the camera.
@@ -138,8 +138,8 @@ class TableModel(NamedTuple):
         moving = np.arange(len(rows))
         for _ in range(30 if pinhole.near else 0):
             moving = padded(moving)
-            own = None if weights is None else weights[moving]
-            fit = weak.decompose(straight[moving], own, deviations=False)
+            moving_weights = None if weights is None else weights[moving]
+            fit = weak.decompose(straight[moving], moving_weights, deviations=False)
             before = depths[moving]
             depths[moving] = self.depths(fit.motion, fit.alpha)
             straight[moving] = pinhole.straight(images[moving], depths[moving])
@@ -237,8 +237,8 @@ class TableModel(NamedTuple):
         constant, slope = self.frames.certainty.images
         ratio = constant + slope * len(self.frames.shapes)  # mean leverage of frames
         expected = max(ratio * self.frames.noise_variance, LEAST_MISFIT**2)
-        known = distance[np.isfinite(distance)]
-        return median_noise(known) / float(np.sqrt(expected)) if len(known) else 0.0
+        lengths = distance[np.isfinite(distance)]
+        return median_noise(lengths) / float(np.sqrt(expected)) if len(lengths) else 0.0
 
     def linearised(
         self, rows: NDArray, weights: NDArray | None = None
@@ -317,9 +317,9 @@ class TableModel(NamedTuple):
         """Return images of fitted frames as a table, zoomed back by shares (n, 1)."""
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         images = self.images(shapes, fit.motion, fit.translation)
-        known = self.pinhole or self.axes
-        if known is not None and shares:
-            images = zoomed(images, 1.0 / shares[0][..., None], known.centre[:, 0])
+        lens = self.pinhole or self.axes
+        if lens is not None and shares:
+            images = zoomed(images, 1.0 / shares[0][..., None], lens.centre[:, 0])
         return tracks_to_table(images, self.layout)
 
     def images(self, shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
@@ -358,9 +358,9 @@ class TableModel(NamedTuple):
         few such frames would dominate the score. This does not depend on the basis, so
         scores of different K use the same points.
         """
-        given, _, _, sizes, weights = self._ready(rows, weights)
+        mask, _, _, sizes, weights = self._ready(rows, weights)
         squares = np.full((*rows.shape[::2], 2), np.nan)
-        rows, numbers = rows[given], np.flatnonzero(given)
+        rows, numbers = rows[mask], np.flatnonzero(mask)
         folds = np.random.RandomState(0).permutation(rows.shape[2]) % 5
         seen = seen_points(rows)
         counts = np.ones(seen.shape) if weights is None else weights
@@ -380,13 +380,13 @@ class TableModel(NamedTuple):
             usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
             if not len(usable):
                 continue
-            own = None if weights is None else weights[usable]
+            usable_weights = None if weights is None else weights[usable]
             if linear:
                 unit = rows[usable] / sizes[usable, None, None]
-                posterior = frames.posterior_without(unit, held, own)
+                posterior = frames.posterior_without(unit, held, usable_weights)
                 fit = frames.shown(posterior, sizes[usable])
             else:
-                fit = weak.decompose(visible[usable], own, False)
+                fit = weak.decompose(visible[usable], usable_weights, False)
                 fit = self.in_table_cameras(rows[usable], *fit)
             # Prediction of the held-out points, and its error
             shapes = compose(self.mean_shape[held], self.basis[:, held], fit.alpha)
@@ -394,10 +394,10 @@ class TableModel(NamedTuple):
             places = np.ix_(usable, np.flatnonzero(held))
             error = np.square(tracks[places] - predicted).sum(axis=2)
             counted = seen[places] & np.isfinite(error)
-            some = ~seen[usable].all(axis=1)
+            gaps = ~seen[usable].all(axis=1)
             # Effect of the threshold 2: docs/benchmarks/README.md, "Thresholds"
-            leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
-            counted[some] &= leverage[:, held] <= 2.0
+            leverage = _camera_leverage(self.mean_shape, seen[usable[gaps]] & ~held)
+            counted[gaps] &= leverage[:, held] <= 2.0
             found = counts[places][..., None] * np.stack([error, signal[places]], 2)
             found[~counted] = np.nan
             squares[np.ix_(numbers[usable], places[1][0])] = found
@@ -413,8 +413,8 @@ class TableModel(NamedTuple):
         Of at most `MOST_ROWS` rows. Of robust fits it is that of the median point, with
         normally distributed errors.
         """
-        some = spread(np.arange(table.n_frames), MOST_ROWS)
-        squares = self.held_out(table.take(some), *(w[some] for w in weights))
+        sample = spread(np.arange(table.n_frames), MOST_ROWS)
+        squares = self.held_out(table.take(sample), *(w[sample] for w in weights))
         return unexplained_share(squares, self.frames.loss != "linear")
 
     def _ready(
@@ -542,13 +542,13 @@ def warn_if_foreign(
     certainty, camera = model.frames.certainty, model.frames.camera
     if table.n_frames < FEWEST_COMPARED or (certainty.weighted and not weights):
         return
-    some = spread(np.arange(table.n_frames), 100)
-    rows, own = table.take(some), [w[some] for w in weights]
+    sample = spread(np.arange(table.n_frames), 100)
+    rows, row_weights = table.take(sample), [w[sample] for w in weights]
     if fit is None:
-        fit = model.decompose(rows, *own, deviations=False, dtype=np.float64)
+        fit = model.decompose(rows, *row_weights, deviations=False, dtype=np.float64)
     else:
-        fit = Decomposition(*(part[some] for part in fit))
-    distance = model.distances(rows, *fit[:3], *own)
+        fit = Decomposition(*(part[sample] for part in fit))
+    distance = model.distances(rows, *fit[:3], *row_weights)
     misfit = model.misfit(distance)
     if misfit > (OF_AFFINE if camera == "affine" else LARGEST_MISFIT):
         way = "Fit X separately"
@@ -558,7 +558,7 @@ def warn_if_foreign(
                 "table, or fit X separately"
             )
         elif camera != "affine" and certainty.determined:
-            before, after = adapting_errors(estimator, rows, *own)
+            before, after = adapting_errors(estimator, rows, *row_weights)
             if after < before:
                 way = (
                     "Adapt the model to X: AutoNRSfM(model, prior=model).fit(X). Held-"
@@ -585,29 +585,29 @@ def adapting_errors(
     can look like other points.
     """
     layout, pinhole = estimator._model.layout, estimator._model.pinhole
-    given = {"layout": layout, "focal_length": pinhole and pinhole.focal_length}
-    given |= {"n_components": "auto", "refinement": "joint", "prior": estimator}
-    adapted = clone(estimator).set_params(**given, keep_frames=False)
+    parameters = {"layout": layout, "focal_length": pinhole and pinhole.focal_length}
+    parameters |= {"n_components": "auto", "refinement": "joint", "prior": estimator}
+    adapted = clone(estimator).set_params(**parameters, keep_frames=False)
     of_points = weights[0][::2] if weights else None
     with warnings.catch_warnings(action="ignore"):
         try:
             adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)
         except ValueError:
             return np.nan, np.nan
-    others = [each[1::2] for each in (rows, *weights)]
-    parts = [each._model.held_out_sums(*others)[0] for each in (estimator, adapted)]
+    test_rows = [each[1::2] for each in (rows, *weights)]
+    parts = [each._model.held_out_sums(*test_rows)[0] for each in (estimator, adapted)]
     return tuple(float(noise / signal) for noise, signal in parts)
 
 
 def far_points(distance: NDArray, frames: Any) -> float:
     """Return how far points (n, J) lie from shapes; zero if they are these points."""
     if frames.loss == "linear":
-        shown = distance[np.isfinite(distance).any(axis=1)]
-        square = np.median(np.nanmean(shown**2, axis=1))
+        distance = distance[np.isfinite(distance).any(axis=1)]
+        square = np.median(np.nanmean(distance**2, axis=1))
     else:  # without outliers
         square = 2.0 * median_noise(distance[np.isfinite(distance)]) ** 2
-    others = square > OTHER_POINTS**2 + 2.0 * frames.noise_variance
-    return float(np.sqrt(square)) if others else 0.0
+    mismatch = square > OTHER_POINTS**2 + 2.0 * frames.noise_variance
+    return float(np.sqrt(square)) if mismatch else 0.0
 
 
 def fitted_prior(prior: Any) -> Any:
@@ -666,15 +666,15 @@ def prior_start(
     """
     model = settings.prior
     frames = model.frames
-    some = spread(np.arange(table.rows.n_frames), 200)
-    rows = table.rows.take(some)
-    weights = None if table.weights is None else table.weights[some]
+    sample = spread(np.arange(table.rows.n_frames), 200)
+    rows = table.rows.take(sample)
+    weights = None if table.weights is None else table.weights[sample]
     frames = replace(frames, camera="weak_perspective", loss=settings.loss)
     fit = frames.posterior(rows, False, weights)
-    far = far_points(distances(rows, frames.shapes, *fit[:3]), frames)
-    if checked and far:
+    share = far_points(distances(rows, frames.shapes, *fit[:3]), frames)
+    if checked and share:
         raise ValueError(
-            f"the table does not show the points of the prior: they lie {far:.0%} of "
+            f"the table does not show the points of the prior: they lie {share:.0%} of "
             "the size of the object from its shapes. Check whether the columns have "
             "the same points in the same order"
         )
