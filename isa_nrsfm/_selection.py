@@ -306,9 +306,9 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
         X, y = indexable(X, y)
         for_splitter, for_scorer = self._routed("fit", params)
         splits = list(plain.cv.split(X, y, **for_splitter))
-        given = estimator.get_params(deep=False)
+        settings = estimator.get_params(deep=False)
         # No files of trials
-        trial = StartedNRSfM(**given | {"keep_frames": bool(estimator.keep_frames)})
+        trial = StartedNRSfM(**settings | {"keep_frames": bool(estimator.keep_frames)})
         joint = trial.refinement in JOINT_REFINEMENTS
         if joint:  # a consensus only with the chosen K
             trial.set_params(refinement="joint")
@@ -410,10 +410,10 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params)
             return routed.splitter.get("split", {}), routed.scorer.score
-        others = sorted(set(params) - ({"groups"} if method == "fit" else set()))
-        if others:
+        names = sorted(set(params) - ({"groups"} if method == "fit" else set()))
+        if names:
             raise TypeError(
-                f"{method} takes metadata {', '.join(others)} only with metadata "
+                f"{method} takes metadata {', '.join(names)} only with metadata "
                 "routing: sklearn.set_config(enable_metadata_routing=True)"
             )
         return params, {}
@@ -421,9 +421,9 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
 
 def checked_candidates(n_components: Any) -> list[int]:
     """Return different numbers of basis shapes above zero in ascending order."""
-    given = np.atleast_1d(np.asarray(n_components))
-    candidates, whole = np.unique(given).tolist(), given.dtype.kind in "iu"
-    different = given.ndim == 1 and len(candidates) == len(given) > 0
+    numbers = np.atleast_1d(np.asarray(n_components))
+    candidates, whole = np.unique(numbers).tolist(), numbers.dtype.kind in "iu"
+    different = numbers.ndim == 1 and len(candidates) == len(numbers) > 0
     if not (whole and different and candidates[0] > 0):
         raise ValueError(
             "n_components must be numbers of basis shapes, such as range(1, 9), "
@@ -471,8 +471,8 @@ def results_of(candidates: list[int], parts: list[dict[str, Any]]) -> dict[str, 
         results |= {f"std_{name}": values.std(axis=1)}
     # Of the scores. Unknown ones rank last.
     results |= {f"split{i}_{name}": column for i, column in enumerate(values.T)}
-    known = np.nan_to_num(results["mean_test_score"], nan=-np.inf)
-    results["rank_test_score"] = rankdata(-known, method="min").astype(np.int32)
+    scores = np.nan_to_num(results["mean_test_score"], nan=-np.inf)
+    results["rank_test_score"] = rankdata(-scores, method="min").astype(np.int32)
     return results
 
 
@@ -702,8 +702,8 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         params, free = first_settings(given)
         estimator = clone(estimator).set_params(**params)
         point = None if self.image_size is None else np.divide(self.image_size, 2)
-        known = estimator.camera == "perspective" or estimator.focal_length is not None
-        if known and estimator.principal_point is None:
+        lens = estimator.camera == "perspective" or estimator.focal_length is not None
+        if lens and estimator.principal_point is None:
             estimator.set_params(principal_point=point)
         weights = {} if point_weight is None else {"point_weight": point_weight}
         self.best_estimator_, self.trials_ = decided(
@@ -768,11 +768,11 @@ class _Rows(NamedTuple):
 
     def rough(self, params: dict[str, Any], **continued: Any) -> StartedNRSfM:
         """Return a fit of few rows."""
-        some = spread(np.arange(self.X.shape[0]), ROUGH_ROWS)
+        sample = spread(np.arange(self.X.shape[0]), ROUGH_ROWS)
         model = StartedNRSfM(**params)
         model._continued = continued
-        weights = {name: w[some] for name, w in self.weights.items()}
-        return model.fit(taken_rows(self.X, some), **weights)
+        weights = {name: w[sample] for name, w in self.weights.items()}
+        return model.fit(taken_rows(self.X, sample), **weights)
 
     def squares(self, model: AffineNRSfM) -> NDArray:
         """Return squared errors and signals (n, J, 2) of held-out points."""
@@ -786,10 +786,10 @@ class _Rows(NamedTuple):
         """
         S = model.reconstruct(self.X).mT
         S = S[np.isfinite(S).all(axis=(1, 2))]
-        some = spread(np.arange(S.shape[2]), consensus.MOST_POINTS)
-        distances, before, left = consensus.neighbour_distances(S[:, :, some]), 0.0, 0.0
+        S = S[:, :, spread(np.arange(S.shape[2]), consensus.MOST_POINTS)]
+        distances, before, left = consensus.neighbour_distances(S), 0.0, 0.0
         for points, count in consensus.neighbourhoods(distances, consensus.SMALLEST):
-            part = centred(S[:, :, some[points]])
+            part = centred(S[:, :, points])
             before += count * np.sum((part - part.mean(axis=0)) ** 2)
             for _ in range(3):  # to their mean
                 part = procrustes(part.mean(axis=0) @ part.mT) @ part
@@ -826,8 +826,8 @@ class _Fit(NamedTuple):
     @property
     def determined(self) -> bool:
         """Whether the depth is determined."""
-        known = self.model._model.frames.certainty.determined
-        return bool(known and self.model.camera != "affine")
+        certainty = self.model._model.frames.certainty
+        return bool(certainty.determined and self.model.camera != "affine")
 
 
 # Each proposal: why a setting cannot win, otherwise the changes of the best fit.
@@ -852,9 +852,9 @@ def _perspective(best: _Fit, rows: _Rows) -> Proposal:
     near: dict[str, Any] = {"camera": "perspective"}
     near["principal_point"] = tuple(map(float, point))
     # More basis shapes would explain the perspective.
-    few = {"n_components": min(len(model.basis_), MOST_SHAPES)}
-    near |= few if model.n_components == AUTO else {}
-    params = model.get_params(deep=False) | few | {"prior": None, "refinement": "joint"}
+    cap = {"n_components": min(len(model.basis_), MOST_SHAPES)}
+    near |= cap if model.n_components == AUTO else {}
+    params = model.get_params(deep=False) | cap | {"prior": None, "refinement": "joint"}
     params |= near | {"focal_length": 5 * max(point)}
     seen = rows.rough(params).camera_ == "perspective"
     return near if seen else "held-out points do not show it"
@@ -904,8 +904,8 @@ def _consensus(best: _Fit, rows: _Rows) -> Proposal:
     """
     if best.model.camera == "affine" or rows.weights:
         return "not with affine cameras or weights"
-    known = best.model.prior or best.model.camera == "perspective"
-    if best.determined and (known or rows.own_rotations(best.model) < OWN_ROTATIONS):
+    cue = best.model.prior or best.model.camera == "perspective"
+    if best.determined and (cue or rows.own_rotations(best.model) < OWN_ROTATIONS):
         return "the depth is known"
     return {"refinement": "consensus"}
 
@@ -960,13 +960,13 @@ def decided(
     groups and weights are those of `AffineNRSfM.fit`.
     Returns the fit that is kept, with warnings, and what was tried.
     """
-    some = spread(np.arange(X.shape[0]), MOST_ROWS)
-    few = {name: np.asarray(each)[some] for name, each in weights.items()}
-    X_few = taken_rows(X, some)
+    sample = spread(np.arange(X.shape[0]), MOST_ROWS)
+    row_weights = {name: np.asarray(each)[sample] for name, each in weights.items()}
+    X_sample = taken_rows(X, sample)
     layout = face_layout or ""
     if "prior" in free and not layout:
-        layout = _layout_name(estimator, X_few)
-    rows = _Rows(X_few, few, principal_point, layout)
+        layout = _layout_name(estimator, X_sample)
+    rows = _Rows(X_sample, row_weights, principal_point, layout)
 
     def fitted(
         model: AffineNRSfM, setting: str, robust: bool, first: _Fit | None = None
