@@ -812,7 +812,7 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
 
     `n_components` and the given focal length are estimated if they are None; the table
     has the mean of several. A fit from the model of a similar table has that of it.
-    If perspective is not found, its fit does not settle, or held-out points do not
+    If perspective is not found, its fit does not settle, or points of new frames do not
     prefer it, the fit is that of weak-perspective cameras, with a warning. The model of
     that fit may be known, as "weak".
     """
@@ -862,7 +862,7 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         with warnings.catch_warnings(action="ignore"):
             weak = (settings.known or {}).get("weak") or plain(errors=False).model
         models = fit.model, weak
-        error, of_weak = (m.held_out_error(table.source, *weights) for m in models)
+        error, of_weak = (m.expected_error(table.source, *weights) for m in models)
         why = "" if error < of_weak else NOT_BETTER
     table.progress(PERSPECTIVE_STAGE)
     if why:

@@ -23,7 +23,13 @@ from isa_nrsfm._frames.camera_models import (
     turns_to,
     zoomed,
 )
-from isa_nrsfm._frames.models import MIRROR, Decomposition, FrameModel, LinearisedFrames
+from isa_nrsfm._frames.models import (
+    MIRROR,
+    Decomposition,
+    FrameModel,
+    LinearisedFrames,
+    leverages,
+)
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
@@ -407,15 +413,27 @@ class TableModel(NamedTuple):
         """Return the sums (1, 2) of squared errors and signals of held-out points."""
         return np.nansum(self.held_out(*rows_and_weights), axis=(0, 1))[None]
 
-    def held_out_error(self, table: FrameBlocks, *weights: NDArray) -> float:
-        """Return the share of the energy of held-out points that is not explained.
+    def expected_error(self, table: FrameBlocks, *weights: NDArray) -> float:
+        """Return the share of the energy of points of new frames that is not explained.
 
-        Of at most `MOST_ROWS` rows. Of robust fits it is that of the median point, with
-        normally distributed errors.
+        From held-out points of at most `MOST_ROWS` fitted rows, and their optimism. Of
+        robust fits it is that of the median point, with normally distributed errors.
         """
         sample = spread(np.arange(table.n_frames), MOST_ROWS)
-        squares = self.held_out(table.take(sample), *(w[sample] for w in weights))
-        return unexplained_share(squares, self.frames.loss != "linear")
+        rows, weights = table.take(sample), tuple(w[sample] for w in weights)
+        squares, robust = self.held_out(rows, *weights), self.frames.loss != "linear"
+        return self.optimism(rows, *weights) * unexplained_share(squares, robust)
+
+    def optimism(self, rows: NDArray, weights: NDArray | None = None) -> float:
+        """Return the squared error of new frames over that of fitted rows (n, 2, J).
+
+        The shapes have seen all points of these, also held-out ones. With n coordinates
+        that determine the shapes of N, it is ``exp(2 n / N)`` (Akaike, "A new look at
+        the statistical model identification", 1974).
+        """
+        constant, slope = self.frames.certainty.images
+        leverage = np.nanmean(leverages(self.posterior(rows, weights).alpha))
+        return float(np.exp(2.0 * slope * leverage / constant))
 
     def _ready(
         self, rows: NDArray, weights: NDArray | None = None
@@ -437,7 +455,7 @@ class TableModel(NamedTuple):
 
 
 def unexplained_share(squares: NDArray, robust: bool) -> float:
-    """Return `held_out_error` of squared errors and signals (n, J, 2)."""
+    """Return the share of energy of squared errors and signals (n, J, 2)."""
     error, signal = np.moveaxis(squares, 2, 0)
     if np.isnan(error).all():
         return np.nan

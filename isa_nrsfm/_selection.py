@@ -779,6 +779,11 @@ class _Rows(NamedTuple):
         table, weights = model._opened(self.X, **self.weights, judged=False)
         return np.asarray(table.joined(model._model.held_out, *weights))
 
+    def optimism(self, model: AffineNRSfM) -> float:
+        """Return the squared error of new frames over that of these."""
+        table, weights = model._opened(self.X, **self.weights, judged=False)
+        return model._model.optimism(table.whole(), *weights)
+
     def own_rotations(self, model: AffineNRSfM) -> float:
         """Return the share of the deformation of groups that is their own rotation.
 
@@ -804,10 +809,12 @@ class _Fit(NamedTuple):
     trial: Trial
     caught: list[warnings.WarningMessage]
     squares: NDArray
+    optimism: float
 
     def clearly_better(self, other: "_Fit", robust: bool) -> bool:
-        """Return whether held-out points of frames have clearly smaller errors."""
-        pairs = np.stack([other.squares[..., 0], self.squares[..., 0]])
+        """Return whether points of new frames have clearly smaller errors."""
+        fits = other, self
+        pairs = np.stack([fit.optimism * fit.squares[..., 0] for fit in fits])
         pairs = pairs[:, np.isfinite(pairs.sum(axis=0)).any(axis=1)]
         gain = np.subtract(*(np.nanmedian if robust else np.nanmean)(pairs, axis=2))
         return len(gain) > 0 and gain.mean() > CLEAR * gain.std() / np.sqrt(len(gain))
@@ -981,7 +988,7 @@ def decided(
         error = unexplained_share(squares, robust or model.loss != "linear")
         depth = float(getattr(model, "depth_uncertainty_", np.nan))
         trial = Trial(setting, error, depth, seconds, "used")
-        return _Fit(model, trial, caught, squares)
+        return _Fit(model, trial, caught, squares, rows.optimism(model))
 
     robust, trials = False, []
     setting = f"{estimator.camera.replace('_p', ' p')} cameras"
