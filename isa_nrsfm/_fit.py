@@ -862,7 +862,8 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         with warnings.catch_warnings(action="ignore"):
             weak = (settings.known or {}).get("weak") or plain(errors=False).model
         models = fit.model, weak
-        error, of_weak = (m.expected_error(table.source, *weights) for m in models)
+        parts = table.source, *weights
+        error, of_weak = (m.optimism(*parts) * m.held_out_error(*parts) for m in models)
         why = "" if error < of_weak else NOT_BETTER
     table.progress(PERSPECTIVE_STAGE)
     if why:

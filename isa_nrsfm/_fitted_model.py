@@ -413,26 +413,27 @@ class TableModel(NamedTuple):
         """Return the sums (1, 2) of squared errors and signals of held-out points."""
         return np.nansum(self.held_out(*rows_and_weights), axis=(0, 1))[None]
 
-    def expected_error(self, table: FrameBlocks, *weights: NDArray) -> float:
-        """Return the share of the energy of points of new frames that is not explained.
+    def held_out_error(self, table: FrameBlocks, *weights: NDArray) -> float:
+        """Return the share of the energy of held-out points that is not explained.
 
-        From held-out points of at most `MOST_ROWS` fitted rows, and their optimism. Of
-        robust fits it is that of the median point, with normally distributed errors.
+        Of at most `MOST_ROWS` rows. Of robust fits it is that of the median point, with
+        normally distributed errors.
         """
         sample = spread(np.arange(table.n_frames), MOST_ROWS)
-        rows, weights = table.take(sample), tuple(w[sample] for w in weights)
-        squares, robust = self.held_out(rows, *weights), self.frames.loss != "linear"
-        return self.optimism(rows, *weights) * unexplained_share(squares, robust)
+        squares = self.held_out(table.take(sample), *(w[sample] for w in weights))
+        return unexplained_share(squares, self.frames.loss != "linear")
 
-    def optimism(self, rows: NDArray, weights: NDArray | None = None) -> float:
-        """Return the squared error of new frames over that of fitted rows (n, 2, J).
+    def optimism(self, table: FrameBlocks, *weights: NDArray) -> float:
+        """Return the squared error of new frames over that of the fitted ones.
 
         The shapes have seen all points of these, also held-out ones. With n coordinates
         that determine the shapes of N, it is ``exp(2 n / N)`` (Akaike, "A new look at
-        the statistical model identification", 1974).
+        the statistical model identification", 1974). Of at most `MOST_ROWS` rows.
         """
+        sample = spread(np.arange(table.n_frames), MOST_ROWS)
+        fit = self.posterior(table.take(sample), *(w[sample] for w in weights))
         constant, slope = self.frames.certainty.images
-        leverage = np.nanmean(leverages(self.posterior(rows, weights).alpha))
+        leverage = np.nanmean(leverages(fit.alpha))
         return float(np.exp(2.0 * slope * leverage / constant))
 
     def _ready(
@@ -455,7 +456,7 @@ class TableModel(NamedTuple):
 
 
 def unexplained_share(squares: NDArray, robust: bool) -> float:
-    """Return the share of energy of squared errors and signals (n, J, 2)."""
+    """Return `held_out_error` of squared errors and signals (n, J, 2)."""
     error, signal = np.moveaxis(squares, 2, 0)
     if np.isnan(error).all():
         return np.nan

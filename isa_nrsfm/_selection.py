@@ -782,7 +782,7 @@ class _Rows(NamedTuple):
     def optimism(self, model: AffineNRSfM) -> float:
         """Return the squared error of new frames over that of these."""
         table, weights = model._opened(self.X, **self.weights, judged=False)
-        return model._model.optimism(table.whole(), *weights)
+        return model._model.optimism(table, *weights)
 
     def own_rotations(self, model: AffineNRSfM) -> float:
         """Return the share of the deformation of groups that is their own rotation.
