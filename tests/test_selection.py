@@ -213,3 +213,18 @@ def test_held_out_rows_are_not_fitted_without_joint_refinement():
 
 
 test_refusals = refusals_of("selection", globals())
+
+
+@pytest.mark.slow
+def test_optimism_of_fitted_frames_is_that_of_new_ones():
+    """On average: one ratio has a standard deviation of a tenth."""
+    options = {"camera": "weak_perspective", "noise": 0.02, "random_state": 0}
+    parts = np.split(make_nonrigid_tracks(480, 16, 2, **options).data, 8)
+    ratios, expected = [], []
+    for X, others in zip(parts, np.roll(parts, 1, axis=0), strict=True):
+        model = OneStart(2, camera="weak_perspective", random_state=0).fit(X)
+        ratios.append(model.score(others) / model.score(X))
+        table, weights = model._opened(X, judged=False)
+        expected.append(model._model.optimism(table, *weights))
+    assert 1.15 < np.mean(expected) < 1.3
+    assert_allclose(np.mean(ratios), np.mean(expected), rtol=0.06)
