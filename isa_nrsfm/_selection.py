@@ -702,8 +702,9 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         params, free = first_settings(given)
         estimator = clone(estimator).set_params(**params)
         point = None if self.image_size is None else np.divide(self.image_size, 2)
-        lens = estimator.camera == "perspective" or estimator.focal_length is not None
-        if lens and estimator.principal_point is None:
+        pinhole = estimator.camera == "perspective"
+        pinhole |= estimator.focal_length is not None
+        if pinhole and estimator.principal_point is None:
             estimator.set_params(principal_point=point)
         weights = {} if point_weight is None else {"point_weight": point_weight}
         self.best_estimator_, self.trials_ = decided(
@@ -774,15 +775,14 @@ class _Rows(NamedTuple):
         weights = {name: w[sample] for name, w in self.weights.items()}
         return model.fit(taken_rows(self.X, sample), **weights)
 
-    def squares(self, model: AffineNRSfM) -> NDArray:
-        """Return squared errors and signals (n, J, 2) of held-out points."""
-        table, weights = model._opened(self.X, **self.weights, judged=False)
-        return np.asarray(table.joined(model._model.held_out, *weights))
+    def held_out(self, model: AffineNRSfM) -> tuple[NDArray, float]:
+        """Return squared errors and signals (n, J, 2) of held-out points, and optimism.
 
-    def optimism(self, model: AffineNRSfM) -> float:
-        """Return the squared error of new frames over that of these."""
+        That is the squared error of new frames over that of these.
+        """
         table, weights = model._opened(self.X, **self.weights, judged=False)
-        return model._model.optimism(table, *weights)
+        squares = np.asarray(table.joined(model._model.held_out, *weights))
+        return squares, model._model.optimism(table, *weights)
 
     def own_rotations(self, model: AffineNRSfM) -> float:
         """Return the share of the deformation of groups that is their own rotation.
@@ -984,11 +984,12 @@ def decided(
             if not hasattr(model, "_model"):
                 model.fit(X, groups=groups, **weights)
         seconds = time.perf_counter() - since
-        squares = first.squares if first else rows.squares(model)
+        figures = first and (first.squares, first.optimism)
+        squares, optimism = figures or rows.held_out(model)
         error = unexplained_share(squares, robust or model.loss != "linear")
         depth = float(getattr(model, "depth_uncertainty_", np.nan))
         trial = Trial(setting, error, depth, seconds, "used")
-        return _Fit(model, trial, caught, squares, rows.optimism(model))
+        return _Fit(model, trial, caught, squares, optimism)
 
     robust, trials = False, []
     setting = f"{estimator.camera.replace('_p', ' p')} cameras"

@@ -518,6 +518,13 @@ def spread(order: NDArray, n: int) -> NDArray:
     return order[np.linspace(0, len(order) - 1, n).round().astype(int)]
 
 
+def point_patterns(seen: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the different rows of a mask (n, J), and the index (n,) of each row."""
+    bits = np.packbits(seen, axis=1)
+    _, first, pattern = np.unique(bits, axis=0, return_index=True, return_inverse=True)
+    return seen[first], pattern.reshape(-1)
+
+
 def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     """
     Return indices of about `most` frames of rows (I, 2, J), for the model of a table.

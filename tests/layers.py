@@ -6,7 +6,8 @@ from isa_nrsfm._estimator import limited
 from isa_nrsfm._joint.settings import LIMITS
 
 # Of quick tests: joint fits have one start, and few steps for the errors of depths.
-QUICK_LIMITS = {"few_frames": 0, "widths": (), "error_steps": 3, "restarts": False}
+ONE_START = {"few_frames": 0, "widths": (), "restarts": False}
+QUICK_LIMITS = ONE_START | {"error_steps": 3}
 
 # The run of FastICA or FastISA that is kept may go round in a cycle; it says so.
 may_not_converge = pytest.mark.filterwarnings(
@@ -33,5 +34,5 @@ def with_limits(**limits):
     return limited(LIMITS._replace(**limits))
 
 
-# One start of a fit, with the errors of depths of users.
-OneStart = with_limits(few_frames=0, widths=(), restarts=False)
+# The second one has the errors of depths of users.
+Quick, OneStart = with_limits(**QUICK_LIMITS), with_limits(**ONE_START)

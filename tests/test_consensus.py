@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from frame_parts import depth_errors
-from layers import QUICK_LIMITS, with_limits
+from layers import QUICK_LIMITS, Quick, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
 from scenes import with_gaps
@@ -43,7 +43,6 @@ from isa_nrsfm.metrics import mean_shape_error_3d
 AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
 AllStarts = with_limits(**QUICK_LIMITS | {"restarts": True})
-Quick = with_limits(**QUICK_LIMITS)
 
 
 def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):

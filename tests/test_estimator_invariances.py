@@ -30,11 +30,8 @@ ALPHA_TOLERANCE = 2e-5
 SHAPE_TOLERANCE = 1e-6
 
 
-# Many starts are those of test_default_strategies_are_invariant.
-
-
 def estimator(params, scale_frames=True):
-    """Return an estimator."""
+    """Return an estimator. Many starts: test_default_strategies_are_invariant."""
     params = {"scale_frames": scale_frames, "random_state": 0} | params
     return OneStart(4, **params)
 

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
-from layers import QUICK_LIMITS, slow_after, with_limits
+from layers import Quick, slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
@@ -160,7 +160,7 @@ TABLE = make_face_tracks(40, n_components=1, random_state=0, noise=0.01).data
 
 @made_once
 def plain_model(**params):
-    return with_limits(**QUICK_LIMITS)(1, random_state=0, **params).fit(TABLE)
+    return Quick(1, random_state=0, **params).fit(TABLE)
 
 
 test_refusals = refusals_of("points_in_space", globals())

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from layers import QUICK_LIMITS, with_limits
+from layers import Quick
 from numpy.testing import assert_allclose
 from refusals import refusals_of
 
@@ -121,7 +121,7 @@ def test_a_prior_keeps_its_origin(plain):
 
 def test_what_would_not_be_removed_is_not_advised(table):
     turned = table.reshape(60, -1, 2)[:, :, ::-1].reshape(60, -1)  # yaw is pitch
-    found = with_limits(**QUICK_LIMITS)(2, **CALIBRATED).fit(turned).diagnostics()
+    found = Quick(2, **CALIBRATED).fit(turned).diagnostics()
     assert found.pose_share.max() > 0.3
     assert found.messages[-1].endswith("compare coefficients of similar views only")
 

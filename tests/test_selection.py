@@ -212,9 +212,6 @@ def test_held_out_rows_are_not_fitted_without_joint_refinement():
     assert_allclose(ours, cross_val_score(estimator, table, cv=2), rtol=1e-9)
 
 
-test_refusals = refusals_of("selection", globals())
-
-
 @pytest.mark.slow
 def test_optimism_of_fitted_frames_is_that_of_new_ones():
     """On average: one ratio has a standard deviation of a tenth."""
@@ -228,3 +225,6 @@ def test_optimism_of_fitted_frames_is_that_of_new_ones():
         expected.append(model._model.optimism(table, *weights))
     assert 1.15 < np.mean(expected) < 1.3
     assert_allclose(np.mean(ratios), np.mean(expected), rtol=0.06)
+
+
+test_refusals = refusals_of("selection", globals())

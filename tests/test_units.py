@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layers import QUICK_LIMITS, slow_after, start_may_not_converge, with_limits
+from layers import Quick, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from sklearn.base import BaseEstimator, TransformerMixin
@@ -91,7 +91,7 @@ def fitted(second=False, **settings):
     """Return a model of one of the two tables, to be left as it is."""
     X = table(settings["camera"])
     # More steps amplify rounding errors.
-    model = with_limits(**QUICK_LIMITS)(2, random_state=0, **settings)
+    model = Quick(2, random_state=0, **settings)
     return model.fit(second_table(X) if second else X)
 
 

@@ -29,7 +29,7 @@ from isa_nrsfm._prepare.robust import (
     lower_medians,
     robust_sizes,
 )
-from isa_nrsfm._tables import seen_points
+from isa_nrsfm._tables import point_patterns, seen_points
 
 # Depths are not determined above this error, relative to their root mean square:
 # docs/depth.md, "Undetermined depth".
@@ -318,15 +318,12 @@ class FrameModel:
         if self.joint:
             unit = rows / sizes[:, None, None]
             return self.shown(self.posterior(unit, deviations, weights), sizes)
-        K, seen = len(self.shapes) - 1, np.packbits(seen_points(rows), axis=1)
+        K, (patterns, pattern) = len(self.shapes) - 1, point_patterns(seen_points(rows))
         empty = (np.full((len(rows), *n), np.nan) for n in ((2, 3), (2,), (K,), (K,)))
         fit = Decomposition(*empty)
         # Frames that show the same points together
-        _, numbers, counts = np.unique(
-            seen, axis=0, return_inverse=True, return_counts=True
-        )
-        order = np.argsort(numbers.ravel(), kind="stable")
-        for frames in np.split(order, np.cumsum(counts))[:-1]:
+        for number in range(len(patterns)):
+            frames = np.flatnonzero(pattern == number)
             part = rigid_fit(rows[frames], self.shapes, self.camera)
             fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
         return fit._replace(motion=fit.motion @ np.linalg.inv(self.gauge.space))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from isa_nrsfm._linalg import OF_DIFFERENCES, OF_STEPS, centred, unpacked
-from isa_nrsfm._tables import FrameBlocks, representative_frames
+from isa_nrsfm._tables import FrameBlocks, point_patterns, representative_frames
 
 # Low-rank model of the rows of a measurement matrix: B (rank, n_points), rows centred,
 # and the noise variance of a coordinate
@@ -73,10 +73,8 @@ def _frames(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     last array is the index (n_frames,) of the pattern of each frame.
     """
     seen = ~np.isnan(rows).any(axis=1)
-    bits = np.packbits(seen, axis=1)
-    _, first, pattern = np.unique(bits, axis=0, return_index=True, return_inverse=True)
-    patterns = seen[first].astype(float)
-    return np.where(seen[:, None], rows, 0.0), patterns, pattern.reshape(-1)
+    patterns, pattern = point_patterns(seen)
+    return np.where(seen[:, None], rows, 0.0), patterns.astype(float), pattern
 
 
 def _principal_axes(rows: NDArray, rank: int) -> Model:
