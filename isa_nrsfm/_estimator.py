@@ -1034,7 +1034,8 @@ default="affine"
         Return minus the inverse SNR of points held out of the fit of their frame.
 
         The points are divided into five fixed parts, each predicted from the others.
-        This error rises with too many basis shapes: it can choose `n_components`.
+        With affine cameras this error rises with too many basis shapes: it can choose
+        `n_components`. With others it is the same for all: take `AffineNRSfMCV`.
 
         Parameters
         ----------

@@ -142,9 +142,10 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
     `AffineNRSfM` with the number of basis shapes chosen by cross-validation.
 
     Each number of basis shapes is fitted to parts of the frames and scored on the
-    others. The fits form a path: each starts from an earlier one, which takes less than
-    half the time of a plain search with `GridSearchCV`. Then the whole table is fitted
-    with the chosen number, as by `AffineNRSfM`.
+    others. These fits have no more directions of deformation, for calibrated cameras
+    too. They form a path: each starts from an earlier one, which takes less than half
+    the time of a plain search with `GridSearchCV`. Then the whole table is fitted with
+    the chosen number, as by `AffineNRSfM`.
 
     Parameters
     ----------

@@ -63,11 +63,15 @@ print(by_person.fit(tracks.data, groups=person).n_components_)
 # basis shapes and the leading direction of its residual, and for a part of the frames
 # also from the fit of all frames. All fits run to convergence, and the start with the
 # best fit to the training frames is used. Held-out frames therefore affect only the
-# start of a fit. If the objective has one minimum, the errors agree with those of
-# `GridSearchCV` within half a percent. If it has several, as for motion capture with
-# affine cameras, both searches may find different minima, and errors differ by several
-# percent in either direction. ``python -m benchmarks.choice`` prints costs, selected
-# numbers and differences.
+# start of a fit. With affine cameras and one minimum of the objective, the errors agree
+# with those of `GridSearchCV` within half a percent. If it has several, as for motion
+# capture, both searches may find different minima, and errors differ by several percent
+# in either direction. ``python -m benchmarks.choice`` prints costs, selected numbers
+# and differences.
+#
+# With calibrated cameras `AffineNRSfM` has all directions of a shape, and its score is
+# the same for each number of basis shapes: `GridSearchCV` has no choice. The fits of
+# `AffineNRSfMCV` have only as many directions as basis shapes.
 #
 # On the command line
 # -------------------
