@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 from numpydoc.validate import validate
@@ -25,6 +26,7 @@ MODULES = [
 PUBLIC_MODULES = ["isa_nrsfm", *(name for name in MODULES if "._" not in name)]
 # Not every docstring needs an extended summary, a See Also section or an example.
 NOT_NEEDED = {"ES01", "SA01", "EX01"}
+MEMBERS = FunctionType | property | classmethod | staticmethod
 
 
 def public_objects():
@@ -40,80 +42,67 @@ def public_objects():
 
 def documented_names():
     """Return the public objects and the public members that they define."""
-    names = []
+    names = set()
     for path, item in public_objects().items():
-        names.append(path)
+        names.add(path)
         for owner in inspect.getmro(item) if inspect.isclass(item) else ():
             if owner.__module__.startswith("isa_nrsfm"):
-                names += [
-                    f"{path}.{name}"
-                    for name, member in vars(owner).items()
-                    if not name.startswith("_")
-                    and (
-                        inspect.isfunction(member)
-                        or isinstance(member, property | classmethod | staticmethod)
-                    )
-                ]
-    return sorted(set(names))
-
-
-def run(*command):
-    """Return the exit status and the output of a command at the root."""
-    done = subprocess.run(
-        [sys.executable, *command], cwd=ROOT, capture_output=True, text=True
-    )
-    return done.returncode, done.stdout + done.stderr
+                for name, member in vars(owner).items():
+                    if isinstance(member, MEMBERS) and not name.startswith("_"):
+                        names.add(f"{path}.{name}")
+    return sorted(names)
 
 
 LINTERS = {
     "ruff": ["-m", "ruff", "check", *FOLDERS],
     "format": ["-m", "ruff", "format", "--check", *FOLDERS],
     "mypy": ["-m", "mypy"],
-    "imports": ["-c", "from importlinter.cli import lint_imports_command as f; f()"],
+    "imports": [
+        *("-c", "from importlinter.cli import lint_imports_command as f; f()"),
+        "--no-cache",
+    ],
 }
-LINTERS["imports"].append("--no-cache")
 
 
 @pytest.mark.lint
 @pytest.mark.parametrize("linter", LINTERS)
 def test_linters_have_no_complaints(linter):
-    status, output = run(*LINTERS[linter])
-    assert status == 0, output
+    command = [sys.executable, *LINTERS[linter]]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.lint
-@pytest.mark.parametrize("name", documented_names())
-def test_docstrings_are_complete(name):
-    errors = [e for e in validate(name)["errors"] if e[0] not in NOT_NEEDED]
-    item = public_objects().get(name)
-    if hasattr(item, "_fields"):
-        # The fields of a named tuple may be documented as attributes.
-        sections = inspect.getdoc(item).partition("\nAttributes\n")[2]
-        if all(f"\n{field} : " in sections for field in item._fields):
-            errors = [e for e in errors if e[0] != "PR01"]
+def test_docstrings_are_complete():
+    objects, errors = public_objects(), []
+    for name in documented_names():
+        not_needed = {*NOT_NEEDED}
+        fields = getattr(objects.get(name), "_fields", None)
+        if fields is not None:
+            # The fields of a named tuple may be documented as attributes.
+            doc = inspect.getdoc(objects[name]).partition("\nAttributes\n")[2]
+            if all(f"\n{field} : " in doc for field in fields):
+                not_needed.add("PR01")
+        found = validate(name)["errors"]
+        errors += [(name, *each) for each in found if each[0] not in not_needed]
     assert errors == []
 
 
-def undocumented(tree):
-    """Return what has no docstring, or "the module"."""
-    if not ast.get_docstring(tree):
-        yield "the module"
-    inner = set()
-    for node in ast.walk(tree):  # breadth first: outer functions come before inner ones
-        if isinstance(node, ast.FunctionDef):
-            inner |= {id(child) for child in ast.walk(node) if child is not node}
-            exempt = (
-                node.name in ("__init__", "__call__")
-                or node.name == "_unmix"  # documented where it is declared
-                or id(node) in inner
-                or any(ast.unparse(d) == "overload" for d in node.decorator_list)
-            )
-        elif isinstance(node, ast.ClassDef):
-            exempt = False
-        else:
-            continue
+def undocumented(node):
+    """Return what has no docstring, or "the module"; inner functions need none."""
+    is_function = isinstance(node, ast.FunctionDef)
+    if is_function or isinstance(node, ast.Module | ast.ClassDef):
+        name = getattr(node, "name", "the module")
+        # `_unmix` is documented where it is declared.
+        exempt = is_function and (
+            name in ("__init__", "__call__", "_unmix")
+            or any(ast.unparse(d) == "overload" for d in node.decorator_list)
+        )
         if not exempt and not ast.get_docstring(node):
-            yield f"{node.lineno} {node.name}"
+            yield name
+    if not is_function:
+        for child in ast.iter_child_nodes(node):
+            yield from undocumented(child)
 
 
 def state_of(tree):
@@ -121,19 +110,16 @@ def state_of(tree):
     yield from (node for node in ast.walk(tree) if isinstance(node, ast.Global))
     for node in tree.body:
         for target in node.targets if isinstance(node, ast.Assign) else ():
-            for name in ast.walk(target):
-                if isinstance(name, ast.Name) and not name.id.startswith("__"):
-                    if not name.id.strip("_")[0].isupper():
-                        yield name.id
+            names = (n.id for n in ast.walk(target) if isinstance(n, ast.Name))
+            yield from (name for name in names if re.match("_?[^A-Z_]", name))
 
 
 def private_imports(tree):
     """Return private names that are taken of other modules."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
-            "isa_nrsfm"
-        ):
-            folder = ROOT / str(node.module).replace(".", "/")
+        source = str(getattr(node, "module", None))
+        if isinstance(node, ast.ImportFrom) and source.startswith("isa_nrsfm"):
+            folder = ROOT / source.replace(".", "/")
             names = {a.name for a in node.names if a.name.startswith("_")}
             modules = {name for name in names if (folder / f"{name}.py").is_file()}
             yield from names - modules - {"__version__"}
