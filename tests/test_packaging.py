@@ -16,15 +16,22 @@ from packaging.requirements import Requirement
 from isa_nrsfm import __version__
 
 ROOT = Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def text(name):
+    """Return the text of a file of the project."""
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def files(pattern):
+    """Return the names of files of the project."""
+    return {str(file.relative_to(ROOT)) for file in ROOT.glob(pattern)}
+
+
+PROJECT = tomllib.loads(text("pyproject.toml"))
 CORE = {"numpy", "scipy", "scikit-learn", "joblib"}
-# Files of the package that are no Python code.
-DATA = "py.typed analysis/texts.toml cli/options.toml cli/report.html"
-DATA += " datasets/face_model.csv datasets/face_prior.npz datasets/figures.toml"
-DATA += " datasets/sources.toml export/scene.gltf export/viewer.html export/viewer.js"
-DATA += " io/formats.toml io/keypoints.toml io/model_file.toml skeletons/layouts.toml"
-DATA += " skeletons/words.toml"
-DATA = {f"isa_nrsfm/{name}" for name in DATA.split()}
+# Code of the package and other files, of which none is compiled
+PACKAGE = {name for name in files("isa_nrsfm/**/*.*") if not name.endswith(".pyc")}
 FIT_OF_AN_ARRAY = """
 import sys
 
@@ -54,8 +61,8 @@ for refinement in (None, "joint"):
 
 def lowest_versions(requirements):
     """Return the lowest version of each required package."""
-    pairs = map(Requirement, requirements)
-    return {each.name: str(each.specifier).removeprefix(">=") for each in pairs}
+    needed = map(Requirement, requirements)
+    return {each.name: str(each.specifier).removeprefix(">=") for each in needed}
 
 
 def installed_besides(packages):
@@ -91,37 +98,30 @@ def test_arrays_are_fitted_with_the_core_dependencies_alone():
 
 
 @pytest.mark.slow
-def test_wheel_has_the_package_and_its_licence(tmp_path, monkeypatch):
+def test_wheel_and_sdist_have_all_files_and_no_large_data(tmp_path, monkeypatch):
     with ZipFile(built("wheel", tmp_path, monkeypatch)) as wheel:
         sizes = {each.filename: each.file_size for each in wheel.infolist()}
     about = f"isa_nrsfm-{__version__}.dist-info"
     assert {f"{about}/licenses/LICENSE", f"{about}/entry_points.txt"} <= set(sizes)
-    package = {name for name in sizes if not name.startswith(about)}
-    code = {str(file.relative_to(ROOT)) for file in ROOT.glob("isa_nrsfm/**/*.py")}
-    assert package == DATA | code
+    assert {name for name in sizes if not name.startswith(about)} == PACKAGE
     assert max(sizes.values()) < 100_000
 
-
-@pytest.mark.slow
-def test_sdist_has_code_tests_and_pages_without_large_data(tmp_path, monkeypatch):
     with tarfile.open(built("sdist", tmp_path, monkeypatch)) as sdist:
         sizes = {each.name.partition("/")[2]: each.size for each in sdist}
-    assert DATA <= set(sizes)
-    files = "CHANGELOG.md CITATION.cff LICENSE README.md pyproject.toml noxfile.py"
-    files += " tests/conftest.py docs/conf.py benchmarks/__main__.py"
-    tables = {str(file.relative_to(ROOT)) for file in ROOT.glob("tests/data/*")}
-    tables.add("tests/refusals.txt")  # the calls of all refusals
-    assert set(files.split()) | tables <= set(sizes)
-    tests = {name: size for name, size in sizes.items() if name.startswith("tests/")}
-    assert max(size for name, size in tests.items() if name not in tables) < 100_000
+    others = "CHANGELOG.md CITATION.cff LICENSE README.md pyproject.toml noxfile.py"
+    others += " tests/conftest.py docs/conf.py benchmarks/__main__.py"
+    # The calls of all refusals are large, too.
+    tables = files("tests/data/*") | {"tests/refusals.txt"}
+    assert PACKAGE | tables | {*others.split()} <= set(sizes)
+    small = {name for name in sizes if name.startswith("tests/")} - tables
+    assert max(sizes[name] for name in small) < 100_000
     assert max(sizes.values()) < 500_000
 
 
 def test_version_is_the_same_everywhere():
     assert PROJECT["tool"]["hatch"]["version"]["path"] == "isa_nrsfm/__init__.py"
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert citation["version"] == __version__
-    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert yaml.safe_load(text("CITATION.cff"))["version"] == __version__
+    changes = text("CHANGELOG.md")
     headings = r"^## \[(.+)\] - (?:\d{4}-\d\d-\d\d|unreleased)$"
     versions = re.findall(headings, changes, re.MULTILINE)
     assert versions[0] == __version__
@@ -129,18 +129,17 @@ def test_version_is_the_same_everywhere():
 
 
 def test_the_recipe_has_the_bounds_and_the_version_of_the_package():
-    file = ROOT / ".github" / "conda-forge" / "recipe.yaml"
-    if not file.exists():
+    if not (ROOT / ".github").exists():
         pytest.skip("the sdist has no recipe")
-    recipe = yaml.safe_load(file.read_text(encoding="utf-8"))
-    assert recipe["context"]["version"] == __version__
-    python = ">=" + recipe["context"]["python_min"]
-    assert python == PROJECT["project"]["requires-python"]
-    run = recipe["requirements"]["run"][1:]
-    assert [each.replace(" ", "") for each in run] == PROJECT["project"]["dependencies"]
-    extras = PROJECT["project"]["optional-dependencies"]
-    bounds = lowest_versions(sum(extras.values(), PROJECT["build-system"]["requires"]))
-    optional = recipe["requirements"]["run_constraints"]
-    for requirement in [recipe["requirements"]["host"][-1], *optional]:
+    recipe = yaml.safe_load(text(".github/conda-forge/recipe.yaml"))
+    context, needed = recipe["context"], recipe["requirements"]
+    project = PROJECT["project"]
+    assert context["version"] == __version__
+    assert ">=" + context["python_min"] == project["requires-python"]
+    run = [each.replace(" ", "") for each in needed["run"][1:]]
+    assert run == project["dependencies"]
+    extras = project["optional-dependencies"].values()
+    bounds = lowest_versions(sum(extras, PROJECT["build-system"]["requires"]))
+    for requirement in [needed["host"][-1], *needed["run_constraints"]]:
         name, bound = requirement.replace("-base", "").split(" >=")
         assert bounds[name] == bound, name
