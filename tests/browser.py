@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import os
+import select
 import shutil
 import signal
 import time
@@ -17,6 +18,11 @@ FLAGS = (
     "--remote-debugging-pipe"
 ).split()
 PATIENCE = 30.0
+# Methods of events, and kinds of calls of the console
+COMPLAINTS = (
+    ("Runtime.exceptionThrown", "Log.entryAdded"),
+    ("error", "warning", "assert"),
+)
 
 
 def find_browser():
@@ -41,7 +47,6 @@ class Browser:
         self._process = spawn(program, command, os.environ, file_actions=moves)
         for file in (theirs_in, theirs_out, quiet, *high):
             os.close(file)
-        os.set_blocking(self._from, False)
         self._rest, self._number, self._session = b"", 0, None
         self.events = []
         targets = self.call("Target.getTargets")["targetInfos"]
@@ -95,9 +100,18 @@ class Browser:
         """Return the value of an expression as points (n_points, 3)."""
         return np.reshape(self.run(code), (-1, 3))
 
+    def at(self, name, what):
+        """Return what an element has, or do what it can."""
+        return self.run(f"document.getElementById('{name}').{what}")
+
     def click(self, name):
         """Click an element."""
-        self.run(f"document.getElementById('{name}').click()")
+        self.at(name, "click()")
+
+    def box(self, name):
+        """Return the left and upper edge of an element, its width and its height."""
+        box = self.at(name, "getBoundingClientRect().toJSON()")
+        return [box[side] for side in ("x", "y", "width", "height")]
 
     def wait(self, condition):
         """Wait until a condition is true."""
@@ -114,6 +128,13 @@ class Browser:
         for kind, (x, y) in zip(kinds, (start, end, end), strict=True):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
 
+    def touch(self, *moves):
+        """Move fingers from places to others, and lift them."""
+        kinds = "touchStart", "touchMove", "touchEnd"
+        for kind, places in zip(kinds, (*moves, []), strict=True):
+            points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
+            self.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
     def press(self, key, code=0):
         """Press a key."""
         keys = {"key": key, "code": key, "windowsVirtualKeyCode": code}
@@ -123,14 +144,11 @@ class Browser:
     def complaints(self):
         """Return what errors and warnings came up since the page was opened."""
         self.run("new Promise(requestAnimationFrame)")
+        methods, kinds = COMPLAINTS
         return [
             event
             for event in self.events
-            if event["method"] in ("Runtime.exceptionThrown", "Log.entryAdded")
-            or (
-                event["method"] == "Runtime.consoleAPICalled"
-                and event["params"]["type"] in ("error", "warning", "assert")
-            )
+            if event["method"] in methods or event["params"].get("type") in kinds
         ]
 
     def requests(self):
@@ -151,15 +169,10 @@ class Browser:
 
     def _receive(self):
         """Return the next message."""
-        until = time.monotonic() + PATIENCE
         while b"\0" not in self._rest:
-            try:
-                got = os.read(self._from, 1 << 16)
-            except BlockingIOError:
-                if time.monotonic() > until:
-                    raise TimeoutError("the browser does not answer") from None
-                time.sleep(0.005)
-                continue
+            if not select.select([self._from], [], [], PATIENCE)[0]:
+                raise TimeoutError("the browser does not answer")
+            got = os.read(self._from, 1 << 16)
             if not got:
                 raise RuntimeError("the browser has gone")
             self._rest += got

@@ -28,14 +28,18 @@ SHOWN = np.linspace(0, N_FRAMES - 1, 60).astype(int)
 
 def show(browser, frame):
     """Move the slider of frames."""
-    browser.run(
-        "(() => { const slider = document.getElementById('frame'); slider.value ="
-        f" {frame}; slider.dispatchEvent(new Event('input')); }})()"
+    browser.at("frame", f"value = {frame}")
+    browser.at("frame", "dispatchEvent(new Event('input'))")
+
+
+def texts_of(browser, selector):
+    return browser.run(
+        f"[...document.querySelectorAll('{selector}')].map((e) => e.textContent)"
     )
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory):
+def program(tmp_path_factory):
     """Return a browser, or skip."""
     program = find_browser()
     if program is None:
@@ -54,22 +58,27 @@ def page(tmp_path_factory):
     return path.as_uri()
 
 
+@pytest.fixture
+def browser(program, page):
+    """Return a browser that shows this page."""
+    program.open(page)
+    return program
+
+
 def opened(browser, folder, model, **options):
     """Write the page of a model, and open it."""
     write_viewer(model, path := folder / "viewer.html", **options)
     browser.open(path.as_uri())
 
 
-def test_sliders_move_the_points(browser, page):
-    browser.open(page)
+def test_sliders_move_the_points(browser):
     before = browser.array("viewer.points()")
-    browser.run("document.getElementById('weight-0').focus()")
+    browser.at("weight-0", "focus()")
     for _ in range(5):
         browser.press("PageUp", 33)
     weight = browser.run("viewer.state().weights[0]")
     assert weight > 1
-    after = browser.array("viewer.points()")
-    moved = np.linalg.norm(after - before, axis=1)
+    moved = np.linalg.norm(browser.array("viewer.points()") - before, axis=1)
     assert moved[8] > 0.05  # the chin, as the jaw opens
     assert moved[27] < moved[8] / 2
     assert browser.run("document.querySelector('output').textContent") == ""
@@ -80,7 +89,11 @@ def test_sliders_move_the_points(browser, page):
 
 
 def test_a_page_asks_for_nothing_and_has_no_errors(browser, page):
-    browser.open(page)
+    # Names and labels are shown as they are.
+    assert browser.run("document.title") == "3D shape model"
+    assert texts_of(browser, ".weight label") == ["jaw", HOSTILE, "brows"]
+    assert texts_of(browser, "#legend li") == sorted(set(LABELS))
+    assert texts_of(browser, "b") == []
     for name in ("play", "ghost", "mirror", "over", "pose", "front"):
         browser.click(name)
         browser.run(DRAWN)
@@ -96,21 +109,9 @@ def test_a_page_asks_for_nothing_and_has_no_errors(browser, page):
     assert len(browser.complaints()) >= 2
 
 
-def test_names_and_labels_are_shown_as_they_are(browser, page):
-    browser.open(page)
-    assert browser.run("document.title") == "3D shape model"
-    labels = "[...document.querySelectorAll('.weight label')].map((e) => e.textContent)"
-    assert browser.run(labels) == ["jaw", HOSTILE, "brows"]
-    legend = "[...document.querySelectorAll('#legend li')].map((e) => e.textContent)"
-    assert browser.run(legend) == sorted(set(LABELS))
-    assert browser.run("document.querySelectorAll('b').length") == 0
-
-
-def test_the_mouse_turns_and_zooms_the_shape(browser, page):
-    browser.open(page)
-    places = "document.getElementById('scene').getBoundingClientRect().toJSON()"
-    box = browser.run(places)
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+def test_the_mouse_turns_and_zooms_the_shape(browser):
+    x, y, width, height = browser.box("scene")
+    x, y = x + width / 2, y + height / 2
     points = browser.run("viewer.points()")
     # At first the shape is turned by 20 degrees.
     assert browser.run("viewer.state().turn[0]") == pytest.approx(np.cos(np.pi / 9))
@@ -129,9 +130,8 @@ def test_the_mouse_turns_and_zooms_the_shape(browser, page):
     assert_allclose(browser.array("viewer.projected()"), before, atol=1e-3)
 
 
-def test_keys_turn_and_zoom_the_shape(browser, page):
-    browser.open(page)
-    browser.run("document.getElementById('scene').focus()")
+def test_keys_turn_and_zoom_the_shape(browser):
+    browser.at("scene", "focus()")
     browser.press("0", 48)
     for key, code in (("ArrowRight", 39), ("ArrowUp", 38), ("+", 187)):
         browser.press(key, code)
@@ -142,42 +142,29 @@ def test_keys_turn_and_zoom_the_shape(browser, page):
     assert browser.run("viewer.state().turn") == list(np.eye(3).ravel())
 
 
-def test_fingers_turn_and_pinch_the_shape(browser, page):
-    browser.open(page, width=390, height=844, mobile=True)
-
-    def touch(kind, *places):
-        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
-        browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
-
-    touch("touchStart", (150, 350))
-    touch("touchMove", (200, 350))
-    touch("touchEnd")
-    assert browser.run("viewer.state().turn[0]") < 0.99
-    touch("touchStart", (150, 350), (200, 350))
-    touch("touchMove", (100, 350), (250, 350))
-    touch("touchEnd")
-    assert browser.run("viewer.state().zoom") > 1.5
+def test_fingers_turn_and_pinch_the_shape(program, page):
+    program.open(page, width=390, height=844, mobile=True)
+    program.touch([(150, 350)], [(200, 350)])
+    assert program.run("viewer.state().turn[0]") < 0.99
+    program.touch([(150, 350), (200, 350)], [(100, 350), (250, 350)])
+    assert program.run("viewer.state().zoom") > 1.5
 
 
-def test_frames_play_and_stop(browser, page):
-    browser.open(page)
-    browser.run("document.getElementById('pace').value = '30'")
+def test_frames_play_and_stop(browser):
+    browser.at("pace", "value = '30'")
     browser.click("play")
     browser.wait("viewer.state().frame >= 3")
-    assert browser.run("document.getElementById('play').textContent") == "Pause"
+    assert browser.at("play", "textContent") == "Pause"
     browser.click("play")
     state = browser.run("viewer.state()")
     assert not state["playing"]
-    model = face_model()
     row = SHOWN[state["frame"]]
-    assert_allclose(state["weights"], model.alpha_[row], atol=1e-5)
+    assert_allclose(state["weights"], face_model().alpha_[row], atol=1e-5)
     browser.run(DRAWN)
-    seen = browser.run("document.getElementById('seen').textContent")
-    assert seen == f"row {row}: {LABELS[row]}"
+    assert browser.at("seen", "textContent") == f"row {row}: {LABELS[row]}"
 
 
-def test_a_frame_is_seen_as_by_its_camera(browser, page):
-    browser.open(page)
+def test_a_frame_is_seen_as_by_its_camera(browser):
     show(browser, 7)
     before = browser.array("viewer.projected()")[:, :2]
     browser.click("pose")
@@ -193,23 +180,19 @@ def test_a_frame_is_seen_as_by_its_camera(browser, page):
     assert distance(seen) < 0.06 < distance(before)
 
 
-def test_a_click_in_the_plane_of_coefficients_shows_the_nearest_frame(browser, page):
-    browser.open(page)
-    browser.run("document.getElementById('plane').scrollIntoView()")
-    where = "document.getElementById('plane').getBoundingClientRect().toJSON()"
-    box = browser.run(where)
+def test_a_click_in_the_plane_of_coefficients_shows_the_nearest_frame(browser):
+    browser.at("plane", "scrollIntoView()")
+    x, y, width, height = browser.box("plane")
     # The frame with the largest first coefficient is farthest to the right.
     alpha = face_model().alpha_[SHOWN]
     right = int(np.argmax(alpha[:, 0]))
     share = (alpha[right, 1] - alpha[:, 1].min()) / np.ptp(alpha[:, 1])
-    x = box["x"] + box["width"] - 10
-    y = box["y"] + box["height"] - 10 - share * (box["height"] - 20)
-    browser.drag((x, y), (x, y))
+    place = x + width - 10, y + height - 10 - share * (height - 20)
+    browser.drag(place, place)
     browser.wait(f"viewer.state().frame === {right}")
 
 
-def test_a_basis_shape_swings(browser, page):
-    browser.open(page)
+def test_a_basis_shape_swings(browser):
     browser.run("document.querySelectorAll('.weight button')[2].click()")
     browser.wait("viewer.state().weights[2] > 1")
     assert browser.run("viewer.state().weights.slice(0, 2)") == [0, 0]
@@ -218,57 +201,55 @@ def test_a_basis_shape_swings(browser, page):
 
 
 @pytest.mark.parametrize(("width", "mobile"), [(320, True), (390, True), (1200, False)])
-def test_pages_fit_the_width_of_the_window(browser, page, width, mobile):
-    browser.open(page, width=width, height=700, mobile=mobile)
-    assert browser.run("document.documentElement.scrollWidth") == width
-    boxes = browser.run(
+def test_pages_fit_the_width_of_the_window(program, page, width, mobile):
+    program.open(page, width=width, height=700, mobile=mobile)
+    assert program.run("document.documentElement.scrollWidth") == width
+    boxes = program.run(
         "[...document.querySelectorAll('canvas, input, button, select')]"
         ".map((e) => e.getBoundingClientRect()).map((r) => [r.left, r.right])"
     )
-    assert np.min(boxes) >= 0
-    assert np.max(boxes) <= width
-    seen = browser.array("viewer.projected()")
-    assert seen[:, 0].min() >= 0
-    assert seen[:, 0].max() <= width
+    across = program.array("viewer.projected()")[:, 0]
+    assert 0 <= min(np.min(boxes), across.min())
+    assert max(np.max(boxes), across.max()) <= width
 
 
-def test_one_basis_shape_and_no_face(browser, tmp_path):
-    opened(browser, tmp_path, blob_model(), n_frames=0, edges=[[0, 1], [1, 2]])
-    browser.run(DRAWN)
-    assert browser.complaints() == []
-    assert browser.run("document.getElementById('frames').hidden")
-    opened(browser, tmp_path, blob_model(), camera=None)
-    browser.click("play")
-    browser.wait("viewer.state().frame >= 1")
-    assert browser.complaints() == []
-    assert browser.run("document.getElementById('posed').hidden")
+def test_one_basis_shape_and_no_face(program, tmp_path):
+    opened(program, tmp_path, blob_model(), n_frames=0, edges=[[0, 1], [1, 2]])
+    program.run(DRAWN)
+    assert program.complaints() == []
+    assert program.at("frames", "hidden")
+    opened(program, tmp_path, blob_model(), camera=None)
+    program.click("play")
+    program.wait("viewer.state().frame >= 1")
+    assert program.complaints() == []
+    assert program.at("posed", "hidden")
+    assert program.at("barred", "hidden")
 
 
-def test_error_bars_are_along_the_viewing_direction(browser, tmp_path):
-    given = {"depth_std": (deviations := np.linspace(0.0, 1.0, 68)), "n_frames": 10}
-    opened(browser, tmp_path, calibrated_model(), **given)
-    assert browser.run("viewer.state().frame") == 0
-    assert not browser.run("document.getElementById('barred').hidden")
+def test_error_bars_are_along_the_viewing_direction(program, tmp_path):
+    deviations = np.linspace(0.0, 1.0, 68)
+    model = calibrated_model()
+    opened(program, tmp_path, model, depth_std=deviations, n_frames=10)
+    assert program.run("viewer.state().frame") == 0
+    assert not program.at("barred", "hidden")
     for frame in (0, 7):
-        show(browser, frame)
-        browser.run("document.getElementById('pose').checked = true")
-        browser.click("front")
+        show(program, frame)
+        program.at("pose", "checked = true")
+        program.click("front")
         # In the view of its camera a bar is a point, but for the perspective.
-        size = np.ptp(browser.array("viewer.projected()")[:, :2])
+        size = np.ptp(program.array("viewer.projected()")[:, :2])
         lengths = []
         for _ in range(2):
-            far, near = browser.array("viewer.bars()").reshape(2, 68, 3)[..., :2]
+            far, near = program.array("viewer.bars()").reshape(2, 68, 3)[..., :2]
             lengths.append(np.linalg.norm(near - far, axis=1))
-            browser.run("document.getElementById('scene').focus()")
+            program.at("scene", "focus()")
             for _ in range(16):  # to the side
-                browser.press("ArrowRight", 39)
+                program.press("ArrowRight", 39)
         assert lengths[0].max() < 0.3 * lengths[1].max()
         assert_allclose(lengths[1], deviations * lengths[1][-1], atol=0.1 * size)
         assert np.corrcoef(lengths[1], deviations)[0, 1] > 0.99
-    browser.run(DRAWN)
-    assert browser.complaints() == []
-    opened(browser, tmp_path, calibrated_model(), n_frames=10)
-    assert browser.run("document.getElementById('barred').hidden")
+    program.run(DRAWN)
+    assert program.complaints() == []
 
 
 INK = """
@@ -290,24 +271,23 @@ INK = """
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_left_and_right_have_colours_of_their_own(browser, tmp_path, scheme):
+def test_left_and_right_have_colours_of_their_own(program, tmp_path, scheme):
     media = [{"name": "prefers-color-scheme", "value": scheme}]
-    browser.call("Emulation.setEmulatedMedia", features=media)
-    opened(browser, tmp_path, face_model())
-    browser.run(DRAWN)
-    found = browser.run(INK)
-    browser.call("Emulation.setEmulatedMedia", features=[])
+    program.call("Emulation.setEmulatedMedia", features=media)
+    opened(program, tmp_path, face_model())
+    program.run(DRAWN)
+    found = program.run(INK)
+    program.call("Emulation.setEmulatedMedia", features=[])
     # The left side of a face that looks at us is on the right.
     assert found["right"] < found["other"] < found["left"]
-    assert not browser.run("document.getElementById('sides').hidden")
+    assert not program.at("sides", "hidden")
 
 
-def test_videos_play_at_true_speed(browser, tmp_path):
+def test_videos_play_at_true_speed(program, tmp_path):
     seconds = np.arange(N_FRAMES) * 0.05
-    opened(browser, tmp_path, face_model(), times=seconds, n_frames=N_FRAMES)
-    assert browser.run("document.getElementById('pace').value") == "true"
-    begun = browser.run("performance.now()")
-    browser.click("play")
-    browser.wait("viewer.state().frame >= 5")
-    passed = browser.run("performance.now()") - begun
-    assert passed >= 5 * 50
+    opened(program, tmp_path, face_model(), times=seconds, n_frames=N_FRAMES)
+    assert program.at("pace", "value") == "true"
+    begun = program.run("performance.now()")
+    program.click("play")
+    program.wait("viewer.state().frame >= 5")
+    assert program.run("performance.now()") - begun >= 5 * 50
