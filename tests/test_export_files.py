@@ -46,70 +46,85 @@ from isa_nrsfm.skeletons import get_skeleton  # noqa: F401  in refusals.txt
 pytestmark = may_not_converge
 
 
+def shapes_of(data):
+    """Return the mean shape and the basis shapes of a page."""
+    return numbers(data["shapes"]).reshape(1 + len(data["components"]), -1, 3)
+
+
+def alpha_of(data):
+    """Return the coefficients of the frames of a page."""
+    return numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
+
+
+def page_of(folder, model, **options):
+    """Return the data on a page."""
+    write_viewer(model, folder / "viewer.html", **options)
+    return content_of(folder / "viewer.html")
+
+
 @pytest.fixture
-def written(tmp_path):
-    """Return a function that writes a model and reads the file."""
+def page(tmp_path):
+    """Return a function that writes a page and returns its data."""
+    return partial(page_of, tmp_path)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Return a function that writes a model as a scene, and reads the file."""
 
     def write(model, **options):
-        path = tmp_path / "model.glb"
-        write_glb(model, path, **options)
-        return Read(path)
+        write_glb(model, tmp_path / "model.glb", **options)
+        return Read(tmp_path / "model.glb")
 
     return write
 
 
-@pytest.mark.parametrize("make", [face_model, calibrated_model])
-def test_weights_are_coefficients(written, make, tmp_path):
-    model = make()
-    read = written(model)
-    surface = read.primitive(4)
-    mean = read.array(surface["attributes"]["POSITION"])
-    basis = [read.array(target["POSITION"]) for target in surface["targets"]]
-    assert read.mesh["weights"] == [0.0] * N_COMPONENTS
-    assert read.mesh["extras"]["factor"] > 0
-    # The shapes of the page in a unit of its own: y up and z to the viewer.
-    write_viewer(model, tmp_path / "a.html")
-    expected = numbers(content_of(tmp_path / "a.html")["shapes"]).reshape(-1, 68, 3)
-    expected = expected / np.ptp(expected[0], axis=0).max()
-    assert_allclose([mean, *basis], expected, atol=1e-6)
-    assert mean[8, 1] < mean[27, 1]
-    assert mean[30, 2] > mean[0, 2]
+JAW = ["jaw", "smile \u2013 wide", "brows"]
 
 
-def test_names_and_bounds_are_exact(written):
-    names = ["jaw", "smile \u2013 wide", "brows"]
-    assert written(face_model(), names=names).mesh["extras"]["targetNames"] == names
-    read = written(face_model())
-    extras = read.mesh["extras"]
-    assert extras["targetNames"] == ["alpha_1", "alpha_2", "alpha_3"]
-    assert extras["pointNames"] == [str(j) for j in range(68)]
-    assert extras["lines"] == "ibug-68"
+@pytest.mark.parametrize(
+    ("make", "names"), [(face_model, None), (calibrated_model, JAW)]
+)
+def test_shapes_have_y_up_in_scenes_and_on_pages(scene, page, make, names):
+    data, read = page(make()), scene(make(), names=names)
+    shapes = shapes_of(data)
+    assert np.linalg.norm(shapes[0], axis=1).max() == pytest.approx(1)
+    assert_allclose(shapes[0].mean(axis=0), 0, atol=1e-6)
+    assert shapes[0, 8, 1] < shapes[0, 27, 1]
+    assert shapes[0, 30, 2] > shapes[0, 0, 2]
+    assert len(numbers(data["edges"], "<u4")) > 100
+    # In a scene they have a unit of its own, and their weights are coefficients.
     primitive = read.primitive(4)
-    for part in (primitive["attributes"], *primitive["targets"]):
-        accessor = read.document["accessors"][part["POSITION"]]
-        points = read.array(part["POSITION"])
-        assert_array_equal(accessor["min"], points.min(axis=0))
-        assert_array_equal(accessor["max"], points.max(axis=0))
+    parts = [primitive["attributes"], *primitive["targets"]]
+    found = np.array([read.array(part["POSITION"]) for part in parts])
+    assert_allclose(found, shapes / np.ptp(shapes[0], axis=0).max(), atol=1e-6)
+    for part, points in zip(parts, found, strict=True):
+        bounds = read.document["accessors"][part["POSITION"]]
+        assert_array_equal(bounds["min"], points.min(axis=0))
+        assert_array_equal(bounds["max"], points.max(axis=0))
+    assert read.mesh["weights"] == [0.0] * N_COMPONENTS
+    extras = read.mesh["extras"]
+    assert extras["factor"] > 0
+    assert extras["targetNames"] == (names or ["alpha_1", "alpha_2", "alpha_3"])
+    assert extras["pointNames"] == data["points"] == [str(j) for j in range(68)]
+    assert extras["lines"] == "ibug-68"
 
 
-def test_the_surface_covers_the_front_view(written):
-    read = written(face_model())
+def test_the_surface_covers_the_front_view(scene):
+    read = scene(face_model())
     surface = read.primitive(4)
     corners = read.array(surface["indices"]).reshape(-1, 3).astype(int)
     mean = read.array(surface["attributes"]["POSITION"]).astype(float)
     a, b, c = mean[corners, :2].transpose(1, 0, 2)
     areas = np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1))) / 2
     assert areas.sum() == pytest.approx(ConvexHull(mean[:, :2]).volume)
-
-
-def test_points_on_a_line_have_no_triangles(written):
     model = copy.copy(blob_model())
     model.mean_shape_ = np.outer(np.arange(20.0), [1, 1, 0])
-    refused("on one line in the front view", written, model, camera=None)
+    refused("on one line in the front view", scene, model, camera=None)
 
 
-def test_the_animation_swings_each_basis_shape_in_turn(written):
-    read = written(face_model())
+def test_the_animation_swings_each_basis_shape_in_turn(scene):
+    read = scene(face_model())
     (animation,) = read.document["animations"]
     (sampler,), (channel,) = animation["samplers"], animation["channels"]
     assert channel["target"] == {"node": 0, "path": "weights"}
@@ -130,16 +145,6 @@ def test_the_animation_swings_each_basis_shape_in_turn(written):
 QUICK = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
 
 
-def test_arrays_are_the_attributes_of_the_model():
-    model = face_model()
-    arrays = shape_arrays(model)
-    for name, array in arrays._asdict().items():
-        if not name.endswith("names"):
-            assert_array_equal(array, getattr(model, f"{name}_"))
-    assert list(arrays.component_names) == ["alpha_1", "alpha_2", "alpha_3"]
-    assert list(arrays.point_names[:3]) == ["0", "1", "2"]
-
-
 def arrays_of(columns=None, n_components=1, **options):
     """Return the arrays of a model of faces with names of columns."""
     table = pd.DataFrame(faces().data, columns=columns)
@@ -149,10 +154,9 @@ def arrays_of(columns=None, n_components=1, **options):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat"])
-def test_files_have_all_arrays(tmp_path, suffix):
-    path = tmp_path / f"shapes{suffix}"
-    write_shapes(face_model(), str(path))
-    expected = shape_arrays(face_model())._asdict()
+def test_files_have_the_attributes_of_the_model(tmp_path, suffix):
+    path, model = tmp_path / f"shapes{suffix}", face_model()
+    write_shapes(model, str(path))
     if suffix == ".npz":
         with np.load(path, allow_pickle=False) as arrays:
             read = dict(arrays)
@@ -161,29 +165,14 @@ def test_files_have_all_arrays(tmp_path, suffix):
         assert (names.dtype, names.shape) == (object, (N_COMPONENTS, 1))
         read = loadmat(path, squeeze_me=True, chars_as_strings=True)
         read = {name: read[name] for name in ShapeArrays._fields}
-    assert set(read) == set(expected)
-    for name, array in expected.items():
-        assert_array_equal(read[name], array)
+    assert list(read.pop("component_names")) == ["alpha_1", "alpha_2", "alpha_3"]
+    assert list(read.pop("point_names")) == [str(j) for j in range(68)]
+    assert set(read) == set(ShapeArrays._fields[:-2])
+    for name, array in read.items():
+        assert_array_equal(array, getattr(model, f"{name}_"))
 
 
 # --- pages ---------------------------------------------------------------------------
-
-
-def shapes_of(data):
-    """Return the mean shape and the basis shapes of a page."""
-    return numbers(data["shapes"]).reshape(1 + len(data["components"]), -1, 3)
-
-
-def page_of(folder, model, **options):
-    """Return the data on a page."""
-    write_viewer(model, folder / "viewer.html", **options)
-    return content_of(folder / "viewer.html")
-
-
-@pytest.fixture
-def page(tmp_path):
-    """Return a function that writes a page and returns its data."""
-    return partial(page_of, tmp_path)
 
 
 def test_a_page_is_one_file_that_asks_for_nothing(tmp_path):
@@ -199,27 +188,6 @@ def test_a_page_is_one_file_that_asks_for_nothing(tmp_path):
     assert "{{" not in text.replace(script, "")
 
 
-def test_shapes_have_y_up_and_size_one(page):
-    data = page(face_model())
-    shapes = shapes_of(data)
-    assert np.linalg.norm(shapes[0], axis=1).max() == pytest.approx(1)
-    assert_allclose(shapes[0].mean(axis=0), 0, atol=1e-6)
-    assert shapes[0, 8, 1] < shapes[0, 27, 1]
-    assert shapes[0, 30, 2] > shapes[0, 0, 2]
-    assert len(numbers(data["edges"], "<u4")) > 100
-    assert data["points"] == [str(j) for j in range(68)]
-
-
-def test_frames_are_those_of_the_fit(page):
-    model = face_model()
-    data = page(model)
-    alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
-    assert_array_equal(alpha, model.alpha_.astype("f4"))
-    assert data["rows"] == [str(i) for i in range(N_FRAMES)]
-    assert data["count"] == f"{N_FRAMES} rows."
-    assert data["labels"] == data["categories"] == []
-
-
 CAMERAS = ["affine", "weak_perspective", "orthographic"]
 
 
@@ -233,10 +201,9 @@ def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
     told = "weak_perspective" if camera == "affine" else camera
     assert f"{told.replace('_', '-')} cameras" in data["about"]
     shapes = shapes_of(data).astype(float)
-    alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
     rotations = numbers(data["rotations"]).reshape(-1, 3, 3)
     assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-5)
-    frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+    frames = shapes[0] + np.tensordot(alpha_of(data), shapes[1:], 1)
     seen = (frames @ rotations.mT)[:, :, :2] * [1, -1]
     # The page turns the images of y that points up.
     images = truth.clean * [1, -1 if "origin" in options else 1]
@@ -277,33 +244,31 @@ def test_deviations_have_the_size_of_the_shapes(page):
     data = page(model, X=X, depth_std=std, n_frames=4)
     found = numbers(data["deviations"]).reshape(4, 68)
     size = np.linalg.norm(shapes[0, 0] - shapes[0, 16])
-    alpha = numbers(data["alpha"]).reshape(4, -1)[0]
     mean, *basis = shapes_of(data)
-    drawn = mean + np.tensordot(alpha, basis, 1)
+    drawn = mean + np.tensordot(alpha_of(data)[0], basis, 1)
     unit = np.linalg.norm(drawn[0] - drawn[16]) / size
     assert_allclose(found, unit * std[[0, 49, 99, 149]], rtol=1e-4)
     assert page(model)["deviations"] == ""
+    # One for each point counts for all frames.
+    alike = np.insert(np.linspace(0.0, 1.0, 67), 3, np.nan)
+    found = numbers(page(model, depth_std=alike, n_frames=9)["deviations"])
+    assert_allclose(found, np.tile(unit * alike, 9), rtol=1e-5)
 
 
-def test_deviations_of_points_are_those_of_all_frames(page):
-    model, deviations = calibrated_model(), np.linspace(0.0, 1.0, 68)
-    deviations[3] = np.nan
-    data = page(model, depth_std=deviations)
-    found = numbers(data["deviations"]).reshape(N_FRAMES, 68)
-    assert_allclose(found, np.tile(deviations * found[0, -1], (N_FRAMES, 1)), rtol=1e-5)
-    assert np.isnan(found[:, 3]).all()
-
-
-def test_other_tables_are_shown_by_their_index(page):
+def test_frames_are_those_of_the_fit_or_of_another_table(page):
     model = face_model()
+    data = page(model)
+    assert_array_equal(alpha_of(data), model.alpha_.astype("f4"))
+    assert data["rows"] == [str(i) for i in range(N_FRAMES)]
+    assert data["count"] == f"{N_FRAMES} rows."
+    assert data["labels"] == data["categories"] == []
     table = pd.DataFrame(faces().data[:6].copy(), index=list("abcdef"))
     table.iloc[2] = np.nan
     data = page(model, X=table.to_numpy(), n_frames=5)
     assert data["rows"] == ["0", "1", "3", "5"]
     count = "5 of 6 rows, evenly spread; 1 of them show too few points."
     assert data["count"] == count
-    alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
-    assert_allclose(alpha, model.alpha_[[0, 1, 3, 5]], atol=1e-5)
+    assert_allclose(alpha_of(data), model.alpha_[[0, 1, 3, 5]], atol=1e-5)
     data = page(model, X=table, labels=list("uvwxyz"))
     assert data["rows"] == list("abdef")
     assert data["labels"] == [0, 1, 3, 4, 5]
@@ -314,16 +279,16 @@ MIXED = np.array([10, 9.5, "b", None, "a", np.nan, 9.5, 10] * 5, dtype=object)
 
 
 def test_times_are_seconds_that_rise(page):
-    model = face_model()
-    n_frames = len(model.alpha_)
-    seconds = np.arange(n_frames) / 25 + 100
-    seconds[n_frames // 2 :] -= seconds[n_frames // 2] - 3  # another video
-    content = page(model, times=seconds, n_frames=n_frames)
-    found = numbers(content["times"], "<f8")
-    assert_allclose(found, np.arange(n_frames) / 25, atol=1e-9)
-    assert not len(numbers(page(model)["times"], "<f8"))
-    few = numbers(page(model, times=seconds, n_frames=3)["times"], "<f8")
-    assert_allclose(few, found[[0, (n_frames - 1) // 2, -1]], atol=1e-9)
+    model, half = face_model(), N_FRAMES // 2
+    seconds = np.arange(N_FRAMES) / 25 + 100
+    seconds[half:] -= seconds[half] - 3  # another video
+    found, few, none = (
+        numbers(page(model, times=times, n_frames=n_frames)["times"], "<f8")
+        for times, n_frames in ((seconds, N_FRAMES), (seconds, 3), (None, 3))
+    )
+    assert_allclose(found, np.arange(N_FRAMES) / 25, atol=1e-9)
+    assert_allclose(few, found[[0, half - 1, -1]], atol=1e-9)
+    assert not len(none)
 
 
 # --- angles and distances ------------------------------------------------------------
@@ -343,72 +308,61 @@ def rotations_of(poses):
     return Rotation.from_euler("ZXY", angles, degrees=True)
 
 
-class TestFramePoses:
-    def test_true_up_to_a_common_rotation(self, fitted):
-        truth, model = fitted
-        found = rotations_of(frame_poses(model, truth.data))
-        true = Rotation.from_euler("yxz", truth.angles, degrees=True)
-        common = (found.inv() * true).mean()
-        off = np.degrees((found * common * true.inv()).magnitude())
-        assert np.median(off) < 2
-        # Upright and frontal, as the makers of the faces have it
-        assert np.degrees(common.magnitude()) < 5
-
-    def test_deviations_are_those_of_the_errors(self, fitted):
-        truth, model = fitted
-        if model.camera == "affine":
-            assert np.isnan(frame_poses(model, truth.data).yaw_std).all()
-            return
-        # Frames of the model itself, with its noise
-        clean = model.inverse_transform(model.alpha_, model.motion_, model.translation_)
-        clean = clean.reshape(N_FRAMES, 68, 2)
-        sizes = (clean - clean.mean(axis=1, keepdims=True)).std(axis=(1, 2))
-        noise = np.sqrt(model.noise_variance_) * sizes[:, None, None]
-        noisy = clean + noise * np.random.default_rng(0).normal(size=clean.shape)
-        wanted = frame_poses(model)
-        found = frame_poses(model, noisy.reshape(N_FRAMES, -1))
-        for name in ("yaw", "pitch", "roll"):
-            off = getattr(found, name) - getattr(wanted, name)
-            ratio = np.sqrt(np.mean((off / getattr(found, f"{name}_std")) ** 2))
-            # Deviations contain the uncertainty of the shapes, which is none here.
-            assert ratio < 1.25
-
-    def test_of_the_fitted_table(self, fitted):
-        truth, model = fitted
-        expected = frame_poses(model, truth.data)[:4]
-        assert_allclose(frame_poses(model)[:4], expected, atol=1e-4)
-        assert np.isnan(frame_poses(model).yaw_std).all()
-
-    def test_of_fitted_frames(self, fitted):
-        truth, model = fitted
-        X = truth.data[:20]
-        frames = model.decompose(X)
-        assert_array_equal(frame_poses(model, frames)[:4], frame_poses(model, X)[:4])
-        assert np.isnan(frame_poses(model, frames).yaw_std).all()
-        found, pair = point_distances(model, [MOUTH], frames, unit=EYES), [MOUTH]
-        assert_array_equal(found, point_distances(model, pair, X, unit=EYES))
+def test_poses_are_true_up_to_a_common_rotation(fitted):
+    truth, model = fitted
+    found = rotations_of(frame_poses(model, truth.data))
+    true = Rotation.from_euler("yxz", truth.angles, degrees=True)
+    common = (found.inv() * true).mean()
+    off = np.degrees((found * common * true.inv()).magnitude())
+    assert np.median(off) < 2
+    # Upright and frontal, as the makers of the faces have it
+    assert np.degrees(common.magnitude()) < 5
 
 
-class TestPointDistances:
-    def test_true_in_units_of_the_eyes(self, fitted):
-        truth, model = fitted
-        found = point_distances(model, [MOUTH, EYES])
-        true = np.linalg.norm(truth.shapes[:, 48] - truth.shapes[:, 54], axis=1)
-        mean = truth.shapes.mean(axis=0)
-        true /= np.linalg.norm(mean[36] - mean[45])
-        assert np.corrcoef(found[:, 0], true)[0, 1] > 0.98
-        assert_allclose(found[:, 0].mean(), true.mean(), rtol=0.03)
-        assert found[:, 1].mean() == pytest.approx(1.0, abs=0.01)
+def test_deviations_of_poses_are_those_of_the_errors():
+    assert np.isnan(frame_poses(face_model(), faces().data[:5]).yaw_std).all()
+    model = calibrated_model()
+    # Frames of the model itself, with its noise
+    clean = model.inverse_transform(model.alpha_, model.motion_, model.translation_)
+    clean = clean.reshape(N_FRAMES, 68, 2)
+    sizes = (clean - clean.mean(axis=1, keepdims=True)).std(axis=(1, 2))
+    noise = np.sqrt(model.noise_variance_) * sizes[:, None, None]
+    noisy = clean + noise * np.random.default_rng(0).normal(size=clean.shape)
+    wanted = frame_poses(model)
+    found = frame_poses(model, noisy.reshape(N_FRAMES, -1))
+    for name in ("yaw", "pitch", "roll"):
+        off = getattr(found, name) - getattr(wanted, name)
+        ratio = np.sqrt(np.mean((off / getattr(found, f"{name}_std")) ** 2))
+        # Deviations contain the uncertainty of the shapes, which is none here.
+        assert ratio < 1.25
 
-    def test_units(self, fitted):
-        truth, model = fitted
-        eyes = point_distances(model, [MOUTH])
-        mouth = point_distances(model, [MOUTH], unit=MOUTH, length=50.0)
-        ratio = mouth / eyes
-        assert_allclose(ratio, ratio[0, 0])
-        assert mouth.mean() == pytest.approx(50.0, rel=0.01)
-        again = point_distances(model, [MOUTH], truth.data)
-        assert_allclose(again, eyes, atol=2e-3)
+
+def test_frames_that_are_fitted_have_the_poses_and_distances_of_their_table(fitted):
+    truth, model = fitted
+    X = truth.data[:20]
+    frames, expected = model.decompose(X), frame_poses(model, X)[:4]
+    again, poses = frame_poses(model, frames), frame_poses(model)
+    assert_array_equal(again[:4], expected)
+    assert_allclose([part[:20] for part in poses[:4]], expected, atol=1e-4)
+    assert np.isnan([*again.yaw_std, *poses.yaw_std]).all()
+    again, expected = (point_distances(model, [MOUTH], part) for part in (frames, X))
+    assert_array_equal(again, expected)
+
+
+def test_distances_are_true_in_units_of_the_eyes_or_others(fitted):
+    truth, model = fitted
+    found = point_distances(model, [MOUTH, EYES])
+    mouth, eyes = found.T
+    true = np.linalg.norm(truth.shapes[:, 48] - truth.shapes[:, 54], axis=1)
+    mean = truth.shapes.mean(axis=0)
+    true /= np.linalg.norm(mean[36] - mean[45])
+    assert np.corrcoef(mouth, true)[0, 1] > 0.98
+    assert_allclose(mouth.mean(), true.mean(), rtol=0.03)
+    assert eyes.mean() == pytest.approx(1.0, abs=0.01)
+    assert_allclose(point_distances(model, [MOUTH, EYES], truth.data), found, atol=2e-3)
+    other = point_distances(model, [MOUTH], unit=MOUTH, length=50.0)[:, 0]
+    assert_allclose(other / mouth, other[0] / mouth[0])
+    assert other.mean() == pytest.approx(50.0, rel=0.01)
 
 
 # --- point distribution models -------------------------------------------------------
@@ -422,14 +376,17 @@ def on_tangent_space(shapes, mean):
 
 
 def share_left(pdm, shapes):
-    """Return the share of the variance of shapes that the modes leave.
-
-    The variances of the scores are the eigenvalues.
-    """
+    """Return the share of the variance of shapes that their principal axes leave."""
     drift = (on_tangent_space(shapes, pdm.mean) - pdm.mean).reshape(len(shapes), -1)
     modes = pdm.modes.reshape(len(pdm.modes), -1)
+    assert_allclose(modes @ modes.T, np.eye(len(modes)), atol=1e-12)
+    assert all(mode[np.abs(mode).argmax()] > 0 for mode in modes)
+    assert_allclose(pdm.mean.mean(axis=0), 0, atol=1e-9)
+    # The variances of the scores are the eigenvalues.
     scores = drift @ modes.T
     assert_allclose(np.mean(scores**2, axis=0), pdm.eigenvalues, rtol=1e-6)
+    values = np.linalg.svd(drift, compute_uv=False)[: len(modes)]
+    assert_allclose(values**2 / len(drift), pdm.eigenvalues, rtol=1e-6)
     assert_allclose(np.mean(scores, axis=0), 0, atol=1e-6)
     return np.sum((drift - scores @ modes) ** 2) / np.sum(drift**2)
 
@@ -453,44 +410,31 @@ def pdm():
     return point_distribution_model(face_model())
 
 
-def test_modes_are_orthonormal_and_sorted(pdm):
-    flat = pdm.modes.reshape(len(pdm.modes), -1)
-    assert len(flat) == N_COMPONENTS
-    assert_allclose(flat @ flat.T, np.eye(N_COMPONENTS), atol=1e-12)
-    assert np.all(np.diff(pdm.eigenvalues) < 0)
-    assert_allclose(pdm.mean.mean(axis=0), 0, atol=1e-9)
-    largest = np.abs(flat).argmax(axis=1)
-    assert np.all(flat[np.arange(N_COMPONENTS), largest] > 0)
-
-
-@pytest.mark.parametrize("y_up", [False, True])
 @pytest.mark.parametrize("camera", ["weak_perspective", None])
-@pytest.mark.parametrize("make", [face_model, calibrated_model])
-def test_faces_stand_upright_and_look_at_the_viewer(make, camera, y_up):
-    model = face_model(y_up=y_up) if make is face_model else make()
-    mean = point_distribution_model(model, camera=camera).mean
+@pytest.mark.parametrize(
+    "make", [face_model, partial(face_model, y_up=True), calibrated_model]
+)
+def test_faces_stand_upright_and_look_at_the_viewer(make, camera):
+    mean = point_distribution_model(make(), camera=camera).mean
     ear, nose, other_ear, brow, chin = mean[[0, 30, 16, 19, 8]]
     assert brow[1] < nose[1] < chin[1]  # y points down
     assert ear[0] < nose[0] < other_ear[0]
     assert nose[2] < min(ear[2], other_ear[2])  # z points away
 
 
-def test_more_frames_than_coordinates():
-    X = make_nonrigid_tracks(60, 12, 2, noise=0.02, random_state=0).data
-    model = AffineNRSfM(2, **QUICK).fit(X)
-    found = point_distribution_model(model, n_modes=0.999)
-    shapes = on_tangent_space(model.reconstruct(X, camera="weak_perspective"), found[0])
-    flat = (shapes - found.mean).reshape(60, -1)
-    values = np.linalg.svd(flat, compute_uv=False)[: len(found.modes)]
-    assert_allclose(found.eigenvalues, values**2 / 60, rtol=1e-6)
-
-
 def test_euclidean_shapes_of_the_frames_are_reproduced(pdm):
+    assert len(pdm.modes) == N_COMPONENTS
     assert_true_mean(pdm, faces())
     shapes = face_model().reconstruct(faces().data, camera="weak_perspective")
     assert share_left(pdm, shapes) < 0.03
     whole = point_distribution_model(face_model(), n_modes=0.9999)
     assert share_left(whole, shapes) < 1.01e-4
+    # More frames than coordinates
+    X = make_nonrigid_tracks(60, 12, 2, noise=0.02, random_state=0).data
+    model = AffineNRSfM(2, **QUICK).fit(X)
+    shapes = model.reconstruct(X, camera="weak_perspective")
+    found = point_distribution_model(model, n_modes=0.999)
+    assert share_left(found, shapes) < 1.01e-3
 
 
 def assert_true_mean(pdm, truth):
@@ -528,16 +472,15 @@ def test_rows_without_points_are_left_out():
         assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
-def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):
+def test_a_share_of_the_variance_takes_as_few_modes_as_have_it():
     model = face_model()
     everything = point_distribution_model(model, n_modes=0.999999).eigenvalues
     share = np.cumsum(everything) / everything.sum()
     for n_modes in (1, 2, 3):
-        between = share[n_modes - 1] - 1e-6
-        found = point_distribution_model(model, n_modes=float(between))
+        between = float(share[n_modes - 1] - 1e-6)
+        found = point_distribution_model(model, n_modes=between)
         assert len(found.modes) == n_modes
-        exact = point_distribution_model(model, n_modes=n_modes)
-        assert_equal(found, exact)
+        assert_equal(found, point_distribution_model(model, n_modes=n_modes))
 
 
 def test_files_have_the_same_numbers(pdm, tmp_path):
@@ -546,25 +489,18 @@ def test_files_have_the_same_numbers(pdm, tmp_path):
     assert_equal(read_pdm(str(tmp_path / "pdm.txt")), pdm)
     with np.load(tmp_path / "pdm.npz") as arrays:
         assert_equal(PointDistributionModel(**arrays), pdm)
-    matrices = loadmat(tmp_path / "pdm.mat")  # as MATLAB code of OpenFace has them
-    shapes = {name: matrices[name].shape for name in "MVE"}
-    m = N_COMPONENTS
-    assert shapes == {"M": (204, 1), "V": (204, m), "E": (m, 1)}
-    assert_array_equal(matrices["M"][68:136, 0], pdm.mean[:, 1])
-
-
-def test_openface_reads_the_text(pdm, tmp_path):
-    path = tmp_path / "pdm.txt"
-    write_pdm(pdm, path)
-    mean, components, variances = read_as_openface_does(path)
+    # As OpenFace reads the text, and as its MATLAB code has them: all x, then all y,
+    # then all z; a shape is mean + components * scores.
+    of_matlab = loadmat(tmp_path / "pdm.mat")
+    mean, components, variances = read_as_openface_does(tmp_path / "pdm.txt")
+    assert_array_equal(of_matlab["M"], mean)
+    assert_array_equal(of_matlab["V"], components)
+    assert_array_equal(of_matlab["E"], variances.T)
     assert mean.shape == (204, 1)
-    assert components.shape == (204, N_COMPONENTS)
-    assert variances.shape == (1, N_COMPONENTS)
-    # All x, then all y, then all z; a shape is mean + components * scores.
+    assert_array_equal(variances, pdm.eigenvalues[None])
     scores = np.array([1.0, -2.0, 0.5])
     shape = (mean[:, 0] + components @ scores).reshape(3, 68).T
     assert_allclose(shape, pdm.mean + np.tensordot(scores, pdm.modes, 1))
-    assert_array_equal(variances[0], pdm.eigenvalues)
 
 
 # Rows that end in blanks, carriage returns, more matrices at the end.
