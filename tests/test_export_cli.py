@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from export_models import face_model, faces
+from export_models import faces
 from exported_files import Read, content_of
 from fit_runs import MODEL, told
 from made_once import made_once
@@ -21,26 +21,23 @@ from isa_nrsfm.export import (
 from isa_nrsfm.io import save_model
 
 QUICK = [*"--n-components 1 --isa fast --n-init 2 --no-figures".split()]
-NAMED = f"named_{MODEL}"
 NAMES = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Return a folder with a model, and one with names of points."""
-    folder = tmp_path_factory.mktemp("export")
-    save_model(face_model(), folder / MODEL)
-    save_model(named_model(), folder / NAMED)
-    return folder
+@made_once
+def named_model():
+    table = pd.DataFrame(faces().data[:50], columns=NAMES)
+    return AffineNRSfM(2, random_state=0).fit(table)
 
 
 @pytest.fixture
-def export(folder, tmp_path, succeeds):
-    """Return a function that exports a model: output file and report."""
+def export(tmp_path, succeeds):
+    """Return a function that exports a model with names: output file and report."""
+    save_model(named_model(), tmp_path / MODEL)
 
-    def run(name, *options, model=NAMED):
+    def run(name, *options):
         output = tmp_path / name
-        out, err = succeeds("export", folder / model, *options, "--output", output)
+        out, err = succeeds("export", tmp_path / MODEL, *options, "--output", output)
         assert err == ""
         return output, " ".join(out.split())
 
@@ -48,37 +45,33 @@ def export(folder, tmp_path, succeeds):
 
 
 def test_the_suffix_tells_what_is_written(export, tmp_path):
-    output, report = export("face.glb", model=MODEL)
-    write_glb(face_model(), tmp_path / "expected.glb")
-    assert output.read_bytes() == (tmp_path / "expected.glb").read_bytes()
-    assert f"{output.stat().st_size} bytes" in report
+    model = named_model()
+    for write, name in ((write_glb, "face.glb"), (write_viewer, "face.HTML")):
+        output, report = export(name)
+        write(model, tmp_path / f"expected_{name}")
+        assert output.read_bytes() == (tmp_path / f"expected_{name}").read_bytes()
+        assert f"{output.stat().st_size} bytes" in report
 
-    output, _ = export("face.HTML", model=MODEL)
-    write_viewer(face_model(), tmp_path / "expected.html")
-    assert output.read_text() == (tmp_path / "expected.html").read_text()
+    output, report = export("pdm.txt")
+    assert_equal(read_pdm(output), point_distribution_model(model))
+    assert "2 modes of 68 points" in report
 
-    output, report = export("pdm.txt", model=MODEL)
-    assert_equal(read_pdm(output), point_distribution_model(face_model()))
-    assert "3 modes of 68 points" in report
-
-    output, _ = export("shapes.npz", model=MODEL)
-    with np.load(output) as arrays:
+    with np.load(export("shapes.npz")[0]) as arrays:
         assert set(arrays) == set(ShapeArrays._fields)
-        assert_array_equal(arrays["basis"], face_model().basis_)
+        assert_array_equal(arrays["basis"], model.basis_)
 
 
 def test_options_reach_what_is_written(export):
     pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
-    output, _ = export("pdm.txt", "--n-modes", 1, *pose, model=MODEL)
-    options = {"camera": None, "origin": "lower"}
-    mirrored = face_model().mirrored()
-    expected = point_distribution_model(mirrored, n_modes=1, **options)
-    assert_equal(read_pdm(output), expected)
+    options = {"camera": None, "origin": "lower", "n_modes": 1}
+    expected = point_distribution_model(named_model().mirrored(), **options)
+    assert_equal(read_pdm(export("pdm.txt", "--n-modes", 1, *pose)[0]), expected)
     assert len(read_pdm(export("b.txt", "--n-modes", "0.1")[0]).modes) == 1
 
     output, _ = export("a.glb", "--names", "jaw open, smile", "--edges", "none")
-    assert Read(output).mesh["extras"]["targetNames"] == ["jaw open", "smile"]
-    assert [each["mode"] for each in Read(output).mesh["primitives"]] == [0]  # points
+    mesh = Read(output).mesh
+    assert mesh["extras"]["targetNames"] == ["jaw open", "smile"]
+    assert [each["mode"] for each in mesh["primitives"]] == [0]  # points
 
 
 def test_edges_are_pairs_of_names_or_numbers_of_points(export, tmp_path):
@@ -104,12 +97,6 @@ def test_the_viewer_of_a_flat_object_has_affine_shapes(fits, tmp_path, rng):
     content = content_of(tmp_path / "viewer.html")
     assert content["about"].startswith("Affine shapes")
     assert content["rotations"] == ""
-
-
-@made_once
-def named_model():
-    table = pd.DataFrame(faces().data[:50], columns=NAMES)
-    return AffineNRSfM(2, random_state=0).fit(table)
 
 
 def exported(folder, name, *options):
