@@ -365,17 +365,17 @@ def test_faces_are_joined_and_upright(estimator, upside_down):
     display = BasisShapeDisplay.from_estimator(estimator)
     edges = get_skeleton("ibug-68").edges
     assert_array_equal(display.edges, edges)
-    lines = display.axes_[0, 1].collections[0]
-    expected = display.mean_shape[:, [2, 1]][edges]
-    assert_allclose(lines.get_segments(), expected, atol=1e-12)
+    for ax, columns in zip(display.axes_[0], ([0, 1], [2, 1]), strict=True):
+        points = display.mean_shape[:, columns]
+        lines = ax.collections[0].get_segments()
+        assert_allclose(lines, points[edges], atol=1e-12)
+        # On the page the brows are above the chin, and the nose is at one side.
+        height = ax.transData.transform(points)[:, 1]
+        assert height[17:27].min() > height[27:36].max() > height[8]
     for ax in display.axes_.ravel():
         assert ax.yaxis_inverted()
         assert not ax.xaxis_inverted()
         assert ax.get_aspect() == 1
-    # On the page the brows are above the chin, and the nose is at one side.
-    for ax, columns in zip(display.axes_[0], ([0, 1], [2, 1]), strict=True):
-        height = ax.transData.transform(display.mean_shape[:, columns])[:, 1]
-        assert height[17:27].min() > height[27:36].max() > height[8]
     depth = display.mean_shape[:, 2]
     assert depth[30] in (depth.min(), depth.max())
     display = BasisShapeDisplay.from_estimator(upside_down, origin="upper")
@@ -383,13 +383,13 @@ def test_faces_are_joined_and_upright(estimator, upside_down):
 
 
 def test_titles_have_names_energies_and_drifts(estimator):
-    display = BasisShapeDisplay.from_estimator(estimator)
+    show = BasisShapeDisplay.from_estimator
+    display, named = show(estimator), show(estimator, component_names=["jaw", "lip"])
     assert texts(display)[0] == "Mean shape, front and side"
     assert display.energy_share.sum() == pytest.approx(1)
     assert display.energy_share[0] > display.energy_share[1]
     share = percent(display.energy_share[0])
     assert texts(display)[1] == f"Basis shape 1 ({share} of energy)"
-    named = BasisShapeDisplay.from_estimator(estimator, component_names=["jaw", "lip"])
     assert texts(named)[1] == f"jaw ({share} of energy)"
     display = random_shapes().plot(components=[2, 0])
     assert_array_equal(display.components_, [2, 0])
@@ -397,7 +397,7 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert_allclose(drift, 2 * display.basis[2][:, :2], atol=1e-12)
 
 
-def test_undetermined_depth_has_no_side_view():
+def test_undetermined_depth_has_no_side_view(rng):
     faces = make_face_tracks(30, n_components=1, random_state=0)
     model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
     images = faces.shapes[..., :2].reshape(30, -1)
@@ -409,18 +409,15 @@ def test_undetermined_depth_has_no_side_view():
     assert not side.collections
     assert side.get_xlabel() == "depth not determined"
     assert not display.basis[..., 2].any()
-
-
-def test_notes_of_narrow_side_views_end_within_the_figure(rng):
+    # The note of a narrow view ends within the figure.
     mean, *basis = rng.normal(size=(5, 20, 3)) * [0.2, 1.0, 0.2]
-    display = drawn_shapes(
-        mean, 0.1 * np.array(basis), depth_note="depth not determined"
-    )
-    display.plot().figure_.canvas.draw()
+    note = {"depth_note": "depth not determined"}
+    display = drawn_shapes(mean, 0.1 * np.array(basis), **note).plot()
+    display.figure_.canvas.draw()
     for side in display.axes_[:, 1]:
         assert side.get_xlabel() == "depth not determined"
-        note = side.xaxis.label.get_window_extent()
-        assert note.x1 <= display.figure_.bbox.x1
+        end = side.xaxis.label.get_window_extent().x1
+        assert end <= display.figure_.bbox.x1
 
 
 MOODS = np.array(["b", "a", "c"])[np.arange(30) % 3]
@@ -438,17 +435,13 @@ def ticks(axes):
     return [label.get_text() for label in axes.get_xticklabels()]
 
 
-def test_classes_have_boxes_of_their_frames():
+def test_classes_have_boxes_of_their_frames_and_numbers_points():
     for k, axes in enumerate(drawn_classes()):
         thick = [line for line in axes.lines if line.get_linewidth() == 1.4]
         medians = [line.get_ydata()[0] for line in thick]
         assert_allclose(medians, [np.median(ALPHA[MOODS == c, k]) for c in "abc"])
-
-
-def test_numbers_are_points():
     age = np.linspace(20.5, 60, 30)
-    display = CoefficientsDisplay(alpha=ALPHA, y=age).plot()
-    points = display.axes_[1].collections[0].get_offsets()
+    points = drawn_classes(y=age)[1].collections[0].get_offsets()
     assert_allclose(points, np.column_stack([age, ALPHA[:, 1]]))
 
 
@@ -554,11 +547,14 @@ def share_outside(matrix):
 
 def test_points_of_frames_are_the_numbers(faces, estimator):
     show, rows = ReprojectionDisplay.from_estimator, [7, 3, 30]
-    display = show(estimator, faces.data, frames=rows)
+    names = [f"photo{i}.jpg" for i in range(40)]
+    table = pd.DataFrame(faces.data, columns=faces.feature_names, index=names)
+    display = show(clone(estimator).fit(table), table, frames=rows)
     assert_array_equal(display.frames, rows)
-    table = estimator.reproject(faces.data).reshape(-1, 68, 2)
+    assert display.frame_names == [names[row] for row in rows]
+    reprojected = estimator.reproject(faces.data).reshape(-1, 68, 2)
     for i, row in enumerate(rows):
-        seen, fitted = faces.tracks[row], table[row]
+        seen, fitted = faces.tracks[row], reprojected[row]
         assert_allclose(display.observed_[i].get_offsets(), seen)
         assert_allclose(display.reprojected_[i].get_offsets(), fitted)
         errors = np.stack([seen, fitted], axis=1)
@@ -566,49 +562,36 @@ def test_points_of_frames_are_the_numbers(faces, estimator):
         edges = get_skeleton("ibug-68").edges
         assert_allclose(display.edges_[i].get_segments(), fitted[edges])
         assert display.observed_[i].axes is display.axes_[i]
-        error = inverse_snr(faces.data[[row]], table[row].reshape(1, -1))
+        error = inverse_snr(faces.data[[row]], fitted.reshape(1, -1))
         assert display.inverse_snr[i] == pytest.approx(error)
-        title = f"row {row}\ninverse SNR {percent(error)}"
+        title = f"row {names[row]}\ninverse SNR {percent(error)}"
         assert display.axes_[i].get_title() == title
-    # Planar tables show the same.
+    # Planar tables show the same, and rows without names have numbers.
     planar = table_of(faces.tracks, "planar")
     other = clone(estimator).set_params(layout="planar").fit(planar)
     other = show(other, planar, frames=rows)
     assert_array_equal(display.observed, other.observed)
     assert_allclose(display.reprojected, other.reprojected)
+    assert other.axes_[0].get_title().startswith("row 7\n")
 
 
-def test_random_frames(faces, estimator):
+def test_frames_are_random_and_can_be_fitted(faces, estimator):
     show = ReprojectionDisplay.from_estimator
-    drawn = (show(estimator, faces.data, random_state=seed) for seed in (0, 0, 1))
-    one, same, other = drawn
-    assert len(one.frames) == 6
-    assert_array_equal(one.frames, np.unique(one.frames))
-    assert_array_equal(one.frames, same.frames)
-    assert set(one.frames) != set(other.frames)
-    assert_array_equal(show(estimator, faces.data[:4]).frames, range(4))
+    one, same, other = (
+        show(estimator, faces.data, random_state=seed).frames for seed in (0, 0, 1)
+    )
+    assert len(one) == 6
+    assert_array_equal(one, np.unique(one))
+    assert_array_equal(one, same)
+    assert set(one) != set(other)
     for frames in ([40], [-1], 3, [], [0.5]):
         refused("frames must be", show, estimator, faces.data, frames=frames)
-
-
-def test_random_rows_can_be_fitted(estimator, faces):
     X = faces.data[:6].copy()
     X[1] = np.nan
     X[4, 2:] = np.nan
-    display = ReprojectionDisplay.from_estimator(estimator, X)
-    assert_array_equal(display.frames, [0, 2, 3, 5])
+    assert_array_equal(show(estimator, X).frames, [0, 2, 3, 5])
     message = "between 1 and the 4 rows of X with at least 4 points; got 5"
-    refused(message, ReprojectionDisplay.from_estimator, estimator, X, n_frames=5)
-
-
-def test_rows_of_dataframes_may_have_names(faces):
-    names = [f"photo{i}.jpg" for i in range(40)]
-    X = pd.DataFrame(faces.data, columns=faces.feature_names, index=names)
-    estimator = AffineNRSfM(2, refinement=None, random_state=0).fit(X)
-    display = ReprojectionDisplay.from_estimator(estimator, X, frames=[5, 2])
-    assert display.frame_names == [names[5], names[2]]
-    assert display.axes_[1].get_title().startswith(f"row {names[2]}\n")
-    assert_array_equal(display.observed, faces.tracks[[5, 2]])
+    refused(message, show, estimator, X, n_frames=5)
 
 
 def test_frames_of_faces_are_upright(faces, estimator, upside_down):
