@@ -5,7 +5,6 @@ those of a dense objective, the fit is its minimum, covariances are inverse Hess
 and the fit of a frame does not depend on the others.
 """
 
-
 import numpy as np
 import pytest
 import scenes
@@ -34,7 +33,6 @@ from isa_nrsfm._frames.camera_models import (
 from isa_nrsfm._frames.models import spread_starts  # noqa: F401  in refusals.txt
 from isa_nrsfm._frames.search import (
     FrameSearch,
-    calibrated_starts,
     frame_sums,
     frame_tracks,
 )
@@ -483,27 +481,6 @@ class TestReversal:
         for i, start in enumerate(self.reversed(turned)[:10]):
             end = TestMinimum.minimum(scene, camera, i, start, noise)
             assert value(scene, i, fits.motion[i], noise) <= end + 1e-6
-
-
-def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):
-    """Also of equal singular values, of one, of none, and of axes in the columns."""
-    M = rng.standard_normal((2, 3, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
-    M[:, :2, :4] = 0.0
-    M[:, :2, 0] = np.eye(2)
-    M[0, 0, 1] = M[1, 1, 2] = M[0, 1, 3] = 2.0
-    M[:, :2, 4] = 0.0
-    affine = M.copy()
-    completed = calibrated_starts(CAMERAS["weak_perspective"], M)[1]
-    assert_array_equal(M, affine)
-    size = np.linalg.norm(M[:, :2], axis=(0, 1), ord=2)
-    size[4] = 1.0
-    products = (
-        np.einsum("rci,sci->irs", completed, completed) / size[:, None, None] ** 2
-    )
-    assert_allclose(products, np.broadcast_to(np.eye(2), products.shape), atol=1e-12)
-    some = np.arange(40) != 4
-    assert_allclose(completed[:, :2, some] / size[some], M[:, :2, some] / size[some])
-    assert (np.einsum("ri,ri->i", completed[:, 2], M[:, 2]) >= 0).all()
 
 
 test_refusals = refusals_of("frames", globals())
