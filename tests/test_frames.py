@@ -254,6 +254,8 @@ def test_cameras_of_zero_have_no_scale():
     rows, scales = nearest_calibrated(zero)
     assert_allclose(rows @ rows.mT, [np.eye(2)], atol=1e-14)
     assert_array_equal(scales, [0.0])
+    for start in calibrated_starts(CAMERAS["orthographic"], frames_last(zero)):
+        assert_calibrated(frames_first(start), "orthographic")
     weak = CAMERAS["weak_perspective"]
     assert np.isfinite(weak.inverse_curvature(frames_last(zero), np.ones((6, 1)))).all()
     assert np.isfinite(full_rotations(zero)[0]).all()
