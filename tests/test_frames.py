@@ -33,6 +33,7 @@ from isa_nrsfm._frames.camera_models import (
 from isa_nrsfm._frames.models import spread_starts  # noqa: F401  in refusals.txt
 from isa_nrsfm._frames.search import (
     FrameSearch,
+    calibrated_starts,
     frame_sums,
     frame_tracks,
 )
