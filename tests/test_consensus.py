@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from frame_parts import depth_errors
-from layers import QUICK_LIMITS, Quick, with_limits
+from layers import Quick
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
 from scenes import with_gaps
-from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
@@ -21,12 +20,10 @@ from isa_nrsfm._joint.consensus import (
     Group,
     Scene,
     _principal,
-    _turns,
     aligning_rotations,
     centred,
     common_coordinates,
     group_fit,
-    group_fits,
     hidden_residuals,
     interpolation,
     merge,
@@ -34,7 +31,6 @@ from isa_nrsfm._joint.consensus import (
     neighbourhoods,
     principal_shapes,
     share_of_first,
-    weighted,
 )
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -42,7 +38,6 @@ from isa_nrsfm.metrics import mean_shape_error_3d
 
 AS_USERS = ["few_frames", "widths", "error_steps", "restarts"]
 SETTINGS = FitSettings(camera="orthographic", max_iter=300)
-AllStarts = with_limits(**QUICK_LIMITS | {"restarts": True})
 
 
 def random_groups(rng, z, sizes=(4, 4, 5, 6), weights=(1, 2, 1, 3)):
@@ -124,26 +119,6 @@ class TestMerge:
         assert_allclose(half[seen], ((rows + fitted) / 2)[seen])
         assert_allclose(half[1, :, 2], fitted[1, :, 2])
 
-    def test_weights_are_inverse_disagreements_of_sizes_and_starts(self):
-        """Groups of a size and start share one factor, of the merge of their size."""
-        rng = np.random.default_rng(7)
-        first = rng.standard_normal((5, 3, 8))
-        groups = random_groups(rng, rng.standard_normal((5, 8)), sizes=(5, 5, 5, 6))
-        groups[2] = groups[2]._replace(start=1)
-        for group in groups:
-            group.coordinates[:, 2] += rng.standard_normal((5, len(group.points)))
-        scene = scene_of(first)
-        found = weighted(scene, groups)
-        z = merge(scene, groups[:3])[:, 2]
-        off = [
-            np.mean((centred(g.coordinates[:, 2]) - centred(z[:, g.points])) ** 2)
-            for g in groups[:3]
-        ]
-        both = np.average(off[:2], weights=[g.weight for g in groups[:2]])
-        for group, square in zip(groups, (both, both, off[2]), strict=False):
-            after = next(g for g in found if g.points is group.points)
-            assert_allclose(after.weight, group.weight / (5 * square), rtol=1e-9)
-
 
 def test_interpolation_of_changes():
     """Chosen points keep their changes; others have means of three of them."""
@@ -175,10 +150,10 @@ def test_principal_shapes_of_frames():
 
 def test_share_of_the_joint_fit_by_hidden_points():
     """The true model predicts hidden points, missing ones do not count."""
-    tracks = make_nonrigid_tracks(60, 20, 2, camera="orthographic", random_state=0)
+    tracks = make_nonrigid_tracks(40, 20, 2, camera="orthographic", random_state=0)
     model = Quick(2, camera="orthographic", random_state=0).fit(tracks.data)
     frames = model._model.frames
-    rows = tracks.data.reshape(60, 20, 2).mT / model._model.unit
+    rows = tracks.data.reshape(40, 20, 2).mT / model._model.unit
     flat = replace(frames, shapes=frames.shapes * [[1.0], [1.0], [0.5]])
     assert np.abs(hidden_residuals(frames, rows)).max() < 1e-4
     assert np.abs(hidden_residuals(flat, rows)).max() > 1e-2
@@ -215,21 +190,6 @@ class TestGroupFit:
         assert np.sqrt(np.mean(off**2)) < 0.02
         assert np.sqrt(np.mean((found[:, :2] - truth[frames, :2]) ** 2)) < 0.02
         assert noise >= 1e-5
-
-    def test_each_group_is_fitted_from_the_cameras_of_each_start(self):
-        """The fits are those of single groups; none depends on the other cameras."""
-        scene, _ = self.scene()
-        cameras = scene.motion, scene.motion[::-1]
-        distances = cdist(scene.first[0].T, scene.first[0].T)
-        starts = list(zip((1.0, 0.5), cameras, strict=True))
-        tasks, fits = group_fits(scene, starts, distances, 2, SETTINGS)
-        assert [start for _, _, start in tasks] == [0, 1]
-        assert tasks[1][1] == 0.5 * tasks[0][1]
-        for (points, *_), motion, fit in zip(tasks, cameras, fits, strict=True):
-            rows, first = scene.rows.take(points, 2), scene.first.take(points, 2)
-            own = scene._replace(rows=rows, first=first, motion=motion)
-            for part, expected in zip(fit, group_fit(own, 2, SETTINGS), strict=True):
-                assert_allclose(part, expected)
 
     def test_frames_with_few_points_are_left_out(self):
         """Frames show at least four points of a group; more than basis shapes do."""
@@ -282,12 +242,15 @@ def error(found, Y):
     return np.linalg.norm(centred(found[:, 2]) - Y[:, 2]) / np.linalg.norm(Y[:, 2])
 
 
-def test_depths_become_truer_and_true_ones_stay(corrected):
+def test_depths_become_truer_and_true_ones_stay_in_any_order(corrected):
     Y, groups, first, found = corrected
     assert error(found, Y) < 0.5 * error(first, Y)
     assert_array_equal(found[:, :2], Y[:, :2])
-    found = common_coordinates(Y[:, :2], Y, groups, FLOOR, FLOOR)
-    assert error(found, Y) < 2 * np.sqrt(FLOOR)
+    kept = common_coordinates(Y[:, :2], Y, groups, FLOOR, FLOOR)
+    assert error(kept, Y) < 2 * np.sqrt(FLOOR)
+    order = np.random.default_rng(3).permutation(len(Y))
+    again = common_coordinates(Y[order, :2], first[order], groups[::-1], FLOOR, FLOOR)
+    assert_allclose(again, found[order], atol=1e-6)
 
 
 def test_missing_points_are_filled_in(corrected):
@@ -300,13 +263,6 @@ def test_missing_points_are_filled_in(corrected):
     assert_array_equal(found[:, :2][seen], Y[:, :2][seen])
     assert np.sqrt(np.mean((found[:, :2] - Y[:, :2])[~seen] ** 2)) < 0.05
     assert error(found, Y) < 0.5 * error(first, Y)
-
-
-def test_order_of_groups_and_frames_does_not_matter(corrected):
-    Y, groups, first, found = corrected
-    order = np.random.default_rng(3).permutation(len(Y))
-    again = common_coordinates(Y[order, :2], first[order], groups[::-1], FLOOR, FLOOR)
-    assert_allclose(again, found[order], atol=1e-6)
 
 
 def test_points_and_frames_of_no_group_stay(corrected):
@@ -334,22 +290,6 @@ def test_precision_is_that_of_probabilistic_components(s2, rng):
     assert_allclose(found, expected, atol=1e-9 / s2)
     off = (shapes.mean(axis=2, keepdims=True) - shapes).reshape(12, -1)
     assert_allclose(slope.reshape(12, -1), expected @ off, atol=1e-9 / s2)
-
-
-def test_turns_are_gauss_newton_steps_with_the_gaussian_held(rng):
-    """They solve the normal equations of shapes that are turned, in each frame."""
-    shapes = rng.standard_normal((5, 3, 1)) + 0.1 * rng.standard_normal((5, 3, 40))
-    shapes -= shapes.mean(axis=0)
-    precision, slope, *_, w = _turns(shapes, 1e-3)
-    for i in (0, 17):
-        S, step = shapes[:, :, i], 1e-6
-        D = [
-            (S @ Rotation.from_rotvec(step * axis).as_matrix() - S).ravel() / step
-            for axis in np.eye(3)
-        ]
-        D = np.array(D).T
-        expected = np.linalg.solve(D.T @ precision @ D, D.T @ slope[:, :, i].ravel())
-        assert_allclose(w[:, i], expected, rtol=1e-4, atol=1e-6)
 
 
 def test_aligning_rotations_leave_the_deformation(rng):
@@ -420,31 +360,13 @@ def body():
 class TestEstimator:
     """`AffineNRSfM` with refinement="consensus"."""
 
-    @pytest.mark.slow
-    def test_fits_of_little_evidence_hardly_count(self, monkeypatch):
-        """The groups of a fit from another start have its weight."""
-        depths = []
-        for weight in (0.0, 1e-9, 1.0):
-
-            def others(*args, weight=weight):
-                *_, fit = args
-                shapes = fit.state.shapes * [[1.0], [0.2], [3.0]]
-                return [(weight, fit.state._replace(shapes=shapes))] if weight else []
-
-            monkeypatch.setattr("isa_nrsfm._fit.other_fits", others)
-            model = AllStarts(3, camera="orthographic", refinement="consensus")
-            fit = model.fit(X[:100])
-            depths.append(fit.reconstruct(X[:100]))
-        change = [np.linalg.norm(z - depths[0]) for z in depths[1:]]
-        assert change[0] < 1e-3 * change[1]
-
     def test_frames_of_the_fit_are_those_of_transform(self):
         """`alpha_` and `motion_` are the results of `decompose`.
 
         A number of basis shapes is that of the result, beyond the joint fit's.
         """
         few = X[:40]
-        body = consensus_fit(few, 14, AllStarts, tol=1.0)
+        body = consensus_fit(few, 14, Quick, tol=1.0)
         assert body.basis_.shape == (14, 16, 3)
         assert body.alpha_.shape == (40, 14)
         assert len(body.get_feature_names_out()) == 14
@@ -478,41 +400,17 @@ class TestEstimator:
                 assert 0.5 < np.sqrt(np.mean((off / std) ** 2)) < 2.0
 
     @pytest.mark.slow
-    def test_number_of_processes_does_not_matter(self, body):
+    def test_processes_order_of_frames_and_missing_points(self, body):
         """Two processes have the same result to the bit."""
         other = consensus_fit(n_jobs=2)
         assert_array_equal(other.basis_, body.basis_)
         assert_array_equal(other.alpha_, body.alpha_)
-
-    @pytest.mark.slow
-    def test_order_of_frames_does_not_matter(self, body):
-        """Permuted rows have permuted shapes."""
         other = consensus_fit(X[np.random.default_rng(0).permutation(len(X))])
         before, after = (in_camera(model, X) for model in (body, other))
         assert mean_shape_error_3d(before, after, convention="camera") < 0.01
-
-    @pytest.mark.slow
-    def test_missing_points(self, body):
-        """Hidden points are found, nearly as well as from the complete table."""
         table = with_gaps(X, 0.2, 1)
-        error = error_of(consensus_fit(table), table, SHAPES)
-        assert error < 2 * error_of(body, X, SHAPES)
-
-    @pytest.mark.slow
-    @pytest.mark.xfail(reason="outliers double the errors: 0.065 in place of 0.034")
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-    def test_robust_losses(self, loss):
-        """A few outliers hardly change the shapes."""
-        table, truth = articulated()
-        wrong, frames = table.copy(), np.arange(len(table))
-        rows = np.random.default_rng(2).choice(frames, 10, replace=False)
-        wrong[rows, 6] += 0.3
-        good, errors = np.setdiff1d(frames, rows), []
-        for data, name in ((wrong, loss), (table, "linear")):
-            found = in_camera(consensus_fit(data, 14, loss=name), data)[good]
-            error = mean_shape_error_3d(truth[good], found, convention="camera")
-            errors.append(error)
-        assert errors[0] < 1.3 * errors[1]
+        hidden = error_of(consensus_fit(table), table, SHAPES)
+        assert hidden < 2 * error_of(body, X, SHAPES)
 
     @pytest.mark.parametrize("noise", [0.0, 0.02])
     def test_a_sufficient_joint_fit_is_kept(self, noise):

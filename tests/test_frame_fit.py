@@ -76,20 +76,6 @@ class TestFrameModel:
         motion = expected.motion * scale[..., None]
         assert_allclose(fitted.motion, motion, atol=1e-8 * np.abs(motion).max())
 
-    def test_errors_of_shapes_lower_the_precision_of_the_images(self):
-        frames, tracks = posterior_frames()
-        rows, sizes = tracks.mT, np.ones(len(tracks))
-        alone = frames.fit(rows, sizes, True, None)
-        certainty = DepthCertainty(images=(1.5, 0.2))
-        fitted = replace(frames, certainty=certainty).fit(rows, sizes, True, None)
-        assert_array_equal(fitted.alpha, alone.alpha)
-        ratio = 1.5 + 0.2 * (1 + np.sum(alone.alpha**2, axis=1))
-        prior = np.eye(2)
-        precision = np.linalg.inv(frames.posterior(rows).covariance) - prior
-        expected = np.linalg.inv(precision / ratio[:, None, None] + prior)
-        variances = np.diagonal(expected, axis1=1, axis2=2)
-        assert_allclose(fitted.alpha_std**2, variances, rtol=1e-8)
-
     @GAPS
     @EACH_LOSS
     def test_weights_of_a_robust_loss_agree_with_the_fit(self, loss, missing):
@@ -136,6 +122,32 @@ class TestFrameModel:
         assert_allclose(images[0, seen], tracks[0, seen], atol=1e-2)
 
 
+def test_certainty_of_shapes_and_the_leverage_of_frames():
+    """Errors of shapes lower the precision of images, more so in frames far out."""
+    frames, tracks = posterior_frames()
+    frames = replace(frames, camera="weak_perspective")
+    sizes = np.linspace(1.0, 2.0, len(tracks))
+    rows = (sizes[:, None, None] * tracks).mT
+    fit = frames.posterior(tracks.mT)
+    leverage, points = 1.0 + np.sum(fit.alpha**2, axis=1), np.linspace(0.0, 1e-2, 20)
+    assert np.ptp(leverage) > 1.0
+    # Of points
+    certainty = DepthCertainty(points=points, leverage=3.0)
+    alone = depth_deviations(frames, rows, sizes) ** 2
+    found = depth_deviations(replace(frames, certainty=certainty), rows, sizes)
+    expected = alone + np.outer(sizes**2 * leverage / 3.0, points)
+    assert_allclose(found**2, expected, rtol=1e-9)
+    # Of images
+    certainty = DepthCertainty(images=(1.5, 0.2))
+    found = replace(frames, certainty=certainty).fit(rows, sizes, True, None)
+    assert_array_equal(found.alpha, frames.fit(rows, sizes, True, None).alpha)
+    precision = np.linalg.inv(fit.covariance) - np.eye(2)
+    ratio = 1.5 + 0.2 * leverage[:, None, None]
+    expected = np.linalg.inv(precision / ratio + np.eye(2))
+    variances = np.diagonal(expected, axis1=1, axis2=2)
+    assert_allclose(found.alpha_std**2, variances, rtol=1e-8)
+
+
 RESIDUAL = 1e-3  # of a point of the fitted frames
 
 
@@ -178,21 +190,6 @@ class TestDepthDeviations:
             variances = np.diag(D[:, 2].T @ covariance @ D[:, 2])
             expected = np.sqrt(factors[i] * variances)
             assert_allclose(found[i], expected, rtol=1e-5)
-
-    def test_variances_of_points_grow_with_the_leverage_of_the_frame(self):
-        frames, tracks = posterior_frames()
-        frames = replace(frames, camera="weak_perspective")
-        sizes = np.linspace(1.0, 2.0, len(tracks))
-        rows = (sizes[:, None, None] * tracks).mT
-        alone = depth_deviations(frames, rows, sizes)
-        certainty = DepthCertainty(points=np.linspace(0.0, 1e-2, 20), leverage=3.0)
-        frames = replace(frames, certainty=certainty)
-        alpha = frames.posterior(tracks.mT).alpha
-        leverage = 1.0 + np.sum(alpha**2, axis=1)
-        expected = alone**2 + np.outer(sizes**2 * leverage / 3.0, certainty.points)
-        found = depth_deviations(frames, rows, sizes)
-        assert_allclose(found**2, expected, rtol=1e-9)
-        assert np.ptp(leverage) > 1.0
 
 
 def test_information_on_the_shapes(rng):
@@ -261,14 +258,12 @@ class TestExtents:
         assert_allclose(values, ratio - 1, rtol=0.1)
         assert_allclose(*values, rtol=1e-12)
         cube = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(1, 3, 8)
-        value, gradient = extent_penalty(cube.astype(float))
-        assert_allclose(value, 0, atol=1e-12)
-        assert_allclose(gradient, 0, atol=1e-12)
-        for flat in (cube * np.array([1.0, 1.0, 0.0])[:, None], 0.0 * cube):
-            value, gradient = extent_penalty(flat)
+        for extents in ([1.0, 1.0, 1.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]):
+            value, gradient = extent_penalty(cube * np.reshape(extents, (3, 1)))
             assert np.isfinite(value)
-            assert np.isfinite(gradient).all()
-            assert_allclose(gradient[:, 2], 0)  # flat objects stay flat
+            assert_allclose(gradient[:, 2], 0, atol=1e-12)  # flat objects stay flat
+            if all(extents):
+                assert_allclose(value, 0, atol=1e-12)
 
 
 class TestFrontalFaces:
@@ -376,14 +371,6 @@ def test_depth_of_an_animal_seen_from_the_side_is_withheld():
         model.fit(X)
     assert error_of_depths(model, X, points)[1] > 0.5
     assert model.depth_uncertainty_ > 0.9
-
-
-@pytest.mark.slow
-def test_uncertainty_of_depths_does_not_depend_on_the_order_of_rows():
-    X, *_ = faces_turned_by(4, n_frames=600)
-    rows = np.random.default_rng(1).permutation(len(X))
-    first, second = (fitted(table).depth_uncertainty_ for table in (X, X[rows]))
-    assert_allclose(second, first, rtol=0.01)
 
 
 @pytest.mark.filterwarnings("ignore:the points of X lie")

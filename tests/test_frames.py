@@ -5,8 +5,6 @@ those of a dense objective, the fit is its minimum, covariances are inverse Hess
 and the fit of a frame does not depend on the others.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 import scenes
@@ -34,13 +32,8 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.models import spread_starts  # noqa: F401  in refusals.txt
 from isa_nrsfm._frames.search import (
-    LARGE_RISE,
-    REVERSED,
     FrameSearch,
-    State,
-    _rise,
     calibrated_starts,
-    coefficient_posterior,
     frame_sums,
     frame_tracks,
 )
@@ -91,6 +84,12 @@ def moved(camera, M, step):
     return CAMERAS[camera].moved(M[..., None], np.reshape(step, (-1, 1)))[..., 0]
 
 
+def disturbed(M, camera, size):
+    """Return cameras (2, 3, n) after random steps of their parameters."""
+    shape = CAMERAS[camera].n_parameters, M.shape[2]
+    return CAMERAS[camera].moved(M, size * np.random.default_rng(1).normal(size=shape))
+
+
 def hessian_of(f, n, h=1e-3):
     """Return the Hessian (n, n) of a function of a step, by central differences."""
     hessian, steps = np.empty((n, n)), h * np.eye(n)
@@ -109,9 +108,16 @@ class TestMinimum:
         assert fits.converged.all()
         if camera != "affine":
             assert_calibrated(fits.motion, camera)
+        rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
+        if scene.weights is not None:
+            rest *= scene.weights[..., None]
+        assert_allclose(np.nansum(rest, axis=1), 0.0, atol=1e-11)
         rng = np.random.default_rng(1)
         for i, M in enumerate(fits.motion):
-            least = value(scene, i, M)
+            frame, least = Regression.of(scene, i, M), value(scene, i, M)
+            assert_allclose(fits.alpha[i], frame.mean(NOISE**2), rtol=1e-9, atol=1e-12)
+            square = frame.square(fits.alpha[i], NOISE**2)
+            assert fits.objective[i] == pytest.approx(square, rel=1e-9)
             for _ in range(5):
                 step = 1e-4 * rng.normal(size=CAMERAS[camera].n_parameters)
                 ends = (moved(camera, M, sign * step) for sign in (1, -1))
@@ -119,19 +125,6 @@ class TestMinimum:
                 assert min(rises) > 0
                 # Equal on both sides: the slope is zero, not only small.
                 assert_allclose(rises[0], rises[1], rtol=1e-2)
-
-    def test_coefficients_and_position(self, camera, kind):
-        scene = scene_of(camera, kind)
-        fits = fitted(scene, camera)
-        for i, M in enumerate(fits.motion):
-            frame = Regression.of(scene, i, M)
-            assert_allclose(fits.alpha[i], frame.mean(NOISE**2), rtol=1e-9, atol=1e-12)
-            square = frame.square(fits.alpha[i], NOISE**2)
-            assert fits.objective[i] == pytest.approx(square, rel=1e-9)
-        rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
-        if scene.weights is not None:
-            rest *= scene.weights[..., None]
-        assert_allclose(np.nansum(rest, axis=1), 0.0, atol=1e-11)
 
     def test_covariances_are_those_of_camera_and_coefficients_together(
         self, camera, kind
@@ -157,7 +150,7 @@ class TestMinimum:
 
     @pytest.mark.parametrize("depth", slow_after(1, [0.1, 1.0]))
     def test_is_no_higher_than_from_many_other_starts(self, camera, kind, depth):
-        scene = scene_of(camera, kind, noise=0.1, n_frames=2, depth=depth)
+        scene = scene_of(camera, kind, noise=0.1, n_frames=1, depth=depth)
         noise = 0.1**2
         fits = fitted(scene, camera, noise)
         rng = np.random.default_rng(1)
@@ -180,60 +173,42 @@ class TestMinimum:
         return minimize(f, np.zeros(CAMERAS[camera].n_parameters)).fun
 
 
+def half_hessian(search, problem, M, size=1e-5):
+    """Return half the Hessian of s2 F (p, p, n), by differences of the slope."""
+    rows = []
+    for tangent in np.eye(search.model.n_parameters):
+        step = np.tile(size * tangent[:, None], M.shape[2])
+        below, above = (
+            search.evaluate(problem, search.model.moved(M, sign * step)).slope
+            for sign in (-1, 1)
+        )
+        rows.append((below - above) / (2 * size))
+    # Differences of the slope along tangents that turn along: what is not symmetric is
+    # the commutator of two rotations.
+    hessian = np.array(rows)
+    return 0.5 * (hessian + hessian.swapaxes(0, 1))
+
+
 @CAMERA
 class TestDerivatives:
     """Away from the minimum, where the gradient is not zero."""
 
-    H = 1e-5
-
-    @staticmethod
-    def disturbed(M, cameras, size=0.1):
-        rng = np.random.default_rng(1)
-        step = size * rng.normal(size=(cameras.n_parameters, M.shape[2]))
-        return cameras.moved(M, step)
-
-    def states(self, search, problem, M):
-        """Yield the states above and below along each tangent."""
-        n = search.model.n_parameters
-        for c in range(n):
-            step = np.zeros((n, M.shape[2]))
-            step[c] = self.H
-            yield tuple(
-                search.evaluate(problem, search.model.moved(M, sign * step))
-                for sign in (1, -1)
-            )
-
     @KINDS
-    def test_value_by_dense_algebra(self, camera, kind):
-        scene = scene_of(camera, kind)
-        search, problem, M = problem_of(scene, camera, NOISE**2)
-        got = search.evaluate(problem, M).value
-        expected = [value(scene, i, each) for i, each in enumerate(scene.motion)]
-        assert_allclose(got, NOISE**2 * np.array(expected), rtol=1e-9)
-
-    def numerical_hessian(self, search, problem, M):
-        """Return half the Hessian of s2 F (p, p, n), by differences of the slope."""
-        rows = [
-            (below.slope - above.slope) / (2 * self.H)
-            for above, below in self.states(search, problem, M)
-        ]
-        # Differences of the slope along tangents that turn along: what is not
-        # symmetric is the commutator of two rotations.
-        hessian = np.array(rows)
-        return 0.5 * (hessian + hessian.swapaxes(0, 1))
-
-    @KINDS
-    def test_hessian_is_exact_but_for_the_determinant(self, camera, kind):
+    def test_value_and_hessian_are_exact_but_for_the_determinant(self, camera, kind):
         # What is left falls like the noise.
-        scene = scene_of(camera, kind)
-        errors = []
+        scene, errors = scene_of(camera, kind), []
         for noise in (1e-2, 1e-3, 1e-4):
             search, problem, M = problem_of(scene, camera, noise)
-            M = self.disturbed(M, CAMERAS[camera], 0.03)
-            got = unpacked(search.evaluate(problem, M).hessian)
-            expected = self.numerical_hessian(search, problem, M)
+            values = [
+                value(scene, i, each, noise) for i, each in enumerate(scene.motion)
+            ]
+            found = search.evaluate(problem, M).value
+            assert_allclose(found, noise * np.array(values), rtol=1e-9)
+            M = disturbed(M, camera, 0.03)
+            found = unpacked(search.evaluate(problem, M).hessian)
+            expected = half_hessian(search, problem, M)
             size = np.abs(expected).max(axis=(0, 1))
-            errors.append((np.abs(got - expected).max(axis=(0, 1)) / size).max())
+            errors.append((np.abs(found - expected).max(axis=(0, 1)) / size).max())
         assert errors[0] < 0.1
         assert errors[1] < 0.15 * errors[0]
         assert errors[2] < 0.15 * errors[1]
@@ -241,9 +216,9 @@ class TestDerivatives:
     @pytest.mark.parametrize("noise", [1e-3, 0.1, 10.0])
     def test_hessian_of_the_determinant_is_a_bound(self, camera, noise):
         search, problem, M = problem_of(scene_of(camera), camera, noise)
-        M = self.disturbed(M, CAMERAS[camera])
-        got = unpacked(search.evaluate(problem, M).hessian)
-        excess = got - self.numerical_hessian(search, problem, M)
+        M = disturbed(M, camera, 0.1)
+        found = unpacked(search.evaluate(problem, M).hessian)
+        excess = found - half_hessian(search, problem, M)
         assert (np.linalg.eigvalsh(frames_first(excess))[:, 0] > -1e-5).all()
         assert np.abs(excess).max() > 1e-5
 
@@ -276,14 +251,15 @@ class TestCameraModel:
 
 
 def test_cameras_of_zero_have_no_scale():
-    rows, scales = nearest_calibrated(np.zeros((1, 2, 3)))
+    zero = np.zeros((1, 2, 3))
+    rows, scales = nearest_calibrated(zero)
     assert_allclose(rows @ rows.mT, [np.eye(2)], atol=1e-14)
     assert_array_equal(scales, [0.0])
-    inverse = CAMERAS["weak_perspective"].inverse_curvature(
-        np.zeros((2, 3, 1)), np.ones((6, 1))
-    )
-    assert np.isfinite(inverse).all()
-    assert np.isfinite(full_rotations(np.zeros((1, 2, 3)))[0]).all()
+    for start in calibrated_starts(CAMERAS["orthographic"], frames_last(zero)):
+        assert_calibrated(frames_first(start), "orthographic")
+    weak = CAMERAS["weak_perspective"]
+    assert np.isfinite(weak.inverse_curvature(frames_last(zero), np.ones((6, 1)))).all()
+    assert np.isfinite(full_rotations(zero)[0]).all()
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1e9])
@@ -308,14 +284,6 @@ class TestExact:
         assert fits.converged.all()
         assert_allclose(fits.objective, 0, atol=1e-9)
 
-    def test_prepared_frames(self, camera, gaps):
-        scene = scene_of(camera, "gaps" if gaps else "complete")
-        weights = np.isfinite(scene.tracks[..., 0]) * 1.0
-        frames = frame_tracks(scene.tracks.swapaxes(1, 2), weights)
-        search = FrameSearch(scene.shapes, CAMERAS[camera])
-        expected = fitted(scene, camera)
-        assert_same_fits(search.fit(frames, NOISE**2), expected, 1e-8)
-
 
 @CAMERA
 class TestInvariance:
@@ -338,17 +306,6 @@ class TestInvariance:
         often = np.tile(np.arange(8), 520)
         got = fitted(scene._replace(tracks=scene.tracks[often]), camera)
         assert_same_fits(got, fitted(scene, camera).take(often), 1e-10)
-
-    def test_fits_are_the_same_without_covariances(self, camera):
-        scene = scene_of(camera)
-        scene.tracks[10:] = with_gaps(scene.tracks[10:])
-        starts = np.ones((2, 3))
-        expected = fitted(scene, camera, starts=starts)._asdict()
-        got = fitted(scene, camera, starts=starts, covariances=False)._asdict()
-        assert got.pop("covariance").shape == (20, 0, 0)
-        assert np.isnan(got.pop("turn_covariance")).all()
-        for name, value in got.items():
-            assert_array_equal(value, expected[name])
 
     @GAPS
     @pytest.mark.parametrize("unit", [1e-100, 1e100])
@@ -411,8 +368,10 @@ class TestDegenerate:
             rigid = fit_posterior(scene.tracks, shapes[:1], 1.0)
             assert (fits.objective <= rigid.objective * (1 + 1e-6)).all()
 
-    def test_no_basis_shape_is_the_rigid_fit(self, camera):
+    def test_no_frames_and_no_basis_shape_which_is_the_rigid_fit(self, camera):
         scene = scene_of(camera)
+        none = fitted(scene._replace(tracks=np.zeros((0, 20, 2))), camera)
+        assert none.motion.shape == (0, 2, 3)
         fits = fitted(scene._replace(shapes=scene.shapes[:1]), camera)
         assert fits.alpha.shape == (20, 0)
         assert fits.covariance.shape == (20, 0, 0)
@@ -455,11 +414,6 @@ class TestDegenerate:
             assert_allclose(fits.motion[1], 0, atol=1e-12)
             assert_allclose(fits.alpha[1], 0, atol=1e-12)
 
-    def test_no_frames(self, camera):
-        scene = scene_of(camera)
-        fits = fitted(scene._replace(tracks=np.zeros((0, 20, 2))), camera)
-        assert fits.motion.shape == (0, 2, 3)
-
 
 def test_flat_shapes_have_cameras_that_are_zero_across():
     scene = scenes.random_scene(0, noise=NOISE)
@@ -500,50 +454,26 @@ class TestReversal:
     def scene(self, camera, deviation=0.01):
         return scene_of(camera, noise=deviation, depth=0.1, n_frames=40)
 
-    def reversed(self, scene):
-        """Return cameras reflected at the plane of the mean shape."""
-        axes = np.linalg.svd(scene.shapes[0], full_matrices=False)[0]
-        return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
-
-    def search(self, scene, camera, noise, motion):
-        search, problem, _ = problem_of(scene, camera, noise)
-        return search.reversed_cameras(problem, motion)
-
     def test_cameras_that_start_reversed_are_turned_back(self, camera):
         scene = self.scene(camera)
-        found, better = self.search(scene, camera, 1e-4, self.reversed(scene))
         expected = fitted(scene, camera, 1e-4).motion
+        search, problem, _ = problem_of(scene, camera, 1e-4)
+        found, better = search.reversed_cameras(problem, self.reversed(scene))
         assert better.mean() > 0.9
         # A few steps lead there, not all of them to the minimum.
         away = np.abs(found - expected).max(axis=(1, 2))[better]
         assert away.max() < 0.2
         assert np.median(away) < 1e-4
         assert_calibrated(found, camera)
-
-    def test_reversals_are_tried_over_a_large_rise(self, camera):
-        # In a joint fit cameras can be in high minima, where the bound does not hold.
-        scene = scenes.random_scene(
-            n_frames=1500,
-            noise=0.01,
-            camera=camera,
-            deformation=0.4,
-            extent=(1.0, 0.8, 0.3),
-        )
-        search, problem, M = problem_of(scene, camera, 1e-4)
-        M = M * REVERSED
-        _, better = self.search(scene, camera, 1e-4, frames_first(M) @ search.space)
-        M, _ = search.descend(problem, search.evaluate(problem, M), 6)
-        posterior = coefficient_posterior(problem, M)
-        value = search.evaluate(problem, M).value
-        steep = _rise(problem, M, posterior) > LARGE_RISE * value
-        assert (better & steep).sum() >= 3
-
-    def test_cameras_at_the_minimum_stay(self, camera):
-        scene = self.scene(camera)
-        expected = fitted(scene, camera, 1e-4).motion
-        found, better = self.search(scene, camera, 1e-4, expected)
+        # Those at the minimum stay.
+        found, better = search.reversed_cameras(problem, expected)
         assert not better.any()
         assert_array_equal(found, expected)
+
+    def reversed(self, scene):
+        """Return cameras reflected at the plane of the mean shape."""
+        axes = np.linalg.svd(scene.shapes[0], full_matrices=False)[0]
+        return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
 
     def test_fit_takes_the_better_of_the_two(self, camera):
         # The depth of the object is that of the noise: the start can be reversed.
@@ -554,60 +484,6 @@ class TestReversal:
         for i, start in enumerate(self.reversed(turned)[:10]):
             end = TestMinimum.minimum(scene, camera, i, start, noise)
             assert value(scene, i, fits.motion[i], noise) <= end + 1e-6
-
-
-def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):
-    """Also of equal singular values, of one, of none, and of axes in the columns."""
-    M = rng.standard_normal((2, 3, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
-    M[:, :2, :4] = 0.0
-    M[:, :2, 0] = np.eye(2)
-    M[0, 0, 1] = M[1, 1, 2] = M[0, 1, 3] = 2.0
-    M[:, :2, 4] = 0.0
-    affine = M.copy()
-    completed = calibrated_starts(CAMERAS["weak_perspective"], M)[1]
-    assert_array_equal(M, affine)
-    size = np.linalg.norm(M[:, :2], axis=(0, 1), ord=2)
-    size[4] = 1.0
-    products = (
-        np.einsum("rci,sci->irs", completed, completed) / size[:, None, None] ** 2
-    )
-    assert_allclose(products, np.broadcast_to(np.eye(2), products.shape), atol=1e-12)
-    some = np.arange(40) != 4
-    assert_allclose(completed[:, :2, some] / size[some], M[:, :2, some] / size[some])
-    assert (np.einsum("ri,ri->i", completed[:, 2], M[:, 2]) >= 0).all()
-
-
-class Energies(NamedTuple):
-    energy: np.ndarray
-
-
-class Wells(FrameSearch):
-    """The function ``x^4 / 4 - x^2 / 2`` of each frame, with minima ``+- 1``."""
-
-    def __init__(self, n_frames):
-        self.problem = Energies(np.ones(n_frames)), np.zeros(n_frames)
-        self.model = CAMERAS["affine"]  # steps are added
-
-    def evaluate(self, problem, x):
-        value = x[0] ** 4 / 4 - x[0] ** 2 / 2
-        return State(x, value, (x - x**3) / 2, np.ones_like(x), (3 * x**2 - 1) / 2)
-
-    def ended(self, start, known=None, max_steps=60):
-        state = self.evaluate(self.problem, np.array([start]))
-        found, converged = self.descend(self.problem, state, max_steps, known)
-        return found[0], converged
-
-
-def test_search_is_given_up_in_the_well_of_a_known_minimum_or_out_of_its_reach():
-    known = np.zeros((1, 2)), np.array([-10.0, -0.2]), np.zeros(2)
-    found, converged = Wells(2).ended([1.1, 1.1], known)
-    assert_array_equal(converged, [False, True])
-    assert_allclose(found, [1.1, 1.0], rtol=1e-7)
-    known = np.ones((1, 2)), np.full(2, -0.3), np.array([0.2, 0.01])
-    found, _ = Wells(2).ended([1.5, 1.5], known, 3)
-    steps = [Wells(1).ended([1.5], max_steps=n)[0][0] for n in range(4)]
-    assert found[0] == next(x for x in steps if abs(x - 1.0) < 0.2)
-    assert abs(found[1] - 1.0) < abs(found[0] - 1.0)
 
 
 test_refusals = refusals_of("frames", globals())

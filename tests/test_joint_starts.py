@@ -22,7 +22,6 @@ from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState, Widths
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
-    affine_start,
     best_starts,
     both_sides,
     flat_cameras,
@@ -30,7 +29,6 @@ from isa_nrsfm._joint.starts import (
     likely_basis,
     mixed_cameras,
     reversed_groups,
-    rigid_start,
     steadied,
     unfolded,
 )
@@ -84,63 +82,36 @@ def camera_error(motion, truth):
 
 
 @BOTH
-def test_rigid_start_of_a_rigid_object_is_the_truth(camera):
-    scene = random_scene(camera, n_components=0)
-    factors = scene.factors
-    paper = np.concatenate([factors.rigid_shape[None], np.zeros((2, 3, N_POINTS))])
-    scaled = camera == "weak_perspective"
-    motion, shapes = rigid_start(factors, paper, scaled)
-    assert_calibrated(motion, camera)
-    size = np.sqrt(np.mean(scene.scales**2)) if scaled else 1.0
-    assert camera_error(size * motion, scene.motion) < 1e-8
-    assert_allclose(motion @ shapes[0], scene.rows, atol=1e-8)
-
-
-WIDTHS = LIMITS.widths
-
-
-class TestMixedCameras:
-    def test_exact_cameras_are_among_them(self):
-        scene = random_scene()
-        found = list(mixed_cameras(scene.rows, None, np.arange(60), WIDTHS))
-        errors = [camera_error(motion, scene.motion) for motion in found]
-        rigid = rigid_start(scene.factors, scene.shapes, False)[0]
+@pytest.mark.parametrize(("noise", "n_mixtures"), [(0.0, 2), (0.05, 6)])
+def test_mixed_cameras_are_calibrated_and_exact_without_noise(
+    camera, noise, n_mixtures
+):
+    scene = random_scene(camera, noise=noise)
+    scales = scene.scales if camera == "weak_perspective" else None
+    found = list(mixed_cameras(scene.rows, scales, np.arange(60), LIMITS.widths))
+    # Of up to 6, 9, 12, 18, 24 and 36 columns, if there are as many
+    assert len(found) == n_mixtures
+    for motion in found:
+        assert_calibrated(motion, camera)
+    if not noise:
         # The cost is of fourth order in some directions.
-        assert min(errors) < 1e-4
-        assert camera_error(rigid, scene.motion) > 0.05
-
-    @BOTH
-    def test_are_calibrated(self, camera):
-        scene = random_scene(camera, noise=0.05)
-        scales = scene.scales if camera == "weak_perspective" else None
-        found = list(mixed_cameras(scene.rows, scales, np.arange(60), WIDTHS))
-        # Of up to 6, 9, 12, 18, 24 and 36 columns of the 39 there are.
-        assert len(found) == 6
-        for motion in found:
-            assert_calibrated(motion, camera)
+        assert min(camera_error(each, scene.motion) for each in found) < 1e-4
 
 
-class TestLiftedShapes:
-    @BOTH
-    @pytest.mark.parametrize("n_frames", [60, 200])
-    def test_basis_shapes_are_principal_directions(self, camera, n_frames):
-        # With more frames than coordinates, and with fewer.
-        scene = random_scene(camera, n_frames=n_frames)
-        shapes = lifted_shapes(scene.rows, scene.motion, 3)
-        pairs = zip(scene.rows, scene.motion, strict=True)
-        lifted = [(np.linalg.pinv(M) @ (W - M @ shapes[0])).ravel() for W, M in pairs]
-        _, S, Vt = np.linalg.svd(np.array(lifted), full_matrices=False)
-        flat = shapes[1:].reshape(3, -1)
-        assert_allclose(np.linalg.norm(flat, axis=1), S[:3] / np.sqrt(n_frames))
-        cosines = flat @ Vt[:3].T / np.linalg.norm(flat, axis=1)[:, None]
-        assert_allclose(np.abs(cosines), np.eye(3), atol=1e-6)
-
-    def test_zeros_where_there_are_not_as_many(self):
-        scene = random_scene(n_frames=4)
-        shapes = lifted_shapes(scene.rows, scene.motion, 6)
-        assert shapes.shape == (7, 3, N_POINTS)
-        assert_array_equal(shapes[5:], 0.0)
-        assert np.isfinite(shapes).all()
+@BOTH
+@pytest.mark.parametrize("n_frames", [4, 60, 200])
+def test_lifted_shapes_are_principal_directions(camera, n_frames):
+    # With more frames than coordinates, with fewer, and with fewer than shapes
+    scene = random_scene(camera, n_frames=n_frames)
+    shapes = lifted_shapes(scene.rows, scene.motion, 6)
+    pairs = zip(scene.rows, scene.motion, strict=True)
+    lifted = [(np.linalg.pinv(M) @ (W - M @ shapes[0])).ravel() for W, M in pairs]
+    _, S, Vt = np.linalg.svd(np.array(lifted), full_matrices=False)
+    flat = shapes[1:4].reshape(3, -1)
+    assert_allclose(np.linalg.norm(flat, axis=1), S[:3] / np.sqrt(n_frames))
+    cosines = flat @ Vt[:3].T / np.linalg.norm(flat, axis=1)[:, None]
+    assert_allclose(np.abs(cosines), np.eye(3), atol=1e-6)
+    assert_array_equal(shapes[n_frames + 1 :], 0.0)
 
 
 def problem_of(scene, thorough=True):
@@ -165,43 +136,22 @@ def started(scene, camera, problem=None):
     return best_starts(problem, table, paper, CAMERAS[camera])
 
 
-class TestBestStarts:
-    def test_has_nearly_the_true_cameras_where_the_rigid_ones_are_wrong(self):
-        scene = random_scene(amplitude=0.6)
-        rigid, _ = rigid_start(scene.factors, scene.shapes, False)
-        assert camera_error(rigid, scene.motion) > 0.3
-        motion = started(scene, "orthographic")[0].motion
-        assert camera_error(motion, scene.motion) < 0.05
-
-    @pytest.mark.parametrize(("thorough", "n_starts"), [(False, 1), (True, 3)])
-    def test_of_many_frames_has_cameras_of_all(self, thorough, n_starts):
-        # The comparison is of some of them.
-        scene = random_scene(n_frames=450, noise=0.01)
-        states = started(scene, "orthographic", problem_of(scene, thorough))
-        assert len(states) == n_starts
-        for state in states:
-            assert state.motion.shape == (450, 2, 3)
-            assert_calibrated(state.motion, "orthographic")
-            assert camera_error(state.motion, scene.motion) < 0.2
-
-
-def test_affine_start_is_the_rigid_fit():
-    scene = random_scene(noise=0.02)
-    paper = paper_shapes(scene.factors)
-    state = affine_start(problem_of(scene), scene.W, paper)
-    assert_array_equal(state.shapes[0], paper[0])
-    left = 0.0
-    for i, W in enumerate(scene.rows):
-        M = W @ np.linalg.pinv(paper[0])
-        assert_allclose(state.motion[i], M, atol=1e-12)
-        left += np.sum((W - M @ paper[0]) ** 2)
-    assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
-    # Basis shapes are one deviation of their coefficients.
-    for before, after in zip(paper[1:], state.shapes[1:], strict=True):
-        images = state.motion @ before
-        norms = np.sum(images**2, axis=(1, 2))
-        alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
-        assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
+@pytest.mark.parametrize(
+    ("thorough", "n_starts", "largest", "options"),
+    [
+        (True, 3, 0.05, {"amplitude": 0.6}),  # rigid cameras are wrong by 0.3
+        (True, 3, 0.2, {"n_frames": 450, "noise": 0.01}),  # some of them are compared
+        (False, 1, 0.2, {"n_frames": 450, "noise": 0.01}),
+    ],
+)
+def test_best_starts_have_nearly_the_true_cameras(thorough, n_starts, largest, options):
+    scene = random_scene(**options)
+    states = started(scene, "orthographic", problem_of(scene, thorough))
+    assert len(states) == n_starts
+    for state in states:
+        assert state.motion.shape == scene.motion.shape
+        assert_calibrated(state.motion, "orthographic")
+    assert camera_error(states[0].motion, scene.motion) < largest
 
 
 @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
@@ -303,6 +253,9 @@ class TestWholeDistribution:
 
     def test_noise_has_the_coordinates_that_are_left(self):
         problem, state = random_problem()
+        rigid = np.array([1.0, 0.0, 0.0, 0.0])[:, None, None]
+        still = state._replace(shapes=rigid * state.shapes)
+        assert determined(problem, still, None)[1].n_relevant == 1  # at least one
         widths = Widths(np.full(3, 0.1), np.array([1.0, 0.5, 0.0]), np.ones(3), 36)
         precisions = np.tile(10 * np.eye(3), (3, 1, 1))
         plain = MarginalLikelihood(problem.frames, precisions=precisions)(*state)
@@ -313,14 +266,6 @@ class TestWholeDistribution:
         slope = plain.noise_gradient - n_unknowns
         assert found.noise_gradient == pytest.approx(slope)
         assert_allclose(found.shape_gradient, plain.shape_gradient)
-
-    def test_of_a_rigid_object(self):
-        problem, state = random_problem()
-        rigid = np.array([1.0, 0.0, 0.0, 0.0])[:, None, None]
-        still = state._replace(shapes=rigid * state.shapes)
-        _, widths = determined(problem, still, None)
-        assert widths.n_relevant == 1  # at least one
-        assert not (widths.shares > 0.5).any()
 
     def test_all_directions_have_no_noise_without_the_correction(self):
         """The likelihood alone explains each frame by enough directions."""
@@ -417,20 +362,6 @@ def test_depths_of_sheets_that_wave_to_both_sides_are_withheld(seed):
     assert off.sum() < 0.05**2 * np.sum(truth**2)
 
 
-@pytest.mark.slow
-def test_depths_of_a_ring_that_bends_to_both_sides_are_withheld():
-    """Each frame has two depths, and all choices of them are equally likely."""
-    rng, angle = np.random.default_rng(0), 2 * np.pi * np.arange(24) / 24
-    waves = np.stack([np.cos(2 * angle), np.sin(2 * angle)])
-    across, along = 0.2 * rng.normal(size=(2, 150, 2)) @ waves
-    flat = [(1 + along) * np.cos(angle), (1 + along) * np.sin(angle)]
-    for degrees in (15, 60):
-        X, points, _ = seen(np.stack([*flat, across], axis=2), degrees, 0)
-        model = AffineNRSfM(4, camera="weak_perspective", random_state=0)
-        warned("depth of the shapes is not determined", model.fit, X)
-        assert depth_error(model, X, points)[1] > 1.0
-
-
 @pytest.mark.parametrize("reversed_share", [0.0, 0.25, 0.5])
 def test_groups_of_frames_are_turned_back(reversed_share):
     """Shapes that fit frames reversed together explain them, but not the others."""
@@ -491,9 +422,8 @@ def test_noise_of_the_fit_is_the_most_evident():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_beating_wings_are_no_rolling_bird(seed, monkeypatch):
+def test_beating_wings_are_no_rolling_bird(seed):
     """Depths are right or withheld, for a bird from above that turns by 3 degrees."""
-    monkeypatch.setattr(AffineNRSfM, "_limits", LIMITS)
     X, points, _ = seen(bird(140, seed), 3, seed)
     model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
     with warnings.catch_warnings(action="ignore"):

@@ -79,15 +79,12 @@ class TestValue:
             assert each.at().value == pytest.approx(expected, rel=1e-12)
 
     @PENALTIES
-    def test_penalty_adds_the_energies_of_the_basis_shapes(self, scene, penalty):
+    def test_penalty_and_precisions_add_energies_of_basis_shapes(self, scene, penalty):
         energies = sum(np.sum(frame.X**2, axis=0) for frame in frames_of(scene))
-        added = scene.at(penalty).value - scene.at().value
-        assert added == pytest.approx(np.sum(penalty * energies), rel=1e-12)
-
-    def test_precisions_add_the_squares_of_the_basis_shapes(self, scene):
-        added = scene.at(precisions=precisions()).value - scene.at().value
         pairs = zip(precisions(), scene.shapes[1:], strict=True)
-        expected = sum(np.trace(B.T @ P @ B) for P, B in pairs)
+        squares = sum(np.trace(B.T @ P @ B) for P, B in pairs)
+        added = scene.at(penalty, precisions=precisions()).value - scene.at().value
+        expected = np.sum(penalty * energies) + squares
         assert added == pytest.approx(expected, rel=1e-12)
 
     def test_coefficients_and_residual(self, scene):
@@ -97,26 +94,6 @@ class TestValue:
                 assert_allclose(alpha, frame.mean(NOISE), rtol=1e-10, atol=1e-12)
                 residual += frame.square(frame.mean(NOISE), 0.0)
             assert passed.residual == pytest.approx(residual, rel=1e-11)
-
-    def test_is_precise_where_the_noise_is_tiny(self):
-        # Basis shapes that are nearly the same make the equations ill-conditioned.
-        scene = random_scene("complete", n_components=2)
-        scene.shapes[2] = scene.shapes[1] + 1e-5 * scene.shapes[2]
-        c = np.vstack([np.ones(11), np.random.default_rng(1).normal(size=(2, 11))])
-        tracks = np.einsum("ira,kaj,ki->ijr", scene.motion, scene.shapes, c)
-        scene = scene._replace(tracks=tracks)
-        noise = 1e-11
-        expected = 0.0
-        for frame in frames_of(scene):
-            y = frame.y - frame.first
-            stacked = np.vstack([frame.X, np.sqrt(noise) * np.eye(2)])
-            Q, R = np.linalg.qr(stacked)
-            z = np.concatenate([y, [0.0, 0.0]])
-            expected += np.sum((z - Q @ (Q.T @ z)) ** 2) / noise
-            expected += 2 * np.log(np.abs(np.diag(R))).sum()
-            expected += (len(y) - 2) * np.log(noise)
-        rounding = 1e-15 * np.sum(tracks**2) / noise
-        assert scene.at(noise=noise).value == pytest.approx(expected, abs=rounding)
 
     def test_coefficients_are_precise_where_the_noise_is_tiny(self, scene):
         scene.shapes[2] = scene.shapes[1] + 1e-4 * scene.shapes[2]
@@ -128,70 +105,44 @@ class TestValue:
             left += np.sum((frame.X.T @ rest - 1e-14 * alpha) ** 2)
         assert np.sqrt(left) < 2e-13
 
-    def test_counts_of_the_table(self):
-        scene = random_scene("missing")
-        frames = likelihood_of(scene.tracks, scene.weights, 0.0).frames
-        assert frames.n_frames == len(scene.tracks)
-        n_seen, square = frames.totals
-        assert n_seen == np.isfinite(scene.tracks).sum()
-        energy = sum(frame.y @ frame.y for frame in frames_of(scene))
-        assert square == pytest.approx(energy, rel=1e-13)
 
-
-class TestGradient:
-    @PENALTIES
-    @pytest.mark.parametrize(
-        "name", ["shapes", "motion", "shapes near a prior", "shapes of precisions"]
-    )
-    def test_against_differences(self, scene, penalty, name):
-        given = {"prior": shape_prior(scene)} if "prior" in name else {}
-        given |= {"precisions": precisions()} if "precisions" in name else {}
-        name = name.partition(" ")[0]
-        field = {"shapes": "shape_gradient", "motion": "motion_gradient"}[name]
-        gradient = getattr(scene.at(penalty, **given), field)
-        rng = np.random.default_rng(1)
+@PENALTIES
+@pytest.mark.parametrize("kind", ["plain", "prior", "precisions"])
+def test_gradients_are_slopes_of_the_value(scene, penalty, kind):
+    of_kind = {"prior": shape_prior(scene), "precisions": precisions()}
+    given = {kind: of_kind[kind]} if kind in of_kind else {}
+    found, rng = scene.at(penalty, **given), np.random.default_rng(1)
+    gradients = found.shape_gradient, found.motion_gradient, found.noise_gradient
+    for name, gradient in zip(("shapes", "motion", "noise"), gradients, strict=True):
         for _ in range(5):
-            change = rng.normal(size=gradient.shape)
-            step = 1e-5
-            moved = (getattr(scene, name) + s * step * change for s in (1, -1))
-            above, below = (scene._replace(**{name: value}) for value in moved)
-            values = (each.at(penalty, **given).value for each in (above, below))
-            slope = np.subtract(*values) / (2 * step)
+            change, values = rng.normal(size=np.shape(gradient)), []
+            for step in (1e-5, -1e-5):
+                if name == "noise":
+                    other = scene.at(penalty, NOISE * np.exp(step * change), **given)
+                else:
+                    moved = getattr(scene, name) + step * change
+                    other = scene._replace(**{name: moved}).at(penalty, **given)
+                values.append(other.value)
+            slope = np.subtract(*values) / 2e-5
             assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
-
-    @PENALTIES
-    def test_by_the_logarithm_of_the_noise_against_differences(self, scene, penalty):
-        step = 1e-5
-        noises = NOISE * np.exp([step, -step])
-        above, below = (scene.at(penalty, noise).value for noise in noises)
-        gradient = scene.at(penalty).noise_gradient
-        assert gradient == pytest.approx((above - below) / (2 * step), rel=1e-6)
 
 
 @PENALTIES
-class TestCurvature:
-    def test_of_the_shapes_at_each_point(self, scene, penalty):
-        got = scene.at(penalty, precisions=precisions()).shape_curvature
-        n_points = scene.shapes.shape[2]
-        prior = NOISE * block_diag(np.zeros((3, 3)), *precisions())
-        expected = np.tile(prior, (n_points, 1, 1))
-        weights = 1.0 if scene.weights is None else scene.weights
-        weights = np.broadcast_to(weights, scene.tracks.shape[:2])
-        for i, (frame, M) in enumerate(
-            zip(frames_of(scene), scene.motion, strict=True)
-        ):
-            E = second_moments(frame, NOISE, penalty)
-            expected += weights[i][:, None, None] * np.kron(E, M.T @ M)
-        assert got.shape[0] == (1 if scene.weights is None else n_points)
-        assert_allclose(np.broadcast_to(got, expected.shape), expected, rtol=1e-10)
-
-    def test_of_the_cameras(self, scene, penalty):
-        got = scene.at(penalty).motion_curvature
-        for i, frame in enumerate(frames_of(scene)):
-            E = second_moments(frame, NOISE, penalty)
-            A = np.einsum("kl,kaj,lbj->ab", E, frame.shapes, frame.shapes)
-            packed = A[np.triu_indices(3)]
-            assert_allclose(got[:, i], packed, rtol=1e-10, atol=1e-12)
+def test_curvatures_by_dense_matrices(scene, penalty):
+    passed, n_points = scene.at(penalty, precisions=precisions()), scene.shapes.shape[2]
+    prior = NOISE * block_diag(np.zeros((3, 3)), *precisions())
+    expected = np.tile(prior, (n_points, 1, 1))
+    weights = 1.0 if scene.weights is None else scene.weights
+    weights = np.broadcast_to(weights, scene.tracks.shape[:2])
+    for i, (frame, M) in enumerate(zip(frames_of(scene), scene.motion, strict=True)):
+        E = second_moments(frame, NOISE, penalty)
+        expected += weights[i][:, None, None] * np.kron(E, M.T @ M)
+        A = np.einsum("kl,kaj,lbj->ab", E, frame.shapes, frame.shapes)
+        found = passed.motion_curvature[:, i]
+        assert_allclose(found, A[np.triu_indices(3)], rtol=1e-10, atol=1e-12)
+    found = passed.shape_curvature
+    assert found.shape[0] == (1 if scene.weights is None else n_points)
+    assert_allclose(np.broadcast_to(found, expected.shape), expected, rtol=1e-10)
 
 
 def assert_same(got, expected):

@@ -17,6 +17,8 @@ from isa_nrsfm.export import frame_points, frame_poses
 from isa_nrsfm.io import load_model, save_model
 
 F, CENTRE = 1000.0, (640.0, 360.0)
+PERSPECTIVE = {"camera": "perspective", "focal_length": F, "principal_point": CENTRE}
+PERSPECTIVE |= {"random_state": 0}
 WEAK = "The fit is that of weak-perspective cameras"
 AllStarts = with_limits(error_steps=3)
 
@@ -53,9 +55,7 @@ def scene(
 
 def fitted(X, kind=AffineNRSfM, **params):
     """Return a fit with perspective cameras."""
-    given = {"n_components": 2, "camera": "perspective", "random_state": 0}
-    given |= {"focal_length": F, "principal_point": CENTRE}
-    return kind(**given | params).fit(X)
+    return kind(**PERSPECTIVE | {"n_components": 2} | params).fit(X)
 
 
 def frame_error(shapes, truth):
@@ -109,19 +109,15 @@ def test_frames(noisy, tmp_path):
     std = model.reconstruct(X, return_std=True)[1]
     assert 0.0 < std.min() < std.max() < 0.5
     assert model.diagnostics(X).outlier_share == 0.0
+    deviations = np.sqrt(np.trace(model.rotation_covariance(X), axis1=1, axis2=2))
+    assert 0.001 < deviations.mean() < 0.05
+    motion = model.smooth(X).decomposition.motion
+    assert_allclose(motion, model.motion_, rtol=0, atol=0.05 * motion.max())
     save_model(model, tmp_path / "model.npz")
     loaded = load_model(tmp_path / "model.npz")
     assert_array_equal(loaded.transform(X), model.alpha_)
     assert_array_equal(loaded.positions_, model.positions_)
     assert loaded.camera_ == "perspective"
-
-
-def test_rotation_covariance_and_smoothing(noisy):
-    X, model = noisy.X, noisy.model
-    deviations = np.sqrt(np.trace(model.rotation_covariance(X), axis1=1, axis2=2))
-    assert 0.001 < deviations.mean() < 0.05
-    motion = model.smooth(X).decomposition.motion
-    assert_allclose(motion, model.motion_, rtol=0, atol=0.05 * motion.max())
 
 
 @pytest.mark.slow
@@ -342,11 +338,8 @@ def test_outliers(noisy):
 def test_number_of_basis_shapes():
     X = scene(n_frames=60, noise=0.005).X
     assert len(fitted(X, AllStarts, n_components="auto").basis_) == 2
-    trial = AllStarts(
-        camera="perspective", focal_length=F, principal_point=CENTRE, random_state=0
-    )
-    search = AffineNRSfMCV((1, 2), estimator=trial, cv=2).fit(X)
-    assert search.n_components_ == 2
+    trial = AllStarts(**PERSPECTIVE)
+    assert AffineNRSfMCV((1, 2), estimator=trial, cv=2).fit(X).n_components_ == 2
 
 
 test_refusals = refusals_of("perspective", globals())
