@@ -705,7 +705,8 @@ def test_intervals_of_coefficients_hold(loss, camera, rng):
 )
 def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meaning):
     made = make_nonrigid_tracks(40, 24, 2, camera=truth, noise=0.02, random_state=0)
-    model = AffineNRSfM(2, camera=camera, random_state=0).fit(made.data)
+    # Affine images have no end in calibrated cameras.
+    model = AffineNRSfM(2, camera=camera, tol=1.0, random_state=0).fit(made.data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         found = model.diagnostics()
