@@ -198,3 +198,12 @@ def public_methods():
     return {
         name for name in names if not re.search("^_|_$|_request$|_names_out$", name)
     }
+
+
+def test_orthographic_cameras_do_not_scale_frames():
+    # So that one column of the page is enough.
+    settings = {"camera": "orthographic", "refinement": "joint"}
+    scaled, other = (fitted(**settings, **each) for each in ({}, SCALED[1]))
+    for name in units():
+        values = getattr(scaled, name), getattr(other, name)
+        np.testing.assert_array_equal(*values, err_msg=name)
