@@ -1,27 +1,24 @@
 """One BLAS thread inside of decorated functions, and as many as before after them."""
 
-import contextlib
 import signal
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from itertools import count
-from linecache import getline
+from contextlib import suppress
+from functools import partial
 from threading import Barrier
 
 import numpy as np
 import pytest
+from interrupts import interrupted_after
 from layers import slow_after
-from numpy.testing import assert_array_equal, assert_equal
+from numpy.testing import assert_equal
 from refusals import refused
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm.datasets import make_nonrigid_tracks
-
-# Python does not interrupt between the last call of a block and the release of a lock.
-WITH = "with self._lock:"
 
 
 @one_blas_thread()
@@ -44,16 +41,15 @@ def two_threads():
         yield
 
 
-def fail():
-    raise KeyError
+def fail(error=KeyError):
+    raise error
 
 
 @pytest.mark.usefixtures("two_threads")
 def test_threads_are_set_back():
-    assert threads_of_blas() == {1}
-    assert numbers_of_threads() == {2}
-    assert threads_of_blas(threads_of_blas) == {1}
-    assert numbers_of_threads() == {2}
+    for during in (lambda: None, threads_of_blas):
+        assert threads_of_blas(during) == {1}
+        assert numbers_of_threads() == {2}
     refused(None, threads_of_blas, fail, error=KeyError)
     assert numbers_of_threads() == {2}
 
@@ -96,11 +92,8 @@ def test_fits_in_four_threads_leave_the_process_as_it_was(error):
     def work(number):
         model = AffineNRSfM(1, random_state=0, max_iter=2).fit(X)
         if number == 2:
-            refused(None, threads_of_blas, interrupted, error=error)
+            refused(None, threads_of_blas, partial(fail, error), error=error)
         return model.transform(X), model.score(X)
-
-    def interrupted():
-        raise error
 
     before = state()
     with warnings.catch_warnings():
@@ -125,33 +118,18 @@ def test_results_are_the_same_to_the_bit():
             model = AffineNRSfM(3, random_state=0).fit(X)
             of_table = model.transform(X), model.score(X)
             fits.append((model.basis_, model.alpha_, *of_table))
-    for one, two in zip(*fits, strict=True):
-        assert_array_equal(one, two)
+    assert_equal(*fits)
 
 
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("method", ["__enter__", "__exit__"])
 def test_an_interrupt_at_any_line_of_the_limit_leaves_no_user(method):
     file = sys.modules[one_blas_thread.__module__].__file__
-    for n_lines in count():
-        left = n_lines
-
-        def trace(frame, event, arg):
-            nonlocal left
-            if frame.f_code.co_filename != file or frame.f_code.co_name != method:
-                return None
-            if event == "line" and getline(file, frame.f_lineno).strip() != WITH:
-                left -= 1
-                if left < 0:
-                    raise KeyboardInterrupt
-            return trace
-
-        sys.settrace(trace)
-        with contextlib.suppress(KeyboardInterrupt):
-            threads_of_blas()
-        sys.settrace(None)
+    n_lines, ended = 0, []
+    while not ended:
+        n_lines += 1
+        with suppress(KeyboardInterrupt), interrupted_after(n_lines, file, [method]):
+            ended.append(threads_of_blas())
         assert threads_of_blas() == {1}
         assert numbers_of_threads() == {2}
-        if left >= 0:
-            break
-    assert n_lines > 5
+    assert n_lines > 6

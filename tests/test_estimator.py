@@ -13,7 +13,7 @@ from layers import may_not_converge, slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refusals_of, refused
-from scenes import table_of, tracks_of, with_gaps
+from scenes import measurements, table_of, tracks_of, with_gaps
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
@@ -29,6 +29,7 @@ FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
 TABLE = FACES.data
 ONLY_JOINT = "alpha_std_ noise_variance_ camera_noise_ratio_ reliability_".split()
 ONLY_JOINT += ["objective_history_", "gradient_norm_"]
+TABLE_METHODS = ("transform", "decompose", "reconstruct", "reproject")
 
 
 def estimator(n_components=K, **params):
@@ -44,10 +45,9 @@ def fitted(refinement="joint"):
 
 
 def model_tracks(model, motion, translation, alpha):
-    """Return the tracks that the documented formula gives, frame by frame."""
+    """Return the tracks that the documented formula gives."""
     shapes = model.mean_shape_ + np.tensordot(alpha, model.basis_, 1)
-    frames = zip(shapes, motion, translation, strict=True)
-    return np.stack([shape @ M.T + t for shape, M, t in frames])
+    return shapes @ np.swapaxes(motion, 1, 2) + np.asarray(translation)[:, None]
 
 
 def frame_weights(tracks, scale_frames):
@@ -132,45 +132,58 @@ def variant(request):
 # --- attributes ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("refinement", "dtype"), [("joint", np.float32), ("alternating", np.float64)]
-)
-def test_attributes_have_the_documented_shapes_and_types(dtype, refinement):
-    n_components = 4
-    model = estimator(n_components, refinement=refinement).fit(TABLE.astype(dtype))
-    in_type_of_the_table = {
+@pytest.mark.parametrize("refinement", ["joint", "alternating"])
+def test_attributes_and_results_have_the_documented_shapes_and_types(refinement):
+    table = TABLE.astype(np.float32)
+    model = estimator(refinement=refinement).fit(table)
+    reference = fitted(refinement)
+    in_single_precision = {
         "mean_shape_": (N_POINTS, 3),
-        "basis_": (n_components, N_POINTS, 3),
-        "alpha_": (N_FRAMES, n_components),
+        "basis_": (K, N_POINTS, 3),
+        "alpha_": (N_FRAMES, K),
         "motion_": (N_FRAMES, 2, 3),
         "translation_": (N_FRAMES, 2),
         "reference_motion_": (2, 3),
         "reference_translation_": (2,),
     }
+    in_double_precision = {
+        "mode_covariance_": (3 * K, 3 * K),
+        "singular_values_": (3 * K + 3,),
+        "energy_share_": (K,),
+    }
+    numbers = ["inverse_snr_", "rank_floor_"]
     if refinement == "joint":
-        in_type_of_the_table["alpha_std_"] = (N_FRAMES, n_components)
-        assert model.reliability_.shape == (n_components,)
-        for name in ("noise_variance_", "camera_noise_ratio_", "gradient_norm_"):
-            assert isinstance(getattr(model, name), float), name
-        assert model.objective_history_.shape == (model.n_iter_ + 1,)
-        assert np.isfinite(model.objective_history_).all()
+        in_single_precision["alpha_std_"] = (N_FRAMES, K)
+        in_double_precision["reliability_"] = (K,)
+        in_double_precision["objective_history_"] = (model.n_iter_ + 1,)
+        numbers += ["noise_variance_", "camera_noise_ratio_", "gradient_norm_"]
     else:
-        for name in ONLY_JOINT:
-            assert not hasattr(model, name)
-    for name, shape in in_type_of_the_table.items():
-        assert getattr(model, name).shape == shape, name
-        assert getattr(model, name).dtype == dtype, name
-    assert model.mode_covariance_.shape == (3 * n_components, 3 * n_components)
-    assert model.singular_values_.shape == (3 * n_components + 3,)
-    assert model.energy_share_.shape == (n_components,)
-    assert_allclose(model.energy_share_.sum(), 1)
-    assert type(model.inverse_snr_) is float
-    assert type(model.rank_floor_) is float
+        assert not any(hasattr(model, name) for name in ONLY_JOINT)
+    for name, shape in (in_single_precision | in_double_precision).items():
+        found = getattr(model, name)
+        single = name in in_single_precision
+        assert found.shape == shape, name
+        assert found.dtype == (np.float32 if single else np.float64), name
+        assert getattr(reference, name).dtype == np.float64, name
+        assert np.isfinite(found).all(), name
+    assert all(isinstance(getattr(model, name), float) for name in numbers)
     assert type(model.n_iter_) is int
-    assert model.n_components_ == n_components
-    assert model.n_features_in_ == 2 * N_POINTS
+    assert (model.n_components_, model.n_features_in_) == (K, 2 * N_POINTS)
+    assert_allclose(model.energy_share_.sum(), 1)
     assert isinstance(model.isa_, FastISA)
     assert not hasattr(model, "feature_names_in_")
+
+    found = {name: getattr(model, name)(table) for name in TABLE_METHODS}
+    found["images"] = model.inverse_transform(model.alpha_)
+    found["euclidean"] = model.reconstruct(table, camera="orthographic")
+    for name, results in found.items():
+        for each in results if isinstance(results, tuple) else (results,):
+            assert each.dtype == np.float32, name
+    # Cameras and coefficients are computed in double precision from shapes that were
+    # rounded to single precision.
+    assert_array_equal(found["transform"], model.alpha_)
+    assert_allclose(model.alpha_, reference.alpha_, atol=1e-4)
+    assert_allclose(model.inverse_snr_, reference.inverse_snr_, rtol=1e-3)
 
 
 def test_every_attribute_is_documented():
@@ -180,15 +193,6 @@ def test_every_attribute_is_documented():
     text = inspect.getdoc(type(model))
     documented = {name for name in dir(model) if f"\n{name} : " in text}
     assert found == {name for name in documented if name.endswith("_")}
-
-
-def scaled_matrix(model, table):
-    """Return the centred tracks of a table, scaled as in the fit, (2I, J)."""
-    tracks = tracks_of(table, model.layout)
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    weights = frame_weights(tracks, scales_frames(model))
-    scaled = centred * np.sqrt(weights)[:, None, None]
-    return np.vstack(list(scaled.mT))
 
 
 def is_joint(model):
@@ -203,7 +207,8 @@ def is_whole(model):
 @only(loss=["linear"])  # of others outliers have been filled in
 def test_singular_values_and_rank_floor_are_those_of_the_measurement_matrix(variant):
     model, table, _ = variant
-    S = np.linalg.svd(scaled_matrix(model, table), compute_uv=False)
+    W = measurements(tracks_of(table, model.layout), scales_frames(model))
+    S = np.linalg.svd(W, compute_uv=False)
     rank = 3 * model.n_components + 3
     assert_allclose(model.rank_floor_, np.sum(S[rank:] ** 2) / np.sum(S**2), rtol=1e-9)
     # Directions that are not reported explain more than K.
@@ -223,28 +228,20 @@ def test_mode_covariance(variant):
     C = model.mode_covariance_
     assert_allclose(C, C.T, atol=1e-12 * np.abs(C).max())
     assert np.linalg.eigvalsh(C)[0] > -1e-12 * np.trace(C)
-    blocks = [slice(3 * k, 3 * k + 3) for k in range(model.n_components)]
     if is_joint(model):
-        # (1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i), by plain loops.
-        sizes = 1 / np.sqrt(size_weights(model, table))
-        for k, rows in enumerate(blocks):
-            for m, columns in enumerate(blocks):
-                expected = sum(
-                    a[k] * a[m] * M.T @ M
-                    for a, M in zip(
-                        model.alpha_, model.motion_ / sizes[:, None, None], strict=True
-                    )
-                ) / (2 * N_FRAMES)
-                if not scales_frames(model):  # in the units of the table
-                    expected = expected * sizes[0] ** 2
-                tolerance = 1e-10 * np.abs(C).max()
-                assert_allclose(C[rows, columns], expected, atol=tolerance)
+        # (1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i), of frames of size one
+        weights = frame_weights(tracks_of(table, model.layout), scales_frames(model))
+        alpha, motion = model.alpha_, model.motion_
+        parts = weights[:, None] * alpha, alpha, motion, motion
+        expected = np.einsum("ik,im,irc,ird->kcmd", *parts) / (2 * N_FRAMES)
+        tolerance = 1e-10 * np.abs(C).max()
+        assert_allclose(C, expected.reshape(C.shape), atol=tolerance)
         return
     # Block k is (W Q)^T (W Q) / 2I, in other axes, for an orthonormal basis Q of the
     # subspace that the three coordinates of basis shape k span.
-    W = scaled_matrix(model, table)
-    for rows, shape in zip(blocks, model.basis_, strict=True):
-        motion = W @ np.linalg.qr(shape)[0]
+    W = measurements(tracks_of(table, model.layout), scales_frames(model))
+    for k, shape in enumerate(model.basis_):
+        motion, rows = W @ np.linalg.qr(shape)[0], slice(3 * k, 3 * k + 3)
         expected = np.linalg.eigvalsh(motion.T @ motion / len(W))
         assert_allclose(np.linalg.eigvalsh(C[rows, rows]), expected, rtol=1e-6)
 
@@ -276,11 +273,9 @@ def test_coefficients_have_unit_variance_and_energy_decreases(variant):
     assert np.all(np.diff(model.energy_share_) < 0)
     if model.loss != "linear":
         return
-    weights = size_weights(model, table)
-    energy = np.zeros(model.n_components)
-    for alpha, M, weight in zip(model.alpha_, model.motion_, weights, strict=True):
-        images = model.basis_ @ M.T
-        energy += weight * alpha**2 * np.sum(images**2, axis=(1, 2))
+    images = np.einsum("irc,kjc->ikjr", model.motion_, model.basis_)
+    of_frames = model.alpha_**2 * np.sum(images**2, axis=(2, 3))
+    energy = size_weights(model, table) @ of_frames
     # Directions that are not reported have the rest.
     share = model.energy_share_
     assert_allclose(share / share.sum(), energy / energy.sum(), rtol=1e-9)
@@ -391,39 +386,16 @@ def test_inverse_transform_takes_the_mean_view_by_default():
 
     alpha = model.alpha_[:4]
     table = model.inverse_transform(alpha)
-    camera = [model.reference_motion_] * 4
-    position = [model.reference_translation_] * 4
+    mean_view = model.reference_motion_, model.reference_translation_
+    camera, position = ([each] * 4 for each in mean_view)
     expected = model_tracks(model, camera, position, alpha)
     assert_allclose(tracks_of(table), expected, rtol=1e-12)
-    for motion, translation in [
-        (model.reference_motion_, None),
-        (None, model.reference_translation_.tolist()),
-        (camera, model.reference_translation_),
-        (model.reference_motion_, position),
-    ]:
+    for motion, translation in product((None, mean_view[0], camera), (None, position)):
         found = model.inverse_transform(alpha, motion, translation)
         assert_allclose(found, table, rtol=1e-12)
     # The same coefficients come out again: the table is made by the model.
     # The prior draws them a little to zero.
     assert_allclose(model.transform(table), alpha, atol=model.alpha_std_.max())
-
-
-def test_single_precision_is_kept():
-    table = TABLE.astype(np.float32)
-    model = estimator().fit(table)
-    for method in ("transform", "decompose", "reconstruct", "reproject"):
-        result = getattr(model, method)(table)
-        for array in result if isinstance(result, tuple) else (result,):
-            assert array.dtype == np.float32, method
-    assert model.reconstruct(table, camera="orthographic").dtype == np.float32
-    assert model.inverse_transform(model.alpha_).dtype == np.float32
-    assert estimator(refinement=None).fit_transform(table).dtype == np.float32
-    # Cameras and coefficients are computed in double precision from shapes that were
-    # rounded to single precision.
-    assert_array_equal(model.transform(table), model.alpha_)
-    reference = fitted()
-    assert_allclose(model.alpha_, reference.alpha_, atol=1e-4)
-    assert_allclose(model.inverse_snr_, reference.inverse_snr_, rtol=1e-3)
 
 
 def test_large_tables_in_single_precision_have_the_same_noise():
@@ -440,10 +412,7 @@ def test_fit_transform_returns_a_copy_of_alpha(refinement):
     model = estimator(refinement=refinement)
     alpha = model.fit_transform(TABLE)
     assert_array_equal(alpha, model.alpha_)
-    alpha[:] = 0
-    assert np.all(model.alpha_.std(axis=0) > 0.9)
-    if refinement is None:
-        assert model.fit(TABLE, y=None) is model
+    assert not np.shares_memory(alpha, model.alpha_)
 
 
 # --- kinds of tables ----------------------------------------------------------------
@@ -481,16 +450,14 @@ def with_value(value):
     return table
 
 
-@pytest.mark.parametrize("library", ["pandas", "polars"])
-def test_columns_that_are_no_points_are_refused(library):
+def test_columns_that_are_no_points_are_refused():
     table = pd.DataFrame(TABLE, columns=FACES.feature_names)
     for j in range(68):
         table.insert(3 * j + 2, f"likelihood_{j}", 0.9)
-    given = table
-    if library == "polars":
-        given = pl.DataFrame(dict(table.items()))
+    tables = table, pl.DataFrame(dict(table.items()))
     planar, search = estimator(layout="planar"), AffineNRSfMCV([1, 2])
-    for model in (estimator(), planar, search, PseudoInverseNRSfM()):
+    models = estimator(), planar, search, PseudoInverseNRSfM()
+    for model, given in product(models, tables):
         refused(r"not named as the x or y of a point .*landmark", model.fit, given)
     points = landmark_table(table).points
     alphas = [estimator(refinement=None).fit(X).alpha_ for X in (points, TABLE)]
@@ -524,31 +491,14 @@ def test_parameters_set_after_the_fit_change_nothing(changed):
     assert_equal(found, expected)
 
 
-def test_threads_work_on_new_frames_to_the_bit():
-    many = make_nonrigid_tracks(2500, 14, 2, noise=0.02, random_state=0).data
-    model = AffineNRSfM(2, random_state=0).fit(many[:300])
-    alone = model.decompose(many), model.score(many)
-    model.set_params(n_jobs=2)
-    together = model.decompose(many), model.score(many)
-    assert_equal(alone[0], together[0])
-    assert alone[1] == together[1]
-
-
 @pytest.mark.parametrize("refinement", ["joint", "alternating"])
 def test_refinement_that_is_cut_short_says_so(refinement):
-    with pytest.warns(
-        ConvergenceWarning, match="converge in max_iter=1 steps"
-    ) as caught:
-        model = estimator(4, max_iter=1, tol=0, refinement=refinement).fit(TABLE)
+    model = estimator(4, max_iter=1, tol=0, refinement=refinement)
+    with pytest.warns(ConvergenceWarning, match="converge in max_iter=1 st") as caught:
+        model.fit(TABLE)
     assert model.n_iter_ == 1
     assert np.isfinite(model.inverse_snr_)
     assert {warning.filename for warning in caught} == {__file__}
-
-
-def test_layout_warning_points_to_the_caller():
-    with pytest.warns(UserWarning, match="layout='planar' explains") as caught:
-        estimator(refinement=None).fit(table_of(FACES.tracks, "planar"))
-    assert [warning.filename for warning in caught] == [__file__]
 
 
 @may_not_converge
@@ -565,26 +515,20 @@ def test_same_seed_gives_the_same_result_to_the_bit_for_any_n_jobs(isa):
     assert_array_equal(estimator(**options).fit(TABLE).alpha_, first.alpha_)
 
 
-def test_strategy_gets_what_it_leaves_open():
+def test_strategy_keeps_what_it_says_itself_and_gets_the_rest():
     isa = FastISA(n_init=2)
     model = estimator(isa=isa, n_jobs=1, refinement=None).fit(TABLE)
     assert isa.random_state is None  # a clone is fitted
     assert not hasattr(isa, "components_")
     assert isinstance(model.isa_.random_state, int | np.integer)
-    assert model.isa_.n_jobs == 1
-    assert model.isa_.n_init == 2
+    assert (model.isa_.n_jobs, model.isa_.n_init) == (1, 2)
 
-
-def test_strategy_keeps_what_it_says_itself():
-    isa = FastISA(n_init=2, random_state=7)
-    options = {"refinement": None}
-    models = [estimator(isa=clone(isa).set_params(n_jobs=1), n_jobs=2, **options)]
-    models += [estimator(isa=isa, random_state=seed, **options) for seed in (1, None)]
-    alphas = [model.fit(TABLE).alpha_ for model in models]
-    assert all(model.isa_.random_state == 7 for model in models)
-    assert models[0].isa_.n_jobs == 1
-    assert_array_equal(alphas[0], alphas[1])
-    assert_array_equal(alphas[0], alphas[2])
+    options = {"isa": isa.set_params(random_state=7, n_jobs=1), "n_jobs": 2}
+    options["refinement"] = None
+    models = [estimator(random_state=i, **options).fit(TABLE) for i in (0, 1, None)]
+    for model in models:
+        assert (model.isa_.random_state, model.isa_.n_jobs) == (7, 1)
+        assert_array_equal(model.alpha_, models[0].alpha_)
 
 
 class Given(BaseEstimator):
@@ -687,24 +631,24 @@ def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
 )
 def test_mirror_images_fit_as_well(camera, refinement):
     model, truth = calibrated(camera, refinement)
-    mirrored = model.mirrored()
+    mirrored, X = model.mirrored(), truth.data
     depth = np.array([1.0, 1.0, -1.0])
-    assert_array_equal(mirrored.mean_shape_, model.mean_shape_ * depth)
-    assert_array_equal(mirrored.motion_, model.motion_ * depth)
-    assert_array_equal(mirrored.transform(truth.data), model.transform(truth.data))
-    assert_allclose(mirrored.reproject(truth.data), model.reproject(truth.data))
-    assert mirrored.score(truth.data) == pytest.approx(model.score(truth.data))
-    shapes = model.reconstruct(truth.data) * depth
-    assert_allclose(mirrored.reconstruct(truth.data), shapes, atol=1e-9)
+    for name in ("mean_shape_", "motion_"):
+        assert_array_equal(getattr(mirrored, name), getattr(model, name) * depth)
+    assert_array_equal(mirrored.transform(X), model.transform(X))
+    assert_allclose(mirrored.reproject(X), model.reproject(X))
+    assert mirrored.score(X) == pytest.approx(model.score(X))
+    shapes = model.reconstruct(X) * depth
+    assert_allclose(mirrored.reconstruct(X), shapes, atol=1e-9)
     if camera != "affine":
         assert_allclose(np.linalg.det(mirrored.rotations_), 1)
         assert_allclose(mirrored.rotations_, depth[:, None] * model.rotations_ * depth)
     signs = np.tile(depth, len(model.basis_))
     covariance = model.mode_covariance_ * np.outer(signs, signs)
     assert_allclose(mirrored.mode_covariance_, covariance, rtol=0, atol=1e-15)
-    again = mirrored.mirrored()
-    assert_array_equal(again.basis_, model.basis_)
-    assert_array_equal(again.mode_covariance_, model.mode_covariance_)
+    for name in ("basis_", "mode_covariance_"):
+        again = getattr(mirrored.mirrored(), name)
+        assert_array_equal(again, getattr(model, name))
 
 
 @pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
@@ -715,13 +659,13 @@ def test_shapes_of_fitted_frames(camera):
     frames = model.decompose(X)
     reported = model.shapes(frames.alpha.tolist())
     assert_array_equal(model.reconstruct(frames), reported)
-    if camera == "affine":
-        assert_array_equal(model.reconstruct(X), reported)
     assert np.isnan(model.inverse_transform(frames.alpha)[2]).all()
-    wanted = "orthographic" if camera == "affine" else camera
-    found = model.reconstruct(frames, wanted)
-    if camera == "affine":
-        assert_array_equal(found, model.reconstruct(X, wanted))
+    if camera != "affine":
+        assert_array_equal(model.reconstruct(frames, camera), reported)
+        return
+    for wanted in (None, "orthographic"):
+        shapes = model.reconstruct(frames, wanted)
+        assert_array_equal(shapes, model.reconstruct(X, wanted))
 
 
 @pytest.mark.slow
@@ -753,22 +697,6 @@ def test_intervals_of_coefficients_hold(loss, camera, rng):
 
 
 @pytest.mark.parametrize(
-    ("loss", "missing"), slow_after(1, [("linear", 0.3), ("cauchy", 0.0)])
-)
-def test_intervals_contain_the_errors_of_shapes(loss, missing):
-    options = {"camera": "orthographic", "random_state": 0}
-    truth = make_nonrigid_tracks(640, 20, 5, noise=0.02, missing=missing, **options)
-    seen = truth.visible.sum(axis=1) >= 10
-    X, known = truth.data[seen], np.insert(truth.alpha[seen], 0, 1.0, axis=1)
-    model = AffineNRSfM(5, loss=loss, **options).fit(X[:60])
-    # Truth in the basis of the fit
-    found = model.decompose(X[60:])
-    expected = known[60:] @ np.linalg.lstsq(known[60:], found.alpha)[0]
-    errors = (found.alpha - expected) / found.alpha_std
-    assert 0.92 < np.mean(np.abs(errors) < 1.96) < 0.98
-
-
-@pytest.mark.parametrize(
     ("camera", "truth", "least", "most", "meaning"),
     [
         ("affine", "weak_perspective", 1.0, 1.1, "as well as affine ones"),
@@ -777,7 +705,8 @@ def test_intervals_contain_the_errors_of_shapes(loss, missing):
 )
 def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meaning):
     made = make_nonrigid_tracks(40, 24, 2, camera=truth, noise=0.02, random_state=0)
-    model = AffineNRSfM(2, camera=camera, random_state=0).fit(made.data)
+    # Affine images have no end in calibrated cameras.
+    model = AffineNRSfM(2, camera=camera, tol=1.0, random_state=0).fit(made.data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         found = model.diagnostics()

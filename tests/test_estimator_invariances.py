@@ -87,13 +87,10 @@ def variant(request):
 
 
 @pytest.fixture(scope="module")
-def model(tracks, variant):
-    return estimator(variant).fit(table_of(tracks))
-
-
-@pytest.fixture(scope="module")
-def unscaled(tracks, variant):
-    return estimator(variant, scale_frames=False).fit(table_of(tracks))
+def models(tracks, variant):
+    """Return the fits of frames that are scaled, and of those that are not."""
+    X = table_of(tracks)
+    return {scaled: estimator(variant, scaled).fit(X) for scaled in (True, False)}
 
 
 def all_shapes(model):
@@ -130,42 +127,31 @@ def with_changes(tracks, *names):
 
 # Several at once where nothing can hide: none undoes what another does.
 @pytest.mark.parametrize(
-    "changes",
+    ("scale_frames", "changes"),
     [
-        ("image mirrored", "frames moved", "huge unit"),
-        ("axes exchanged", "frames turned", "one frame rescaled", "tiny unit"),
+        (True, ("image mirrored", "frames moved", "huge unit")),
+        (True, ("axes exchanged", "frames turned", "one frame rescaled", "tiny unit")),
+        (False, ("frames moved", "frames turned", "tiny unit")),
     ],
-    ids=", ".join,
+    ids=str,
 )
-def test_coefficients_do_not_depend_on_placement(tracks, model, variant, changes):
-    changed = with_changes(tracks, *changes)
-    assert_models_agree(estimator(variant).fit(table_of(changed)), model)
-    # The model of the first table gives the coefficients of the second one.
-    assert_allclose(model.transform(table_of(changed)), model.alpha_, atol=1e-9)
-
-
-def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, variant):
-    changed = with_changes(tracks, "frames moved", "frames turned", "tiny unit")
-    fitted = estimator(variant, scale_frames=False).fit(table_of(changed))
-    assert_models_agree(fitted, unscaled)
+def test_coefficients_do_not_depend_on_placement(
+    tracks, models, variant, scale_frames, changes
+):
+    changed, model = table_of(with_changes(tracks, *changes)), models[scale_frames]
+    assert_models_agree(estimator(variant, scale_frames).fit(changed), model)
+    if scale_frames:
+        # The model of the first table gives the coefficients of the second one.
+        assert_allclose(model.transform(changed), model.alpha_, atol=1e-9)
 
 
 @may_not_converge
 @pytest.mark.parametrize("refinement", slow_after(1, ["joint", "alternating"]))
 @pytest.mark.parametrize(
     ("name", "n_components"),
-    slow_after(
-        1,
-        [
-            ("missing", 2),
-            ("muct_68", 4),
-            ("ict_bu3dfe_like_68", 9),
-            ("akhter_drink", 3),
-        ],
-    ),
+    slow_after(1, [("missing", 2), ("muct_68", 4), ("ict_bu3dfe_like_68", 9)]),
 )
 def test_default_strategies_are_invariant(load_data, name, n_components, refinement):
-    # Motion capture and missing points, too.
     if name == "missing":
         options = {"noise": 0.02, "missing": 0.2, "random_state": 0}
         original = make_nonrigid_tracks(100, 30, n_components=2, **options).tracks
@@ -177,15 +163,7 @@ def test_default_strategies_are_invariant(load_data, name, n_components, refinem
     model = AffineNRSfM(n_components, refinement=refinement, random_state=0)
     tables = map(table_of, (original, changed[frames][:, points]))
     first, other = (clone(model).fit(table) for table in tables)
-    expected = first.alpha_[frames]
-    if (name, refinement) == ("akhter_drink", "joint"):
-        # The valley of the objective is flat: along it rounding errors grow in the
-        # hundreds of steps, which end by the tolerance, at the same objective.
-        ends = [model.objective_history_[-1] / len(frames) for model in (first, other)]
-        assert abs(ends[0] - ends[1]) < 2 * 0.025  # the tolerance, for each frame
-        assert_allclose(other.alpha_, expected, atol=0.1, rtol=0)
-        return
-    assert_allclose(other.alpha_, expected, atol=ALPHA_TOLERANCE, rtol=0)
+    assert_allclose(other.alpha_, first.alpha_[frames], atol=ALPHA_TOLERANCE, rtol=0)
     assert_shapes_agree(all_shapes(other), all_shapes(first)[:, points])
 
 
@@ -202,23 +180,22 @@ def test_robust_fits_are_invariant(loss):
         ("frames turned", "frames rescaled"),
     ):
         changed = table_of(with_changes(original, *changes))
-        second = clone(first).fit(changed)
-        assert_allclose(second.alpha_, first.alpha_, atol=1e-4, rtol=0)
-        assert_allclose(first.transform(changed), first.alpha_, atol=1e-4, rtol=0)
+        for alpha in (clone(first).fit(changed).alpha_, first.transform(changed)):
+            assert_allclose(alpha, first.alpha_, atol=1e-4, rtol=0)
 
 
 # --- gauge --------------------------------------------------------------------------
 
 
-def third_moment(values):
-    return np.mean(values**3, axis=0)
+def centred_frames(tracks):
+    """Return the frames, centred, and their sizes (n_frames, 1, 1)."""
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    return centred, np.std(centred, axis=(1, 2), keepdims=True)
 
 
 @pytest.mark.parametrize("scale_frames", [True, False])
-def test_x_and_y_are_the_axes_of_the_mean_camera(tracks, model, unscaled, scale_frames):
-    fitted = model if scale_frames else unscaled
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+def test_x_and_y_are_the_axes_of_the_mean_camera(tracks, models, scale_frames):
+    fitted, (centred, sizes) = models[scale_frames], centred_frames(tracks)
     mean = np.mean(fitted.motion_ / (sizes if scale_frames else 1.0), axis=0)
     mean /= np.abs(mean).max()
     assert_allclose(mean[:, 2], 0, atol=1e-10)
@@ -237,15 +214,14 @@ def test_axes_are_principal_axes_where_cameras_have_no_common_view(rng):
     for scale_frames in (True, False):
         options = {"isa": FastISA(n_init=2), "scale_frames": scale_frames}
         fitted = OneStart(2, **options, random_state=0).fit(table_of(turned))
-        centred = turned - turned.mean(axis=1, keepdims=True)
-        sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+        _, sizes = centred_frames(turned)
         motion = fitted.motion_ / (sizes if scale_frames else 1.0)
         mean = np.linalg.svd(motion.mean(axis=0), compute_uv=False)
         assert mean[1] < 0.2 * np.sqrt(np.mean(np.sum(motion**2, axis=(1, 2))) / 2)
         second = np.mean(np.swapaxes(motion, 1, 2) @ motion, axis=0)
         assert_allclose(second, np.diag(np.diag(second)), atol=1e-9 * second.max())
         assert np.all(np.diff(np.diag(second)) < 0)
-        assert np.all(third_moment(fitted.mean_shape_) > 0)
+        assert np.all(np.mean(fitted.mean_shape_**3, axis=0) > 0)
         # The reference camera looks along the third axis.
         reference = fitted.reference_motion_
         assert_allclose(reference[:, 2], 0)

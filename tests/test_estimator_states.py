@@ -9,10 +9,8 @@ import contextlib
 import copy
 import inspect
 import pickle
-import sys
 import tempfile
 import warnings
-from linecache import getline
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +25,9 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from numpy.testing import assert_allclose, assert_array_equal
+from interrupts import interrupted_after
+from layers import slow_after
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from scenes import with_gaps
 from sklearn.base import clone
@@ -110,32 +110,6 @@ def table(kind, seed):
 
 
 @contextlib.contextmanager
-def interrupted_after(n_lines, files):
-    """Raise KeyboardInterrupt in the given line that runs of files with this path."""
-    left = n_lines
-
-    def trace(frame, event, arg):
-        nonlocal left
-        name = frame.f_code.co_filename
-        if not name.startswith(files):
-            return None
-        # Python does not interrupt between a block and the release of its lock.
-        locks = getline(name, frame.f_lineno).strip() == "with self._lock:"
-        if event == "line" and not locks:
-            left -= 1
-            if left == 0:
-                raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        yield
-    finally:
-        sys.settrace(before)
-
-
-@contextlib.contextmanager
 def only_own_warnings():
     """Take warnings of the package as they come, and all others as errors."""
     with warnings.catch_warnings():
@@ -159,6 +133,14 @@ def assert_not_fitted(model, X, folder):
     refused(None, save_model, model, folder / "none.npz", error=NotFittedError)
     assert not any(folder.iterdir())
     assert [name for name in vars(model) if name.endswith("_")] == []
+
+
+def pickled(model):
+    return pickle.loads(pickle.dumps(model))
+
+
+def arrays_of(model):
+    return {name: v for name, v in vars(model).items() if isinstance(v, np.ndarray)}
 
 
 class Estimator(RuleBasedStateMachine):
@@ -190,17 +172,26 @@ class Estimator(RuleBasedStateMachine):
             self.alpha = self.model.transform(X)
         self.attributes = set(vars(self.model))
 
-    @rule(kind_and_seed=tables)
-    def fit(self, kind_and_seed):
-        X = table(*kind_and_seed)
+    def fit_of(self, X, interruption):
+        """Fit a table, and note what is found if the fit ends."""
+        before = vars(self.model).get("_model")
         try:
-            with only_own_warnings():
+            with only_own_warnings(), interruption:
                 self.model.fit(X)
         except np.linalg.LinAlgError:  # a ValueError, but of NumPy
             raise
         except (ValueError, TypeError):  # the former fit is still there
             return
+        except KeyboardInterrupt:
+            # Before its results are set, what was found earlier stays as it was.
+            # After that, it is whole.
+            if vars(self.model).get("_model") is before:
+                return
         self.note_fit(X)
+
+    @rule(kind_and_seed=tables)
+    def fit(self, kind_and_seed):
+        self.fit_of(table(*kind_and_seed), contextlib.nullcontext())
 
     @rule(
         kind_and_seed=tables,
@@ -210,21 +201,7 @@ class Estimator(RuleBasedStateMachine):
         ),
     )
     def interrupt(self, kind_and_seed, lines):
-        X, before = table(*kind_and_seed), vars(self.model).get("_model")
-        try:
-            with only_own_warnings(), interrupted_after(*lines):
-                self.model.fit(X)
-        except KeyboardInterrupt:
-            # Before its results are set, what was found earlier stays as it was.
-            # After that, it is whole.
-            if vars(self.model).get("_model") is not before:
-                self.note_fit(X)
-        except np.linalg.LinAlgError:
-            raise
-        except (ValueError, TypeError):
-            return
-        else:
-            self.note_fit(X)
+        self.fit_of(table(*kind_and_seed), interrupted_after(*lines))
 
     @rule(data=st.data())
     def set_params(self, data):
@@ -235,11 +212,9 @@ class Estimator(RuleBasedStateMachine):
     def clone(self):
         assert_not_fitted(clone(self.model), self.X, self.path)
 
-    @rule(how=st.sampled_from(["pickle", "deepcopy"]))
-    def copy(self, how):
-        model = self.model
-        copied = pickle.loads(pickle.dumps(model)) if how == "pickle" else None
-        self.model = copied or copy.deepcopy(model)
+    @rule(copied=st.sampled_from([copy.deepcopy, pickled]))
+    def copy(self, copied):
+        self.model = copied(self.model)
 
     @precondition(lambda self: self.fitted)
     @rule()
@@ -250,17 +225,8 @@ class Estimator(RuleBasedStateMachine):
         loaded = load_model(path)
         path.unlink()
         assert str(loaded.get_params()) == str(self.model.get_params())
-        found, expected = (
-            {
-                name: value
-                for name, value in vars(model).items()
-                if isinstance(value, np.ndarray)
-            }
-            for model in (loaded, self.model)
-        )
-        assert found.keys() == expected.keys()
-        for name, value in expected.items():
-            assert_array_equal(found[name], value)
+        found, expected = (arrays_of(each) for each in (loaded, self.model))
+        assert_equal(found, expected)
         # A file has the stability in place of the fits of halves that it follows from.
         self.attributes = set(vars(self.model)) - {"_halves", "_stability"}
         self.model = loaded
@@ -291,12 +257,10 @@ class Estimator(RuleBasedStateMachine):
         if hasattr(model, "alpha_"):
             assert_allclose(model.alpha_, alpha, rtol=0, atol=ROUNDING)
         for name, value in vars(model).items():
-            if name.endswith("_") and isinstance(value, np.ndarray | float):
-                value = np.asarray(value)
-                per_frame = value.shape[:1] == shown.shape and value.ndim > 0
-                kept = value[shown] if per_frame else value
-                if kept.dtype.kind == "f" and name != "mirror_certainty_":
-                    assert np.isfinite(kept).all(), name
+            numbers = name.endswith("_") and np.asarray(value).dtype.kind == "f"
+            if numbers and name != "mirror_certainty_":
+                per_frame = np.shape(value)[:1] == shown.shape
+                assert np.isfinite(value[shown] if per_frame else value).all(), name
 
 
 def test_frames_that_are_equal_support_one_basis_shape():
@@ -342,12 +306,6 @@ FEW = settings(max_examples=3, stateful_step_count=4)
 MANY = settings(max_examples=40, stateful_step_count=10)
 
 
-@pytest.mark.parametrize(
-    "examples",
-    [
-        pytest.param(FEW, id="few"),
-        pytest.param(MANY, id="many", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("examples", slow_after(1, [FEW, MANY]), ids=["few", "many"])
 def test_an_estimator_is_fitted_whole_or_not_at_all(examples):
     run_state_machine_as_test(Estimator, settings=examples)

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from layers import may_not_converge, slow_after, with_limits
+from layers import Quick, may_not_converge, slow_after, with_limits
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import images, random_scene, table_of
 from sklearn.base import clone
@@ -20,7 +20,7 @@ REAL_TABLES = (
     "shark_torresani"
 ).split()
 FAST = FastISA(n_init=2)
-AllStarts, OneStart = with_limits(), with_limits(few_frames=0, widths=())
+AllStarts = with_limits()
 FACES = make_face_tracks(60, n_components=2, random_state=0).tracks
 
 
@@ -30,39 +30,28 @@ def real_tracks(load_data, name):
     return tracks[~np.isnan(tracks).any(axis=(1, 2))]
 
 
-def messages_of_fit(table, **params):
-    """Return the texts of the warnings of a fit, but for those of ISA."""
-    params = {"refinement": None} | params
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        AffineNRSfM(1, isa=FAST, random_state=0, **params).fit(table)
-    return [str(w.message) for w in caught if w.category is not ConvergenceWarning]
-
-
 # --- layout -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("right", ["interleaved", "planar"])
 @pytest.mark.parametrize("name", slow_after(3, REAL_TABLES))
 def test_right_layout_gives_no_warning_and_the_wrong_one_does(load_data, name, right):
-    tracks = real_tracks(load_data, name)
     # Planar tables stand in for those whose frames count by size.
-    scale_frames = right == "interleaved"
-    wrong = "planar" if right == "interleaved" else "interleaved"
-    table = table_of(tracks, right)
-    assert messages_of_fit(table, layout=right, scale_frames=scale_frames) == []
-    *_, message = messages_of_fit(table, layout=wrong, scale_frames=scale_frames)
-    assert message.startswith(f"layout='{right}' explains the table much better")
+    options = {"scale_frames": right == "interleaved", "refinement": None, "isa": FAST}
+    table = table_of(real_tracks(load_data, name), right)
+    for layout in ("interleaved", "planar"):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            AffineNRSfM(1, layout=layout, random_state=0, **options).fit(table)
+        found = [str(w.message) for w in caught if w.category is not ConvergenceWarning]
+        if layout == right:
+            assert found == []
+        else:
+            better = f"layout='{right}' explains the table much better"
+            assert found[-1].startswith(better)
 
 
 # --- degenerate tables --------------------------------------------------------------
-
-
-def assert_finite(model):
-    for name, value in vars(model).items():
-        known = name.endswith("_") and name != "mirror_certainty_"
-        if known and isinstance(value, np.ndarray | float):
-            assert np.isfinite(value).all(), name
 
 
 def fitted(tracks, n_components, kind=AffineNRSfM, **params):
@@ -71,11 +60,14 @@ def fitted(tracks, n_components, kind=AffineNRSfM, **params):
     Warnings of ISA's convergence do not count.
     """
     params = {"isa": FAST, "refinement": "alternating", "random_state": 0} | params
+    table = table_of(tracks)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        model = kind(n_components, **params).fit(table_of(tracks))
-    assert_finite(model)
-    table = table_of(tracks)
+        model = kind(n_components, **params).fit(table)
+    for name, value in vars(model).items():
+        known = name.endswith("_") and name != "mirror_certainty_"
+        if known and isinstance(value, np.ndarray | float):
+            assert np.isfinite(value).all(), name
     assert np.isfinite(model.reproject(table)).all()
     assert_allclose(model.transform(table), model.alpha_, atol=1e-9)
     assert model.rank_floor_ <= model.inverse_snr_ + 1e-25
@@ -94,11 +86,10 @@ def jointly(tracks, n_components, repeat=False, **params):
     params = {"refinement": "joint", "isa": None} | params
     model = fitted(tracks, n_components, **params)
     assert_array_equal(model.transform(table_of(tracks)), model.alpha_)
-    if not repeat:
-        return model
-    again = fitted(tracks, n_components, **params)
-    assert_array_equal(again.alpha_, model.alpha_)
-    assert_array_equal(again.basis_, model.basis_)
+    if repeat:
+        again = fitted(tracks, n_components, **params)
+        assert_array_equal(again.alpha_, model.alpha_)
+        assert_array_equal(again.basis_, model.basis_)
     return model
 
 
@@ -193,7 +184,7 @@ def test_joint_refinement_of_the_shark(load_data, k, loss):
     # The refinement has hardly an end where the table determines so little. Most points
     # hardly move: those that do are no outliers.
     tracks = real_tracks(load_data, "shark_torresani")[::8]
-    model = jointly(tracks, k, repeat=k == 1, kind=OneStart, loss=loss, max_iter=100)
+    model = jointly(tracks, k, repeat=k == 1, kind=Quick, loss=loss, max_iter=100)
     assert model.inverse_snr_ < fitted(tracks, k).inverse_snr_
 
 
@@ -213,13 +204,13 @@ def test_joint_refinement_of_repeated_frames(n_different, n_components, seed):
 
 def test_joint_refinement_of_duplicated_points_and_frames():
     tracks = FACES[:40, ::2]
-    once = jointly(tracks, 2, kind=OneStart)
+    once = jointly(tracks, 2)
     # A point that is seen twice tells a little more of the noise, a frame counts twice.
     twice = np.concatenate([tracks, tracks[:, ::-1]], axis=1)
-    points = jointly(twice, 2, kind=OneStart)
+    points = jointly(twice, 2)
     assert_allclose(points.inverse_snr_, once.inverse_snr_, rtol=1e-2)
     assert_allclose(points.basis_[:, 34:], points.basis_[:, 33::-1], atol=1e-6)
-    frames = jointly(np.tile(tracks, (2, 1, 1)), 2, kind=OneStart)
+    frames = jointly(np.tile(tracks, (2, 1, 1)), 2)
     assert_allclose(frames.alpha_[40:], frames.alpha_[:40], atol=1e-9)
     assert_allclose(frames.inverse_snr_, once.inverse_snr_, rtol=1e-2)
 

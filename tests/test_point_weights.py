@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from refusals import refusals_of, warned
 from scenes import table_of, tracks_of, waving_scene, with_gaps
 from sklearn.base import clone
-from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
@@ -46,16 +45,15 @@ class Noisy(NamedTuple):
 
 
 @made_once
-def noisy(seed=0):
+def noisy(seed=0, n_points=N_POINTS):
     """Return a table with 1 percent noise, and 30 percent at two of five points."""
-    scene = make_nonrigid_tracks(N_FRAMES, N_POINTS, K, random_state=seed)
+    scene = make_nonrigid_tracks(N_FRAMES, n_points, K, random_state=seed)
     rng = np.random.default_rng(seed)
-    tracks = scene.tracks
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    size = np.sqrt(np.mean(centred**2, axis=(1, 2)))
-    deviation = np.where(rng.random(tracks.shape[:2]) < 0.4, 0.3, 0.01)
-    noise = (size[:, None] * deviation)[..., None] * rng.normal(size=tracks.shape)
-    X = (tracks + noise).reshape(N_FRAMES, -1)
+    size = np.std(scene.tracks - scene.tracks.mean(axis=1, keepdims=True), axis=(1, 2))
+    deviation = np.where(rng.random((N_FRAMES, n_points)) < 0.4, 0.3, 0.01)
+    noise = rng.normal(size=scene.tracks.shape)
+    tracks = scene.tracks + (size[:, None] * deviation)[..., None] * noise
+    X = tracks.reshape(N_FRAMES, -1)
     return Noisy(X, (0.01 / deviation) ** 2, scene.shapes)
 
 
@@ -64,16 +62,20 @@ def estimator(**params):
 
 
 @made_once
-def fitted(camera="affine", seed=0, weighted=True):
+def fitted(camera="affine", seed=0, weighted=True, n_points=N_POINTS):
     """Return the fit of `noisy`."""
-    X, weights, _ = noisy(seed)
+    X, weights, _ = noisy(seed, n_points)
     weights = weights if weighted else None
     return estimator(camera=camera).fit(X, point_weight=weights)
 
 
 def without_some():
-    """Return weights of one or zero, and the table without the points of zero."""
+    """Return weights of one or zero, and the table without the points of zero.
+
+    No point of row 7 is left.
+    """
     holed = with_gaps(noisy().X, 0.1, 1)
+    holed[7] = np.nan
     return 1.0 * np.isfinite(holed[:, ::2]), holed
 
 
@@ -96,22 +98,21 @@ class TestMeaning:
             with_ones = getattr(found, method)(X, point_weight=ones)
             assert_array_equal(with_ones, getattr(expected, method)(X))
 
-    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
-    def test_points_of_weight_zero_are_missing(self, layout):
+    @pytest.mark.parametrize(
+        ("layout", "ordered"),
+        [("interleaved", np.ascontiguousarray), ("planar", np.asfortranarray)],
+    )
+    def test_points_of_weight_zero_are_missing(self, layout, ordered):
         weights, holed = without_some()
-        X, holed = (table_of(tracks_of(each), layout) for each in (noisy().X, holed))
-        expected = estimator(layout=layout).fit(holed)
-        assert_same_fit(estimator(layout=layout).fit(X, point_weight=weights), expected)
+        tables = (table_of(tracks_of(each), layout) for each in (noisy().X, holed))
+        X, holed, weights = map(ordered, (*tables, weights))
+        model, empty = estimator(layout=layout), "no point is visible in 1 of 60 rows"
+        expected = warned(empty, clone(model).fit, holed)
+        assert_same_fit(warned(empty, model.fit, X, point_weight=weights), expected)
+        assert_array_equal(np.isnan(model.alpha_).any(axis=1), np.arange(60) == 7)
         assert expected.score(X, point_weight=weights) == expected.score(holed)
         alpha = expected.transform(X, point_weight=weights)
         assert_array_equal(alpha, expected.transform(holed))
-
-    def test_memory_order_changes_no_bit(self):
-        X, weights = noisy().X, noisy().weights.copy()
-        weights[3, 5] = 0.0
-        expected = estimator().fit(X, point_weight=weights)
-        X, weights = np.asfortranarray(X), np.asfortranarray(weights)
-        assert_same_fit(estimator().fit(X, point_weight=weights), expected)
 
     def test_weights_of_missing_points_have_no_effect(self):
         table = noisy()
@@ -124,15 +125,6 @@ class TestMeaning:
         with pytest.warns(UserWarning, match="only one of"):
             assert_array_equal(fitted().transform(X, point_weight=weights), expected)
 
-    def test_a_row_of_zeros_is_a_row_without_points(self):
-        weights = noisy().weights.copy()
-        weights[7] = 0.0
-        with pytest.warns(UserWarning, match="no point is visible in 1 of 60 rows"):
-            model = estimator().fit(noisy().X, point_weight=weights)
-        assert_array_equal(np.isnan(model.alpha_).any(axis=1), np.arange(60) == 7)
-        found = model.transform(noisy().X, point_weight=weights)
-        assert_allclose(found, model.alpha_, atol=1e-9)
-
     def test_single_precision_and_scale(self):
         X = noisy().X.astype(np.float32)
         model = estimator().fit(X, point_weight=noisy().weights.astype(np.float32))
@@ -140,16 +132,23 @@ class TestMeaning:
         assert_allclose(model.alpha_, fitted().alpha_, atol=1e-3)
 
 
+WEIGHTED_FITS = [("weak_perspective", 0, N_POINTS), ("affine", 0, 320)]
+WEIGHTED_FITS += [(camera, 1, N_POINTS) for camera in ("weak_perspective", "affine")]
+
+
 class TestAccuracy:
-    @CAMERAS
-    @pytest.mark.parametrize("seed", slow_after(1, range(2)))
-    def test_weighted_fits_have_less_error(self, camera, seed):
-        X, _, shapes = noisy(seed)
-        model, plain = fitted(camera, seed), fitted(camera, seed, weighted=False)
+    @pytest.mark.parametrize(
+        ("camera", "seed", "n_points"), slow_after(2, WEIGHTED_FITS)
+    )
+    @pytest.mark.filterwarnings("ignore:the table has outliers")  # without weights
+    def test_weighted_fits_have_less_error(self, camera, seed, n_points):
+        X, _, shapes = noisy(seed, n_points)
+        model, plain = (fitted(camera, seed, each, n_points) for each in (True, False))
         found = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
         # Errors of 0.4 to 1 % with weights, and 5 to 8 % without them
         error = affine_shape_error(shapes, found)
-        assert error < 0.3 * affine_shape_error(shapes, plain.reconstruct(X))
+        most = 0.3 if n_points == N_POINTS else 0.5
+        assert error < most * affine_shape_error(shapes, plain.reconstruct(X))
 
     def test_noise_hardly_depends_on_the_unit_of_the_weights(self):
         model = estimator().fit(noisy().X, point_weight=0.5 * noisy().weights)
@@ -157,21 +156,6 @@ class TestAccuracy:
         assert model.noise_variance_ == pytest.approx(expected, rel=0.1)
         assert (model.alpha_std_ > 1.2 * fitted().alpha_std_).all()
         assert (model.alpha_std_ < 1.8 * fitted().alpha_std_).all()
-
-    def test_many_points_are_refined_with_weights(self, rng):
-        scene = make_nonrigid_tracks(N_FRAMES, 320, K, random_state=0)
-        deviation = np.where(rng.random((N_FRAMES, 320)) < 0.4, 0.3, 0.01)
-        noise = deviation[..., None] * rng.normal(size=scene.tracks.shape)
-        X = (scene.tracks + noise).reshape(N_FRAMES, -1)
-        weights = (0.01 / deviation) ** 2
-        model = estimator().fit(X, point_weight=weights)
-        alpha = model.transform(X, point_weight=weights)
-        assert_allclose(alpha, model.alpha_, atol=1e-9)
-        found = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
-        # Without weights the noisy points are outliers.
-        plain = warned("the table has outliers", estimator().fit, X).reconstruct(X)
-        error = affine_shape_error(scene.shapes, found)
-        assert error < 0.5 * affine_shape_error(scene.shapes, plain)
 
 
 # Without weights the noise of the points is larger than that of the fit.
@@ -280,20 +264,6 @@ class TestRouting:
         assert_allclose(found, StandardScaler().fit_transform(fitted().alpha_))
         again = pipeline.transform(X, point_weight=weights)
         assert_allclose(again, found, atol=1e-9)
-
-    @pytest.mark.slow
-    def test_grid_search(self):
-        X, weights, _ = noisy()
-        model = estimator().set_fit_request(point_weight=True)
-        model.set_score_request(point_weight=True)
-        search = GridSearchCV(model, {"n_components": [1, 2]}, cv=2)
-        search.fit(X, point_weight=weights)
-        assert search.best_params_ == {"n_components": K}
-        assert_array_equal(search.best_estimator_.alpha_, fitted().alpha_)
-        first, second = slice(0, 30), slice(30, 60)
-        part = estimator().fit(X[second], point_weight=weights[second])
-        expected = part.score(X[first], point_weight=weights[first])
-        assert search.cv_results_["split0_test_score"][1] == expected
 
 
 def with_weight(value, method="fit"):

@@ -167,6 +167,7 @@ def test_threads_make_no_difference(tmp_path, kind):
         assert_array_equal(getattr(one, name), getattr(two, name))
     alpha, again = (in_blocks(each.transform, X, 0.1) for each in (one, two))
     assert_array_equal(alpha, again)
+    assert in_blocks(one.score, X, 0.1) == in_blocks(two.score, X, 0.1)
 
 
 @pytest.mark.parametrize("kind", ["memmap", "dask"])
