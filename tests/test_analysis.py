@@ -10,6 +10,7 @@ from refusals import refusals_of, warned
 from scipy.signal import lfilter
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
+from sklearn.metrics import r2_score
 from sklearn.pipeline import make_pipeline
 from sklearn.utils import shuffle
 
@@ -117,20 +118,19 @@ class TestAssociation:
     def test_eta_squared_is_r_squared_on_the_classes(self):
         alpha, y = related()
         y = np.where(y == 1, 1, rng_of(1).integers(2, 4, len(y)))
-        found = association(alpha, y, n_permutations=9, random_state=0)
+        found = association(alpha, y, **FEW)
         dummies = (y[:, None] == np.unique(y)).astype(float)
-        for k, column in enumerate(alpha.T):
-            r2 = LinearRegression().fit(dummies, column).score(dummies, column)
-            assert found.statistic[k] == pytest.approx(r2)
-        assert found.kind == "classes"
-        assert found.n_frames == len(y)
+        means = LinearRegression().fit(dummies, alpha).predict(dummies)
+        expected = r2_score(alpha, means, multioutput="raw_values")
+        assert_allclose(found.statistic, expected)
+        assert (found.kind, found.n_frames) == ("classes", len(y))
 
     def test_numbers_have_spearmans_correlation(self):
         alpha, _ = related()
         age = np.exp(alpha[:, 0]) + 0.1 * rng_of(3).normal(size=len(alpha))
-        found = association(alpha, age, n_permutations=99, random_state=0)
-        for k, column in enumerate(alpha.T):
-            assert found.statistic[k] == pytest.approx(spearmanr(column, age).statistic)
+        found = association(alpha, age, **FEW)
+        expected = [spearmanr(column, age).statistic for column in alpha.T]
+        assert_allclose(found.statistic, expected)
         assert found.kind == "number"
         assert found.p_value[0] == 0.01
         assert found.p_value[1:].min() > 0.05
@@ -223,11 +223,6 @@ class TestAssociation:
         assert_allclose(found.statistic, expected.statistic)
         assert_allclose(found.p_value, expected.p_value, atol=0.06)
 
-    def test_blocks_of_a_video_in_another_order_are_taken_for_frames(self):
-        order = rng_of(0).permutation(200)
-        alone = least_p(lambda rng: [a[order] for a in video(rng)], n_trials=20)
-        assert np.mean(alone <= 0.05) > 0.5
-
     @pytest.mark.parametrize(("trial", "n_trials"), slow_after(1, EFFECTS))
     def test_real_effects_are_found(self, trial, n_trials):
         assert np.mean(least_p(trial, n_trials) <= 0.05) > 0.8
@@ -258,21 +253,18 @@ class TestAssociation:
         assert_array_equal(found.p_value, expected.p_value)
 
     def test_p_values_step_down(self):
-        rng = rng_of(4)
-        alpha, y = rng.normal(size=(60, 6)), np.arange(60) % 2
+        alpha, y = rng_of(4).normal(size=(60, 6)), np.arange(60) % 2
         found = association(alpha, y, random_state=0)
-        alone = [
-            association(a, y, random_state=0).p_value[0] for a in alpha.T[..., None]
-        ]
-        strength = np.argsort(-found.statistic)
-        assert np.all(np.diff(found.p_value[strength]) >= 0)
+        alone = np.array(
+            [association(a, y, random_state=0).p_value[0] for a in alpha.T[..., None]]
+        )
+        order = np.argsort(-found.statistic)
+        p, alone = found.p_value[order], alone[order]
+        assert np.all(np.diff(p) >= 0)
         # That of the strongest of so many is larger than its own, the weakest has its.
-        assert np.all(found.p_value >= alone)
-        first = alone[strength[0]]
-        expected = 1 - (1 - first) ** 6
-        assert found.p_value[strength[0]] == pytest.approx(expected, rel=0.25)
-        last = max(alone[strength[-1]], found.p_value[strength[-2]])
-        assert found.p_value[strength[-1]] == last
+        assert np.all(p >= alone)
+        assert p[0] == pytest.approx(1 - (1 - alone[0]) ** 6, rel=0.25)
+        assert p[-1] == max(alone[-1], p[-2])
 
     def test_table(self):
         found = association(*related(), **FEW)
@@ -282,27 +274,24 @@ class TestAssociation:
         assert_array_equal(frame["p_value"], found.p_value)
         head, *rows, meaning = str(found).splitlines()
         assert head.split() == ["eta", "squared", "p"]
-        shown = [row.split() for row in rows]
-        assert [row[0] for row in shown] == ["alpha_1", "alpha_2", "alpha_3"]
-        assert_allclose([float(row[2]) for row in shown], found.p_value, atol=5e-4)
+        names, _, shown = zip(*(row.split() for row in rows), strict=True)
+        assert names == ("alpha_1", "alpha_2", "alpha_3")
+        assert_allclose(np.float64(shown), found.p_value, atol=5e-4)
         assert meaning.endswith("p-values: permutations of frames; 120 frames")
-        untested = found._replace(untested="one group", kind="number")
-        assert "rank correlation" in str(untested)
-        assert "no p-values: one group; 120 frames" in str(untested)
+        untested = str(found._replace(untested="one group", kind="number"))
+        assert "rank correlation" in untested
+        assert "no p-values: one group; 120 frames" in untested
 
 
 class TestPredictability:
-    def test_accuracy_of_classes(self):
+    def test_accuracy_of_classes_and_r_squared_of_numbers(self):
         alpha, y = related(effect=8.0)
         scores = predictability(alpha, y, random_state=0)
         assert len(scores) == 5
         assert scores.mean() > 0.98
         assert predictability(alpha[:, :1], y, random_state=0).mean() < 0.7
-
-    def test_r_squared_of_numbers(self):
-        alpha, _ = related()
-        y = alpha @ [1.0, 2.0, 3.0]
-        assert predictability(alpha, y, random_state=0).min() > 0.99
+        numbers = alpha @ [1.0, 2.0, 3.0]
+        assert predictability(alpha, numbers, random_state=0).min() > 0.99
 
     def test_groups_stay_together(self, rng):
         # Each person has coefficients of one's own that tell the label, and no other's.
@@ -329,14 +318,6 @@ class TestWithinGroups:
     alpha = rng_of(0).normal(size=(30, 2))
     people = np.repeat(["a", "b", "c"], 10)
 
-    def test_neutral_frames(self):
-        neutral = np.arange(30) % 10 < 2
-        given = {"groups": self.people, "neutral": neutral}
-        got = WithinGroups().fit_transform(self.alpha, **given)
-        for person in "abc":
-            means = got[(self.people == person) & neutral].mean(axis=0)
-            assert_allclose(means, 0, atol=1e-15)
-
     def test_groups_of_the_fit_keep_their_means_and_new_ones_have_their_own(self):
         step = WithinGroups().fit(self.alpha, groups=self.people)
         rows = [[1.0, 2.0], [3.0, 2.0], [1.0, 2.0]]
@@ -344,20 +325,21 @@ class TestWithinGroups:
         assert_allclose(got[:2], [[-1, 0], [1, 0]])
         assert_allclose(got[2], [1, 2] - self.alpha[10:20].mean(axis=0))
 
-    def test_frames_without_coefficients_stay_without(self):
-        alpha = self.alpha.copy()
+    def test_means_are_those_of_neutral_frames_with_coefficients(self):
+        alpha, neutral = self.alpha.copy(), np.arange(30) % 10 < 4
         alpha[3] = np.nan
-        got = WithinGroups().fit_transform(alpha, groups=self.people)
-        assert np.isnan(got[3]).all()
-        assert_allclose(got[:10][np.arange(10) != 3].mean(axis=0), 0, atol=1e-15)
+        given = {"groups": self.people, "neutral": neutral}
+        got = WithinGroups().fit_transform(alpha, **given)
+        assert_array_equal(np.isnan(got), np.isnan(alpha))
+        for person in "abc":
+            means = np.nanmean(got[(self.people == person) & neutral], axis=0)
+            assert_allclose(means, 0, atol=1e-15)
 
     def test_in_a_pipeline(self):
+        requests, step = {"groups": True, "neutral": False}, WithinGroups()
         with sklearn.config_context(enable_metadata_routing=True):
-            step = WithinGroups()
-            step.set_fit_request(groups=True, neutral=False)
-            step.set_transform_request(groups=True, neutral=False)
-            pipeline = make_pipeline(step)
-            got = pipeline.fit_transform(self.alpha, groups=self.people)
+            step.set_fit_request(**requests).set_transform_request(**requests)
+            got = make_pipeline(step).fit_transform(self.alpha, groups=self.people)
         expected = WithinGroups().fit_transform(self.alpha, groups=self.people)
         assert_allclose(got, expected)
 
@@ -368,30 +350,25 @@ class TestWithinGroups:
         warned(message, step.transform, self.alpha[:1], groups=["new"])
 
 
-class TestBetweenShare:
-    def test_of_a_random_effects_model(self, rng):
-        person = np.repeat(np.arange(400), rng.integers(2, 12, 400))
-        share = np.array([0.0, 0.3, 0.9, 1.0])
-        alpha = np.sqrt(share) * rng.normal(size=(400, 4))[person]
-        alpha += np.sqrt(1 - share) * rng.normal(size=(len(person), 4))
-        found = between_share(alpha, person)
-        assert_allclose(found.between, share, atol=0.05)
-        assert_allclose(found.within, 1 - found.between)
-        assert found.n_groups == 400
-        assert found.n_frames == len(person)
+def test_share_between_groups_of_a_random_effects_model(rng):
+    person = np.repeat(np.arange(400), rng.integers(2, 12, 400))
+    share = np.array([0.0, 0.3, 0.9, 1.0])
+    alpha = np.sqrt(share) * rng.normal(size=(400, 4))[person]
+    alpha += np.sqrt(1 - share) * rng.normal(size=(len(person), 4))
+    found = between_share(alpha, person)
+    assert_allclose(found.between, share, atol=0.05)
+    assert_allclose(found.within, 1 - found.between)
+    assert (found.n_groups, found.n_frames) == (400, len(person))
 
 
-class TestAlignedFrames:
-    def test_position_size_and_turn_are_taken_away(self, rng):
-        shape = rng.normal(size=20) + 1j * rng.normal(size=20)
-        turns = np.exp(1j * rng.normal(size=(9, 1)))
-        frames = turns * rng.uniform(1, 5, (9, 1)) * shape
-        frames = np.ascontiguousarray(frames + rng.normal(size=(9, 1)))
-        got = AlignedFrames().fit_transform(frames.view(float))
-        assert_allclose(got, got[:1].repeat(9, axis=0), atol=1e-9)
-        points = got.view(complex)
-        assert_allclose(points.mean(axis=1), 0, atol=1e-12)
-        assert_allclose(np.mean(np.abs(points) ** 2, axis=1), 1)
+def test_position_size_and_turn_of_frames_are_taken_away(rng):
+    shape = rng.normal(size=20) + 1j * rng.normal(size=20)
+    frames = rng.uniform(1, 5, (9, 1)) * np.exp(1j * rng.normal(size=(9, 1))) * shape
+    frames = np.ascontiguousarray(frames + rng.normal(size=(9, 1)))
+    points = AlignedFrames().fit_transform(frames.view(float)).view(complex)
+    assert_allclose(points, points[:1].repeat(9, axis=0), atol=1e-9)
+    assert_allclose(points.mean(axis=1), 0, atol=1e-12)
+    assert_allclose(np.mean(np.abs(points) ** 2, axis=1), 1)
 
 
 test_refusals = refusals_of("analysis", globals())

@@ -11,8 +11,11 @@ import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose
 from refusals import refusals_of, refused, warned
+from scenes import with_outliers
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
+from sklearn.linear_model import LinearRegression
+from sklearn.model_selection import KFold, cross_val_predict
 from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
@@ -34,25 +37,15 @@ from isa_nrsfm.skeletons import get_skeleton
 TABLE = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
 
 
-def random_coefficients(seed, n_frames=50, n_components=3):
-    """Return coefficients and the mean of their covariances."""
-    rng = np.random.default_rng(seed)
-    alpha = rng.normal(size=(n_frames, n_components)) * [2.0, 1.0, 0.3]
-    factor = rng.normal(size=(n_components, n_components))
-    return alpha, 0.2 * factor @ factor.T
-
-
-def of_known_shapes(alpha, covariance):
-    """Return the reliabilities for shapes that do not follow any noise."""
-    return reliabilities(alpha, covariance, np.zeros(covariance.shape), 1.0)
-
-
 class TestReliabilities:
-    def test_are_shares_of_the_variance(self):
-        alpha, covariance = random_coefficients(0)
-        moment = sum(np.outer(a, a) for a in alpha) / len(alpha)
+    def test_are_shares_of_the_variance(self, rng):
+        # Of coefficients with covariances, for shapes that do not follow any noise
+        alpha = rng.normal(size=(50, 3)) * [2.0, 1.0, 0.3]
+        factor = rng.normal(size=(3, 3))
+        covariance, moment = 0.2 * factor @ factor.T, alpha.T @ alpha / 50
         expected = np.sort(eigvals(moment, moment + covariance).real)[::-1]
-        assert_allclose(of_known_shapes(alpha, covariance), expected, rtol=1e-9)
+        found = reliabilities(alpha, covariance, np.zeros((3, 3)), 1.0)
+        assert_allclose(found, expected, rtol=1e-9)
 
     @pytest.mark.parametrize("gamma", [0.2, 20.0])
     def test_are_correlations_with_the_truth(self, gamma, rng):
@@ -72,6 +65,7 @@ class TestReliabilities:
 
     @pytest.mark.parametrize(("gamma", "above"), [(0.2, 1.05), (2.0, 10.0)])
     def test_by_their_formula_from_the_limit_of_detection_on(self, gamma, above):
+        # Of a random matrix of rank one and noise
         signal = above * np.sqrt(gamma)
         y = (1 + signal) * (1 + gamma / signal)
         share, left = 1 - 1 / y, np.full((1, 1), 1 / y)
@@ -82,25 +76,20 @@ class TestReliabilities:
 
     @pytest.mark.parametrize(
         ("n_frames", "n_points", "n_components"),
-        slow_after(1, [(100, 68, 4), (300, 68, 1), (60, 478, 2)]),
+        slow_after(1, [(100, 68, 4), (300, 68, 1)]),
     )
     @pytest.mark.parametrize("loss", ["linear", "cauchy"])
     def test_noise_of_rigid_objects(self, n_frames, n_points, n_components, loss):
         options = {"noise": 0.01, "random_state": n_frames}
         rigid = make_nonrigid_tracks(n_frames, n_points, 0, **options)
         model = AffineNRSfM(n_components, loss=loss, random_state=0).fit(rigid.data)
-        # With 60 frames the robust weights of one seed of four leave a share of 0.2.
-        few = n_frames == 60 and loss == "cauchy"
-        assert model.reliability_.max() < (0.3 if few else 0.1)
-        if few:
-            return
+        assert model.reliability_.max() < 0.1
         (message,) = model.diagnostics().messages
         assert "no deformation was found" in message
 
-    @pytest.mark.parametrize("n_points", [68, 400])
-    def test_true_shapes_keep_theirs(self, n_points):
+    def test_true_shapes_keep_theirs(self):
         options = {"noise": 0.02, "amplitude": 0.1, "random_state": 0}
-        truth = make_nonrigid_tracks(100, n_points, 2, **options)
+        truth = make_nonrigid_tracks(100, 400, 2, **options)
         model = AffineNRSfM(4, random_state=0).fit(truth.data)
         assert (model.reliability_[:2] > 0.98).all()
         assert (model.reliability_[2:] == 0).all()
@@ -135,11 +124,10 @@ class TestWeakInformation:
         assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
 
     def test_some_of_many_frames_stand_for_all(self, rng):
-        mean_shape, basis = rng.normal(size=(6, 3)), rng.normal(size=(1, 6, 3))
-        motion, alpha = rng.normal(size=(1, 2, 3)), rng.normal(size=(1, 1))
-        one = weak_information(mean_shape, basis, motion, alpha)
-        motion, alpha = np.repeat(motion, 1000, axis=0), np.repeat(alpha, 1000, 0)
-        many = weak_information(mean_shape, basis, motion, alpha)
+        shapes = rng.normal(size=(6, 3)), rng.normal(size=(1, 6, 3))
+        frame = rng.normal(size=(1, 2, 3)), rng.normal(size=(1, 1))
+        one = weak_information(*shapes, *frame)
+        many = weak_information(*shapes, *(each.repeat(1000, axis=0) for each in frame))
         assert_allclose(many, 1000 * one, atol=1e-9 * np.abs(many).max())
 
 
@@ -160,19 +148,18 @@ class TestFigures:
 
     @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
     def test_are_printed_as_sentences_and_a_table(self, model, camera):
-        found = model.diagnostics()
+        found, depth = model.diagnostics(), "not estimated"
         if camera == "affine":
             pose = np.array([np.nan, 0.1])
             found = found._replace(depth_uncertainty=np.nan, pose_share=pose)
             found = found._replace(messages=("Use more frames",))
         fit, of_depth, first, *_, head, one, two = str(found).splitlines()
         assert fit == "fit: not known without the table"
-        depth = f"{100 * found.depth_uncertainty:.3g} % of the depth"
         if camera == "affine":
             assert (first, two.split()[2:4]) == ("Use more frames", ["10", "%"])
-            depth = "not estimated"
         else:
             assert (of_depth, first) == ("depth: GOOD", "no warning")
+            depth = f"{100 * found.depth_uncertainty:.3g} % of the depth"
         assert f"\ndepth error: {depth}\n" in str(found)
         assert f"\ncameras: {found.camera_meaning}\n" in str(found)
         assert head.split() == "effective frames pose share in another fit".split()
@@ -183,14 +170,11 @@ class TestFigures:
 OUTLIERS = "the table has outliers: .* % of the points .* they bend the shapes"
 
 
-def with_outliers(faces, share, seed=0):
+def with_wrong_points(faces, share):
     """Return a table of faces with wrong points, and which points are wrong."""
-    rng = np.random.default_rng(seed)
-    tracks = faces.tracks.copy()
-    wrong = rng.random(tracks.shape[:2]) < share
-    size = tracks.std(axis=1).mean()
-    tracks[wrong] += size * rng.normal(size=(np.count_nonzero(wrong), 2))
-    return tracks.reshape(len(tracks), -1), wrong
+    table = with_outliers(faces.tracks, faces.tracks.std(axis=1).mean(), share)
+    wrong = (table != faces.tracks).any(axis=2)
+    return table.reshape(len(table), -1), wrong
 
 
 class TestPoseShare:
@@ -200,11 +184,8 @@ class TestPoseShare:
         alpha = rng.normal(size=(40, 2))
         alpha[:, 0] += 1 + 5 * R[:, 0, 2]
         predictors = np.hstack([np.ones((40, 1)), R.reshape(40, 9)])
-        error = np.empty_like(alpha)
-        for part in np.arange(40).reshape(5, 8):
-            others = np.delete(np.arange(40), part)
-            fit = np.linalg.lstsq(predictors[others], alpha[others])[0]
-            error[part] = alpha[part] - predictors[part] @ fit
+        fit = LinearRegression(fit_intercept=False)
+        error = alpha - cross_val_predict(fit, predictors, alpha, cv=KFold(5))
         energy = np.sum((alpha - alpha.mean(axis=0)) ** 2, axis=0)
         expected = 1 - np.sum(error**2, axis=0) / energy
         found = pose_share(scales * R[:, :2], alpha)
@@ -253,7 +234,7 @@ class TestOutliers:
     @pytest.mark.slow
     def test_are_named_and_stand_for_what_they_cause(self):
         faces = make_face_tracks(60, n_components=2, noise=0.01, random_state=0)
-        table, wrong = with_outliers(faces, 0.05)
+        table, wrong = with_wrong_points(faces, 0.05)
         model = warned(OUTLIERS, AffineNRSfM(2, random_state=0).fit, table)
         found = model.diagnostics(table)
         (message,) = found.messages
@@ -287,31 +268,29 @@ class TestOutliers:
 
     def test_fit_names_a_few_that_directions_of_the_shapes_explain(self):
         faces = make_face_tracks(40, camera="weak_perspective", random_state=0)
-        table, wrong = with_outliers(faces, 0.02)
+        table, wrong = with_wrong_points(faces, 0.02)
         given = AffineNRSfM("auto", camera="weak_perspective", random_state=0)
         with pytest.warns(match=OUTLIERS) as caught:
             given.fit(table)
         rows = re.search("in the rows (.*), ...:", str(caught[0].message))[1]
         assert wrong[[*map(int, rows.split(", "))]].any(axis=1).all()
-        given.fit(faces.data)
 
     @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
     def test_distances_are_those_of_fits_without_the_point(self, camera):
         options = {"camera": "weak_perspective", "noise": 0.01, "random_state": 0}
         faces = make_face_tracks(40, **options)
         model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
-        rows = faces.tracks[:6].mT.copy()
+        frames, rows = model._model, faces.tracks[:6].mT.copy()
         rows[:, :, 9] += 30.0  # beyond the noise
         rows -= rows.mean(axis=2, keepdims=True)
-        sizes = np.sqrt(np.mean(rows**2, axis=(1, 2)))
-        unit, frames = rows / sizes[:, None, None], model._model.frames
-        found = left_out_distances(frames, unit)
+        sizes = np.sqrt(np.mean(rows**2, axis=(1, 2), keepdims=True))
+        found = left_out_distances(frames.frames, rows / sizes)
         others = np.where(np.arange(rows.shape[2]) == 9, np.nan, rows)
-        left = model._model.decompose(others, deviations=False)
-        shapes = model._model.shapes(left, None, False)
-        images = model._model.images(shapes, left.motion, left.translation)
+        left = frames.decompose(others, deviations=False)
+        shapes = frames.shapes(left, None, False)
+        images = frames.images(shapes, left.motion, left.translation)
         distance = np.linalg.norm(rows.mT - images, axis=2)[:, 9]
-        assert_allclose(sizes * found[:, 9], distance, rtol=0.05)
+        assert_allclose(sizes[:, 0, 0] * found[:, 9], distance, rtol=0.05)
 
 
 def described(share):
@@ -322,15 +301,13 @@ def described(share):
 
 
 def test_a_few_frames_that_determine_a_coefficient_are_named():
-    faces = make_face_tracks(200, n_components=1, noise=0.01, random_state=0)
-    tracks = faces.tracks.copy()
+    tracks = make_face_tracks(200, n_components=1, noise=0.01, random_state=0).tracks
     tracks[:4, 48:68, 1] *= 1.3  # all lips of four frames
     model = AffineNRSfM(2, random_state=0).fit(tracks.reshape(200, -1))
     message = r"a few of the 200 frames determine alpha_. \(.* most row [0-3]\)"
     found = model.diagnostics()
-    effective = found.effective_frames
     assert any(re.match(message, each) for each in found.messages)
-    assert effective.min() < 10 < effective.max()
+    assert found.effective_frames.min() < 10 < found.effective_frames.max()
 
 
 OF_MODEL = {"camera": "weak_perspective", "loss": "linear", "consensus": False}
@@ -409,8 +386,7 @@ def test_the_summary_has_key_figures_and_diagnostics():
 )
 def test_what_is_not_known_is_left_out(params):
     shown = estimator(**params).fit(TABLE)._html_repr()
-    assert "inverse SNR: " in shown
-    assert "cameras: " not in shown
+    assert ("inverse SNR: " in shown, "cameras: " in shown) == (True, False)
 
 
 def test_names_of_columns_are_escaped():

@@ -38,9 +38,9 @@ def some_dynamics(n_walks=0, share=0.3, n_shares=K):
     return Dynamics(rates, walks, np.full(n_shares, logit(share)))
 
 
-def simulated(n_steps, rng, dynamics=None):
+def simulated(n_steps, rng, dynamics):
     """Return parameters (n_steps, p) that follow the dynamics."""
-    F, Q, first, shown = (dynamics or some_dynamics()).matrices()
+    F, Q, first, shown = dynamics.matrices()
     # Signs of an eigendecomposition, the default, differ between machines.
     draw = partial(rng.multivariate_normal, np.zeros(len(F)), method="cholesky")
     z = [draw(first)]
@@ -74,20 +74,15 @@ def observed(x, rng, noise=0.3):
 def alone(x, rng, noise=0.3):
     """Return frames by themselves of coefficients (n_frames, K), without cameras."""
     precision, alpha, _ = observed(x, rng, noise)
-    covariance = np.linalg.inv(precision + np.eye(K))
-    blank = np.zeros((len(x), 2, 3)), np.zeros((len(x), 2))
-    return LinearisedFrames(
-        *blank, alpha, covariance, precision, np.zeros((len(x), K, 2))
-    )
+    covariance, blank = np.linalg.inv(precision + np.eye(K)), np.zeros((len(x), 2, 3))
+    parts = blank, blank[..., 0], alpha, covariance, precision, np.zeros((len(x), K, 2))
+    return LinearisedFrames(*parts)
 
 
 def smooth_people(frames, groups):
     """Smooth frames of cameras without parameters."""
-    camera, time = type(CAMERAS["affine"])(held=True), None
-    limits = {"max_gap": 10, "max_iter": 100, "tol": 0.1}
-    return smooth(
-        frames, FrameMap.identity(K), camera, time, groups, **limits, dtype=float
-    )
+    given = FrameMap.identity(K), type(CAMERAS["affine"])(held=True), None, groups
+    return smooth(frames, *given, max_gap=10, max_iter=100, tol=0.1, dtype=float)
 
 
 def dense_posterior(data, dynamics):
@@ -112,21 +107,19 @@ def dense_posterior(data, dynamics):
     return mean, covariance.reshape(n_steps, n, n_steps, n), likelihood
 
 
-class TestDynamics:
-    def test_coefficients_have_the_matern_covariance(self):
-        dynamics = some_dynamics(n_shares=0)
-        rate = np.exp(dynamics.rates)
-        F, Q, first, shown = dynamics.matrices()
-        assert_allclose(F @ first @ F.T + Q, first, atol=1e-15)
-        across = first
-        for t in range(5):
-            expected = np.diag((1 + rate * t) * np.exp(-rate * t))
-            assert_allclose(shown @ across @ shown.T, expected, atol=1e-15)
-            across = F @ across
-
-    def test_intercepts_keep_variance_one(self):
-        _, _, first, shown = some_dynamics(2).matrices()
-        assert_allclose((shown @ first @ shown.T)[:K, :K], np.eye(K))
+def test_coefficients_have_the_matern_covariance():
+    dynamics = some_dynamics(n_shares=0)
+    rate = np.exp(dynamics.rates)
+    F, Q, first, shown = dynamics.matrices()
+    assert_allclose(F @ first @ F.T + Q, first, atol=1e-15)
+    across = first
+    for t in range(5):
+        expected = np.diag((1 + rate * t) * np.exp(-rate * t))
+        assert_allclose(shown @ across @ shown.T, expected, atol=1e-15)
+        across = F @ across
+    # With intercepts they keep variance one.
+    _, _, first, shown = some_dynamics(2).matrices()
+    assert_allclose((shown @ first @ shown.T)[:K, :K], np.eye(K))
 
 
 @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
@@ -164,20 +157,20 @@ class TestSmoother:
         assert_allclose(got, expected, rtol=1e-3, atol=2e-3)
 
 
-class TestEstimation:
-    @pytest.mark.parametrize("noise", slow_after(1, [0.2, 1e-6]))
-    def test_finds_the_rates(self, noise):
-        rng, true = np.random.default_rng(0), some_dynamics(1, n_shares=0)
-        data = [observed(simulated(100, rng, true), rng, noise) for _ in range(2)]
-        found = estimated_dynamics(data, K, False, 30, 1.0)
-        assert_allclose(found.rates, true.rates, atol=0.5)
-        assert_allclose(found.walks, true.walks, atol=0.5)
+@pytest.mark.parametrize("noise", slow_after(1, [0.2, 1e-6]))
+def test_rates_are_found(noise):
+    rng, true = np.random.default_rng(0), some_dynamics(1, n_shares=0)
+    data = [observed(simulated(100, rng, true), rng, noise) for _ in range(2)]
+    found = estimated_dynamics(data, K, False, 30, 1.0)
+    assert_allclose(found.rates, true.rates, atol=0.5)
+    assert_allclose(found.walks, true.walks, atol=0.5)
 
-    @pytest.mark.parametrize("seed", slow_after(1, range(3)))
-    def test_independent_frames_have_none(self, seed):
-        rng = np.random.default_rng(seed)
-        data = observed(rng.normal(size=(100, K)), rng, 1.0)
-        assert estimated_dynamics([data], K, False, 100, 0.1) is None
+
+@pytest.mark.parametrize("seed", slow_after(1, range(3)))
+def test_independent_frames_have_no_rates(seed):
+    rng = np.random.default_rng(seed)
+    data = observed(rng.normal(size=(100, K)), rng, 1.0)
+    assert estimated_dynamics([data], K, False, 100, 0.1) is None
 
 
 class TestPeople:
@@ -185,8 +178,7 @@ class TestPeople:
         ("n_people", "n_frames"), slow_after(1, [(4, 30), (30, 3)])
     )
     def test_photos_in_any_order_have_no_dynamics(self, n_people, n_frames):
-        rng = np.random.default_rng(0)
-        person = np.repeat(np.arange(n_people), n_frames)
+        rng, person = np.random.default_rng(0), np.arange(n_people).repeat(n_frames)
         x = np.sqrt(0.8) * rng.normal(size=(n_people, K))[person]
         x += np.sqrt(0.2) * rng.normal(size=x.shape)
         assert not len(smooth_people(alone(x, rng), person).time_scales)
@@ -213,11 +205,10 @@ class TestPeople:
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_steps_between_cameras_move_one_to_the_other(name):
-    rng, camera = np.random.default_rng(0), CAMERAS[name]
-    start, end = camera.nearest(
-        rng.normal(size=(2, 20, 2, 3)).reshape(-1, 2, 3)
-    ).reshape(2, 20, 2, 3)
+def test_steps_between_cameras_move_one_to_the_other(name, rng):
+    camera = CAMERAS[name]
+    motion = camera.nearest(rng.normal(size=(40, 2, 3)))
+    start, end = motion[:20], motion[20:]
     moved = camera.moved(frames_last(start), camera.steps_between(start, end).T)
     assert_allclose(moved, frames_last(end), atol=1e-12)
 
@@ -239,12 +230,8 @@ def test_likelihood_of_frames_is_linearised(name, loss):
         M = CAMERAS[name].moved(frames_last(alone.motion[[row]]), x[k:, None])
         return (frames_first(M)[0] @ shape)[:, points]
 
-    T = np.array(
-        [
-            (images(start + step) - images(start - step)) / 2e-4
-            for step in 1e-4 * np.eye(len(start))
-        ]
-    )
+    steps = 1e-4 * np.eye(len(start))
+    T = np.array([images(start + h) - images(start - h) for h in steps]) / 2e-4
     if loss == "linear":
         assert_allclose(alone.slope[row], T.mean(axis=2), rtol=1e-6, atol=1e-6)
         T = (T - T.mean(axis=2, keepdims=True)).reshape(len(T), -1)
@@ -278,17 +265,16 @@ class TestSmooth:
         rng, t = np.random.default_rng(0), np.arange(100)
         shapes = waving_scene(100, 20, [0.1, 0.07])[0].shapes
         turns = np.stack([0.3 * np.sin(0.1 * t), 0.05 * t, 0.2 * np.cos(0.05 * t)], 1)
-        R = Rotation.from_rotvec(turns).as_matrix()
-        truth = shapes @ R.mT
+        truth = shapes @ Rotation.from_rotvec(turns).as_matrix().mT
         tracks = truth[..., :2] + 0.1 * truth.std() * rng.normal(size=(100, 20, 2))
         options = {"camera": "orthographic", "scale_frames": False, "random_state": 0}
-        model = AffineNRSfM(2, **options).fit(tracks.reshape(100, -1))
+        table = table_of(tracks)
+        model = AffineNRSfM(2, **options).fit(table)
 
         def error(fit):
             turned, _ = full_rotations(fit.motion)
             return mean_shape_error_3d(truth, model.reconstruct(fit) @ turned.mT)
 
-        table = tracks.reshape(100, -1)
         smooth = model.smooth(table).decomposition
         assert error(smooth) < 0.7 * error(model.decompose(table))
 
@@ -299,15 +285,6 @@ class TestSmooth:
         assert (found.alpha_std < 0.8 * model.alpha_std_).mean() > 0.9
         rough = np.abs(np.diff(model.alpha_, 2, axis=0)).mean()
         assert np.abs(np.diff(found.alpha, 2, axis=0)).mean() < 0.5 * rough
-
-    def test_shuffled_frames_stay_as_they_are(self):
-        model, table = waving_model()
-        order = np.random.default_rng(1).permutation(len(table))
-        found = model.smooth(table[order])
-        assert found.time_scales.shape == (0,)
-        expected = model.decompose(table[order])
-        assert_allclose(found.alpha, expected.alpha, atol=1e-12)
-        assert_allclose(found.alpha_std, expected.alpha_std, atol=1e-12)
 
     def test_times_or_dates_say_where_the_gaps_are(self):
         model, table = waving_model()
@@ -324,12 +301,14 @@ class TestSmooth:
         assert (expected.alpha_std[63] > expected.alpha_std[30]).all()
 
     def test_times_with_a_zone(self):
-        model, table = waving_model()
         hours = pd.date_range("2024-03-30", periods=60, freq="h", tz="Europe/Berlin")
-        expected = model.smooth(table[:60], time=3600.0 * np.arange(60), **FEW_STEPS)
-        for times in (list(hours.to_pydatetime()), pd.Series(hours), hours):
-            found = model.smooth(table[:60], time=times, **FEW_STEPS)
-            assert_allclose(found.alpha, expected.alpha, atol=1e-12)
+        kinds = list(hours.to_pydatetime()), pd.Series(hours), hours
+        (model, table), seconds = waving_model(), 3600.0 * np.arange(60)
+        expected, *found = (
+            model.smooth(table[:60], time=each, **FEW_STEPS).alpha
+            for each in (seconds, *kinds)
+        )
+        assert_allclose(found, [expected] * 3, atol=1e-12)
 
     def test_uneven_times_are_rounded_but_stay_apart(self):
         model, table = waving_model()
@@ -348,9 +327,11 @@ class TestSmooth:
 
     def test_frames_of_four_points_have_no_weight(self):
         model, table = waving_model()
-        few, blank = table.copy(), table.copy()
-        few.reshape(100, 20, 2)[50, 4:], blank[50] = np.nan, np.nan
-        found, expected = (model.smooth(X, **FEW_STEPS).alpha for X in (few, blank))
+        few, blank = tracks_of(table.copy()), table.copy()
+        few[50, 4:], blank[50] = np.nan, np.nan
+        found, expected = (
+            model.smooth(X, **FEW_STEPS).alpha for X in (table_of(few), blank)
+        )
         assert_allclose(found, expected, atol=1e-12)
 
     def test_groups_without_points_have_no_coefficients(self):
@@ -361,13 +342,18 @@ class TestSmooth:
         assert found.time_scales.shape == (2,)
         assert_allclose(np.isnan(found.alpha).any(axis=1), groups == 1)
 
-    @pytest.mark.parametrize("n_seen", [0, 1])
-    def test_too_few_frames_stay_as_they_are(self, n_seen):
+    @pytest.mark.parametrize("kind", ["shuffled", "one seen", "none seen"])
+    def test_frames_without_dynamics_stay_as_they_are(self, kind):
         model, table = waving_model()
-        few = np.where(np.arange(4)[:, None] < n_seen, table[:4], np.nan)
-        found = model.smooth(few)
+        if kind == "shuffled":
+            table = np.random.default_rng(1).permutation(table)
+        else:
+            n_seen = int(kind == "one seen")
+            table = np.where(np.arange(4)[:, None] < n_seen, table[:4], np.nan)
+        found, expected = model.smooth(table), model.decompose(table)
         assert found.time_scales.shape == (0,)
-        assert_allclose(found.alpha, model.transform(few), atol=1e-12)
+        assert_allclose(found.alpha, expected.alpha, atol=1e-12)
+        assert_allclose(found.alpha_std, expected.alpha_std, atol=1e-12)
 
 
 test_refusals = refusals_of("dynamics", globals())

@@ -7,6 +7,7 @@ What is held here is which modules are loaded. How long a start takes is measure
 import ast
 import importlib
 import os
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,14 +23,9 @@ from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import FORMATS, save_model, write_table
 from isa_nrsfm.isa import FastISA, PooledFastICA
 
-PACKAGES = [
-    "isa_nrsfm",
-    *(
-        f"isa_nrsfm.{folder.name}"
-        for folder in sorted(Path(isa_nrsfm.__file__).parent.iterdir())
-        if folder.is_dir() and folder.name[0].isalpha()
-    ),
-]
+FOLDERS = [each.name for each in pkgutil.iter_modules(isa_nrsfm.__path__) if each.ispkg]
+PACKAGES = ["isa_nrsfm"]
+PACKAGES += [f"isa_nrsfm.{name}" for name in FOLDERS if name[0].isalpha()]
 # Those that wait until a name is used; the other folders import what they hold.
 WAITING = ["isa_nrsfm", "isa_nrsfm.cli", "isa_nrsfm.export", "isa_nrsfm.io"]
 HELP = ["--version", "--help", "fit --help", "export --help"]
@@ -124,57 +120,44 @@ def test_the_estimator_brings_only_what_every_fit_needs():
     packages = {module.partition(".")[0] for module in modules}
     packages -= {*sys.stdlib_module_names, "isa_nrsfm"}
     assert packages <= {"numpy", "scipy", "sklearn", "joblib", "threadpoolctl"}
-    parts = {f"isa_nrsfm.{part}" for part in ("baselines", "cli", "datasets", "io")}
-    parts |= {"isa_nrsfm.metrics", "isa_nrsfm.plotting"}
-    assert not modules & parts
+    parts = "baselines", "cli", "datasets", "io", "metrics", "plotting"
+    assert not modules & {f"isa_nrsfm.{part}" for part in parts}
 
 
 @pytest.mark.slow
 @pytest.mark.subprocess
-def test_folders_of_the_package_need_no_import_of_their_own():
-    code = (
-        "import isa_nrsfm\n"
-        "assert 'isa_nrsfm.io' not in sys.modules\n"
-        "assert isa_nrsfm.io.load_model and isa_nrsfm.isa.FastISA\n"
-    )
-    loaded_by(f"import sys\n{code}", EAGER_IMPORT="")
-
-
-@pytest.mark.slow
-@pytest.mark.subprocess
-def test_all_names_are_imported_at_once_where_that_is_asked_for():
-    loaded = loaded_by("import isa_nrsfm", EAGER_IMPORT="1")
-    assert {"isa_nrsfm._estimator", "isa_nrsfm.io._tables", "sklearn"} <= loaded
+@pytest.mark.parametrize(
+    ("eager", "code"),
+    [
+        ("", "assert isa_nrsfm.io.load_model and isa_nrsfm.isa.FastISA"),
+        ("1", "assert 'isa_nrsfm._estimator' in sys.modules"),
+    ],
+)
+def test_folders_need_no_import_and_names_come_at_once_where_asked(eager, code):
+    loaded_by(f"import sys, isa_nrsfm\n{code}", EAGER_IMPORT=eager)
 
 
 @pytest.mark.subprocess
 def test_what_is_not_installed_is_an_error_of_the_import():
-    code = (
-        "import sys\nsys.modules['sklearn'] = None\nimport isa_nrsfm\ntry:\n"
-        "    from isa_nrsfm import AffineNRSfM\n"
-        "except ModuleNotFoundError as error:\n    assert 'sklearn' in str(error)\n"
-        "else:\n    raise AssertionError\n"
-    )
-    loaded_by(code, EAGER_IMPORT="")
+    code = "import sys, pytest\nsys.modules['sklearn'] = None\nimport isa_nrsfm\n"
+    code += "with pytest.raises(ModuleNotFoundError, match='sklearn'):\n"
+    loaded_by(f"{code}    from isa_nrsfm import AffineNRSfM", EAGER_IMPORT="")
 
 
 @pytest.mark.subprocess
 def test_transform_loads_no_more_than_it_uses(tmp_path):
     faces = make_face_tracks(40, n_components=1, random_state=0)
     table = pd.DataFrame(faces.data, columns=faces.feature_names)
-    save_model(AffineNRSfM(1, random_state=0).fit(table), tmp_path / "model.npz")
-    write_table(table.iloc[:1], tmp_path / "one.csv")
     files = tmp_path / "model.npz", tmp_path / "one.csv"
+    save_model(AffineNRSfM(1, refinement=None, random_state=0).fit(table), files[0])
+    write_table(table.iloc[:1], files[1])
     run = command("transform", *files, "-o", tmp_path / "alpha.csv")
     loaded = loaded_by(run, EAGER_IMPORT="")
     assert (tmp_path / "alpha.csv").exists()
     assert "isa_nrsfm._estimator" in loaded
-    not_used = {
-        *"matplotlib scipy.io sklearn.decomposition sklearn.model_selection".split(),
-        *(f"isa_nrsfm.{name}" for name in ("cli._fit", "export._viewer")),
-        "isa_nrsfm.plotting._views",
-    }
-    assert not loaded & not_used
+    not_used = "matplotlib scipy.io sklearn.decomposition sklearn.model_selection "
+    not_used += "isa_nrsfm.cli._fit isa_nrsfm.export._viewer isa_nrsfm.plotting._views"
+    assert not loaded & {*not_used.split()}
 
 
 def test_the_help_has_the_formats_and_defaults_that_there_are(capsys):
