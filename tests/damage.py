@@ -32,39 +32,33 @@ def pick(rng, choices):
 
 def damaged_items(items, rng, other):
     """Return a list of which an item is lost, repeated, exchanged or another one."""
-    items = list(items)
     here, there = (int(i) for i in rng.integers(len(items), size=2))
-    match int(rng.integers(5)):
-        case 0:
-            del items[here]
-        case 1:
-            items.insert(there, items[here])
-        case 2:
-            items[here], items[there] = items[there], items[here]
-        case _:
-            items[here] = other(items[here])
-    return items
+    lost = [*items[:here], *items[here + 1 :]]
+    repeated = [*items[:there], items[here], *items[there:]]
+    exchanged = [*items]
+    exchanged[here], exchanged[there] = items[there], items[here]
+    kind = int(rng.integers(5))
+    if kind < 3:
+        return (lost, repeated, exchanged)[kind]
+    return [*items[:here], other(items[here]), *items[here + 1 :]]
 
 
 def damaged_bytes(content, rng):
     """Return bytes of which some are changed, lost or repeated."""
-    data = bytearray(content)
-    start = int(rng.integers(len(data)))
+    start = int(rng.integers(len(content)))
     stop = start + int(rng.integers(1, 40))
-    match int(rng.integers(6)):
-        case 0:
-            data[start] ^= 1 << int(rng.integers(8))
-        case 1:  # a byte that many formats give a meaning
-            data[start] = pick(rng, b',"\n\r\t{}[]:-e. x\x00\xff\x80\x7f')
-        case 2:
-            del data[start:]
-        case 3:
-            del data[start:stop]
-        case 4:
-            data[start:start] = data[start:stop]
-        case 5:  # a length or a number of rows that is far too large
-            data[start : start + 4] = b"\xff\xff\xff\x7f"[: len(data) - start]
-    return bytes(data)
+    rest = content[start:]
+    changes = [
+        lambda: bytes([rest[0] ^ (1 << int(rng.integers(8)))]) + rest[1:],
+        # A byte that many formats give a meaning
+        lambda: bytes([pick(rng, b',"\n\r\t{}[]:-e. x\x00\xff\x80\x7f')]) + rest[1:],
+        lambda: b"",
+        lambda: content[stop:],
+        lambda: content[start:stop] + rest,
+        # A length or a number of rows that is far too large
+        lambda: b"\xff\xff\xff\x7f"[: len(rest)] + rest[4:],
+    ]
+    return content[:start] + pick(rng, changes)()
 
 
 def damaged_text(text, rng, separator=","):

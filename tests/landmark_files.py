@@ -490,6 +490,7 @@ WRITERS = {
         write_mesh(d / "a.csv", TRACKS, shares=False), ".txt"
     ),
     "table-blanks": to("a.txt", saved, TABLE, sep=" "),
+    "table-parquet": to("a.parquet", saved, TABLE),
     "table-folder": to("a", write_each, ".csv", write_row),
     "table": to("a.csv", write_mesh, TRACKS, shares=False),
 }
