@@ -91,17 +91,17 @@ def check_cells(points, failed, path, separator):
     table = io.read_table(path)
     assert table.shape == (len(points), len(header)) == (len(rows) - 1, len(rows[0]))
     assert all(header.count(name) == 1 for name in points)
-    columns = dict(zip(header, zip(*rows[1:], strict=True), strict=True))
-    for name, values in zip(points, points.to_numpy().T, strict=True):
+    cells = [*zip(*rows[1:], strict=True)]
+    for name, texts in zip(table, cells, strict=True):
+        if table[name].dtype != np.float64:
+            assert list(table[name]) == list(texts)
+    for name in points:
+        texts, values = cells[header.index(name)], points[name].to_numpy()
         for i in np.flatnonzero(~failed):
-            cell = columns[name][i].strip()
-            if cell.lower() in MISSING:
+            if (text := texts[i].strip()).lower() in MISSING:
                 assert np.isnan(values[i])
             else:
-                assert float(cell) == values[i]
-    for name in table.columns.difference(points.columns):
-        if table[name].dtype != np.float64:
-            assert list(table[name]) == list(columns[name])
+                assert float(text) == values[i]
 
 
 MISSING = {"", "na", "nan", "n/a", "null", "none", "<na>", "#n/a"}
