@@ -222,17 +222,6 @@ def write_sleap(
     return path
 
 
-def write_sleap_csv(path, tracks, scores):
-    """Write an analysis table, with a row for each of two tracks in a frame."""
-    names = [f"{node}.{word}" for node in BODYPARTS for word in ("score", "x", "y")]
-    values = np.concatenate([scores[..., None], tracks], axis=3)
-    table = pd.DataFrame(values.reshape(2 * len(tracks), -1), columns=names)
-    for place, name in enumerate(["track", "frame_idx", "instance.score"]):
-        table.insert(place, name, 0.5)
-    frames = np.repeat(range(len(tracks)), 2)
-    return saved(path, table.assign(track=[*"ab"] * len(tracks), frame_idx=frames))
-
-
 def coco_annotations(tracks, *, names=BODYPARTS, image=None):
     """Return annotations of one person an image; missing points have zeros."""
     seen = ~np.isnan(tracks).any(axis=2)

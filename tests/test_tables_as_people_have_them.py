@@ -273,6 +273,7 @@ def of_version(name, wrap, nobody=None):
 
 
 NAMED = [("{part}_{axis}", word) for word in ("p", "Likelihood", "visibility")]
+NAMED += [("{part}.{axis}", "score")]  # a table of SLEAP
 NUMBERED = [("p{part}_{axis}", "conf"), ("joint {part}.{axis}", "likelihood")]
 NUMBERED += [("{axis}{part}", "c"), ("{axis}_{part}", "score")]
 
@@ -285,13 +286,14 @@ def test_confidences_are_read_beside_sizes(tmp_path, begins, name, word, size):
     table = table_of(name, POINTS / (1000 if size else 1), parts)
     names = [name.format(part=part, axis=word) for part in parts]
     table = table.join(pd.DataFrame(score, columns=names))
+    table["instance.score"] = 0.5
     path = files.saved(tmp_path / "a.csv", table)
     given = {"format": "mediapipe", "image_size": (1000, 1000)} if size else {}
     found = read_landmarks(path, min_confidence=0.5, **given)
     assert_array_equal(found.confidence, score)
     expected = np.where(score[..., None] < 0.5, np.nan, POINTS)
     assert_allclose(files.tracks_of(found), expected)
-    assert found.frames.empty
+    assert list(found.frames) == ["instance.score"]
     if word == "p":
         options = [*size, "--format", "mediapipe" if size else "table"]
         told = re.search(r"(\S+) % of .* with (--min.*)", begins(path, *options))
