@@ -16,8 +16,9 @@ from landmark_files import BODYPARTS, TRACKS
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
+from sklearn.base import clone
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.datasets import make_body_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import (
     from_mediapipe,
@@ -31,6 +32,8 @@ N = 40
 POINTS = make_nonrigid_tracks(N, 8, 1, noise=0.01, random_state=0).data
 POINTS = (100 * POINTS + 400).round(2).reshape(N, 8, 2)
 FLAT = TRACKS.reshape(12, -1)
+PLAIN_NAME = "{part}_{axis}"
+UNREFINED = AffineNRSfM(1, isa=FastISA(n_init=1), refinement=None)
 
 
 def table_of(name, tracks, parts=BODYPARTS):
@@ -43,7 +46,7 @@ def comma_table(folder, suffix, sign, numbers):
     """Write a table of numbers with commas, and of other columns: path, numbers."""
     cells, path = np.resize(numbers.split(), (3, 16)), folder / f"a{suffix}"
     others = {"note, or text": ["1,2", "3,4", "a, b"], "p": ["0,5", "27,5", "3"]}
-    table = table_of("{part}_{axis}", cells).assign(**others)
+    table = table_of(PLAIN_NAME, cells).assign(**others)
     return files.saved(path, table, sep=sign), cells.ravel(), others
 
 
@@ -51,8 +54,7 @@ def commas_in(folder, suffix, sign, numbers, by=""):
     """Read a table in which commas stand for another sign: what is told."""
     path, cells, others = comma_table(folder, suffix, sign, numbers)
     text, found = warnings_of(read_landmarks, path)
-    for name, values in others.items():
-        assert list(found.frames[name]) == values
+    assert found.frames.to_dict("list") == others
     expected = [float(cell.replace(",", by)) for cell in cells]
     assert_array_equal(found.points.to_numpy().ravel(), expected)
     return text
@@ -87,10 +89,10 @@ def individuals_asked(folder, name, who):
     pd.concat(tables, axis=1).assign(**dict.fromkeys(scores, 1.0)).to_csv(path)
     asked = str(refused(None, read_landmarks, path))
     rows = read_landmarks(path, individuals=re.search("individuals='(.*?)'", asked)[1])
-    assert list(rows.frames["individual"]) == [*who] * N
-    assert list(rows.frames["frame"]) == list(np.repeat(range(N), 2))
-    for i in (0, 1):
-        assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
+    expected = {"frame": list(np.repeat(range(N), 2)), "individual": [*who] * N}
+    assert rows.frames[[*expected]].to_dict("list") == expected
+    pair = np.stack([POINTS, POINTS + 300], axis=1)
+    assert_array_equal(rows.points, pair.reshape(2 * N, -1))
     assert (rows.confidence == 1).all(axis=None)
     error = str(refused(None, told_of_fit, path, " ".join([*QUICK, "1"])))
     options = re.findall(r"use (--\w+ .*?)(?:\. |$)", error)
@@ -108,7 +110,7 @@ def reads_all_parts(name, first, second):
     """Return whether all points of one body are read, if need be as advised."""
     parts = [name.format(a, b) for a, b in product([*first], [*second])]
     parts += [part.replace("L", "R") for part in parts if name[0] == "L"]
-    table, options = table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts), {}
+    table, options = table_of(PLAIN_NAME, np.ones((2, len(parts), 2)), parts), {}
     if name[:3] != "{1}" and isinstance(second, range) and len(second) > 6:
         told = str(refused("more than one set", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
@@ -116,7 +118,7 @@ def reads_all_parts(name, first, second):
 
 
 FEW = [f"{part}_{mouse}" for mouse in "12" for part in BODYPARTS[:5]]
-FEW = table_of("{part}_{axis}", np.ones((2, len(FEW), 2)), FEW)
+FEW = table_of(PLAIN_NAME, np.ones((2, len(FEW), 2)), FEW)
 
 
 def test_individuals_of_few_points_are_not_fitted():
@@ -134,7 +136,7 @@ def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
     text, found = warnings_of(read_landmarks, path)
     assert ("decimal commas" in text) == (decimal == ",")
     pd.testing.assert_frame_equal(found.frames, expected.frames)
-    table = table_of("{part}_{axis}", POINTS).assign(age=np.arange(N) % 7 + 0.5)
+    table = table_of(PLAIN_NAME, POINTS).assign(age=np.arange(N) % 7 + 0.5)
     path = tmp_path / "b.csv"
     table.assign(t=0.04 * np.arange(N)).to_csv(path, sep=";", decimal=decimal)
     found = fits(path, *QUICK, 1, "--label", "age", "--time", "t").report
@@ -151,7 +153,8 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     text, plain = warnings_of(read_landmarks, path)
     assert told in text
     for camera in ("affine", "weak_perspective"):
-        text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points.values)
+        model = clone(UNREFINED).set_params(camera=camera)
+        text, _ = warnings_of(model.fit, plain.points.values)
         assert (told in text) == (camera != "affine")
     for columns in ({}, {"columns": "LM#_x,LM#_y"}):
         size = {"format": "mediapipe", "image_size": (1280, 720)}
@@ -165,7 +168,7 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
 def test_codes_of_missing_points_in_python(tmp_path, code):
     tracks, hidden = POINTS.copy(), np.random.default_rng(1).random((N, 8)) < 0.1
     tracks[hidden] = code
-    table, fit = table_of("{part}_{axis}", tracks), AffineNRSfM(1, refinement=None).fit
+    table, fit = table_of(PLAIN_NAME, tracks), UNREFINED.fit
     table.to_csv(tmp_path / "a.csv", index=False)
     for call, X in ((read_landmarks, tmp_path / "a.csv"), (fit, table.to_numpy())):
         text, _ = warnings_of(call, X)
@@ -179,7 +182,7 @@ def test_times_in_names_of_images_are_told(tmp_path, begins):
     times = pd.Series(pd.date_range("2023-05-01 12:00:30", periods=N, freq="2s"))
     names = times.dt.strftime("%Y-%m-%d_%H-%M-%S.png")
     path = tmp_path / "a.csv"
-    table_of("{part}_{axis}", POINTS).assign(image=names).to_csv(path, index=False)
+    table_of(PLAIN_NAME, POINTS).assign(image=names).to_csv(path, index=False)
     told = begins(path, "--fps", 25)
     option, form = re.search("use (--time .*) with a (--.*), such as", told).groups()
     form = [form, re.search(r"such as (\S*),", told)[1]]
@@ -220,35 +223,22 @@ def categories(folder, known=1):
     return files.write_json(folder / "a.json", content)
 
 
-def test_parts_are_chosen_as_messages_say(tmp_path, begins, fails):
-    folder = tmp_path / "people"
-    both = {"pose": files.SCORED[0], "face": files.SCORED[1]}
-    files.write_openpose(folder, [[files.openpose_person(**both)]] * 9)
-    told = fails("fit", folder, *QUICK, "1", "-o", tmp_path / "b")
-    part, option = re.search(r"of (\w+), .* with (--part)", told).groups()
-    begins(folder, option, part)
-
-
 @pytest.mark.parametrize("kind", ["track_id", "name", "idx", "person_id"])
 def test_who_is_who_is_a_column_of_images_in_their_order(tmp_path, kind):
     who, path = [5, 6, 7] * 4, tmp_path / "a.json"
     content = files.coco_annotations(TRACKS)
+    for row, each in zip(content["annotations"], who, strict=True):
+        row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
     if kind == "idx":  # results of AlphaPose, in the order of texts
-        rows = [
-            files.RESULTS[i] | {"image_id": f"{i}.jpg", kind: [w]}
-            for i, w in enumerate(who)
-        ]
-        content = sorted(rows, key=lambda row: row["image_id"])
-    elif kind == "person_id":  # OpenPose
-        path = tmp_path / "people"
-        path.mkdir()
-        for i, each in enumerate(who):
-            person = files.openpose_person(pose=files.SCORED[i]) | {kind: [each]}
+        known = [{"image_id": f"{i}.jpg", kind: [w]} for i, w in enumerate(who)]
+        content = [a | b for a, b in zip(files.RESULTS, known, strict=True)]
+        content.sort(key=lambda row: row["image_id"])
+    if kind == "person_id":  # OpenPose
+        (path := tmp_path / "people").mkdir()
+        for i, (row, each) in enumerate(zip(files.SCORED, who, strict=True)):
+            person = files.openpose_person(pose=row) | {kind: [each]}
             files.write_json(path / f"cam01.{i}.json", {"people": [person]})
     else:
-        for row, each in zip(content["annotations"], who, strict=True):
-            row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
-    if kind != "person_id":
         files.write_json(path, content)
     found = read_landmarks(path)
     assert list(found.frames[kind]) == who
@@ -313,15 +303,14 @@ def test_pressures_and_velocities_are_no_confidences(
     names = [f"{word}_{j}" for j in range(8)]
     points.join(pd.DataFrame(values, columns=names)).to_csv(path, index=False)
     found = read_landmarks(path)
-    if values.max() > 2 or values.min() < 0:
-        assert found.confidence is None
-        assert list(found.frames) == names
-        told = fails("fit", path, "-o", tmp_path, "--min-confidence", 0.5)
-        assert f"{word}_0, ... are no confidences" in told
-    else:
+    if values.max() <= 2 and values.min() >= 0:
         assert_array_equal(found.confidence, values)
         if numbers == "0.5":  # the same of all points
             assert begins(path) == ""
+        return
+    assert (found.confidence, list(found.frames)) == (None, names)
+    told = fails("fit", path, "-o", tmp_path, "--min-confidence", 0.5)
+    assert f"{word}_0, ... are no confidences" in told
 
 
 def labelled(xy, **known):
@@ -355,8 +344,8 @@ def test_predictions_of_mmpose(tmp_path):
     instances = [files.VIDEO[0]["instances"] * 2, []]
     content = [{"frame_id": i, "instances": each} for i, each in enumerate(instances)]
     found = read_landmarks(files.write_json(tmp_path / "a.json", content))
-    assert list(found.frames["frame"]) == [0, 0, 1]
-    assert list(found.frames["person"].fillna(-1)) == [0, 1, -1]
+    expected = {"frame": [0, 0, 1], "person": [0, 1, -1]}
+    assert found.frames[[*expected]].fillna(-1).to_dict("list") == expected
     assert list(found.failed) == [False, False, True]
 
 
@@ -379,7 +368,7 @@ def test_shares_are_warned_of_once_with_a_way_that_works(tmp_path, read_format):
     tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
     shares = (tracks - tracks.min((0, 1))) / np.ptp(tracks, axis=(0, 1)) * 0.8 + 0.1
     path = tmp_path / "a.csv"
-    table_of("{part}_{axis}", shares, range(17)).to_csv(path, index=False)
+    table_of(PLAIN_NAME, shares, range(17)).to_csv(path, index=False)
     if read_format == "coco":
         names, path = [f"p{j}" for j in range(17)], tmp_path / "a.json"
         files.write_json(path, files.coco_annotations(shares, names=names))
@@ -391,12 +380,12 @@ def test_shares_are_warned_of_once_with_a_way_that_works(tmp_path, read_format):
         line = line.replace("WIDTH, HEIGHT", "640, 480")
         exec(line, scope := {"landmarks": landmarks})
         assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
-    fit = AffineNRSfM(1, camera="weak_perspective", refinement=None).fit
+    fit = clone(UNREFINED).set_params(camera="weak_perspective").fit
     assert "shares" not in warnings_of(fit, landmarks.points)[0]
     assert "shares" in warnings_of(fit, landmarks.points.to_numpy())[0]
 
 
-PLAIN = table_of("{part}_{axis}", POINTS).assign(
+PLAIN = table_of(PLAIN_NAME, POINTS).assign(
     age=np.arange(N),
     who=["anna", "bob"] * (N // 2),
     day=[f"0{1 + i % 9}.02.20{10 + i}" for i in range(N)],
