@@ -31,6 +31,7 @@ from isa_nrsfm.io import (
 N = 40
 POINTS = make_nonrigid_tracks(N, 8, 1, noise=0.01, random_state=0).data
 POINTS = (100 * POINTS + 400).round(2).reshape(N, 8, 2)
+TIMES = 0.04 * np.arange(N)
 FLAT = TRACKS.reshape(12, -1)
 PLAIN_NAME = "{part}_{axis}"
 UNREFINED = AffineNRSfM(1, isa=FastISA(n_init=1), refinement=None)
@@ -136,9 +137,8 @@ def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
     text, found = warnings_of(read_landmarks, path)
     assert ("decimal commas" in text) == (decimal == ",")
     pd.testing.assert_frame_equal(found.frames, expected.frames)
-    table = table_of(PLAIN_NAME, POINTS).assign(age=np.arange(N) % 7 + 0.5)
-    path = tmp_path / "b.csv"
-    table.assign(t=0.04 * np.arange(N)).to_csv(path, sep=";", decimal=decimal)
+    table = table_of(PLAIN_NAME, POINTS).assign(age=np.arange(N) % 7 + 0.5, t=TIMES)
+    table.to_csv(path, sep=";", decimal=decimal)
     found = fits(path, *QUICK, 1, "--label", "age", "--time", "t").report
     assert found["labels"][0]["kind"] == "number"
 
@@ -148,20 +148,37 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
     tracks = tracks - tracks.min((0, 1))
     shares = tracks / tracks[..., 1].max() / seen * [0.53, 0.95] + [0.2, 0.02]
-    path, told = tmp_path / "pose.csv", "like fractions of the width and height"
-    table_of("LM{part}_{axis}", shares, range(17)).to_csv(path, index=False)
+    table, told = (
+        table_of("LM{part}_{axis}", shares, range(17)),
+        "fractions of the width",
+    )
+    path = files.saved(tmp_path / "pose.csv", table)
     text, plain = warnings_of(read_landmarks, path)
     assert told in text
+    assert "mediapipe" in text
     for camera in ("affine", "weak_perspective"):
-        model = clone(UNREFINED).set_params(camera=camera)
-        text, _ = warnings_of(model.fit, plain.points.values)
+        fit = clone(UNREFINED).set_params(camera=camera).fit
+        text, _ = warnings_of(fit, plain.points.to_numpy())
         assert (told in text) == (camera != "affine")
+    assert told not in warnings_of(fit, plain.points)[0]  # which was told before
     for columns in ({}, {"columns": "LM#_x,LM#_y"}):
         size = {"format": "mediapipe", "image_size": (1280, 720)}
         text, found = warnings_of(read_landmarks, path, **size, **columns)
         assert not text
-        points = found.points.to_numpy().reshape(shares.shape)
-        assert_allclose(points, shares * [1280, 720])
+        assert_allclose(files.tracks_of(found), shares * [1280, 720])
+
+
+def test_shares_of_annotations_are_warned_of_with_a_way_that_works(tmp_path):
+    tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
+    shares = (tracks - tracks.min((0, 1))) / np.ptp(tracks, axis=(0, 1)) * 0.8 + 0.1
+    content = files.coco_annotations(shares, names=map(str, range(17)))
+    path = files.write_json(tmp_path / "a.json", content)
+    text, landmarks = warnings_of(read_landmarks, path)
+    assert "If they have another unit, such as metres, ignore this" in text
+    assert "mediapipe" not in text
+    line = re.search("In Python: (.*?), and", text)[1]
+    exec(line.replace("WIDTH, HEIGHT", "640, 480"), scope := {"landmarks": landmarks})
+    assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
 
 
 @pytest.mark.parametrize("code", [(0, 0), (-310, -205)])
@@ -181,11 +198,10 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
 def test_times_in_names_of_images_are_told(tmp_path, begins):
     times = pd.Series(pd.date_range("2023-05-01 12:00:30", periods=N, freq="2s"))
     names = times.dt.strftime("%Y-%m-%d_%H-%M-%S.png")
-    path = tmp_path / "a.csv"
-    table_of(PLAIN_NAME, POINTS).assign(image=names).to_csv(path, index=False)
-    told = begins(path, "--fps", 25)
-    option, form = re.search("use (--time .*) with a (--.*), such as", told).groups()
-    form = [form, re.search(r"such as (\S*),", told)[1]]
+    table = table_of(PLAIN_NAME, POINTS).assign(image=names)
+    path = files.saved(tmp_path / "a.csv", table)
+    form = "use (--time .*) with a (--.*), such as (.*?),"
+    option, *form = re.search(form, begins(path, "--fps", 25)).groups()
     begins(path, *option.split(), *form)
 
 
@@ -361,28 +377,6 @@ def test_curves_of_specimens_are_left_out(tmp_path):
     message, path = "1 points of curves are left out", specimens(tmp_path)
     found = warned(message, read_landmarks, path).frames
     assert list(found.iloc[3]) == ["skull 3.jpg", "3", "0.05"]
-
-
-@pytest.mark.parametrize("read_format", ["coco", "table"])
-def test_shares_are_warned_of_once_with_a_way_that_works(tmp_path, read_format):
-    tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
-    shares = (tracks - tracks.min((0, 1))) / np.ptp(tracks, axis=(0, 1)) * 0.8 + 0.1
-    path = tmp_path / "a.csv"
-    table_of(PLAIN_NAME, shares, range(17)).to_csv(path, index=False)
-    if read_format == "coco":
-        names, path = [f"p{j}" for j in range(17)], tmp_path / "a.json"
-        files.write_json(path, files.coco_annotations(shares, names=names))
-    text, landmarks = warnings_of(read_landmarks, path)
-    assert "If they have another unit, such as metres, ignore this" in text
-    assert ("mediapipe" in text) == (read_format == "table")
-    if read_format == "coco":
-        line = re.search("In Python: (.*?), and", text)[1]
-        line = line.replace("WIDTH, HEIGHT", "640, 480")
-        exec(line, scope := {"landmarks": landmarks})
-        assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
-    fit = clone(UNREFINED).set_params(camera="weak_perspective").fit
-    assert "shares" not in warnings_of(fit, landmarks.points)[0]
-    assert "shares" in warnings_of(fit, landmarks.points.to_numpy())[0]
 
 
 PLAIN = table_of(PLAIN_NAME, POINTS).assign(
