@@ -231,18 +231,6 @@ def test_sleap_axes_are_those_that_the_file_tells(order, named, tmp_path):
     assert_array_equal(np.isnan(tracks_of(sure)[..., 0]), lost)
 
 
-def test_points_without_a_confidence_are_kept(tmp_path):
-    scores = np.full((12, 1, 8), np.nan)
-    scores[0] = 0.1
-    given = {"scores": scores, "names": ()}
-    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
-    landmarks = read_landmarks(path, min_confidence=0.5)
-    assert "individual" not in landmarks.frames
-    lost = np.isnan(tracks_of(landmarks)).all(axis=(1, 2))
-    assert_array_equal(lost, np.arange(12) == 0)
-    assert not landmarks.failed.any()
-
-
 def annotations(folder):
     """Read persons of images in another order, and an image without anybody."""
     tracks = HIDDEN.copy()
@@ -356,17 +344,6 @@ def test_movement_datasets_are_read_by_the_names_of_their_axes(given):
     assert_array_equal(found[..., ::-1], tracks_of(landmarks))
 
 
-def test_edges_of_sleap(tmp_path):
-    nodes = files.BODYPARTS
-    edges = [(nodes[0], nodes[2]), (nodes[1], nodes[2]), (nodes[2], nodes[3])]
-    for shape in (edges, list(zip(*edges, strict=True))):
-        given = {"names": ["a"], "edges": shape}
-        path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
-        found = read_landmarks(path).skeleton
-        assert found.edges.tolist() == [[0, 2], [1, 2], [2, 3]]
-        assert found.point_names == tuple(nodes)
-
-
 def skeleton_in(path, *options):
     """Return the name of the skeleton of a file, or None."""
     return getattr(read_landmarks(path, *options).skeleton, "name", None)
@@ -411,6 +388,9 @@ def sleap(folder, tracks=TRACKS[:, None], **given):
     return files.write_sleap(folder / "a.h5", tracks, **given)
 
 
+EDGES = [("snout", "ear_R"), ("ear_L", "ear_R"), ("ear_R", "neck")]
+# The scores of one individual, which are unknown in all frames but the first one.
+SURE = np.where(np.arange(12)[:, None, None] == 0, 0.1, np.full((12, 1, 8), np.nan))
 FACE, HAND = (
     landmarker_result(f"{part}_landmarks", TRACKS[:1]) for part in ("face", "hand")
 )
