@@ -88,15 +88,13 @@ def mesh(folder, tracks=MESH, **given):
     return files.write_mesh(folder / "a.csv", tracks, **given)
 
 
-def test_pts_files_are_read_in_the_order_of_names(tmp_path):
-    folder = files.write_pts(tmp_path / "faces", TRACKS)
-    (folder / "image_000.pts").rename(folder / "last.PTS")
-    (folder / "._image_001.pts").write_text("not one")
-    (folder / "inner").mkdir()
-    landmarks = read_landmarks(folder)
-    assert_array_equal(tracks_of(landmarks), np.roll(TRACKS, -1, axis=0))
-    assert list(landmarks.frames["file"][-2:]) == ["image_011.pts", "last.PTS"]
-    assert landmarks.confidence is None
+def images(folder):
+    """Read files of points beside other files."""
+    files.write_pts(folder / "faces", TRACKS)
+    (folder / "faces" / "image_000.pts").rename(folder / "faces" / "last.PTS")
+    (folder / "faces" / "._image_001.pts").write_text("not one")
+    (folder / "faces" / "inner").mkdir()
+    return read_landmarks(folder / "faces")
 
 
 def points_of_openpose(n_points, confidence=0.5, seed=1):

@@ -122,12 +122,6 @@ FEW = [f"{part}_{mouse}" for mouse in "12" for part in BODYPARTS[:5]]
 FEW = table_of(PLAIN_NAME, np.ones((2, len(FEW), 2)), FEW)
 
 
-def test_individuals_of_few_points_are_not_fitted():
-    told = str(refused("Their 5 points are too few", landmark_table, FEW))
-    columns = re.search("columns='(.*?)'", told)[1]
-    assert landmark_table(FEW, columns=columns).points.shape == FEW.shape
-
-
 @pytest.mark.parametrize("decimal", slow_after(1, [",", "."]))
 def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
@@ -356,27 +350,12 @@ def test_labels_of_sleap_io():
     refused("instances of one skeleton; got ", from_sleap_io, frames)
 
 
-def test_predictions_of_mmpose(tmp_path):
-    instances = [files.VIDEO[0]["instances"] * 2, []]
-    content = [{"frame_id": i, "instances": each} for i, each in enumerate(instances)]
-    found = read_landmarks(files.write_json(tmp_path / "a.json", content))
-    expected = {"frame": [0, 0, 1], "person": [0, 1, -1]}
-    assert found.frames[[*expected]].fillna(-1).to_dict("list") == expected
-    assert list(found.failed) == [False, False, True]
-
-
 def specimens(folder, points="LM=8"):
     """Return a file of specimens, one of which has a curve, and their points."""
     path = files.write_tps(folder / "a.tps", TRACKS)
     text = path.read_text().replace("ID=3", "CURVES=1\nPOINTS=1\n1 1\nID=3")
     path.write_text(text.replace("LM=8", points))
     return path
-
-
-def test_curves_of_specimens_are_left_out(tmp_path):
-    message, path = "1 points of curves are left out", specimens(tmp_path)
-    found = warned(message, read_landmarks, path).frames
-    assert list(found.iloc[3]) == ["skull 3.jpg", "3", "0.05"]
 
 
 PLAIN = table_of(PLAIN_NAME, POINTS).assign(
@@ -415,13 +394,22 @@ def points_as_advised(table):
     try:
         return landmark_table(table).points.to_numpy()
     except ValueError as error:
-        columns = str(error).rpartition("give columns, such as ")[2].strip("'")
+        columns = re.search("columns(?:=|, such as )'(.*?)'", str(error))[1]
         return landmark_table(table, columns=columns).points.to_numpy()
 
 
 def boxed(name, box):
     """Return a table of points and of boxes around them."""
     return table_of(name, TRACKS).assign(**dict.fromkeys(box.split(), 5.0))
+
+
+def crowd(folder):
+    """Return two persons in an image, and an image of nobody, of MMPose."""
+    people = files.VIDEO[0]["instances"] * 2
+    content = [
+        {"frame_id": i, "instances": each} for i, each in enumerate([people, []])
+    ]
+    return files.write_json(folder / "a.json", content)
 
 
 LETTERS = files.scene(2, 26)  # also w and h
