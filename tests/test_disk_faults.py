@@ -96,17 +96,13 @@ def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
     assert n_failed >= 4  # opened, written, on the disk, closed
 
 
-def test_what_is_no_file_is_written_to(tmp_path):
-    pipe = tmp_path / "pipe.csv"
+def test_pipes_are_written_to_and_links_and_permissions_stay(tmp_path):
+    pipe, path, link = (tmp_path / f"{name}.csv" for name in ("pipe", "a", "link"))
     os.mkfifo(pipe)
     reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     write_table(TABLE, pipe)
     assert os.read(reading, 1000).startswith(b"x0,y0\n")
     os.close(reading)
-
-
-def test_links_and_permissions_stay(tmp_path):
-    path, link = tmp_path / "a.csv", tmp_path / "link.csv"
     path.write_bytes(OLD)
     path.chmod(0o640)
     link.symlink_to("a.csv")
@@ -161,15 +157,13 @@ class TestKeepFrames:
                 assert (after, leftovers(folder)) == (before, []), operations
 
     def test_fits_never_meet(self, tmp_path, table):
-        first = self.estimator(tmp_path / "kept").fit(table)
-        alpha = first.alpha_.copy()
-        first_again = self.estimator(tmp_path / "kept").fit(table)
-        second = self.estimator(tmp_path / "kept").fit(table[:20])
-        names = {m.alpha_.filename for m in (first, first_again, second)}
+        first, again, second = (self.estimator(tmp_path / "kept") for _ in range(3))
+        kept = first.fit(table).alpha_
+        alpha = kept.copy()
+        again.fit(table)
+        assert len(second.fit(table[:20]).alpha_) == 20
+        names = {model.alpha_.filename for model in (first, again, second)}
         assert len(names) == 3
-        assert_array_equal(first.alpha_, alpha)
-        assert len(second.alpha_) == 20
-        kept = first.alpha_
         first.fit(table[:20])
         assert_array_equal(kept, alpha)
 
@@ -183,15 +177,13 @@ class TestKeepFrames:
         for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
             error = refused(None, self.estimator(bad).fit, table, error=OSError)
             assert error.filename == str(bad)
-        model = self.estimator(tmp_path / "no")
-        with disk_faults(tmp_path / "no", "disk full", 2) as faults:
-            error = refused(None, model.fit, table, error=OSError)
-        assert error.filename == str(tmp_path / "no")
-        assert not (tmp_path / "no").exists(), faults.operations
-
-    def test_folders_of_a_fit_that_fails_are_removed(self, tmp_path, table):
-        refused("points", self.estimator(tmp_path / "new" / "kept").fit, table[:, :6])
-        assert list(tmp_path.iterdir()) == []
+        bad = tmp_path / "no"
+        with disk_faults(bad, "disk full", 2) as faults:
+            error = refused(None, self.estimator(bad).fit, table, error=OSError)
+        assert (error.filename, bad.exists()) == (str(bad), False), faults.operations
+        # Neither are there folders of fits that fail.
+        refused("points", self.estimator(bad / "kept").fit, table[:, :6])
+        assert os.listdir(tmp_path) == ["file"]
 
 
 @pytest.fixture
@@ -268,50 +260,45 @@ class TestFit:
         link.symlink_to("mine.txt")
         assert fit(landmarks, folder, 2, "--no-figures") == 0
         assert (mine.read_bytes(), os.readlink(link)) == (OLD, "mine.txt")
+        assert set(os.listdir(folder)) == FILES | {"mine.txt", "link"}
         mine.unlink()
         link.unlink()
-        assert set(os.listdir(folder)) == FILES
         assert whole_run(readable(folder)) == 2
 
     def test_what_is_no_plain_file_is_not_replaced(self, fails, landmarks, tmp_path):
-        folder = tmp_path / "out"
-        folder.mkdir()
-        (folder / "alpha.csv").symlink_to(landmarks)
-        err = fails("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
-        assert "alpha.csv would be overwritten" in err or "overwritten by" in err
-        (folder / "alpha.csv").unlink()
-        (folder / "alpha.csv").mkdir()
-        message = fails("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
-        assert f"{folder / 'alpha.csv'}: is no plain file" in message
-        assert os.listdir(folder) == ["alpha.csv"]
+        alpha = tmp_path / "out" / "alpha.csv"
+        alpha.parent.mkdir()
+        alpha.symlink_to(landmarks)
+        argv = ["fit", landmarks, "-o", alpha.parent, "-k", 1, "--no-figures"]
+        assert "would be overwritten" in fails(*argv)
+        alpha.unlink()
+        alpha.mkdir()
+        assert f"{alpha}: is no plain file" in fails(*argv)
+        assert os.listdir(alpha.parent) == ["alpha.csv"]
 
 
-class TestRunsThatAreMixed:
-    def warned(self, succeeds, folder, landmarks, model="model.npz"):
-        new = ["-o", folder / "new.csv", "--force"]
+def test_models_beside_reports_of_another_run_are_told(
+    succeeds, folder, landmarks, tmp_path
+):
+    def told(model="model.npz"):
+        new = ["-o", tmp_path / "new.csv", "--force"]
         err = succeeds("transform", folder / model, landmarks, *new)[1]
-        new[1] = folder / "new.npz"
+        new[1] = tmp_path / "new.npz"
         assert succeeds("export", folder / model, *new)[1] == err
         return err
 
-    def test_files_of_one_run(self, succeeds, folder, landmarks):
-        assert self.warned(succeeds, folder, landmarks) == ""
-        for absent in ("alpha.csv", "report.json"):
-            (folder / absent).unlink()
-            assert self.warned(succeeds, folder, landmarks) == ""
-        # Reports of something else
-        for text in ("", "[]", '{"sha256": 3}', '{"sha256": {"../a": "b"}}'):
-            (folder / "report.json").write_text(text)
-            assert self.warned(succeeds, folder, landmarks) == ""
-
-    def test_files_of_two_runs(self, succeeds, folder, landmarks, tmp_path):
-        assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
-        for name in ("alpha.csv", "model.npz"):
-            shutil.copy(tmp_path / "other" / name, folder)
-        said = self.warned(succeeds, folder, landmarks)
-        assert f"{folder / 'report.json'} is of another run than model.npz" in said
-
-    def test_a_model_elsewhere(self, succeeds, folder, landmarks):
-        shutil.copy(folder / "model.npz", folder / "copy.npz")
-        (folder / "model.npz").write_bytes(OLD)
-        assert self.warned(succeeds, folder, landmarks, "copy.npz") == ""
+    shutil.copy(folder / "model.npz", folder / "copy.npz")
+    assert told() == ""
+    (folder / "alpha.csv").unlink()
+    assert told() == ""
+    assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
+    for name in ("alpha.csv", "model.npz"):
+        shutil.copy(tmp_path / "other" / name, folder)
+    assert f"{folder / 'report.json'} is of another run than model.npz" in told()
+    assert told("copy.npz") == ""
+    # Reports of something else, or none
+    for text in ("", "[]", '{"sha256": 3}', '{"sha256": {"../a": "b"}}'):
+        (folder / "report.json").write_text(text)
+        assert told() == ""
+    (folder / "report.json").unlink()
+    assert told() == ""
