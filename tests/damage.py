@@ -167,15 +167,13 @@ def damaged_archive(content, rng):
     """Return an archive of arrays of which one is damaged, lost or another."""
     arrays = dict(np.load(io.BytesIO(content)))
     name, other = pick(rng, [*arrays]), pick(rng, [*arrays])
-    match int(rng.integers(6)):
-        case 0:
-            del arrays[name]
-        case 1:
-            arrays[name] = arrays[other]
-        case 2:
-            arrays["x"] = np.zeros(3)
-        case _:
-            arrays[name] = damaged_array(arrays[name], rng)
+    kind = int(rng.integers(6))
+    if kind == 0:
+        del arrays[name]
+    elif kind == 2:
+        arrays["x"] = np.zeros(3)
+    else:
+        arrays[name] = arrays[other] if kind == 1 else damaged_array(arrays[name], rng)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     return buffer.getvalue()
@@ -224,20 +222,22 @@ def damaged_parquet(content, rng):
     table = pq.read_table(io.BytesIO(content))
     place, n = int(rng.integers(table.num_columns)), table.num_rows
     name, said = table.column_names[place], table.schema.metadata or {b"pandas": b"{}"}
-    values = None, "1.5", True, b"x", [1.0], {"a": 1}, 2**62, np.inf, 1e308, np.nan
-    match int(rng.integers(6)):
-        case 0:
-            table = table.remove_column(place)
-        case 1:
-            table = table.append_column(name, table.column(place))
-        case 2:
-            table = table.slice(0, int(rng.integers(n)))
-        case 3:
-            said = {key: damaged_bytes(text, rng) for key, text in said.items()}
-            table = table.replace_schema_metadata(said)
-        case _:
-            table = table.set_column(place, name, pa.array(n * [pick(rng, values)]))
-            table = table.replace_schema_metadata(said)
+
+    def changed_metadata():
+        changed = {key: damaged_bytes(text, rng) for key, text in said.items()}
+        return table.replace_schema_metadata(changed)
+
+    def other_column():
+        values = None, "1.5", True, b"x", [1.0], {"a": 1}, 2**62, np.inf, 1e308, np.nan
+        column = pa.array(n * [pick(rng, values)])
+        return table.set_column(place, name, column).replace_schema_metadata(said)
+
+    changes = [
+        lambda: table.remove_column(place),
+        lambda: table.append_column(name, table.column(place)),
+        lambda: table.slice(0, int(rng.integers(n))),
+        *(changed_metadata, other_column, other_column),
+    ]
     buffer = io.BytesIO()
-    pq.write_table(table, buffer)
+    pq.write_table(pick(rng, changes)(), buffer)
     return buffer.getvalue()
