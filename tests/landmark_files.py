@@ -28,14 +28,13 @@ def tracks_of(landmarks):
     assert min(values.shape) > 0
     assert (points.dtypes == np.float64).all()
     assert not np.isinf(values).any()
-    assert len(set(names)) == len(names)
-    assert len(set(landmarks.point_names)) == len(landmarks.point_names)
-    for table in (points, frames, landmarks.confidence):
-        if table is not None:
-            rows = pd.RangeIndex(len(values))
-            pd.testing.assert_index_equal(table.index, rows, exact=True)
-    if landmarks.confidence is not None:
-        assert tuple(landmarks.confidence) == landmarks.point_names
+    for unique in (names, landmarks.point_names):
+        assert len({*unique}) == len(unique)
+    confidence = frames if landmarks.confidence is None else landmarks.confidence
+    for table in (points, frames, confidence):
+        rows = pd.RangeIndex(len(values))
+        pd.testing.assert_index_equal(table.index, rows, exact=True)
+    assert confidence is frames or tuple(confidence) == landmarks.point_names
     assert failed.dtype == bool
     assert np.isnan(values[failed]).all()
     return values.reshape(len(values), -1, 2)
@@ -200,25 +199,21 @@ def write_sleap(
     h5py = pytest.importorskip("h5py", reason="needs the extra h5")
     words = {"f": "frame", "t": "track", "n": "node", "x": "xy"}
     scores = np.full(tracks.shape[:3], 0.5) if scores is None else scores
+    arrays = {"ftnx": ("tracks", tracks), "ftn": ("point_scores", scores)}
+    arrays["ft"] = "instance_scores", scores.mean(axis=2)
     with h5py.File(path, "w") as file:
-
-        def put(name, values, own_order):
+        for own_order, (name, values) in arrays.items():
             wanted = [letter for letter in order if letter in own_order]
             axes = [own_order.index(letter) for letter in wanted]
             data = file.create_dataset(name, data=values.transpose(axes))
             if named:
                 data.attrs["dims"] = json.dumps([words[letter] for letter in wanted])
-
-        put("tracks", tracks, "ftnx")
-        put("point_scores", scores, "ftn")
-        put("instance_scores", scores.mean(axis=2), "ft")
         occupied = ~np.isnan(tracks).all(axis=(2, 3))
         file["track_occupancy"] = occupied.astype(np.uint8)
-        file["node_names"] = np.array(BODYPARTS, dtype="S")
-        file["track_names"] = np.array(names, dtype="S")
+        for kind, texts in (("node", BODYPARTS), ("track", names), ("edge", edges)):
+            if texts is not None:
+                file[f"{kind}_names"] = np.array(texts, dtype="S")
         file["provenance"] = "{}"
-        if edges is not None:
-            file["edge_names"] = np.array(edges, dtype="S")
     return path
 
 

@@ -301,26 +301,12 @@ def test_confidences_are_read_beside_sizes(tmp_path, begins, name, word, size):
         assert begins(path, *options, *told[2].split()) == ""
 
 
-@pytest.mark.parametrize(
-    ("word", "numbers"),
-    [("p", "0 1013.2"), ("v", "-3 310"), ("c", "2 3"), ("V", "0 1 2"), ("p", "0.5")],
-)
-def test_pressures_and_velocities_are_no_confidences(
-    tmp_path, begins, fails, word, numbers
-):
-    values, path = np.resize(np.float64(numbers.split()), (N, 8)), tmp_path / "a.csv"
-    points = table_of("{axis}_{part}", POINTS, range(8))
-    names = [f"{word}_{j}" for j in range(8)]
-    points.join(pd.DataFrame(values, columns=names)).to_csv(path, index=False)
-    found = read_landmarks(path)
-    if values.max() <= 2 and values.min() >= 0:
-        assert_array_equal(found.confidence, values)
-        if numbers == "0.5":  # the same of all points
-            assert begins(path) == ""
-        return
-    assert (found.confidence, list(found.frames)) == (None, names)
-    told = fails("fit", path, "-o", tmp_path, "--min-confidence", 0.5)
-    assert f"{word}_0, ... are no confidences" in told
+def columns_beside(folder, word, numbers):
+    """Return the path of a table with further columns of each point."""
+    table = table_of("{axis}_{part}", POINTS, range(8))
+    values = np.resize(np.float64(numbers.split()), (N, 8))
+    columns = {f"{word}_{j}": values[:, j] for j in range(8)}
+    return files.saved(folder / "a.csv", table.assign(**columns))
 
 
 def labelled(xy, **known):
