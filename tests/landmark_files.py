@@ -79,19 +79,20 @@ def write_openface(
     return path
 
 
-def saved_again(path, suffix):
+def saved_again(path, suffix, **options):
     """Save a csv file as another kind of table, as people do with pandas."""
     frame = pd.read_csv(path)
     path.unlink()
-    return saved(path.with_suffix(suffix), frame, sep="\t")
+    sign = "," if suffix == ".csv" else "\t"
+    return saved(path.with_suffix(suffix), frame, sep=sign, **options)
 
 
-def saved(path, frame, **options):
+def saved(path, frame, index=False, **options):
     """Save a table with pandas, with options of texts."""
     if path.suffix == ".parquet":
         frame.to_parquet(path)
     else:
-        frame.to_csv(path, index=False, **options)
+        frame.to_csv(path, index=index, **options)
     return path
 
 
@@ -99,12 +100,6 @@ def saved_scene(path, scene, **others):
     """Save the table of a scene with other columns."""
     table = pd.DataFrame(scene.data, columns=scene.feature_names)
     return saved(path, table.assign(**others))
-
-
-def by_pandas(path, index):
-    """Save a csv file again, whose first line are its names."""
-    pd.read_csv(path).to_csv(path, index=index)
-    return path
 
 
 def write_pyfeat(path, tracks, *, detector="Detector"):
@@ -441,8 +436,10 @@ WRITERS = {
     "deeplabcut-individuals": to(
         "a.csv", write_deeplabcut, FRAME.rename_axis(columns={"scorer": "individuals"})
     ),
-    "deeplabcut-pandas": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=False),
-    "deeplabcut-index": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=True),
+    "deeplabcut-pandas": lambda d: saved_again(WRITERS["deeplabcut"](d), ".csv"),
+    "deeplabcut-index": lambda d: saved_again(
+        WRITERS["deeplabcut"](d), ".csv", index=True
+    ),
     "sleap": to("a.h5", write_sleap, TRACKS[:, None], names=["a"]),
     "coco": to("a.json", write_json, COCO),
     "coco-unnamed": to("a.json", write_json, COCO | {"categories": [{"id": 1}]}),

@@ -403,27 +403,25 @@ def test_transform_gives_each_row_its_coefficients(transforms, fitted, faces, tm
     assert_allclose(found[complete], model.alpha_[rows], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("number", "option"),
-    slow_after(1, [(-1, ["--missing-value", "-1"]), (0, ["--zeros-missing"])]),
-)
+MISSING = [(-1, ["--missing-value", "-1"]), (0, ["--zeros-missing"])]
+
+
+@pytest.mark.parametrize(("code", "option"), slow_after(1, MISSING))
 def test_transform_knows_missing_points(
-    fits, transforms, faces, tmp_path, number, option
+    fits, transforms, faces, tmp_path, code, option
 ):
-    faces.loc[[3, 9], ["x_5", "y_5"]] = float(number)
+    faces.loc[[3, 9], ["x_5", "y_5"]] = float(code)
     path = saved(tmp_path / "faces.csv", faces)
     fit = fits(path, *UNREFINED, *option)
-    assert fit.report["table"]["missing_values"] == [number]
+    assert fit.report["table"]["missing_values"] == [code]
     alpha, out, err = transforms(fit.path, path)
-    assert (err, f"points at ({number}, {number}) count as missing" in out) == (
-        "",
-        True,
-    )
+    assert err == ""
+    assert f"points at ({code}, {code}) count as missing" in out
     (fit.folder / "report.json").unlink()
     other, out, err = transforms(fit.path, path)
     assert "count as missing" not in out
     # Without the report nothing but a warning is left.
-    assert ("--missing-value 0" in err) == (number == 0)
+    assert ("--missing-value 0" in err) == (code == 0)
     assert not np.allclose(other["alpha_1"], alpha["alpha_1"])
     pd.testing.assert_frame_equal(alpha, transforms(fit.path, path, *option)[0])
 
@@ -453,10 +451,8 @@ def test_transform_has_the_layout_of_the_model(
     assert_allclose(alpha[ALPHA], model.alpha_, atol=1e-9)
 
 
-def test_a_figure_that_fails_costs_no_results(
-    fits, fitted, table, tmp_path, monkeypatch
-):
-    folder, seen = tmp_path / "results", []
+def test_a_figure_that_fails_costs_no_results(fits, fitted, table, monkeypatch):
+    folder, seen = fitted.folder.with_name("again"), []
     shutil.copytree(fitted.folder, folder)
 
     def fail(*_args, **_keywords):
@@ -464,7 +460,7 @@ def test_a_figure_that_fails_costs_no_results(
         raise np.linalg.LinAlgError("no axes")
 
     monkeypatch.setattr(ModeCovarianceDisplay, "from_estimator", fail)
-    options = ["--force", *QUICK, "--refinement", "none", "-k", "1,2"]
+    options = "--refinement none --isa fast --n-init 1 -k 1,2 --force".split()
     found = fits(table, *options, folder=folder)
     warning, report = "mode_covariance.png was not drawn: no axes", found.report
     assert found.err.endswith(f"\nisa-nrsfm: warning: {warning}\n")
@@ -602,9 +598,8 @@ def model_in(folder, named=True):
 
 def transformed(folder, faces, *options, named=True):
     """Transform a table of other points than those of a model."""
-    faces.to_csv(folder / "new.csv", index=False)
-    model = model_in(folder, named)
-    told("transform", model, folder / "new.csv", "-o", folder / "a.csv", *options)
+    path = saved(folder / "new.csv", faces)
+    told("transform", model_in(folder, named), path, "-o", folder / "a.csv", *options)
 
 
 def kept(call, path, *argv):
