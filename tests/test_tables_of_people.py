@@ -40,11 +40,11 @@ def read_by_fit(path, *options):
     return args, read_frames(args)
 
 
-def asked_in(folder, columns, *options, suffix=".csv"):
+def asked_in(folder, columns, *options, suffix=".csv", **written):
     """Read a table with some columns as the command fit does, without a fit."""
     columns = pd.DataFrame(columns)
     table = pd.concat([landmarks(len(columns)), columns], axis=1)
-    path = saved(folder / f"table{suffix}", table)
+    path = saved(folder / f"table{suffix}", table, **written)
     return asked_columns(*read_by_fit(path, *options))
 
 
@@ -84,9 +84,8 @@ FACES = {"face": np.where(ROWS % 2, "right", "left")}
 def images_of(folder, columns, options):
     """Return the numbers of images that --fps counts."""
     columns = pd.DataFrame(columns, index=ROWS)
-    return np.round(
-        25 * seconds(asked_in(folder, columns, "--fps", 25, *options).times), 9
-    )
+    times = asked_in(folder, columns, "--fps", 25, *options).times
+    return np.round(25 * seconds(times), 9)
 
 
 def numbers_in(names):
@@ -114,12 +113,9 @@ TYPED |= {"mood": ["1", "b"] * (N // 2), "ok": [True, False] * (N // 2)}
 
 def labels_with(folder, word, *options, suffix=".csv"):
     """Return labels of which row 4 has a word for missing."""
-    columns = {
-        "mood": np.where(ROWS % 3, "up", "down").astype(object),
-        "age": (20.5 + ROWS).astype(str).astype(object),
-    }
-    for cells in columns.values():
-        cells[4] = word
+    mood, age = np.where(ROWS % 3, "up", "down"), (20.5 + ROWS).astype(str)
+    columns = pd.DataFrame({"mood": mood, "age": age}, dtype=object)
+    columns.loc[4] = word
     return asked_in(folder, columns, *options, suffix=suffix).labels
 
 
@@ -334,9 +330,8 @@ def followed(call, given, /, **scope):
     return scope
 
 
-LEVELS = WIDE.set_axis(
-    pd.MultiIndex.from_product([[f"p{j}" for j in range(12)], ["x", "y"]]), axis=1
-)
+PAIRS = pd.MultiIndex.from_product([[f"p{j}" for j in range(12)], ["x", "y"]])
+LEVELS = WIDE.set_axis(PAIRS, axis=1)
 
 
 def read_as_advised(folder, text):
@@ -366,6 +361,16 @@ def test_tables_with_other_separators_are_read(tmp_path):
         told = re.escape(f"{name} end with {sign!r}")
         found = warned(told, read_landmarks, tmp_path / name)
         np.testing.assert_array_equal(found.points, WIDE)
+
+
+@pytest.mark.parametrize("decimal", [",", "."])
+@pytest.mark.filterwarnings("ignore:(the cells of|numbers have)")
+def test_other_columns_of_tables_with_other_separators(tmp_path, decimal):
+    columns, written = {"age": ROWS % 7 + 0.5, "t": 0.04 * ROWS}, {"decimal": decimal}
+    options = "--label", "age", "--time", "t"
+    found = asked_in(tmp_path, columns, *options, sep=";", **written)
+    np.testing.assert_array_equal(found.labels[0], columns["age"])
+    np.testing.assert_array_equal(found.times, columns["t"])
 
 
 def test_the_way_from_several_levels_of_names_is_right():
