@@ -22,6 +22,7 @@ from isa_nrsfm.io import read_table, save_model, write_table
 
 OLD = b"what was there before"
 TABLE = pd.DataFrame({"x0": np.linspace(0, 1, 9) / 3, "y0": np.arange(9.0)})
+TRACKS = make_nonrigid_tracks(40, 12, 1, noise=0.01, random_state=0).data
 # More than what a file buffers.
 NUMBERS = np.random.default_rng(0).normal(size=(2000, 2))
 LONG_TABLE = pd.DataFrame(NUMBERS, columns=["x0", "y0"])
@@ -124,82 +125,77 @@ def test_files_that_are_protected_stay(tmp_path):
     assert path.read_bytes() == OLD
 
 
-@pytest.fixture(name="table", scope="module")
-def small_table():
-    return make_nonrigid_tracks(40, 12, 1, noise=0.01, random_state=0).data
+def keeping(folder):
+    """Return an estimator that keeps the coefficients of frames in a folder."""
+    quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
+    return AffineNRSfM(1, keep_frames=folder, **quick)
 
 
-class TestKeepFrames:
-    @staticmethod
-    def estimator(folder, **params):
-        quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
-        return AffineNRSfM(1, keep_frames=folder, **quick, **params)
-
-    @pytest.mark.parametrize("strike", slow_after(1, STRIKES))
-    def test_a_fit_that_fails_leaves_nothing(self, tmp_path, table, strike):
-        folder = tmp_path / "kept"
-        first, second = self.estimator(folder), self.estimator(folder)
-        fits = lambda: first.fit(table), lambda: second.fit(table[:30])
-        faults = every_fault(folder, strike, *fits, stride=4)
-        for raised, before, operations in faults:
-            after = readable(folder)
-            assert before.items() <= after.items()
-            assert len(first.alpha_) == 40
-            if raised is None:
-                assert len(after) == 2 * len(before) == 8
-                assert len(second.alpha_) == 30
-                second = self.estimator(folder)  # without a fit for the next fault
-                continue
-            if isinstance(raised, OSError):
-                assert str(folder) in str(raised.filename)
-            refused(None, second.transform, table, error=NotFittedError)
-            if strike != "killed":
-                assert (after, leftovers(folder)) == (before, []), operations
-
-    def test_fits_never_meet(self, tmp_path, table):
-        first, again, second = (self.estimator(tmp_path / "kept") for _ in range(3))
-        kept = first.fit(table).alpha_
-        alpha = kept.copy()
-        again.fit(table)
-        assert len(second.fit(table[:20]).alpha_) == 20
-        names = {model.alpha_.filename for model in (first, again, second)}
-        assert len(names) == 3
-        first.fit(table[:20])
-        assert_array_equal(kept, alpha)
-
-    def test_bad_folders_are_refused_before_the_fit(self, tmp_path, table, monkeypatch):
-        def never(*_args, **_keywords):
-            raise AssertionError("the fit has begun")
-
-        monkeypatch.setattr(FastISA, "fit", never)
-        refused(r"keep_frames should be .* got ''", self.estimator("").fit, table)
-        (tmp_path / "file").write_bytes(OLD)
-        for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
-            error = refused(None, self.estimator(bad).fit, table, error=OSError)
-            assert error.filename == str(bad)
-        bad = tmp_path / "no"
-        with disk_faults(bad, "disk full", 2) as faults:
-            error = refused(None, self.estimator(bad).fit, table, error=OSError)
-        assert (error.filename, bad.exists()) == (str(bad), False), faults.operations
-        # Neither are there folders of fits that fail.
-        refused("points", self.estimator(bad / "kept").fit, table[:, :6])
-        assert os.listdir(tmp_path) == ["file"]
+@pytest.mark.parametrize("strike", slow_after(1, STRIKES))
+def test_a_fit_that_fails_leaves_no_frames(tmp_path, strike):
+    folder = tmp_path / "kept"
+    first, second = keeping(folder), keeping(folder)
+    fits = lambda: first.fit(TRACKS), lambda: second.fit(TRACKS[:30])
+    faults = every_fault(folder, strike, *fits, stride=4)
+    for raised, before, operations in faults:
+        after = readable(folder)
+        assert before.items() <= after.items()
+        assert len(first.alpha_) == 40
+        if raised is None:
+            assert len(after) == 2 * len(before) == 8
+            assert len(second.alpha_) == 30
+            second = keeping(folder)  # without a fit for the next fault
+            continue
+        if isinstance(raised, OSError):
+            assert str(folder) in str(raised.filename)
+        refused(None, second.transform, TRACKS, error=NotFittedError)
+        if strike != "killed":
+            assert (after, leftovers(folder)) == (before, []), operations
 
 
-@pytest.fixture
-def landmarks(tmp_path):
-    path = tmp_path / "landmarks.csv"
+def test_frames_of_fits_never_meet(tmp_path):
+    first, again, second = (keeping(tmp_path / "kept") for _ in range(3))
+    kept = first.fit(TRACKS).alpha_
+    alpha = kept.copy()
+    again.fit(TRACKS)
+    assert len(second.fit(TRACKS[:20]).alpha_) == 20
+    names = {model.alpha_.filename for model in (first, again, second)}
+    assert len(names) == 3
+    first.fit(TRACKS[:20])
+    assert_array_equal(kept, alpha)
+
+
+def test_bad_folders_of_frames_are_refused_before_the_fit(tmp_path, monkeypatch):
+    def never(*_args, **_keywords):
+        raise AssertionError("the fit has begun")
+
+    monkeypatch.setattr(FastISA, "fit", never)
+    refused(r"keep_frames should be .* got ''", keeping("").fit, TRACKS)
+    (tmp_path / "file").write_bytes(OLD)
+    for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
+        error = refused(None, keeping(bad).fit, TRACKS, error=OSError)
+        assert error.filename == str(bad)
+    bad = tmp_path / "no"
+    with disk_faults(bad, "disk full", 2) as faults:
+        error = refused(None, keeping(bad).fit, TRACKS, error=OSError)
+    assert (error.filename, bad.exists()) == (str(bad), False), faults.operations
+    # Neither are there folders of fits that fail.
+    refused("points", keeping(bad / "kept").fit, TRACKS[:, :6])
+    assert os.listdir(tmp_path) == ["file"]
+
+
+@pytest.fixture(scope="module")
+def landmarks(tmp_path_factory):
+    path = tmp_path_factory.mktemp("table") / "landmarks.csv"
     write_landmarks(path)
     return path
 
 
 @pytest.fixture(scope="module")
-def old_run(tmp_path_factory):
+def old_run(landmarks):
     """Return the folder of a run with figures."""
-    folder = tmp_path_factory.mktemp("old")
-    write_landmarks(folder / "landmarks.csv")
-    assert fit(folder / "landmarks.csv", folder / "out", 1) == 0
-    return folder / "out"
+    assert fit(landmarks, landmarks.with_name("out"), 1) == 0
+    return landmarks.with_name("out")
 
 
 @pytest.fixture
