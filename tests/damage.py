@@ -32,39 +32,33 @@ def pick(rng, choices):
 
 def damaged_items(items, rng, other):
     """Return a list of which an item is lost, repeated, exchanged or another one."""
-    items = list(items)
     here, there = (int(i) for i in rng.integers(len(items), size=2))
-    match int(rng.integers(5)):
-        case 0:
-            del items[here]
-        case 1:
-            items.insert(there, items[here])
-        case 2:
-            items[here], items[there] = items[there], items[here]
-        case _:
-            items[here] = other(items[here])
-    return items
+    lost = [*items[:here], *items[here + 1 :]]
+    repeated = [*items[:there], items[here], *items[there:]]
+    exchanged = [*items]
+    exchanged[here], exchanged[there] = items[there], items[here]
+    kind = int(rng.integers(5))
+    if kind < 3:
+        return (lost, repeated, exchanged)[kind]
+    return [*items[:here], other(items[here]), *items[here + 1 :]]
 
 
 def damaged_bytes(content, rng):
     """Return bytes of which some are changed, lost or repeated."""
-    data = bytearray(content)
-    start = int(rng.integers(len(data)))
+    start = int(rng.integers(len(content)))
     stop = start + int(rng.integers(1, 40))
-    match int(rng.integers(6)):
-        case 0:
-            data[start] ^= 1 << int(rng.integers(8))
-        case 1:  # a byte that many formats give a meaning
-            data[start] = pick(rng, b',"\n\r\t{}[]:-e. x\x00\xff\x80\x7f')
-        case 2:
-            del data[start:]
-        case 3:
-            del data[start:stop]
-        case 4:
-            data[start:start] = data[start:stop]
-        case 5:  # a length or a number of rows that is far too large
-            data[start : start + 4] = b"\xff\xff\xff\x7f"[: len(data) - start]
-    return bytes(data)
+    rest = content[start:]
+    changes = [
+        lambda: bytes([rest[0] ^ (1 << int(rng.integers(8)))]) + rest[1:],
+        # A byte that many formats give a meaning
+        lambda: bytes([pick(rng, b',"\n\r\t{}[]:-e. x\x00\xff\x80\x7f')]) + rest[1:],
+        lambda: b"",
+        lambda: content[stop:],
+        lambda: content[start:stop] + rest,
+        # A length or a number of rows that is far too large
+        lambda: b"\xff\xff\xff\x7f"[: len(rest)] + rest[4:],
+    ]
+    return content[:start] + pick(rng, changes)()
 
 
 def damaged_text(text, rng, separator=","):
@@ -173,15 +167,13 @@ def damaged_archive(content, rng):
     """Return an archive of arrays of which one is damaged, lost or another."""
     arrays = dict(np.load(io.BytesIO(content)))
     name, other = pick(rng, [*arrays]), pick(rng, [*arrays])
-    match int(rng.integers(6)):
-        case 0:
-            del arrays[name]
-        case 1:
-            arrays[name] = arrays[other]
-        case 2:
-            arrays["x"] = np.zeros(3)
-        case _:
-            arrays[name] = damaged_array(arrays[name], rng)
+    kind = int(rng.integers(6))
+    if kind == 0:
+        del arrays[name]
+    elif kind == 2:
+        arrays["x"] = np.zeros(3)
+    else:
+        arrays[name] = arrays[other] if kind == 1 else damaged_array(arrays[name], rng)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     return buffer.getvalue()
@@ -230,20 +222,22 @@ def damaged_parquet(content, rng):
     table = pq.read_table(io.BytesIO(content))
     place, n = int(rng.integers(table.num_columns)), table.num_rows
     name, said = table.column_names[place], table.schema.metadata or {b"pandas": b"{}"}
-    values = None, "1.5", True, b"x", [1.0], {"a": 1}, 2**62, np.inf, 1e308, np.nan
-    match int(rng.integers(6)):
-        case 0:
-            table = table.remove_column(place)
-        case 1:
-            table = table.append_column(name, table.column(place))
-        case 2:
-            table = table.slice(0, int(rng.integers(n)))
-        case 3:
-            said = {key: damaged_bytes(text, rng) for key, text in said.items()}
-            table = table.replace_schema_metadata(said)
-        case _:
-            table = table.set_column(place, name, pa.array(n * [pick(rng, values)]))
-            table = table.replace_schema_metadata(said)
+
+    def changed_metadata():
+        changed = {key: damaged_bytes(text, rng) for key, text in said.items()}
+        return table.replace_schema_metadata(changed)
+
+    def other_column():
+        values = None, "1.5", True, b"x", [1.0], {"a": 1}, 2**62, np.inf, 1e308, np.nan
+        column = pa.array(n * [pick(rng, values)])
+        return table.set_column(place, name, column).replace_schema_metadata(said)
+
+    changes = [
+        lambda: table.remove_column(place),
+        lambda: table.append_column(name, table.column(place)),
+        lambda: table.slice(0, int(rng.integers(n))),
+        *(changed_metadata, other_column, other_column),
+    ]
     buffer = io.BytesIO()
-    pq.write_table(table, buffer)
+    pq.write_table(pick(rng, changes)(), buffer)
     return buffer.getvalue()

@@ -56,11 +56,9 @@ class Faults:
 
     def concerns(self, *paths, dir_fd=None, **_):
         """Tell whether an operation is on files of the folder."""
-        if dir_fd is not None:
-            return True
         paths = [p for p in paths if isinstance(p, str | os.PathLike)]
-        inside = [os.path.abspath(p).startswith(self.folder) for p in paths]
-        return any(inside)
+        inside = (os.path.abspath(p).startswith(self.folder) for p in paths)
+        return dir_fd is not None or any(inside)
 
     def run(self, name, operation, *args, full=True, **keywords):
         """Run an operation, or let it fail."""
@@ -154,8 +152,7 @@ def disk_faults(folder, strike, at):
         for module in (io, builtins):
             stack.enter_context(mock.patch.object(module, "open", counting_open))
         for name in names:
-            patched = mock.patch.object(os, name, counting(name))
-            stack.enter_context(patched)
+            stack.enter_context(mock.patch.object(os, name, counting(name)))
         yield faults
 
 
@@ -164,11 +161,11 @@ def readable(folder):
 
     Hidden files and links that lead nowhere are not found.
     """
+    found = {path.relative_to(folder): path for path in sorted(Path(folder).rglob("*"))}
     return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(Path(folder).rglob("*"))
-        if path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        str(name): path.read_bytes()
+        for name, path in found.items()
+        if path.is_file() and not any(part.startswith(".") for part in name.parts)
     }
 
 

@@ -28,14 +28,13 @@ def tracks_of(landmarks):
     assert min(values.shape) > 0
     assert (points.dtypes == np.float64).all()
     assert not np.isinf(values).any()
-    assert len(set(names)) == len(names)
-    assert len(set(landmarks.point_names)) == len(landmarks.point_names)
-    for table in (points, frames, landmarks.confidence):
-        if table is not None:
-            rows = pd.RangeIndex(len(values))
-            pd.testing.assert_index_equal(table.index, rows, exact=True)
-    if landmarks.confidence is not None:
-        assert tuple(landmarks.confidence) == landmarks.point_names
+    for unique in (names, landmarks.point_names):
+        assert len({*unique}) == len(unique)
+    confidence = frames if landmarks.confidence is None else landmarks.confidence
+    for table in (points, frames, confidence):
+        rows = pd.RangeIndex(len(values))
+        pd.testing.assert_index_equal(table.index, rows, exact=True)
+    assert confidence is frames or tuple(confidence) == landmarks.point_names
     assert failed.dtype == bool
     assert np.isnan(values[failed]).all()
     return values.reshape(len(values), -1, 2)
@@ -48,17 +47,17 @@ def planar(tracks):
 
 def openface_names(n_points=68, *, video=True, face_id=True):
     """Return the columns that OpenFace 2 writes when asked for all of them."""
-    names = ["face", "confidence"]
-    if video:
-        names = ["frame", "face_id", "timestamp", "confidence", "success"]
-        names = names if face_id else [n for n in names if n != "face_id"]
+    names = ["frame", "face_id", "timestamp", "confidence", "success"]
+    names = names if video else ["face", "confidence"]
+    names = names if face_id else [n for n in names if n != "face_id"]
     names += [f"gaze_{eye}_{axis}" for eye in (0, 1) for axis in "xyz"]
     names += ["gaze_angle_x", "gaze_angle_y"]
     names += [f"eye_lmk_{axis}_{j}" for axis in "xyXYZ" for j in range(56)]
     names += [f"pose_{kind}{axis}" for kind in "TR" for axis in "xyz"]
     names += [f"{axis}_{j}" for axis in "xyXYZ" for j in range(n_points)]
-    names += ["p_scale", "p_rx", "p_ry", "p_rz", "p_tx", "p_ty"]
-    names += [f"p_{j}" for j in range(34)]
+    names += [
+        f"p_{word}" for word in ("scale", "rx", "ry", "rz", "tx", "ty", *range(34))
+    ]
     units = (1, 2, 4, 5, 6, 7, 9, 10, 12, 14, 15, 17, 20, 23, 25, 26, 45)
     names += [f"AU{unit:02d}_r" for unit in units]
     return names + [f"AU{unit:02d}_c" for unit in sorted((*units, 28))]
@@ -68,63 +67,64 @@ def write_openface(
     path, tracks, *, success=1, confidence=0.98, video=True, separator=","
 ):
     """Write the csv file of FeatureExtraction, or of FaceLandmarkImg."""
-    n_frames, n_points, _ = tracks.shape
-    names = openface_names(n_points, video=video, face_id=separator == ",")
-    frame = pd.DataFrame(-7.5, index=range(n_frames), columns=names)
+    names = openface_names(tracks.shape[1], video=video, face_id=separator == ",")
+    frame = pd.DataFrame(-7.5, index=range(len(tracks)), columns=names)
     numbers, i = frame.index, names.index("x_0")
     own = {"face": numbers, "frame": numbers + 1, "face_id": 0, "success": success}
     own |= {"timestamp": (numbers / 30).round(3), "confidence": confidence}
     frame = frame.assign(**{name: own[name] for name in own if name in names})
-    frame.iloc[:, i : i + 2 * n_points] = planar(tracks)
+    frame.iloc[:, i : i + tracks[0].size] = planar(tracks)
     header, _, rows = frame.to_csv(index=False).partition("\n")
     path.write_text(header.replace(",", separator) + f"\n{rows}")
     return path
 
 
-def saved_again(path, suffix):
+def saved_again(path, suffix, **options):
     """Save a csv file as another kind of table, as people do with pandas."""
     frame = pd.read_csv(path)
     path.unlink()
-    return saved(path.with_suffix(suffix), frame, sep="\t")
+    sign = "," if suffix == ".csv" else "\t"
+    return saved(path.with_suffix(suffix), frame, sep=sign, **options)
 
 
-def saved(path, frame, **options):
+def saved(path, frame, index=False, **options):
     """Save a table with pandas, with options of texts."""
     if path.suffix == ".parquet":
         frame.to_parquet(path)
     else:
-        frame.to_csv(path, index=False, **options)
+        frame.to_csv(path, index=index, **options)
     return path
 
 
-def by_pandas(path, index):
-    """Save a csv file again, whose first line are its names."""
-    pd.read_csv(path).to_csv(path, index=index)
-    return path
+def saved_scene(path, scene, **others):
+    """Save the table of a scene with other columns."""
+    table = pd.DataFrame(scene.data, columns=scene.feature_names)
+    return saved(path, table.assign(**others))
 
 
 def write_pyfeat(path, tracks, *, detector="Detector"):
     """Write a table as Fex.to_csv does."""
-    n_frames, n_points, _ = tracks.shape
+    n, n_points, _ = tracks.shape
     seen = ~np.isnan(tracks).all(axis=(1, 2))
-    columns = {"frame": np.arange(n_frames)} if detector != "Detectorv2" else {}
-    for name in ("FaceRectX", "FaceRectY", "FaceRectWidth", "FaceRectHeight"):
-        columns[name] = np.where(seen, 100.25, np.nan)
-    columns["FaceScore"] = np.where(seen, np.linspace(0.5, 1, n_frames), np.nan)
+    columns = {"frame": np.arange(n)} if detector != "Detectorv2" else {}
+    for side in ("X", "Y", "Width", "Height"):
+        columns[f"FaceRect{side}"] = np.where(seen, 100.25, np.nan)
+    columns["FaceScore"] = np.where(seen, np.linspace(0.5, 1, n), np.nan)
     if detector == "MPDetector":
-        for j in range(n_points):
-            columns |= {f"{a}_{j}": tracks[:, j, k] for k, a in enumerate("xy")}
-            columns[f"z_{j}"] = np.where(seen, -3.5, np.nan)
+        depths = np.broadcast_to(
+            np.where(seen, -3.5, np.nan)[:, None], tracks.shape[:2]
+        )
+        points, names = np.dstack([tracks, depths]).reshape(n, -1), "xyz"
+        names = [f"{axis}_{j}" for j in range(n_points) for axis in "xyz"]
     else:
-        for k, axis in enumerate("xy"):
-            columns |= {f"{axis}_{j}": tracks[:, j, k] for j in range(n_points)}
-    columns["AU01"] = np.linspace(0, 1, n_frames)
+        points = planar(tracks)
+        names = [f"{axis}_{j}" for axis in "xy" for j in range(n_points)]
+    columns |= dict(zip(names, points.T, strict=True))
+    columns["AU01"] = np.linspace(0, 1, n)
     if detector == "Detectorv2":
-        columns |= {f"Identity_{j}": np.zeros(n_frames) for j in range(1, 513)}
-        for axis in "xyz":
-            columns |= {f"mesh_{axis}_{j}": np.full(n_frames, 9.0) for j in range(478)}
-    columns["input"] = ["video, first.mp4"] * n_frames
-    return saved(path, pd.DataFrame(columns))
+        columns |= {f"Identity_{j}": np.zeros(n) for j in range(1, 513)}
+        columns |= {f"mesh_{a}_{j}": np.full(n, 9.0) for a in "xyz" for j in range(478)}
+    return saved(path, pd.DataFrame(columns | {"input": "video, first.mp4"}))
 
 
 def write_mesh(path, tracks, *, shares=True, sizes=False):
@@ -133,9 +133,8 @@ def write_mesh(path, tracks, *, shares=True, sizes=False):
     columns = {"code": [f"{i:03d}" for i in range(len(tracks))]}
     if sizes:
         columns |= {"image_width": IMAGE_SIZE[0], "image_height": IMAGE_SIZE[1]}
-    for j in range(tracks.shape[1]):
-        columns |= {f"x_{j}": values[:, j, 0], f"y_{j}": values[:, j, 1]}
-        columns[f"z_{j}"] = np.full(len(tracks), -0.01)
+    for j, (x, y) in enumerate(values.transpose(1, 2, 0)):
+        columns |= {f"x_{j}": x, f"y_{j}": y, f"z_{j}": -0.01}
     return saved(path, pd.DataFrame(columns))
 
 
@@ -152,30 +151,27 @@ def write_pts(folder, tracks):
 
 def write_wflw(path, tracks, *, rest=True):
     """Write a list of WFLW; it has 98 points."""
+    others = "10 20 210 220 0 1 0 0 1 0 " if rest else ""
     lines = []
     for i, points in enumerate(tracks):
-        fields = [f"{v:.6f}" for v in points.ravel()]
-        if rest:
-            fields += ["10", "20", "210", "220", *"010010"]
-        lines.append(" ".join([*fields, f"37--Soccer/37_Soccer_{i}.jpg"]))
+        numbers = " ".join(f"{v:.6f}" for v in points.ravel())
+        lines.append(f"{numbers} {others}37--Soccer/37_Soccer_{i}.jpg")
     return write_text(path, *lines)
 
 
 def deeplabcut_frame(tracks, likelihood=0.9, *, bodyparts=BODYPARTS, individuals=()):
     """Return a table as DeepLabCut has it; tracks may have an axis of individuals."""
-    tracks = tracks.reshape(len(tracks), -1, len(bodyparts), 2)
-    shape = (*tracks.shape[:3], 1)
-    coords = ["x", "y", "likelihood"]
-    values = [tracks, np.broadcast_to(np.reshape(likelihood, (-1, 1, 1, 1)), shape)]
-    if likelihood is None:
-        values, coords = [tracks], ["x", "y"]
-    levels = [["DLC_resnet50_mice"], list(individuals), list(bodyparts), coords]
-    names = ["scorer", "individuals", "bodyparts", "coords"]
-    if not individuals:
-        del levels[1], names[1]
-    columns = pd.MultiIndex.from_product(levels, names=names)
-    values = np.concatenate(values, axis=3).reshape(len(tracks), -1)
-    return pd.DataFrame(values, columns=columns)
+    values = tracks.reshape(len(tracks), -1, len(bodyparts), 2)
+    levels = {"scorer": ["DLC_resnet50_mice"], "individuals": list(individuals)}
+    levels |= {"bodyparts": list(bodyparts), "coords": ["x", "y"]}
+    if likelihood is not None:
+        levels["coords"] += ["likelihood"]
+        scores = np.reshape(likelihood, (-1, 1, 1, 1))
+        scores = np.broadcast_to(scores, (*values.shape[:3], 1))
+        values = np.concatenate([values, scores], axis=3)
+    levels = {name: words for name, words in levels.items() if words}
+    columns = pd.MultiIndex.from_product(levels.values(), names=levels)
+    return pd.DataFrame(values.reshape(len(tracks), -1), columns=columns)
 
 
 def write_deeplabcut(path, frame, *, how="table"):
@@ -198,39 +194,22 @@ def write_sleap(
     h5py = pytest.importorskip("h5py", reason="needs the extra h5")
     words = {"f": "frame", "t": "track", "n": "node", "x": "xy"}
     scores = np.full(tracks.shape[:3], 0.5) if scores is None else scores
+    arrays = {"ftnx": ("tracks", tracks), "ftn": ("point_scores", scores)}
+    arrays["ft"] = "instance_scores", scores.mean(axis=2)
     with h5py.File(path, "w") as file:
-
-        def put(name, values, own_order):
+        for own_order, (name, values) in arrays.items():
             wanted = [letter for letter in order if letter in own_order]
             axes = [own_order.index(letter) for letter in wanted]
             data = file.create_dataset(name, data=values.transpose(axes))
             if named:
                 data.attrs["dims"] = json.dumps([words[letter] for letter in wanted])
-
-        put("tracks", tracks, "ftnx")
-        put("point_scores", scores, "ftn")
-        put("instance_scores", scores.mean(axis=2), "ft")
         occupied = ~np.isnan(tracks).all(axis=(2, 3))
         file["track_occupancy"] = occupied.astype(np.uint8)
-        file["node_names"] = np.array(BODYPARTS, dtype="S")
-        file["track_names"] = np.array(names, dtype="S")
+        for kind, texts in (("node", BODYPARTS), ("track", names), ("edge", edges)):
+            if texts is not None:
+                file[f"{kind}_names"] = np.array(texts, dtype="S")
         file["provenance"] = "{}"
-        if edges is not None:
-            file["edge_names"] = np.array(edges, dtype="S")
     return path
-
-
-def write_sleap_csv(path, tracks, scores):
-    """Write an analysis table, with a row for each of two tracks in a frame."""
-    rows = []
-    for frame, track in np.ndindex(tracks.shape[:2]):
-        row = {"track": "ab"[track], "frame_idx": frame, "instance.score": 0.5}
-        for j, node in enumerate(BODYPARTS):
-            x, y = tracks[frame, track, j]
-            row[f"{node}.score"] = scores[frame, track, j]
-            row |= {f"{node}.x": x, f"{node}.y": y}
-        rows.append(row)
-    return saved(path, pd.DataFrame(rows))
 
 
 def coco_annotations(tracks, *, names=BODYPARTS, image=None):
@@ -238,25 +217,24 @@ def coco_annotations(tracks, *, names=BODYPARTS, image=None):
     seen = ~np.isnan(tracks).any(axis=2)
     values = np.concatenate([np.nan_to_num(tracks), 2 * seen[..., None]], axis=2)
     image = range(1, len(tracks) + 1) if image is None else image
-    images = sorted(set(image))
+    known = {"iscrowd": 0, "area": 1.5}
+    rows = [
+        {
+            "id": 100 + i,
+            "image_id": of,
+            "category_id": 1,
+            "keypoints": row.ravel().tolist(),
+        }
+        | {"num_keypoints": int(seen[i].sum()), **known}
+        for i, (of, row) in enumerate(zip(image, values, strict=True))
+    ]
+    size = {"width": 640, "height": 480}
     return {
         "info": {"description": "people"},
         "images": [
-            {"id": i, "file_name": f"{i:012d}.jpg", "width": 640, "height": 480}
-            for i in images
+            {"id": i, "file_name": f"{i:012d}.jpg"} | size for i in sorted({*image})
         ],
-        "annotations": [
-            {
-                "id": 100 + i,
-                "image_id": of,
-                "category_id": 1,
-                "keypoints": [float(v) for v in row.ravel()],
-                "num_keypoints": int(seen[i].sum()),
-                "iscrowd": 0,
-                "area": 1.5,
-            }
-            for i, (of, row) in enumerate(zip(image, values, strict=True))
-        ],
+        "annotations": rows,
         "categories": [{"id": 1, "name": "person", "keypoints": list(names)}],
     }
 
@@ -295,8 +273,9 @@ def write_tps(path, tracks):
     """Write specimens as tpsDig does."""
     lines = []
     for i, points in enumerate(tracks):
-        lines += [f"LM={len(points)}", *(f"{x} {y}" for x, y in points)]
-        lines += [f"IMAGE=skull {i}.jpg", f"ID={i}", "SCALE=0.05"]
+        places = [f"{x} {y}" for x, y in points]
+        head, known = f"LM={len(points)}", [f"IMAGE=skull {i}.jpg", f"ID={i}"]
+        lines += [head, *places, *known, "SCALE=0.05"]
     return write_text(path, *lines)
 
 
@@ -340,26 +319,28 @@ def write_imglab(path, tracks):
     """Write parts of boxes as dlib's imglab does."""
     lines = ["<?xml version='1.0' encoding='ISO-8859-1'?>", "<dataset><images>"]
     for i, points in enumerate(tracks):
-        lines.append(f"<image file='{i}.jpg'>")
-        lines.append("<box top='1' left='2' width='3' height='4'>")
-        for j, (x, y) in enumerate(points):
-            lines.append(f"<part name='{j:02}' x='{x}' y='{y}'/>")
-        lines.append("</box></image>")
+        head = f"<image file='{i}.jpg'>", "<box top='1' left='2' width='3' height='4'>"
+        parts = (
+            f"<part name='{j:02}' x='{x}' y='{y}'/>" for j, (x, y) in enumerate(points)
+        )
+        lines += [*head, *parts, "</box></image>"]
     return write_text(path, *lines, "</images></dataset>")
 
 
 def write_trc(path, tracks, z=0.0):
     """Write points in pixels as Sports2D does."""
     n, J, _ = tracks.shape
-    rates = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate"
-    head = [f"{rates} OrigDataStartFrame OrigNumFrames".replace(" ", "\t")]
-    head += ["\t".join(map(str, [30, 30, n, J, "px", 30, 0, n]))]
-    head += ["Frame#\tTime\t" + "\t\t\t".join(BODYPARTS) + "\t\t"]
-    head += ["\t\t" + "\t".join(f"X{j}\tY{j}\tZ{j}" for j in range(1, J + 1))]
+    names = (
+        "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame"
+    )
+    head = [["PathFileType", 4, "(X/Y/Z)", path.name]]
+    head += [[*names.split(), "OrigNumFrames"], [30, 30, n, J, "px", 30, 0, n]]
+    head += [["Frame#", "Time", "\t\t\t".join(BODYPARTS), "", ""]]
+    head += [["", "", *(f"{axis}{j}" for j in range(1, J + 1) for axis in "XYZ")]]
     spatial = np.concatenate([tracks, np.broadcast_to(z, (n, J, 1))], axis=2)
     rows = enumerate(spatial.reshape(n, -1).tolist())
-    rows = ["\t".join(map(str, [i, i / 30, *row])) for i, row in rows]
-    return write_text(path, f"PathFileType\t4\t(X/Y/Z)\t{path.name}", *head, *rows)
+    rows = [*head, *([i, i / 30, *row] for i, row in rows)]
+    return write_text(path, *("\t".join(map(str, row)) for row in rows))
 
 
 def write_facemap(path, tracks):
@@ -455,8 +436,10 @@ WRITERS = {
     "deeplabcut-individuals": to(
         "a.csv", write_deeplabcut, FRAME.rename_axis(columns={"scorer": "individuals"})
     ),
-    "deeplabcut-pandas": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=False),
-    "deeplabcut-index": lambda d: by_pandas(WRITERS["deeplabcut"](d), index=True),
+    "deeplabcut-pandas": lambda d: saved_again(WRITERS["deeplabcut"](d), ".csv"),
+    "deeplabcut-index": lambda d: saved_again(
+        WRITERS["deeplabcut"](d), ".csv", index=True
+    ),
     "sleap": to("a.h5", write_sleap, TRACKS[:, None], names=["a"]),
     "coco": to("a.json", write_json, COCO),
     "coco-unnamed": to("a.json", write_json, COCO | {"categories": [{"id": 1}]}),
@@ -490,6 +473,7 @@ WRITERS = {
         write_mesh(d / "a.csv", TRACKS, shares=False), ".txt"
     ),
     "table-blanks": to("a.txt", saved, TABLE, sep=" "),
+    "table-parquet": to("a.parquet", saved, TABLE),
     "table-folder": to("a", write_each, ".csv", write_row),
     "table": to("a.csv", write_mesh, TRACKS, shares=False),
 }

@@ -71,19 +71,19 @@ def refusals_of(section, names):
             return folder / name
 
         given = {"tmp_path": tmp_path, "folder": folder, "written": written}
-        given |= GIVEN
+        scope = names | given | GIVEN
         sign, _, rest = message.partition(" ")
         if sign in CHECKS:
-            CHECKS[sign](eval(call, names | given), rest, names | given)
+            CHECKS[sign](eval(call, scope), rest, scope)
             return
         kind, _, rest = message.partition(": ")
         error = vars(builtins).get(kind)
         if error is None:
-            refused(message, eval, call, names | given)
+            refused(message, eval, call, scope)
         elif issubclass(error, Warning):
-            warned(rest, eval, call, names | given, category=error)
+            warned(rest, eval, call, scope, category=error)
         else:
-            refused(rest, eval, call, names | given, error=error)
+            refused(rest, eval, call, scope, error=error)
         assert not any(tmp_path.iterdir())
 
     return test

@@ -10,7 +10,7 @@ import time
 import pandas as pd
 import pytest
 from fit_runs import MODEL
-from landmark_files import write_pts
+from landmark_files import saved, write_pts
 from layers import slow_after
 
 from isa_nrsfm import AffineNRSfM
@@ -19,8 +19,7 @@ from isa_nrsfm.cli._main import show_stage, shown_progress
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import load_model, read_landmarks
 
-QUICK = ["-k", "2", "--isa", "fast", "--n-init", "2", "--refinement", "none"]
-QUICK += ["--no-figures"]
+QUICK = "-k 2 --isa fast --n-init 2 --refinement none --no-figures".split()
 # What a spreadsheet takes for formulas stays as it is: SECURITY.md says so.
 CELLS = ["=1+1", "+1", "-x", "@SUM(A1)", "'=1", '=HYPERLINK("x")', "a\nb", "Ω"] * 5
 # Names of files in Latin-1 and of no encoding at all.
@@ -32,14 +31,19 @@ def faces():
     """Return a table of faces with a column of other texts."""
     bunch = make_face_tracks(n_frames=40, n_components=2, random_state=0)
     frame = pd.DataFrame(bunch.data, columns=bunch.feature_names)
-    return pd.concat([pd.Series(CELLS, name="ομάδα"), frame], axis=1)
+    return frame.assign(ομάδα=CELLS)
+
+
+@pytest.fixture
+def path(faces, tmp_path):
+    """Return the path of that table."""
+    return saved(tmp_path / "faces.csv", faces)
 
 
 def test_paths_that_are_not_utf8(fits, succeeds, faces, tmp_path):
     folder = tmp_path / NOT_UTF8
     folder.mkdir()
-    table = folder / f"{NOT_UTF8}.csv"
-    faces.to_csv(table, index=False)
+    table = saved(folder / f"{NOT_UTF8}.csv", faces)
     found = fits(table, *QUICK, folder=folder / "results")
     assert found.err == ""
     assert "caf\\udce9 \\udcff" in " ".join(found.out.split())
@@ -53,7 +57,7 @@ def test_paths_that_are_not_utf8(fits, succeeds, faces, tmp_path):
 
 def test_files_of_points_whose_names_are_not_utf8(fits, faces, tmp_path):
     folder = tmp_path / os.fsdecode(b"pts \xfe")
-    points = faces.iloc[:, 1:].to_numpy().reshape(40, -1, 2)
+    points = faces.iloc[:, :-1].to_numpy().reshape(40, -1, 2)
     for file in write_pts(folder, points).glob("*.pts"):
         file.rename(folder / f"{file.stem} {NOT_UTF8}.pts")
     files = list(read_landmarks(folder).frames["file"])
@@ -62,17 +66,13 @@ def test_files_of_points_whose_names_are_not_utf8(fits, faces, tmp_path):
 
 
 @pytest.mark.parametrize("encoding", slow_after(1, ["cp1252", "ascii", "utf-16"]))
-def test_output_in_any_encoding(faces, tmp_path, monkeypatch, encoding):
-    faces.to_csv(tmp_path / "faces.csv", index=False)
+def test_output_in_any_encoding(path, tmp_path, monkeypatch, encoding):
     shown = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding=encoding))
-    rule = ["--skip-rows", "ομάδα=Ψ"]
-    folder = ["-o", str(tmp_path / "results")]
-    argv = ["fit", str(tmp_path / "faces.csv"), *folder, *rule, *QUICK]
-    assert main(argv) == 0
-    text = shown.getvalue().decode(encoding)
-    assert text.startswith("2 movements in 40 frames")
-    assert load_model(tmp_path / "results" / MODEL).basis_.shape[0] == 2
+    argv = ["fit", str(path), "-o", str(tmp_path / "out"), "--skip-rows", "ομάδα=Ψ"]
+    assert main([*argv, *QUICK]) == 0
+    assert shown.getvalue().decode(encoding).startswith("2 movements in 40 frames")
+    assert load_model(tmp_path / "out" / MODEL).basis_.shape[0] == 2
 
 
 INTERRUPTED = """
@@ -96,9 +96,8 @@ sys.exit(main(sys.argv[2:]))
     "module",
     slow_after(1, ["argparse", "isa_nrsfm._estimator", "isa_nrsfm.cli._main", "numpy"]),
 )
-def test_interruption_while_modules_are_imported(faces, tmp_path, module):
-    faces.to_csv(tmp_path / "faces.csv", index=False)
-    argv = ["fit", str(tmp_path / "faces.csv"), "-o", str(tmp_path / "out"), *QUICK]
+def test_interruption_while_modules_are_imported(path, tmp_path, module):
+    argv = ["fit", str(path), "-o", str(tmp_path / "out"), *QUICK]
     command = [sys.executable, "-c", INTERRUPTED, module, *argv]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (130, "")
@@ -112,9 +111,12 @@ def test_interruption_while_modules_are_imported(faces, tmp_path, module):
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_the_latest_line_is_repeated(terminal, capsys, monkeypatch):
+def test_the_latest_line_is_repeated_ever_more_rarely(terminal, capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr", stream := io.StringIO())
     monkeypatch.setattr(stream, "isatty", lambda: terminal)
+    with shown_progress(time.perf_counter() - 3600, shortest=0.02):
+        time.sleep(0.2)
+    assert stream.getvalue() == ""
     with shown_progress(time.perf_counter(), shortest=0.02):
         print("a stage: 1 s")
         assert stream.getvalue().count("a stage: 1 s\n") >= terminal
@@ -128,18 +130,10 @@ def test_the_latest_line_is_repeated(terminal, capsys, monkeypatch):
     assert capsys.readouterr().out == ""
 
 
-def test_lines_become_rarer(monkeypatch):
-    monkeypatch.setattr("sys.stderr", stream := io.StringIO())
-    with shown_progress(time.perf_counter() - 3600, shortest=0.02):
-        time.sleep(0.2)
-    assert stream.getvalue() == ""
-
-
 def test_fits_say_their_stage_and_step(capsys):
     table = make_nonrigid_tracks(30, 12, 1, noise=0.01, random_state=0).data
     AffineNRSfM(1, random_state=0, verbose=2).fit(table)
-    begun = re.split("[\r\n]", capsys.readouterr().out)
-    begun = [line.removeprefix("[AffineNRSfM] ") for line in begun]
+    begun = re.split(r"[\r\n]+(?:\[AffineNRSfM\] )?", "\n" + capsys.readouterr().out)
     steps = [int(line.split(" step ")[1]) for line in begun if " step " in line]
     assert steps == [*range(1, len(steps) + 1)]
     assert steps

@@ -12,7 +12,7 @@ from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import find_format
+from isa_nrsfm.io import find_format  # noqa: F401  in refusals.txt
 
 N_FRAMES = 40
 LOST, EMPTY = 3, 7
@@ -22,11 +22,11 @@ QUICK = "-k 1 --isa fast --n-init 2 --refinement none --no-figures".split()
 @cache
 def tracks(n_points):
     """Return points in an image; 68 are those of faces."""
-    make = make_face_tracks if n_points == 68 else make_nonrigid_tracks
-    options = {} if n_points == 68 else {"n_points": n_points}
-    scene = make(N_FRAMES, n_components=1, random_state=0, **options)
-    low, high = scene.data.min(), scene.data.max()
-    return ((scene.data - low) / (high - low) * 400 + 20).reshape(N_FRAMES, -1, 2)
+    faces = make_face_tracks(N_FRAMES, n_components=1, random_state=0)
+    others = make_nonrigid_tracks(N_FRAMES, n_points, 1, random_state=0)
+    data = (faces if n_points == 68 else others).data
+    shares = (data - data.min()) / (data.max() - data.min())
+    return (shares * 400 + 20).reshape(N_FRAMES, -1, 2)
 
 
 # Each writes a file and returns its path, options, columns that are kept, and the
@@ -120,35 +120,10 @@ def test_columns_make_any_file_a_table(fits, tmp_path):
     assert "eye_lmk_x_#,eye_lmk_y_# (56)" in out.partition("coordinates not used: ")[2]
 
 
-def test_a_model_of_other_points_is_refused(fails, fits, transforms, tmp_path):
-    # All name their points x_0, y_0, ..., and are not the same points.
+def test_models_transform_files_of_other_formats(fits, transforms, tmp_path):
     model = fits(write_pts(tmp_path)[0], *QUICK).path
-    mesh, options, *_ = write_mediapipe(tmp_path)
-    message = fails("transform", model, mesh, "-o", tmp_path / "a.csv", *options)
-    assert "820 columns are only in the table (x_68, y_68," in message
     _, out, _ = transforms(model, write_openface(tmp_path)[0])
     assert "1 rows: tracking failed" in out
-
-
-def test_confidences_of_a_plain_table(fits, transforms, tmp_path):
-    confidence = np.random.default_rng(0).uniform(0.2, 1.0, (N_FRAMES, 20))
-    table = pd.DataFrame({"id": [f"i{i}" for i in range(N_FRAMES)]})
-    for j, points in enumerate(tracks(20).swapaxes(0, 1)):
-        table[[f"p{j}_x", f"p{j}_y"]] = points
-        table[f"p{j}_conf"] = confidence[:, j]
-    path = files.saved(tmp_path / "table.csv", table)
-    unsure = ["--min-confidence", "0.4"]
-    found = fits(path, *QUICK, *unsure)
-    assert list(found.alpha) == ["row", "id", "alpha_1"]
-    again, *_ = transforms(found.path, path, *unsure)
-    np.testing.assert_allclose(again["alpha_1"], found.alpha["alpha_1"], atol=1e-3)
-    # Unused, they are counted, and not copied.
-    found = fits(path, *QUICK)
-    assert "not used: p0_conf, ... (confidences) (20)" in found.page
-    assert list(found.alpha) == ["row", "id", "alpha_1"]
-
-
-SHARES = "like fractions of the width and height of an image"
 
 
 def write_shares(folder, change=lambda shares: shares):
@@ -159,19 +134,11 @@ def write_shares(folder, change=lambda shares: shares):
     return files.saved(folder / "hands.csv", table)
 
 
-def test_most_points_are_inside_of_the_image(begins, fails, tmp_path):
-    def change(shares):
-        shares[3, 5] = [0.5, 1.25]
-        shares[4, 6] = [-0.125, 0.5]
-        return shares
-
-    options = ["--format", "mediapipe", "--image-size", "1920x1080"]
-    path = write_shares(tmp_path, change)
-    assert find_format(path) == "table"
-    assert SHARES not in begins(path, *options)
-    path = write_shares(tmp_path, lambda shares: shares - shares[:, :1])
-    message = "the coordinates are no fractions of the width and height of an image"
-    assert message in fails("fit", path, "-o", tmp_path / "results", *options)
+def partly_outside(shares):
+    """Return shares of which a few are outside of the image."""
+    shares[3, 5], shares[4, 6] = [0.5, 1.25], [-0.125, 0.5]
+    return shares
 
 
+MESH = ["--format", "mediapipe", "--image-size", "1920x1080"]
 test_refusals = refusals_of("cli_formats", globals())

@@ -6,17 +6,17 @@ import numpy as np
 import pandas as pd
 import pytest
 from exported_files import Read, content_of
-from fit_runs import JOINT, Results
+from fit_runs import JOINT, Results, ran
 from landmark_files import saved
 from layers import slow_after
 from refusals import refusals_of
 
 from isa_nrsfm import datasets, plotting
-from isa_nrsfm.cli import main
 from isa_nrsfm.export import frame_poses
 from isa_nrsfm.skeletons import get_skeleton
 
-QUICK = [*"--n-components 1 --refinement none --isa fast --n-init 2".split()]
+QUICK = "--n-components 1 --refinement none --isa fast --n-init 1".split()
+UNDRAWN = [*QUICK, "--no-figures"]
 
 
 def write(scene, path, names=None):
@@ -50,13 +50,13 @@ def table(bodies, tmp_path_factory):
 def bodies_fit(table, tmp_path_factory):
     """Return the results of a fit of bodies without names."""
     folder = tmp_path_factory.mktemp("fit")
-    assert main(["fit", str(table), "-o", str(folder), "--no-figures", *QUICK]) == 0
+    assert ran("fit", table, "-o", folder, *UNDRAWN)[0] == 0
     return Results(folder)
 
 
 def test_layouts_are_recognised_by_order_or_names(fits, bodies, bodies_fit, tmp_path):
     path = write(datasets.make_hand_tracks(120, random_state=0), tmp_path / "hands.csv")
-    found = fits(path, "--no-figures", *QUICK)
+    found = fits(path, *UNDRAWN)
     assert "(hand-21)" in found.out
     assert found.report["model"]["skeleton"] == "hand-21"
     assert edges_of(tmp_path / "viewer.html") == (pairs_of("hand-21"), [])
@@ -67,9 +67,9 @@ def test_layouts_are_recognised_by_order_or_names(fits, bodies, bodies_fit, tmp_
     assert "joined by a minimal spanning tree" in content_of(viewer)["about"]
     assert bodies_fit.report["model"]["skeleton"] is None
     names = [f"{name}_{axis}" for name in bodies.point_names for axis in "xy"]
-    fits(write(bodies, tmp_path / "bodies.csv", names), "--no-figures", *QUICK)
-    sides = get_skeleton("coco-17").sides.tolist()
-    assert edges_of(tmp_path / "viewer.html") == (pairs_of("coco-17"), sides)
+    fits(write(bodies, tmp_path / "bodies.csv", names), *UNDRAWN)
+    expected = pairs_of("coco-17"), get_skeleton("coco-17").sides.tolist()
+    assert edges_of(tmp_path / "viewer.html") == expected
 
 
 def test_fit_takes_a_skeleton_for_all_that_it_draws(fits, table, tmp_path, monkeypatch):
@@ -90,11 +90,9 @@ def test_fit_takes_a_skeleton_for_all_that_it_draws(fits, table, tmp_path, monke
 def test_edges_of_a_file(fits, succeeds, table, bodies_fit, tmp_path):
     own, config = tmp_path / "edges.csv", tmp_path / "config.yaml"
     own.write_text("5,7\n7,9\n")
-    for options in ([], ["--edges", own]):
-        found = fits(table, "--no-figures", *QUICK, *options)
-        # Without any, the report names the options.
-        advice = "--edges FILE or --skeleton LAYOUT"
-        assert (advice in found.page) == (options == [])
+    advice = "--edges FILE or --skeleton LAYOUT"  # without any
+    assert advice in bodies_fit.page
+    assert advice not in fits(table, *UNDRAWN, "--edges", own).page
     assert edges_of(tmp_path / "viewer.html")[0] == {(5, 7), (7, 9)}
 
     def drawn(*options):
@@ -124,9 +122,8 @@ def test_transform_writes_a_page(fails, transforms, table, bodies_fit, tmp_path)
 
 def test_where_y_is_zero_is_said(fits, transforms, succeeds, tmp_path):
     # Points without a known layout, which nothing else says to be upside down.
-    scene = datasets.make_nonrigid_tracks(
-        40, 12, 1, camera="weak_perspective", random_state=0
-    )
+    options = {"camera": "weak_perspective", "random_state": 0}
+    scene = datasets.make_nonrigid_tracks(24, 10, 1, **options)
     path = write(scene, tmp_path / "points.csv")
     options = ["-k", "1", "--std", *JOINT]
     lower = ["--origin", "lower", "--viewer", tmp_path / "new.html"]
@@ -152,8 +149,8 @@ def test_edges_are_numbers_of_named_points(run, fails, bodies, tmp_path):
     names = [f"j{j:02d}.{axis}" for j in range(17) for axis in "xy"]
     table = write(bodies, tmp_path / "named.csv", names)
     edges, out = tmp_path / "edges.csv", tmp_path / "out"
-    fit = ["fit", table, "-o", out, "--no-figures", *QUICK, "--edges", edges]
     edges.write_text("5,7\n7,j09\n")
+    fit = ["fit", table, "-o", out, *UNDRAWN, "--edges", edges]
     # Of some of the points, numbers could be those of the table or of these points.
     message = "such as j05, j06 (without --points also their numbers from zero)"
     assert message in fails(*fit, "--points", "without:0-4")
@@ -170,18 +167,18 @@ def faces(tmp_path_factory):
 
 @pytest.mark.parametrize("options", slow_after(1, [[], ["--skeleton", "ibug-68"]]))
 def test_inner_points_are_fitted_and_drawn(fits, transforms, faces, tmp_path, options):
-    found = fits(faces, "--points", "inner", *options, "--no-figures", *QUICK)
+    found = fits(faces, "--points", "inner", *options, *UNDRAWN)
     assert "60 frames of 51 points" in found.out
     assert "coordinates not used: --points inner (17)" in found.page
     assert "(ibug-51)" in found.out
     assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("ibug-51")
     assert found.model.feature_names_in_.tolist()[:2] == ["x_17", "y_17"]
-    alpha, page = found.alpha, tmp_path / "v.html"
-    assert alpha.columns.tolist() == ["row", "alpha_1"]
+    assert found.alpha.columns.tolist() == ["row", "alpha_1"]
     # The table with all points has these points.
+    page = tmp_path / "v.html"
     for columns in ([], ["--columns", "x_#,y_#"]):
         again, *_ = transforms(found.path, faces, *columns, "--viewer", page)
-        np.testing.assert_allclose(again["alpha_1"], alpha["alpha_1"], atol=1e-9)
+        np.testing.assert_allclose(again["alpha_1"], found.alpha["alpha_1"], atol=1e-9)
         assert edges_of(page)[0] == pairs_of("ibug-51")
 
 
@@ -190,7 +187,7 @@ def test_inner_points_are_fitted_and_drawn(fits, transforms, faces, tmp_path, op
     [("without:0-16", range(17, 68)), ("36-47, 30,48-67,30", [30, *range(36, 68)])],
 )
 def test_points_are_named(fits, faces, tmp_path, points, kept):
-    found = fits(faces, "--no-figures", "--points", points, *QUICK)
+    found = fits(faces, "--points", points, *UNDRAWN)
     names = found.model.feature_names_in_
     assert names[::2].tolist() == [f"x_{j}" for j in kept]
     expected = get_skeleton("ibug-68").subset(kept).edges.tolist()

@@ -13,13 +13,11 @@ import os
 import signal
 import warnings
 import zlib
-from collections import Counter
 from pathlib import Path
 
 import damage
 import landmark_files as files
 import numpy as np
-import pandas as pd
 import pytest
 from layers import slow_after
 from sklearn.exceptions import NotFittedError
@@ -84,30 +82,30 @@ def check_landmarks(found):
     assert not np.isnan(points).all(axis=(1, 2)).any()
 
 
-def rows_of(path, separator):
-    """Return the cells of a file as Python's reader finds them, without empty lines."""
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.reader(file, delimiter=separator)
-        return [row for row in rows if "".join(row).strip() or len(row) > 1]
-
-
-def check_cells(points, failed, path, separator=","):
+def check_cells(points, failed, path, separator):
     """Assert that points have the numbers that Python's reader finds in the cells."""
-    rows = rows_of(path, separator)
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = [*csv.reader(file, delimiter=separator)]
+    rows = [row for row in rows if "".join(row).strip() or len(row) > 1]
     header = [name.strip() for name in rows[0]]
-    assert len(rows) - 1 == len(points)
-    times = Counter(header)
-    assert all(times[name] == 1 for name in points)
-    columns = dict(zip(header, zip(*rows[1:], strict=True), strict=True))
-    for name, values in zip(points, points.to_numpy().T, strict=True):
-        written = columns[name]
+    table = io.read_table(path)
+    assert table.shape == (len(points), len(header)) == (len(rows) - 1, len(rows[0]))
+    assert all(header.count(name) == 1 for name in points)
+    cells = [*zip(*rows[1:], strict=True)]
+    for name, texts in zip(table, cells, strict=True):
+        if table[name].dtype != np.float64:
+            assert list(table[name]) == list(texts)
+    for name in points:
+        texts, values = cells[header.index(name)], points[name].to_numpy()
         for i in np.flatnonzero(~failed):
-            cell, value = written[i].strip(), values[i]
-            missing = cell.lower() in ("", "na", "nan", "n/a", "null", "none")
-            missing |= cell.lower() in ("<na>", "#n/a", "nan(ind)", "-nan(ind)")
-            assert np.isnan(value) if missing else float(cell) == value
+            if (text := texts[i].strip()).lower() in MISSING:
+                assert np.isnan(values[i])
+            else:
+                assert float(text) == values[i]
 
 
+MISSING = {"", "na", "nan", "n/a", "null", "none", "<na>", "#n/a"}
+MISSING |= {"nan(ind)", "-nan(ind)"}
 # Warnings of some formats: how an array is read, shares, and what is left out.
 SAID = "the array|.*fractions of the width|not of \\w+, and left|shapes that are no"
 
@@ -123,28 +121,10 @@ def read_format(name):
             found = io.read_landmarks(path, format)
         check_landmarks(found)
         separator = {".csv": ",", ".tsv": "\t"}.get(path.suffix)
-        if format in ("openface", "pyfeat") and separator is not None:
+        if format in ("openface", "pyfeat", "table") and separator is not None:
             check_cells(found.points, found.failed, path, separator)
 
     return read
-
-
-def read_text_table(path):
-    table = io.read_table(path)
-    separator = {".csv": ",", ".tsv": "\t"}[path.suffix]
-    rows = rows_of(path, separator)
-    assert table.shape == (len(rows) - 1, len(rows[0]))
-    for name, cells in zip(table, zip(*rows[1:], strict=True), strict=True):
-        if table[name].dtype != np.float64:
-            assert list(table[name]) == list(cells)
-    found = io.read_landmarks(path, "table")
-    check_landmarks(found)
-    check_cells(found.points, found.failed, path, separator)
-
-
-def read_parquet(path):
-    io.read_table(path)
-    check_landmarks(io.read_landmarks(path, "table"))
 
 
 def read_stored(path):
@@ -171,25 +151,8 @@ def read_shape_model(path):
 # --- formats ------------------------------------------------------------------------
 
 
-def write_points(path):
-    columns = [f"{name}_{axis}" for name in files.BODYPARTS for axis in "xy"]
-    points = files.TRACKS.reshape(len(files.TRACKS), -1)
-    frame = pd.DataFrame(points, columns=columns)
-    frame.insert(0, "id", [f"00{i}" for i in range(len(frame))])
-    io.write_table(frame, path)
-    return path
-
-
-def write_parts(path, suffix):
-    path.mkdir()
-    for number, part in enumerate(np.array_split(files.scene(6), 3)):
-        rows = part.reshape(len(part), -1)
-        file = path / f"part{number}{suffix}"
-        if suffix == ".npy":
-            np.save(file, rows)
-        else:
-            pd.DataFrame(rows, columns=[f"c{i}" for i in range(16)]).to_parquet(file)
-    return path
+def save_row(path, _, points):
+    np.save(path, points.reshape(1, -1))
 
 
 def written(path, write, content):
@@ -204,13 +167,13 @@ def model():
 
 # Writes a valid file or folder and returns its path; reads it and asserts the promises.
 FORMATS = {
-    "csv": (lambda d: write_points(d / "a.csv"), read_text_table),
-    "tsv": (lambda d: write_points(d / "a.tsv"), read_text_table),
-    "parquet": (lambda d: write_points(d / "a.parquet"), read_parquet),
     "model": (lambda d: written(d / "a.npz", io.save_model, model()), read_model),
     "pdm txt": (lambda d: written(d / "a.txt", write_pdm, PDM), read_shape_model),
-    "npy folder": (lambda d: write_parts(d / "a", ".npy"), read_stored),
-    "parquet folder": (lambda d: write_parts(d / "a", ".parquet"), read_stored),
+    "npy folder": (files.to("a", files.write_each, ".npy", save_row), read_stored),
+    "parquet folder": (
+        files.to("a", files.write_each, ".parquet", files.write_row),
+        read_stored,
+    ),
     **{name: (write, read_format(name)) for name, write in files.WRITERS.items()},
 }
 

@@ -22,6 +22,7 @@ from isa_nrsfm.io import read_table, save_model, write_table
 
 OLD = b"what was there before"
 TABLE = pd.DataFrame({"x0": np.linspace(0, 1, 9) / 3, "y0": np.arange(9.0)})
+TRACKS = make_nonrigid_tracks(40, 12, 1, noise=0.01, random_state=0).data
 # More than what a file buffers.
 NUMBERS = np.random.default_rng(0).normal(size=(2000, 2))
 LONG_TABLE = pd.DataFrame(NUMBERS, columns=["x0", "y0"])
@@ -96,17 +97,13 @@ def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
     assert n_failed >= 4  # opened, written, on the disk, closed
 
 
-def test_what_is_no_file_is_written_to(tmp_path):
-    pipe = tmp_path / "pipe.csv"
+def test_pipes_are_written_to_and_links_and_permissions_stay(tmp_path):
+    pipe, path, link = (tmp_path / f"{name}.csv" for name in ("pipe", "a", "link"))
     os.mkfifo(pipe)
     reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     write_table(TABLE, pipe)
     assert os.read(reading, 1000).startswith(b"x0,y0\n")
     os.close(reading)
-
-
-def test_links_and_permissions_stay(tmp_path):
-    path, link = tmp_path / "a.csv", tmp_path / "link.csv"
     path.write_bytes(OLD)
     path.chmod(0o640)
     link.symlink_to("a.csv")
@@ -128,86 +125,77 @@ def test_files_that_are_protected_stay(tmp_path):
     assert path.read_bytes() == OLD
 
 
-@pytest.fixture(name="table", scope="module")
-def small_table():
-    return make_nonrigid_tracks(40, 12, 1, noise=0.01, random_state=0).data
+def keeping(folder):
+    """Return an estimator that keeps the coefficients of frames in a folder."""
+    quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
+    return AffineNRSfM(1, keep_frames=folder, **quick)
 
 
-class TestKeepFrames:
-    @staticmethod
-    def estimator(folder, **params):
-        quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
-        return AffineNRSfM(1, keep_frames=folder, **quick, **params)
-
-    @pytest.mark.parametrize("strike", slow_after(1, STRIKES))
-    def test_a_fit_that_fails_leaves_nothing(self, tmp_path, table, strike):
-        folder = tmp_path / "kept"
-        first, second = self.estimator(folder), self.estimator(folder)
-        fits = lambda: first.fit(table), lambda: second.fit(table[:30])
-        faults = every_fault(folder, strike, *fits, stride=4)
-        for raised, before, operations in faults:
-            after = readable(folder)
-            assert before.items() <= after.items()
-            assert len(first.alpha_) == 40
-            if raised is None:
-                assert len(after) == 2 * len(before) == 8
-                assert len(second.alpha_) == 30
-                second = self.estimator(folder)  # without a fit for the next fault
-                continue
-            if isinstance(raised, OSError):
-                assert str(folder) in str(raised.filename)
-            refused(None, second.transform, table, error=NotFittedError)
-            if strike != "killed":
-                assert (after, leftovers(folder)) == (before, []), operations
-
-    def test_fits_never_meet(self, tmp_path, table):
-        first = self.estimator(tmp_path / "kept").fit(table)
-        alpha = first.alpha_.copy()
-        first_again = self.estimator(tmp_path / "kept").fit(table)
-        second = self.estimator(tmp_path / "kept").fit(table[:20])
-        names = {m.alpha_.filename for m in (first, first_again, second)}
-        assert len(names) == 3
-        assert_array_equal(first.alpha_, alpha)
-        assert len(second.alpha_) == 20
-        kept = first.alpha_
-        first.fit(table[:20])
-        assert_array_equal(kept, alpha)
-
-    def test_bad_folders_are_refused_before_the_fit(self, tmp_path, table, monkeypatch):
-        def never(*_args, **_keywords):
-            raise AssertionError("the fit has begun")
-
-        monkeypatch.setattr(FastISA, "fit", never)
-        refused(r"keep_frames should be .* got ''", self.estimator("").fit, table)
-        (tmp_path / "file").write_bytes(OLD)
-        for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
-            error = refused(None, self.estimator(bad).fit, table, error=OSError)
-            assert error.filename == str(bad)
-        model = self.estimator(tmp_path / "no")
-        with disk_faults(tmp_path / "no", "disk full", 2) as faults:
-            error = refused(None, model.fit, table, error=OSError)
-        assert error.filename == str(tmp_path / "no")
-        assert not (tmp_path / "no").exists(), faults.operations
-
-    def test_folders_of_a_fit_that_fails_are_removed(self, tmp_path, table):
-        refused("points", self.estimator(tmp_path / "new" / "kept").fit, table[:, :6])
-        assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize("strike", slow_after(1, STRIKES))
+def test_a_fit_that_fails_leaves_no_frames(tmp_path, strike):
+    folder = tmp_path / "kept"
+    first, second = keeping(folder), keeping(folder)
+    fits = lambda: first.fit(TRACKS), lambda: second.fit(TRACKS[:30])
+    faults = every_fault(folder, strike, *fits, stride=4)
+    for raised, before, operations in faults:
+        after = readable(folder)
+        assert before.items() <= after.items()
+        assert len(first.alpha_) == 40
+        if raised is None:
+            assert len(after) == 2 * len(before) == 8
+            assert len(second.alpha_) == 30
+            second = keeping(folder)  # without a fit for the next fault
+            continue
+        if isinstance(raised, OSError):
+            assert str(folder) in str(raised.filename)
+        refused(None, second.transform, TRACKS, error=NotFittedError)
+        if strike != "killed":
+            assert (after, leftovers(folder)) == (before, []), operations
 
 
-@pytest.fixture
-def landmarks(tmp_path):
-    path = tmp_path / "landmarks.csv"
+def test_frames_of_fits_never_meet(tmp_path):
+    first, again, second = (keeping(tmp_path / "kept") for _ in range(3))
+    kept = first.fit(TRACKS).alpha_
+    alpha = kept.copy()
+    again.fit(TRACKS)
+    assert len(second.fit(TRACKS[:20]).alpha_) == 20
+    names = {model.alpha_.filename for model in (first, again, second)}
+    assert len(names) == 3
+    first.fit(TRACKS[:20])
+    assert_array_equal(kept, alpha)
+
+
+def test_bad_folders_of_frames_are_refused_before_the_fit(tmp_path, monkeypatch):
+    def never(*_args, **_keywords):
+        raise AssertionError("the fit has begun")
+
+    monkeypatch.setattr(FastISA, "fit", never)
+    refused(r"keep_frames should be .* got ''", keeping("").fit, TRACKS)
+    (tmp_path / "file").write_bytes(OLD)
+    for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
+        error = refused(None, keeping(bad).fit, TRACKS, error=OSError)
+        assert error.filename == str(bad)
+    bad = tmp_path / "no"
+    with disk_faults(bad, "disk full", 2) as faults:
+        error = refused(None, keeping(bad).fit, TRACKS, error=OSError)
+    assert (error.filename, bad.exists()) == (str(bad), False), faults.operations
+    # Neither are there folders of fits that fail.
+    refused("points", keeping(bad / "kept").fit, TRACKS[:, :6])
+    assert os.listdir(tmp_path) == ["file"]
+
+
+@pytest.fixture(scope="module")
+def landmarks(tmp_path_factory):
+    path = tmp_path_factory.mktemp("table") / "landmarks.csv"
     write_landmarks(path)
     return path
 
 
 @pytest.fixture(scope="module")
-def old_run(tmp_path_factory):
+def old_run(landmarks):
     """Return the folder of a run with figures."""
-    folder = tmp_path_factory.mktemp("old")
-    write_landmarks(folder / "landmarks.csv")
-    assert fit(folder / "landmarks.csv", folder / "out", 1) == 0
-    return folder / "out"
+    assert fit(landmarks, landmarks.with_name("out"), 1) == 0
+    return landmarks.with_name("out")
 
 
 @pytest.fixture
@@ -268,50 +256,45 @@ class TestFit:
         link.symlink_to("mine.txt")
         assert fit(landmarks, folder, 2, "--no-figures") == 0
         assert (mine.read_bytes(), os.readlink(link)) == (OLD, "mine.txt")
+        assert set(os.listdir(folder)) == FILES | {"mine.txt", "link"}
         mine.unlink()
         link.unlink()
-        assert set(os.listdir(folder)) == FILES
         assert whole_run(readable(folder)) == 2
 
     def test_what_is_no_plain_file_is_not_replaced(self, fails, landmarks, tmp_path):
-        folder = tmp_path / "out"
-        folder.mkdir()
-        (folder / "alpha.csv").symlink_to(landmarks)
-        err = fails("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
-        assert "alpha.csv would be overwritten" in err or "overwritten by" in err
-        (folder / "alpha.csv").unlink()
-        (folder / "alpha.csv").mkdir()
-        message = fails("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
-        assert f"{folder / 'alpha.csv'}: is no plain file" in message
-        assert os.listdir(folder) == ["alpha.csv"]
+        alpha = tmp_path / "out" / "alpha.csv"
+        alpha.parent.mkdir()
+        alpha.symlink_to(landmarks)
+        argv = ["fit", landmarks, "-o", alpha.parent, "-k", 1, "--no-figures"]
+        assert "would be overwritten" in fails(*argv)
+        alpha.unlink()
+        alpha.mkdir()
+        assert f"{alpha}: is no plain file" in fails(*argv)
+        assert os.listdir(alpha.parent) == ["alpha.csv"]
 
 
-class TestRunsThatAreMixed:
-    def warned(self, succeeds, folder, landmarks, model="model.npz"):
-        new = ["-o", folder / "new.csv", "--force"]
+def test_models_beside_reports_of_another_run_are_told(
+    succeeds, folder, landmarks, tmp_path
+):
+    def told(model="model.npz"):
+        new = ["-o", tmp_path / "new.csv", "--force"]
         err = succeeds("transform", folder / model, landmarks, *new)[1]
-        new[1] = folder / "new.npz"
+        new[1] = tmp_path / "new.npz"
         assert succeeds("export", folder / model, *new)[1] == err
         return err
 
-    def test_files_of_one_run(self, succeeds, folder, landmarks):
-        assert self.warned(succeeds, folder, landmarks) == ""
-        for absent in ("alpha.csv", "report.json"):
-            (folder / absent).unlink()
-            assert self.warned(succeeds, folder, landmarks) == ""
-        # Reports of something else
-        for text in ("", "[]", '{"sha256": 3}', '{"sha256": {"../a": "b"}}'):
-            (folder / "report.json").write_text(text)
-            assert self.warned(succeeds, folder, landmarks) == ""
-
-    def test_files_of_two_runs(self, succeeds, folder, landmarks, tmp_path):
-        assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
-        for name in ("alpha.csv", "model.npz"):
-            shutil.copy(tmp_path / "other" / name, folder)
-        said = self.warned(succeeds, folder, landmarks)
-        assert f"{folder / 'report.json'} is of another run than model.npz" in said
-
-    def test_a_model_elsewhere(self, succeeds, folder, landmarks):
-        shutil.copy(folder / "model.npz", folder / "copy.npz")
-        (folder / "model.npz").write_bytes(OLD)
-        assert self.warned(succeeds, folder, landmarks, "copy.npz") == ""
+    shutil.copy(folder / "model.npz", folder / "copy.npz")
+    assert told() == ""
+    (folder / "alpha.csv").unlink()
+    assert told() == ""
+    assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
+    for name in ("alpha.csv", "model.npz"):
+        shutil.copy(tmp_path / "other" / name, folder)
+    assert f"{folder / 'report.json'} is of another run than model.npz" in told()
+    assert told("copy.npz") == ""
+    # Reports of something else, or none
+    for text in ("", "[]", '{"sha256": 3}', '{"sha256": {"../a": "b"}}'):
+        (folder / "report.json").write_text(text)
+        assert told() == ""
+    (folder / "report.json").unlink()
+    assert told() == ""

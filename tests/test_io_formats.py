@@ -55,16 +55,19 @@ SUCCESS = np.array([1, 0, *[1] * 10])
 CONFIDENCE = np.linspace(0, 1, 12).round(2)
 
 
+def openface_text(**known):
+    """Return a table of OpenFace."""
+    with TemporaryDirectory() as folder:
+        return files.write_openface(Path(folder, "a.csv"), TRACKS, **known).read_text()
+
+
 def openface(folder, **options):
     """Read a table of OpenFace with infinite numbers in the row that failed."""
-    known = {"success": SUCCESS, "confidence": CONFIDENCE}
-    path = files.write_openface(folder / "a.csv", TRACKS, **known)
-    lines = path.read_text().splitlines()
+    lines = openface_text(success=SUCCESS, confidence=CONFIDENCE).splitlines()
     for number, text in ((TRACKS[1, 2, 0], "inf"), (TRACKS[1, 3, 0], "-nan(ind)")):
         assert f",{number}," in lines[2]
         lines[2] = lines[2].replace(f",{number},", f",{text},")
-    path.write_text("\n".join(lines) + "\n")
-    return read_landmarks(path, **options)
+    return read_landmarks(files.write_text(folder / "a.csv", *lines), **options)
 
 
 # The third of twelve faces is not found.
@@ -85,21 +88,13 @@ def mesh(folder, tracks=MESH, **given):
     return files.write_mesh(folder / "a.csv", tracks, **given)
 
 
-def test_shares_of_the_image_become_pixels(tmp_path):
-    landmarks = read_landmarks(mesh(tmp_path), image_size=files.IMAGE_SIZE)
-    assert_allclose(tracks_of(landmarks), MESH)
-    assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
-
-
-def test_pts_files_are_read_in_the_order_of_names(tmp_path):
-    folder = files.write_pts(tmp_path / "faces", TRACKS)
-    (folder / "image_000.pts").rename(folder / "last.PTS")
-    (folder / "._image_001.pts").write_text("not one")
-    (folder / "inner").mkdir()
-    landmarks = read_landmarks(folder)
-    assert_array_equal(tracks_of(landmarks), np.roll(TRACKS, -1, axis=0))
-    assert list(landmarks.frames["file"][-2:]) == ["image_011.pts", "last.PTS"]
-    assert landmarks.confidence is None
+def images(folder):
+    """Read files of points beside other files."""
+    files.write_pts(folder / "faces", TRACKS)
+    (folder / "faces" / "image_000.pts").rename(folder / "faces" / "last.PTS")
+    (folder / "faces" / "._image_001.pts").write_text("not one")
+    (folder / "faces" / "inner").mkdir()
+    return read_landmarks(folder / "faces")
 
 
 def points_of_openpose(n_points, confidence=0.5, seed=1):
@@ -234,30 +229,6 @@ def test_sleap_axes_are_those_that_the_file_tells(order, named, tmp_path):
     assert_array_equal(np.isnan(tracks_of(sure)[..., 0]), lost)
 
 
-def test_sleap_tables_are_tables_with_names(tmp_path):
-    pair = np.stack([TRACKS, TRACKS + 100], axis=1)
-    scores = np.random.default_rng(0).uniform(0, 1, pair.shape[:3])
-    path = files.write_sleap_csv(tmp_path / "a.csv", pair, scores)
-    assert find_format(path) == "table"
-    landmarks = read_landmarks(path, min_confidence=0.2)
-    expected = np.where(scores[..., None] < 0.2, np.nan, pair)
-    assert_array_equal(tracks_of(landmarks), expected.reshape(24, 8, 2))
-    assert list(landmarks.frames) == ["track", "frame_idx", "instance.score"]
-    assert landmarks.point_names[:2] == ("snout", "ear_L")
-
-
-def test_points_without_a_confidence_are_kept(tmp_path):
-    scores = np.full((12, 1, 8), np.nan)
-    scores[0] = 0.1
-    given = {"scores": scores, "names": ()}
-    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
-    landmarks = read_landmarks(path, min_confidence=0.5)
-    assert "individual" not in landmarks.frames
-    lost = np.isnan(tracks_of(landmarks)).all(axis=(1, 2))
-    assert_array_equal(lost, np.arange(12) == 0)
-    assert not landmarks.failed.any()
-
-
 def annotations(folder):
     """Read persons of images in another order, and an image without anybody."""
     tracks = HIDDEN.copy()
@@ -268,18 +239,14 @@ def annotations(folder):
     return read_landmarks(files.write_json(folder / "a.json", content))
 
 
-def test_coco_categories_are_not_mixed(tmp_path):
+def two_kinds(folder):
+    """Return annotations of persons and of a hand."""
     content = files.coco_annotations(TRACKS)
     hand = {"id": 2, "name": "hand", "keypoints": ["wrist", "thumb"]}
     content["categories"].append(hand)
-    seen = {"id": 5, "image_id": 2, "category_id": 2}
-    content["annotations"].append(seen | {"keypoints": [1, 2, 2, 3, 4, 1]})
-    path = files.write_json(tmp_path / "a.json", content)
-    refused("person, hand have different keypoints", read_landmarks, path)
-    del content["categories"][1]
-    message = "1 annotations are of the category 2.* They are left out"
-    people = warned(message, read_landmarks, files.write_json(path, content))
-    assert_array_equal(tracks_of(people), TRACKS)
+    seen = {"id": 5, "image_id": 2, "category_id": 2, "keypoints": [1, 2, 2, 3, 4, 1]}
+    content["annotations"].append(seen)
+    return files.write_json(folder / "a.json", content)
 
 
 SCORED = np.dstack([TRACKS, np.linspace(0, 1, 96).reshape(12, 8)])
@@ -297,20 +264,16 @@ def results(folder, category=1):
 
 
 def test_tables_keep_options_of_their_own(tmp_path):
-    path = tmp_path / "a.tsv"
     names = [f"{axis}{j}" for axis in "ab" for j in range(8)]
     table = pd.DataFrame(files.planar(TRACKS), columns=names)
     table.iloc[2, [3, 11]] = table.iloc[4, 5] = 0
     table.insert(0, "id", [f"{i:03d}" for i in range(12)])
-    table.to_csv(path, sep="\t", index=False)
+    path = files.saved(tmp_path / "a.tsv", table, sep="\t")
     landmarks = read_landmarks(path, columns="a#,b#", missing=0)
     # Zeros are missing on request, and in pairs.
     expected = TRACKS.copy()
     expected[2, 3], expected[4, 5, 0] = np.nan, 0
     assert_array_equal(tracks_of(landmarks), expected)
-    expected[2, 3] = 0
-    as_written = warned("exactly", read_landmarks, path, columns="a#,b#")
-    assert_array_equal(tracks_of(as_written), expected)
     assert list(landmarks.frames["id"])[:2] == ["000", "001"]
     refused(r"a\.tsv cannot be read as table", read_landmarks, path)
 
@@ -342,57 +305,41 @@ def of_mediapipe(part):
 class Variable:
     """As much of an array with named axes as from_movement uses."""
 
-    def __init__(self, values, dims, coords):
-        self.values, self.dims = np.asarray(values), tuple(dims)
-        known = {name: np.asarray(coords[name]) for name in dims if name in coords}
-        self.coords = {name: SimpleNamespace(values=v) for name, v in known.items()}
+    def __init__(self, values, names):
+        self.values, self.dims = np.asarray(values), tuple(names)
+        known = {dim: np.asarray(each) for dim, each in names.items()}
+        self.coords = {dim: SimpleNamespace(values=v) for dim, v in known.items()}
 
     def transpose(self, *dims):
         axes = [self.dims.index(dim) for dim in dims]
-        coords = {name: coord.values for name, coord in self.coords.items()}
-        return Variable(self.values.transpose(axes), dims, coords)
+        names = {dim: self.coords[dim].values for dim in dims}
+        return Variable(self.values.transpose(axes), names)
 
 
-def movement_dataset(plural, order=(0, 1, 2, 3)):
+def movement_dataset(plural="", order=(0, 1, 2, 3), space="xy"):
     """Return a dataset of two mice, as movement names it now and did before."""
-    keypoint, individual = "keypoint" + "s" * plural, "individual" + "s" * plural
-    dims = ["time", "space", keypoint, individual]
-    coords = {"time": np.arange(12) / 30, "space": ["x", "y"]}
-    coords |= {keypoint: files.BODYPARTS, individual: ["id_0", "id_1"]}
+    names = {"time": np.arange(12) / 30, "space": [*space]}
+    names[f"keypoint{plural}"] = files.BODYPARTS
+    names[f"individual{plural}"] = ["id_0", "id_1"]
     pair = np.stack([TRACKS, TRACKS + 100], axis=3).transpose(0, 2, 1, 3)
     pair[3, :, :, 1] = np.nan
-    position = pair.transpose(order)
-    confidence = np.linspace(0, 1, 192).reshape(12, 8, 2)
-    return {
-        "position": Variable(position, [dims[i] for i in order], coords),
-        "confidence": Variable(confidence, [dims[0], *dims[2:]], coords),
-    }
+    of_position = {dim: names[dim] for dim in np.array([*names])[[*order]]}
+    of_scores = {dim: names[dim] for dim in names if dim != "space"}
+    scores = np.linspace(0, 1, 192).reshape(12, 8, 2)
+    position = Variable(pair.transpose(order), of_position)
+    return {"position": position, "confidence": Variable(scores, of_scores)}
 
 
-@pytest.mark.parametrize("plural", [True, False])
-@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 0, 2, 1)], ids=str)
-def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
-    landmarks = from_movement(movement_dataset(plural, order))
+@pytest.mark.parametrize("given", [("", (3, 0, 2, 1)), ("s", (0, 1, 2, 3))], ids=str)
+def test_movement_datasets_are_read_by_the_names_of_their_axes(given):
+    landmarks = from_movement(movement_dataset(*given))
     rows = np.stack([TRACKS, TRACKS + 100], axis=1).reshape(24, 8, 2)
     assert_allclose(tracks_of(landmarks), np.delete(rows, 7, axis=0))
     assert list(landmarks.frames["individual"][:2]) == ["id_0", "id_1"]
     assert_allclose(landmarks.frames["time"][:3], [0, 0, 1 / 30])
     assert landmarks.confidence.iloc[0, 1] == pytest.approx(2 / 191)
-    swapped = movement_dataset(plural, order)
-    swapped["position"].coords["space"].values = np.array(["y", "x"])
-    found = tracks_of(from_movement(swapped))
+    found = tracks_of(from_movement(movement_dataset(*given, space="yx")))
     assert_array_equal(found[..., ::-1], tracks_of(landmarks))
-
-
-def test_edges_of_sleap(tmp_path):
-    nodes = files.BODYPARTS
-    edges = [(nodes[0], nodes[2]), (nodes[1], nodes[2]), (nodes[2], nodes[3])]
-    for shape in (edges, list(zip(*edges, strict=True))):
-        given = {"names": ["a"], "edges": shape}
-        path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
-        found = read_landmarks(path).skeleton
-        assert found.edges.tolist() == [[0, 2], [1, 2], [2, 3]]
-        assert found.point_names == tuple(nodes)
 
 
 def skeleton_in(path, *options):
@@ -411,13 +358,6 @@ WIDE = pd.DataFrame(
     FACES.reshape(4, -1), columns=[f"{a}_{j}" for j in range(68) for a in "xy"]
 )
 THUMB = [SimpleNamespace(x=0.1 * j, y=0.2) for j in range(21)]
-
-
-def openface_text():
-    """Return a table of OpenFace."""
-    with TemporaryDirectory() as folder:
-        path = files.write_openface(Path(folder, "a.csv"), TRACKS)
-        return path.read_text()
 
 
 def openpose(folder, content=None, points=None):
@@ -446,12 +386,14 @@ def sleap(folder, tracks=TRACKS[:, None], **given):
     return files.write_sleap(folder / "a.h5", tracks, **given)
 
 
+EDGES = [("snout", "ear_R"), ("ear_L", "ear_R"), ("ear_R", "neck")]
+# The scores of one individual, which are unknown in all frames but the first one.
+SURE = np.where(np.arange(12)[:, None, None] == 0, 0.1, np.full((12, 1, 8), np.nan))
 FACE, HAND = (
     landmarker_result(f"{part}_landmarks", TRACKS[:1]) for part in ("face", "hand")
 )
-FLAT = Variable(np.zeros((2, 3)), ["time", "space"], {})
-SIDE = movement_dataset(plural=False)
-SIDE["position"].coords["space"].values = np.array(["x", "z"])
+FLAT = Variable(np.zeros((2, 3)), {"time": [0, 1], "space": [*"xyz"]})
+SIDE = movement_dataset(space="xz")
 BOX = {f"FaceRect{side}": 1.0 for side in ("X", "Y", "Width", "Height")}
 
 

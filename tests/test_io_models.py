@@ -128,16 +128,6 @@ def simple_model():
         return AffineNRSfM(2, random_state=0, max_iter=3).fit(TABLE)
 
 
-def with_content(folder, content):
-    """Return a model file with this content, of bytes or of arrays."""
-    path = folder / "model.npz"
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    else:
-        np.savez(path, **content)
-    return path
-
-
 def archive_of_text():
     with zipfile.ZipFile(archive := io.BytesIO(), "w") as file:
         file.writestr("text", "text")
@@ -154,27 +144,23 @@ def digest_of(header, arrays):
     return digest.hexdigest()
 
 
-def parts(estimator):
-    """Return public attributes by name; strategies and densities are None."""
-    public = {name: v for name, v in vars(estimator).items() if name[0] != "_"}
-    return {n: None if hasattr(v, "get_params") else v for n, v in public.items()}
-
-
 def assert_same(loaded, saved):
+    """Assert that two estimators have the same attributes, of the same types."""
     assert type(loaded) is type(saved)
-    found, expected = parts(loaded), parts(saved)
+    found, expected = (
+        {name: value for name, value in vars(each).items() if name[0] != "_"}
+        for each in (loaded, saved)
+    )
     assert found.keys() == expected.keys()
     for name, value in expected.items():
+        if hasattr(value, "get_params"):  # strategies of users are not stored
+            if not type(value).__name__.startswith("Own"):
+                assert_same(found[name], value)
+            continue
         assert_equal(found[name], value)
-        if isinstance(value, np.ndarray):
-            assert type(found[name]) is np.ndarray
-            assert found[name].dtype == value.dtype
-        else:
-            assert type(found[name]) is type(value)
-    for name in {"isa", "isa_", "prior"} & vars(saved).keys():
-        part = getattr(saved, name)
-        if hasattr(part, "get_params") and not type(part).__name__.startswith("Own"):
-            assert_same(getattr(loaded, name), part)
+        kind = np.ndarray if isinstance(value, np.ndarray) else type(value)
+        assert type(found[name]) is kind
+        assert getattr(found[name], "dtype", None) == getattr(value, "dtype", None)
 
 
 @pytest.mark.parametrize("case", slow_after(9, CASES))
@@ -194,8 +180,6 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
     if hasattr(model, "alpha_std_"):
         with warnings.catch_warnings(action="ignore", category=UserWarning):
             assert_equal(loaded.diagnostics(), model.diagnostics())
-    with zipfile.ZipFile(path) as file:
-        assert {Path(name).suffix for name in file.namelist()} == {".npy"}
     with np.load(path, allow_pickle=False) as file:
         header = json.loads(file["header"].tobytes())
         assert sorted(["header", *header["arrays"]]) == sorted(file)
@@ -256,28 +240,22 @@ def with_comment(model):
     return copied
 
 
-def without(name):
-    """Return a change that takes an array out of a file."""
-    return lambda header, arrays: (header, {k: arrays[k] for k in arrays if k != name})
+def changed(name, function):
+    """Return a change of an array of a file, by a function of what there is."""
+    return lambda header, arrays: (header, arrays | {name: function(arrays.get(name))})
 
 
 def with_array(name, value):
     """Return a change that replaces or adds an array of a file."""
-    return lambda header, arrays: (header, arrays | {name: np.asarray(value)})
-
-
-def changed(name, function):
-    """Return a change of an array of a file by a function."""
-    return lambda header, arrays: (header, arrays | {name: function(arrays[name])})
+    return changed(name, lambda _: np.asarray(value))
 
 
 def with_entry(value, *place):
     """Return a change that replaces or adds an entry of a header."""
 
     def change(header, arrays):
-        inner = functools.reduce(lambda tree, key: tree[key], place[:-1], header)
+        inner = functools.reduce(dict.get, place[:-1], header)
         inner[place[-1]] = value
-        return header, arrays
 
     return change
 
@@ -287,12 +265,12 @@ def test_any_change_is_found_by_the_digest(path):
     with np.load(path) as found:
         arrays = dict(found)
     for name in ("alpha_", "header"):
-        changed = arrays[name].copy()
-        changed.flat[-20] += 1
-        np.savez(path, **arrays | {name: changed})
+        other = arrays[name].copy()
+        other.flat[-20] += 1
+        np.savez(path, **arrays | {name: other})
         refused(r"model\.npz cannot be read", load_model, path)
-    swapped = arrays | {"alpha_": arrays["alpha_std_"], "alpha_std_": arrays["alpha_"]}
-    np.savez(path, **swapped)
+    swapped = {"alpha_": arrays["alpha_std_"], "alpha_std_": arrays["alpha_"]}
+    np.savez(path, **arrays | swapped)
     refused("digest is wrong: it is damaged or was chan", load_model, path)
 
 
@@ -304,9 +282,8 @@ def test_files_that_unpack_to_more_than_they_have_are_refused(tmp_path):
             file.writestr(name, whole.read(name), zipfile.ZIP_DEFLATED)
     assert path.stat().st_size < 100_000
     tracemalloc.start()
-    refused(
-        "are compressed. Load them, and save them with numpy.savez", load_model, path
-    )
+    told = "are compressed. Load them, and save them with numpy.savez"
+    refused(told, load_model, path)
     assert tracemalloc.get_traced_memory()[1] < 4_000_000
     tracemalloc.stop()
     np.savez(path, **np.load(path))

@@ -3,10 +3,9 @@
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.testing import assert_array_equal
 from refusals import refusals_of
 
-from isa_nrsfm.io import LandmarkTable, landmark_table, read_table, write_table
+from isa_nrsfm.io import landmark_table, read_table, write_table
 
 N_POINTS = 8
 NAMES = [f"{axis}{j}" for j in range(N_POINTS) for axis in "xy"]
@@ -35,21 +34,10 @@ def cells(path):
     return read_table(path).to_dict("list")
 
 
-def test_landmarks_and_other_columns_are_separated():
-    frame = random_frame()
-    shuffled = frame[["y3", "id", *(name for name in NAMES if name != "y3")]]
-    table = landmark_table(shuffled)
-    assert isinstance(table, LandmarkTable)
-    assert list(table.points) == NAMES
-    assert list(table.other) == ["id"]
-    assert_array_equal(table.points, frame[NAMES])
-    pd.testing.assert_frame_equal(table.other, frame[["id"]])
-    assert (table.points.dtypes == np.float64).all()
-
-    part = frame.iloc[[4, 1]].rename(columns={"x0": " x0 "})
-    points, other = landmark_table(part)
-    assert list(points.index) == list(other.index) == [4, 1]
-    assert points.columns[0] == "x0"
+def shuffled():
+    """Return a table whose columns and rows are in another order."""
+    frame = random_frame().iloc[[4, 1, 0, 2, 3]].rename(columns={"x0": " x0 "})
+    return frame[["y3", "id", *(name for name in frame if name not in ("y3", "id"))]]
 
 
 def points_of(name, values):

@@ -2,7 +2,7 @@
 
 import numpy as np
 from landmark_files import openface_names
-from refusals import refusals_of, refused, warned
+from refusals import refusals_of, warned
 
 from isa_nrsfm.io._landmark_columns import (  # noqa: F401  in refusals.txt
     find_landmark_columns,
@@ -41,15 +41,6 @@ def pattern_of_names(template):
     found = find_landmark_columns(names)
     assert (found.interleaved, found.points) == (names[1:], PARTS)
     return found.pattern
-
-
-def test_several_sets_are_refused_with_the_ways_to_choose():
-    message = str(refused("more than one set", find_landmark_columns, OPENFACE))
-    assert "'x_#,y_#' (68 points: x_0 to x_67)" in message
-    assert "'eye_lmk_x_#,eye_lmk_y_#' (56 points: " in message
-    assert "'X_#,Y_#' (68 points, with a z each: X_0 to X_67)" in message
-    assert "gaze" not in message
-    assert "Choose with columns, such as" in message
 
 
 def test_patterns_that_match_a_part_of_a_set_say_so():

@@ -15,13 +15,10 @@ GIVEN = {
     "prior": (object(), "--prior face"),
     "point_weight": ([[1.0]], "--weights confidence"),
 }
-EACH = pytest.mark.parametrize(
-    ("name", "values", "other", "allowed", "why"), REQUIREMENTS
-)
 
 
-@EACH
-def test_settings_that_need_others(name, values, other, allowed, why):
+@pytest.mark.parametrize(("name", "values", "other", "allowed", "why"), REQUIREMENTS)
+def test_settings_that_need_others(fails, tmp_path, name, values, other, allowed, why):
     value = values[-1] if values else GIVEN[name][0]
     error = refused(None, check_requirements, {name: value, other: WRONG[other]})
     needed = f"needs {other}={' or '.join(map(repr, allowed))}"
@@ -31,9 +28,6 @@ def test_settings_that_need_others(name, values, other, allowed, why):
     for fine in ({name: value, other: allowed[-1]}, {name: value}, {other: "x"}):
         check_requirements(fine)
 
-
-@EACH
-def test_options_that_need_others(fails, tmp_path, name, values, other, allowed, why):
     flag = f"--{name.replace('_', '-')}"
     option = f"{flag} {values[-1]}" if values else GIVEN[name][1]
     given = [*option.split(), f"--{other}", WRONG[other]]

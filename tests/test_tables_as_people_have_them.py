@@ -3,7 +3,7 @@
 import re
 import shlex
 import warnings
-from itertools import pairwise, product
+from itertools import product
 from string import ascii_lowercase  # noqa: F401  in refusals.txt
 from types import SimpleNamespace
 
@@ -15,9 +15,10 @@ from fit_runs import QUICK, begun, told_of_fit
 from landmark_files import BODYPARTS, TRACKS
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refusals_of, refused, warned
+from refusals import refusals_of, refused
+from sklearn.base import clone
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.datasets import make_body_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import (
     from_mediapipe,
@@ -31,6 +32,8 @@ N = 40
 POINTS = make_nonrigid_tracks(N, 8, 1, noise=0.01, random_state=0).data
 POINTS = (100 * POINTS + 400).round(2).reshape(N, 8, 2)
 FLAT = TRACKS.reshape(12, -1)
+PLAIN_NAME = "{part}_{axis}"
+UNREFINED = AffineNRSfM(1, isa=FastISA(n_init=1), refinement=None)
 
 
 def table_of(name, tracks, parts=BODYPARTS):
@@ -43,7 +46,7 @@ def comma_table(folder, suffix, sign, numbers):
     """Write a table of numbers with commas, and of other columns: path, numbers."""
     cells, path = np.resize(numbers.split(), (3, 16)), folder / f"a{suffix}"
     others = {"note, or text": ["1,2", "3,4", "a, b"], "p": ["0,5", "27,5", "3"]}
-    table = table_of("{part}_{axis}", cells).assign(**others)
+    table = table_of(PLAIN_NAME, cells).assign(**others)
     return files.saved(path, table, sep=sign), cells.ravel(), others
 
 
@@ -51,8 +54,7 @@ def commas_in(folder, suffix, sign, numbers, by=""):
     """Read a table in which commas stand for another sign: what is told."""
     path, cells, others = comma_table(folder, suffix, sign, numbers)
     text, found = warnings_of(read_landmarks, path)
-    for name, values in others.items():
-        assert list(found.frames[name]) == values
+    assert found.frames.to_dict("list") == others
     expected = [float(cell.replace(",", by)) for cell in cells]
     assert_array_equal(found.points.to_numpy().ravel(), expected)
     return text
@@ -87,10 +89,10 @@ def individuals_asked(folder, name, who):
     pd.concat(tables, axis=1).assign(**dict.fromkeys(scores, 1.0)).to_csv(path)
     asked = str(refused(None, read_landmarks, path))
     rows = read_landmarks(path, individuals=re.search("individuals='(.*?)'", asked)[1])
-    assert list(rows.frames["individual"]) == [*who] * N
-    assert list(rows.frames["frame"]) == list(np.repeat(range(N), 2))
-    for i in (0, 1):
-        assert_array_equal(rows.points[i::2], POINTS.reshape(N, -1) + 300 * i)
+    expected = {"frame": list(np.repeat(range(N), 2)), "individual": [*who] * N}
+    assert rows.frames[[*expected]].to_dict("list") == expected
+    pair = np.stack([POINTS, POINTS + 300], axis=1)
+    assert_array_equal(rows.points, pair.reshape(2 * N, -1))
     assert (rows.confidence == 1).all(axis=None)
     error = str(refused(None, told_of_fit, path, " ".join([*QUICK, "1"])))
     options = re.findall(r"use (--\w+ .*?)(?:\. |$)", error)
@@ -108,7 +110,7 @@ def reads_all_parts(name, first, second):
     """Return whether all points of one body are read, if need be as advised."""
     parts = [name.format(a, b) for a, b in product([*first], [*second])]
     parts += [part.replace("L", "R") for part in parts if name[0] == "L"]
-    table, options = table_of("{part}_{axis}", np.ones((2, len(parts), 2)), parts), {}
+    table, options = table_of(PLAIN_NAME, np.ones((2, len(parts), 2)), parts), {}
     if name[:3] != "{1}" and isinstance(second, range) and len(second) > 6:
         told = str(refused("more than one set", landmark_table, table))
         options["columns"] = told.rpartition("such as ")[2].strip("'")
@@ -116,29 +118,17 @@ def reads_all_parts(name, first, second):
 
 
 FEW = [f"{part}_{mouse}" for mouse in "12" for part in BODYPARTS[:5]]
-FEW = table_of("{part}_{axis}", np.ones((2, len(FEW), 2)), FEW)
+FEW = table_of(PLAIN_NAME, np.ones((2, len(FEW), 2)), FEW)
 
 
-def test_individuals_of_few_points_are_not_fitted():
-    told = str(refused("Their 5 points are too few", landmark_table, FEW))
-    columns = re.search("columns='(.*?)'", told)[1]
-    assert landmark_table(FEW, columns=columns).points.shape == FEW.shape
-
-
-@pytest.mark.parametrize("decimal", slow_after(1, [",", "."]))
-def test_other_columns_of_tables_with_semicolons(tmp_path, fits, decimal):
+@pytest.mark.parametrize("decimal", [",", "."])
+def test_tables_of_openface_with_semicolons(tmp_path, decimal):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
     expected = read_landmarks(path)
-    table = pd.read_csv(path)
-    table.to_csv(path, sep=";", decimal=decimal, index=False)
+    files.saved(path, pd.read_csv(path), sep=";", decimal=decimal)
     text, found = warnings_of(read_landmarks, path)
     assert ("decimal commas" in text) == (decimal == ",")
     pd.testing.assert_frame_equal(found.frames, expected.frames)
-    table = table_of("{part}_{axis}", POINTS).assign(age=np.arange(N) % 7 + 0.5)
-    path = tmp_path / "b.csv"
-    table.assign(t=0.04 * np.arange(N)).to_csv(path, sep=";", decimal=decimal)
-    found = fits(path, *QUICK, 1, "--label", "age", "--time", "t").report
-    assert found["labels"][0]["kind"] == "number"
 
 
 @pytest.mark.parametrize("seen", slow_after(1, [0.6, 1.0, 0.3]))
@@ -146,28 +136,46 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path, seen):
     tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
     tracks = tracks - tracks.min((0, 1))
     shares = tracks / tracks[..., 1].max() / seen * [0.53, 0.95] + [0.2, 0.02]
-    path, told = tmp_path / "pose.csv", "like fractions of the width and height"
-    table_of("LM{part}_{axis}", shares, range(17)).to_csv(path, index=False)
+    table, told = (
+        table_of("LM{part}_{axis}", shares, range(17)),
+        "fractions of the width",
+    )
+    path = files.saved(tmp_path / "pose.csv", table)
     text, plain = warnings_of(read_landmarks, path)
     assert told in text
+    assert "mediapipe" in text
     for camera in ("affine", "weak_perspective"):
-        text, _ = warnings_of(AffineNRSfM(1, camera=camera).fit, plain.points.values)
+        fit = clone(UNREFINED).set_params(camera=camera).fit
+        text, _ = warnings_of(fit, plain.points.to_numpy())
         assert (told in text) == (camera != "affine")
+    assert told not in warnings_of(fit, plain.points)[0]  # which was told before
     for columns in ({}, {"columns": "LM#_x,LM#_y"}):
         size = {"format": "mediapipe", "image_size": (1280, 720)}
         text, found = warnings_of(read_landmarks, path, **size, **columns)
         assert not text
-        points = found.points.to_numpy().reshape(shares.shape)
-        assert_allclose(points, shares * [1280, 720])
+        assert_allclose(files.tracks_of(found), shares * [1280, 720])
+
+
+def test_shares_of_annotations_are_warned_of_with_a_way_that_works(tmp_path):
+    tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
+    shares = (tracks - tracks.min((0, 1))) / np.ptp(tracks, axis=(0, 1)) * 0.8 + 0.1
+    content = files.coco_annotations(shares, names=map(str, range(17)))
+    path = files.write_json(tmp_path / "a.json", content)
+    text, landmarks = warnings_of(read_landmarks, path)
+    assert "If they have another unit, such as metres, ignore this" in text
+    assert "mediapipe" not in text
+    line = re.search("In Python: (.*?), and", text)[1]
+    exec(line.replace("WIDTH, HEIGHT", "640, 480"), scope := {"landmarks": landmarks})
+    assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
 
 
 @pytest.mark.parametrize("code", [(0, 0), (-310, -205)])
 def test_codes_of_missing_points_in_python(tmp_path, code):
     tracks, hidden = POINTS.copy(), np.random.default_rng(1).random((N, 8)) < 0.1
     tracks[hidden] = code
-    table, fit = table_of("{part}_{axis}", tracks), AffineNRSfM(1, refinement=None).fit
-    table.to_csv(tmp_path / "a.csv", index=False)
-    for call, X in ((read_landmarks, tmp_path / "a.csv"), (fit, table.to_numpy())):
+    table, fit = table_of(PLAIN_NAME, tracks), UNREFINED.fit
+    path = files.saved(tmp_path / "a.csv", table)
+    for call, X in ((read_landmarks, path), (fit, table.to_numpy())):
         text, _ = warnings_of(call, X)
         assert f"exactly ({code[0]}, {code[1]}) ({hidden.sum()} in all)" in text
     assert ("make them NaN before coordinates are shifted" in text) == (code[0] < -1)
@@ -178,37 +186,36 @@ def test_codes_of_missing_points_in_python(tmp_path, code):
 def test_times_in_names_of_images_are_told(tmp_path, begins):
     times = pd.Series(pd.date_range("2023-05-01 12:00:30", periods=N, freq="2s"))
     names = times.dt.strftime("%Y-%m-%d_%H-%M-%S.png")
-    path = tmp_path / "a.csv"
-    table_of("{part}_{axis}", POINTS).assign(image=names).to_csv(path, index=False)
-    told = begins(path, "--fps", 25)
-    option, form = re.search("use (--time .*) with a (--.*), such as", told).groups()
-    form = [form, re.search(r"such as (\S*),", told)[1]]
+    table = table_of(PLAIN_NAME, POINTS).assign(image=names)
+    path = files.saved(tmp_path / "a.csv", table)
+    form = "use (--time .*) with a (--.*), such as (.*?),"
+    option, *form = re.search(form, begins(path, "--fps", 25)).groups()
     begins(path, *option.split(), *form)
 
 
 LISTS = "keypoints foot_kpts face_kpts lefthand_kpts righthand_kpts".split()
-PARTS = "body feet face left_hand right_hand all".split()
-ENDS = [0, 17, 23, 91, 112, 133]
+PARTS = {"body": (0, 17), "feet": (17, 23), "face": (23, 91)}
+PARTS |= {"left_hand": (91, 112), "right_hand": (112, 133), "all": (0, 133)}
 BODIES = files.scene(4, 133, 7)
+
+
+def whole_bodies(folder, lists=LISTS):
+    """Return results, or annotations with lists of the points of each part."""
+    places = [*PARTS.values()][:5] if lists is LISTS else [PARTS["all"]]
+    rows = []
+    for i, points in enumerate(np.dstack([BODIES, np.ones((4, 133))])):
+        values = [points[slice(*place)].ravel().tolist() for place in places]
+        rows.append(dict(zip(lists, values, strict=True)) | {"image_id": i})
+    images = [{"id": i} for i in range(4)]
+    content = {"images": images, "annotations": rows} if lists is LISTS else rows
+    return files.write_json(folder / "a.json", content)
 
 
 @pytest.mark.parametrize("lists", [LISTS, LISTS[:1]])
 @pytest.mark.parametrize("part", PARTS)
 def test_parts_of_whole_bodies(tmp_path, lists, part):
-    ends, rows = ENDS if len(lists) > 1 else [0, 133], []
-    for i, points in enumerate(np.dstack([BODIES, np.ones((4, 133))])):
-        values = [points[a:b].ravel().tolist() for a, b in pairwise(ends)]
-        rows.append(dict(zip(lists, values, strict=True)) | {"image_id": i})
-    content = {"images": [{"id": i} for i in range(4)], "annotations": rows}
-    content = content if len(lists) > 1 else rows
-    path = files.write_json(tmp_path / "a.json", content)
-    first, end = [*pairwise(ENDS), (0, 133)][PARTS.index(part)]
-    found = read_landmarks(path, part=part).points
-    assert_array_equal(found, BODIES[:, first:end].reshape(4, -1))
-    if len(lists) > 1:
-        told = "those in foot_kpts, face_kpts, .* choose with part, one of body, "
-        assert len(warned(told, read_landmarks, path).point_names) == 17
-    refused("'nose' is none of body, ", read_landmarks, path, part="nose")
+    found = read_landmarks(whole_bodies(tmp_path, lists), part=part).points
+    assert_array_equal(found, BODIES[:, slice(*PARTS[part])].reshape(4, -1))
 
 
 def categories(folder, known=1):
@@ -220,35 +227,22 @@ def categories(folder, known=1):
     return files.write_json(folder / "a.json", content)
 
 
-def test_parts_are_chosen_as_messages_say(tmp_path, begins, fails):
-    folder = tmp_path / "people"
-    both = {"pose": files.SCORED[0], "face": files.SCORED[1]}
-    files.write_openpose(folder, [[files.openpose_person(**both)]] * 9)
-    told = fails("fit", folder, *QUICK, "1", "-o", tmp_path / "b")
-    part, option = re.search(r"of (\w+), .* with (--part)", told).groups()
-    begins(folder, option, part)
-
-
 @pytest.mark.parametrize("kind", ["track_id", "name", "idx", "person_id"])
 def test_who_is_who_is_a_column_of_images_in_their_order(tmp_path, kind):
     who, path = [5, 6, 7] * 4, tmp_path / "a.json"
     content = files.coco_annotations(TRACKS)
+    for row, each in zip(content["annotations"], who, strict=True):
+        row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
     if kind == "idx":  # results of AlphaPose, in the order of texts
-        rows = [
-            files.RESULTS[i] | {"image_id": f"{i}.jpg", kind: [w]}
-            for i, w in enumerate(who)
-        ]
-        content = sorted(rows, key=lambda row: row["image_id"])
-    elif kind == "person_id":  # OpenPose
-        path = tmp_path / "people"
-        path.mkdir()
-        for i, each in enumerate(who):
-            person = files.openpose_person(pose=files.SCORED[i]) | {kind: [each]}
+        known = [{"image_id": f"{i}.jpg", kind: [w]} for i, w in enumerate(who)]
+        content = [a | b for a, b in zip(files.RESULTS, known, strict=True)]
+        content.sort(key=lambda row: row["image_id"])
+    if kind == "person_id":  # OpenPose
+        (path := tmp_path / "people").mkdir()
+        for i, (row, each) in enumerate(zip(files.SCORED, who, strict=True)):
+            person = files.openpose_person(pose=row) | {kind: [each]}
             files.write_json(path / f"cam01.{i}.json", {"people": [person]})
     else:
-        for row, each in zip(content["annotations"], who, strict=True):
-            row |= {kind: each} if kind == "track_id" else {"attributes": {kind: each}}
-    if kind != "person_id":
         files.write_json(path, content)
     found = read_landmarks(path)
     assert list(found.frames[kind]) == who
@@ -273,6 +267,7 @@ def of_version(name, wrap, nobody=None):
 
 
 NAMED = [("{part}_{axis}", word) for word in ("p", "Likelihood", "visibility")]
+NAMED += [("{part}.{axis}", "score")]  # a table of SLEAP
 NUMBERED = [("p{part}_{axis}", "conf"), ("joint {part}.{axis}", "likelihood")]
 NUMBERED += [("{axis}{part}", "c"), ("{axis}_{part}", "score")]
 
@@ -285,13 +280,14 @@ def test_confidences_are_read_beside_sizes(tmp_path, begins, name, word, size):
     table = table_of(name, POINTS / (1000 if size else 1), parts)
     names = [name.format(part=part, axis=word) for part in parts]
     table = table.join(pd.DataFrame(score, columns=names))
+    table["instance.score"] = 0.5
     path = files.saved(tmp_path / "a.csv", table)
     given = {"format": "mediapipe", "image_size": (1000, 1000)} if size else {}
     found = read_landmarks(path, min_confidence=0.5, **given)
     assert_array_equal(found.confidence, score)
     expected = np.where(score[..., None] < 0.5, np.nan, POINTS)
     assert_allclose(files.tracks_of(found), expected)
-    assert found.frames.empty
+    assert list(found.frames) == ["instance.score"]
     if word == "p":
         options = [*size, "--format", "mediapipe" if size else "table"]
         told = re.search(r"(\S+) % of .* with (--min.*)", begins(path, *options))
@@ -299,27 +295,12 @@ def test_confidences_are_read_beside_sizes(tmp_path, begins, name, word, size):
         assert begins(path, *options, *told[2].split()) == ""
 
 
-@pytest.mark.parametrize(
-    ("word", "numbers"),
-    [("p", "0 1013.2"), ("v", "-3 310"), ("c", "2 3"), ("V", "0 1 2"), ("p", "0.5")],
-)
-def test_pressures_and_velocities_are_no_confidences(
-    tmp_path, begins, fails, word, numbers
-):
-    values, path = np.resize(np.float64(numbers.split()), (N, 8)), tmp_path / "a.csv"
-    points = table_of("{axis}_{part}", POINTS, range(8))
-    names = [f"{word}_{j}" for j in range(8)]
-    points.join(pd.DataFrame(values, columns=names)).to_csv(path, index=False)
-    found = read_landmarks(path)
-    if values.max() > 2 or values.min() < 0:
-        assert found.confidence is None
-        assert list(found.frames) == names
-        told = fails("fit", path, "-o", tmp_path, "--min-confidence", 0.5)
-        assert f"{word}_0, ... are no confidences" in told
-    else:
-        assert_array_equal(found.confidence, values)
-        if numbers == "0.5":  # the same of all points
-            assert begins(path) == ""
+def columns_beside(folder, word, numbers):
+    """Return the path of a table with further columns of each point."""
+    table = table_of("{axis}_{part}", POINTS, range(8))
+    values = np.resize(np.float64(numbers.split()), (N, 8))
+    columns = {f"{word}_{j}": values[:, j] for j in range(8)}
+    return files.saved(folder / "a.csv", table.assign(**columns))
 
 
 def labelled(xy, **known):
@@ -349,15 +330,6 @@ def test_labels_of_sleap_io():
     refused("instances of one skeleton; got ", from_sleap_io, frames)
 
 
-def test_predictions_of_mmpose(tmp_path):
-    instances = [files.VIDEO[0]["instances"] * 2, []]
-    content = [{"frame_id": i, "instances": each} for i, each in enumerate(instances)]
-    found = read_landmarks(files.write_json(tmp_path / "a.json", content))
-    assert list(found.frames["frame"]) == [0, 0, 1]
-    assert list(found.frames["person"].fillna(-1)) == [0, 1, -1]
-    assert list(found.failed) == [False, False, True]
-
-
 def specimens(folder, points="LM=8"):
     """Return a file of specimens, one of which has a curve, and their points."""
     path = files.write_tps(folder / "a.tps", TRACKS)
@@ -366,40 +338,10 @@ def specimens(folder, points="LM=8"):
     return path
 
 
-def test_curves_of_specimens_are_left_out(tmp_path):
-    message, path = "1 points of curves are left out", specimens(tmp_path)
-    found = warned(message, read_landmarks, path).frames
-    assert list(found.iloc[3]) == ["skull 3.jpg", "3", "0.05"]
-
-
-@pytest.mark.parametrize("read_format", ["coco", "table"])
-def test_shares_are_warned_of_once_with_a_way_that_works(tmp_path, read_format):
-    tracks = make_body_tracks(N, random_state=0).data.reshape(N, 17, 2)
-    shares = (tracks - tracks.min((0, 1))) / np.ptp(tracks, axis=(0, 1)) * 0.8 + 0.1
-    path = tmp_path / "a.csv"
-    table_of("{part}_{axis}", shares, range(17)).to_csv(path, index=False)
-    if read_format == "coco":
-        names, path = [f"p{j}" for j in range(17)], tmp_path / "a.json"
-        files.write_json(path, files.coco_annotations(shares, names=names))
-    text, landmarks = warnings_of(read_landmarks, path)
-    assert "If they have another unit, such as metres, ignore this" in text
-    assert ("mediapipe" in text) == (read_format == "table")
-    if read_format == "coco":
-        line = re.search("In Python: (.*?), and", text)[1]
-        line = line.replace("WIDTH, HEIGHT", "640, 480")
-        exec(line, scope := {"landmarks": landmarks})
-        assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
-    fit = AffineNRSfM(1, camera="weak_perspective", refinement=None).fit
-    assert "shares" not in warnings_of(fit, landmarks.points)[0]
-    assert "shares" in warnings_of(fit, landmarks.points.to_numpy())[0]
-
-
-PLAIN = table_of("{part}_{axis}", POINTS).assign(
-    age=np.arange(N),
-    who=["anna", "bob"] * (N // 2),
-    day=[f"0{1 + i % 9}.02.20{10 + i}" for i in range(N)],
-    team=["a", "b", "", "a"] * (N // 4),
-)
+OTHERS = {"age": np.arange(N), "who": ["anna", "bob"] * (N // 2)}
+OTHERS["day"] = [f"0{1 + i % 9}.02.20{10 + i}" for i in range(N)]
+OTHERS["team"] = ["a", "b", "", "a"] * (N // 4)
+PLAIN = table_of(PLAIN_NAME, POINTS).assign(**OTHERS)
 VIDEOS = PLAIN.assign(image=[f"v{i // 2}.png" for i in range(N)])
 SETS = PLAIN.join(table_of("{axis}_{part}", POINTS[:, :7] / 2, range(7)))
 
@@ -430,13 +372,22 @@ def points_as_advised(table):
     try:
         return landmark_table(table).points.to_numpy()
     except ValueError as error:
-        columns = str(error).rpartition("give columns, such as ")[2].strip("'")
+        columns = re.search("columns(?:=|, such as )'(.*?)'", str(error))[1]
         return landmark_table(table, columns=columns).points.to_numpy()
 
 
 def boxed(name, box):
     """Return a table of points and of boxes around them."""
     return table_of(name, TRACKS).assign(**dict.fromkeys(box.split(), 5.0))
+
+
+def crowd(folder):
+    """Return two persons in an image, and an image of nobody, of MMPose."""
+    people = files.VIDEO[0]["instances"] * 2
+    content = [
+        {"frame_id": i, "instances": each} for i, each in enumerate([people, []])
+    ]
+    return files.write_json(folder / "a.json", content)
 
 
 LETTERS = files.scene(2, 26)  # also w and h

@@ -2,22 +2,15 @@
 
 import contextlib
 import gzip
-import json
 import re
 import warnings
 
+import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import fit, write_landmarks
-from landmark_files import (
-    deeplabcut_frame,
-    saved,
-    scene,
-    write_deeplabcut,
-    write_openface,
-    write_text,
-)
+from landmark_files import saved, scene
 from refusals import refusals_of, refused, warned
 from scenes import table_of
 from sklearn.base import clone
@@ -47,11 +40,11 @@ def read_by_fit(path, *options):
     return args, read_frames(args)
 
 
-def asked_in(folder, columns, *options, suffix=".csv"):
+def asked_in(folder, columns, *options, suffix=".csv", **written):
     """Read a table with some columns as the command fit does, without a fit."""
     columns = pd.DataFrame(columns)
     table = pd.concat([landmarks(len(columns)), columns], axis=1)
-    path = saved(folder / f"table{suffix}", table)
+    path = saved(folder / f"table{suffix}", table, **written)
     return asked_columns(*read_by_fit(path, *options))
 
 
@@ -91,9 +84,8 @@ FACES = {"face": np.where(ROWS % 2, "right", "left")}
 def images_of(folder, columns, options):
     """Return the numbers of images that --fps counts."""
     columns = pd.DataFrame(columns, index=ROWS)
-    return np.round(
-        25 * seconds(asked_in(folder, columns, "--fps", 25, *options).times), 9
-    )
+    times = asked_in(folder, columns, "--fps", 25, *options).times
+    return np.round(25 * seconds(times), 9)
 
 
 def numbers_in(names):
@@ -121,12 +113,9 @@ TYPED |= {"mood": ["1", "b"] * (N // 2), "ok": [True, False] * (N // 2)}
 
 def labels_with(folder, word, *options, suffix=".csv"):
     """Return labels of which row 4 has a word for missing."""
-    columns = {
-        "mood": np.where(ROWS % 3, "up", "down").astype(object),
-        "age": (20.5 + ROWS).astype(str).astype(object),
-    }
-    for cells in columns.values():
-        cells[4] = word
+    mood, age = np.where(ROWS % 3, "up", "down"), (20.5 + ROWS).astype(str)
+    columns = pd.DataFrame({"mood": mood, "age": age}, dtype=object)
+    columns.loc[4] = word
     return asked_in(folder, columns, *options, suffix=suffix).labels
 
 
@@ -156,9 +145,14 @@ def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
     names = [f"frame{i}" for i in (0, 1, 2, 9, 10, 11, 100)] + ["frame100b2", "g"]
     for i, name in enumerate(reversed(names)):
         points = np.full((8, 2), float(len(names) - i))
-        lines = [f"{x} {y}" for x, y in points]
-        lines = ["version: 1", "n_points: 8", "{", *lines, "}"]
-        write_text(tmp_path / "pts" / f"{name}.pts", *lines)
+        lines = [
+            "version: 1",
+            "n_points: 8",
+            "{",
+            *(f"{x} {y}" for x, y in points),
+            "}",
+        ]
+        files.write_text(tmp_path / "pts" / f"{name}.pts", *lines)
         for kind in ("npy", "parquet"):
             (tmp_path / kind).mkdir(exist_ok=True)
         np.save(tmp_path / "npy" / f"{name}.npy", points.reshape(1, -1))
@@ -200,18 +194,17 @@ def test_codes_of_missing_points_cause_a_warning(tmp_path, code, digits):
         assert len(tracks_read(tmp_path, nearer)[1]) == 1
         return
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
-    shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
-    assert re.match(rf"{shown} \({n_points} in all\)", warning)
+    shown = f"in {n_rows} of 200 rows points are at exactly ({code:g}, {code:g})"
+    assert warning.startswith(f"{shown} ({n_points} in all)")
+    warned(re.escape(warning.partition(" If")[0]), PAPER.fit, points)
+    expected = np.where(hidden[..., None], np.nan, tracks).reshape(200, -1)
+    table = pd.DataFrame(points, columns=POINTS)
+    found = landmark_table(table, missing=code).points
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     number = re.search(r"with missing=(\S+)", warning)[1]
-    table = pd.DataFrame(tracks.reshape(200, -1), columns=POINTS)
-    found = landmark_table(table, missing=code).points.to_numpy()
-    np.testing.assert_array_equal(np.isnan(found[:, ::2]), hidden)
-    told = re.escape(warning.partition(" If")[0])
-    warned(told, AffineNRSfM(1, refinement=None).fit, table)
     points, texts = tracks_read(tmp_path, tracks, f"--missing-value={number}")
+    np.testing.assert_array_equal(points, expected)
     assert texts == []
-    expected = np.where(hidden[..., None], np.nan, tracks)
-    np.testing.assert_array_equal(points.reshape(tracks.shape), expected)
 
 
 def test_pixels_of_a_face_that_hardly_moves_are_no_code(tmp_path):
@@ -226,9 +219,8 @@ def test_pixels_of_a_face_that_hardly_moves_are_no_code(tmp_path):
 def test_several_codes_are_missing_together(tmp_path):
     tracks = landmarks().to_numpy().reshape(N, -1, 2) + 50
     tracks[3, 2], tracks[4, 5], tracks[5, 1] = -1, 999, [-1, 3]
-    points, _ = tracks_read(
-        tmp_path, tracks, *["--missing-value", -1, "--missing-value", 999]
-    )
+    options = "--missing-value -1 --missing-value 999".split()
+    points, _ = tracks_read(tmp_path, tracks, *options)
     tracks[3, 2] = tracks[4, 5] = np.nan
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     table = pd.DataFrame([[-1, -1, -1, 4.0] * 4], columns=POINTS[:16])
@@ -240,27 +232,22 @@ def test_several_codes_are_missing_together(tmp_path):
 def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
     path, folder = tmp_path / "table.csv", tmp_path / "out"
     write_landmarks(path)
-    folder.mkdir()
-    (folder / "notes.txt").write_text("mine")
+    files.write_text(folder / "notes.txt", "mine")
     assert fit(path, folder, 0, "--no-figures") == 0  # other names are no matter
     assert fit(path, folder, 0) == 0  # figures are new
-    capsys.readouterr()
+    assert (folder / "notes.txt").read_text() == "mine\n"
     for name in ("cameras.csv", "report.html", "report.json", "basis_shapes.png"):
+        capsys.readouterr()
         other = tmp_path / f"of {name}"
-        other.mkdir()
-        text = json.dumps({"sha256": {}, "mine": [1]})
-        (other / name).write_text(text)
+        files.write_text(other / name, text := '{"sha256": {}, "mine": [1]}')
         options = [] if name.endswith("png") else ["--no-figures"]
         assert fit(path, other, 0, *options) == 1
-        message = (
-            f"would be replaced: .*/{name}. Choose another --output, or .* --force"
-        )
-        assert re.search(message, capsys.readouterr().err)
+        told = f"would be replaced: .*/{name}. Choose another --output, or .* --force"
+        assert re.search(told, capsys.readouterr().err)
         assert [file.name for file in other.iterdir()] == [name]
-        assert (other / name).read_text() == text
+        assert (other / name).read_text() == f"{text}\n"
         assert fit(path, other, 0, *options, "--force") == 0
         assert fit(path, other, 0, *options) == 0
-    assert (folder / "notes.txt").read_text() == "mine"
 
 
 def named_as_others(estimator, **further):
@@ -304,12 +291,10 @@ def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
     tmp_path, suffix, typed
 ):
     success = np.minimum(np.arange(12) % 3, 1)
-    path = write_openface(tmp_path / "a.csv", scene(), success=success)
-    further = pd.DataFrame({"subject": "007", "age": 30, "mood": "NA"}, index=range(12))
-    table = pd.concat([pd.read_csv(path), further], axis=1)
-    if not typed:
-        table = table.astype(str)
-    path = saved(path.with_suffix(suffix), table)
+    path = files.write_openface(tmp_path / "a.csv", scene(), success=success)
+    others = {"subject": "007", "age": 30, "mood": "NA"}
+    table = pd.read_csv(path).copy().assign(**others)
+    path = saved(path.with_suffix(suffix), table if typed else table.astype(str))
     found = read_landmarks(path)
     assert found.format == "openface"
     np.testing.assert_array_equal(found.failed, np.arange(12) % 3 == 0)
@@ -325,8 +310,8 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
     lines = ["a0: &a0 {x: 1}"]
     for i in range(1, 13):
         lines.append(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}")
-    path = tmp_path / "config.yaml"
-    path.write_text("\n".join([*lines, "skeleton:\n- - NO\n  - 1\n- [1, x, NO]\n"]))
+    lines += ["skeleton:", "- - NO", "  - 1", "- [1, x, NO]"]
+    path = files.write_text(tmp_path / "config.yaml", *lines)
     found = read_skeleton(path, ["NO", "1", "x"])
     assert found.name == "config.yaml"
     assert found.edges.tolist() == [[0, 1], [1, 2], [2, 0]]
@@ -345,9 +330,8 @@ def followed(call, given, /, **scope):
     return scope
 
 
-LEVELS = WIDE.set_axis(
-    pd.MultiIndex.from_product([[f"p{j}" for j in range(12)], ["x", "y"]]), axis=1
-)
+PAIRS = pd.MultiIndex.from_product([[f"p{j}" for j in range(12)], ["x", "y"]])
+LEVELS = WIDE.set_axis(PAIRS, axis=1)
 
 
 def read_as_advised(folder, text):
@@ -364,7 +348,7 @@ def read_as_advised(folder, text):
 @pytest.mark.filterwarnings("ignore:the cells of")
 def test_tables_with_other_separators_are_read(tmp_path):
     path = tmp_path / "a.csv"
-    write_deeplabcut(path, deeplabcut_frame(scene()))
+    files.write_deeplabcut(path, files.deeplabcut_frame(scene()))
     expected = read_landmarks(path).points
     path.write_text(path.read_text().replace(",", ";").replace(".", ","))
     found = warned("numbers have decimal commas", read_landmarks, path).points
@@ -377,6 +361,16 @@ def test_tables_with_other_separators_are_read(tmp_path):
         told = re.escape(f"{name} end with {sign!r}")
         found = warned(told, read_landmarks, tmp_path / name)
         np.testing.assert_array_equal(found.points, WIDE)
+
+
+@pytest.mark.parametrize("decimal", [",", "."])
+@pytest.mark.filterwarnings("ignore:(the cells of|numbers have)")
+def test_other_columns_of_tables_with_other_separators(tmp_path, decimal):
+    columns, written = {"age": ROWS % 7 + 0.5, "t": 0.04 * ROWS}, {"decimal": decimal}
+    options = "--label", "age", "--time", "t"
+    found = asked_in(tmp_path, columns, *options, sep=";", **written)
+    np.testing.assert_array_equal(found.labels[0], columns["age"])
+    np.testing.assert_array_equal(found.times, columns["t"])
 
 
 def test_the_way_from_several_levels_of_names_is_right():
