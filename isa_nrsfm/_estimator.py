@@ -231,8 +231,9 @@ default="affine"
     focal_length_ : float or ndarray of shape (n_frames,)
         Focal length of the camera. Infinite if the table shows no perspective.
     focal_length_std_ : float
-        Its standard deviation, from a jackknife over groups of points; zero if it was
-        given, infinite if the depth is not determined.
+        Its standard deviation, from a jackknife over groups of points, and with a prior
+        from the error of the depths; zero if it was given, infinite if the depth is not
+        determined.
     prior_std_ : ndarray of shape (2,)
         Standard deviations of mean shape and basis shapes from those of the prior, in
         sizes of frames. The basis is stretched at most in depth: the second is zero.

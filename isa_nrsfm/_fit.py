@@ -881,6 +881,8 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         place = min(abs(g) for g in fits if g < 0)
         probability = float(expit(table.log_odds(fits[place], fits[-place])))
         attributes |= {"depth_uncertainty_": total, "mirror_certainty_": probability}
+        if prior is not None and deviation:  # images show depths over f
+            deviation = float(np.hypot(deviation, total / f))
     # Frames as new tables have them
     decompose = partial(model.decompose, dtype=np.float64)
     frames: Decomposition = table.source.joined(decompose, *weights)
