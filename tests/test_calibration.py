@@ -260,7 +260,7 @@ def test_models_with_calibrated_cameras_have_a_metric(camera, recwarn):
     assert len(recwarn) == 0
     fit = model.motion_, model.alpha_, model.mean_shape_, model.basis_
     frames = euclidean_frames(metric, *fit)
-    shapes = model.reconstruct(table)
+    shapes = model.shapes(model.alpha_)
     assert mean_shape_error_3d(shapes, frames.shapes, convention="frame") < 1e-6
 
 
