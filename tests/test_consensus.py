@@ -10,6 +10,7 @@ from layers import Quick
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
 from scenes import with_gaps
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
@@ -20,10 +21,12 @@ from isa_nrsfm._joint.consensus import (
     Group,
     Scene,
     _principal,
+    _turns,
     aligning_rotations,
     centred,
     common_coordinates,
     group_fit,
+    group_fits,
     hidden_residuals,
     interpolation,
     merge,
@@ -31,6 +34,7 @@ from isa_nrsfm._joint.consensus import (
     neighbourhoods,
     principal_shapes,
     share_of_first,
+    weighted,
 )
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -119,6 +123,26 @@ class TestMerge:
         assert_allclose(half[seen], ((rows + fitted) / 2)[seen])
         assert_allclose(half[1, :, 2], fitted[1, :, 2])
 
+    def test_weights_are_inverse_disagreements_of_sizes_and_starts(self):
+        """Groups of a size and start share one factor, of the merge of their size."""
+        rng = np.random.default_rng(7)
+        first = rng.standard_normal((5, 3, 8))
+        groups = random_groups(rng, rng.standard_normal((5, 8)), sizes=(5, 5, 5, 6))
+        groups[2] = groups[2]._replace(start=1)
+        for group in groups:
+            group.coordinates[:, 2] += rng.standard_normal((5, len(group.points)))
+        scene = scene_of(first)
+        found = weighted(scene, groups)
+        z = merge(scene, groups[:3])[:, 2]
+        off = [
+            np.mean((centred(g.coordinates[:, 2]) - centred(z[:, g.points])) ** 2)
+            for g in groups[:3]
+        ]
+        both = np.average(off[:2], weights=[g.weight for g in groups[:2]])
+        for group, square in zip(groups, (both, both, off[2]), strict=False):
+            after = next(g for g in found if g.points is group.points)
+            assert_allclose(after.weight, group.weight / (5 * square), rtol=1e-9)
+
 
 def test_interpolation_of_changes():
     """Chosen points keep their changes; others have means of three of them."""
@@ -190,6 +214,21 @@ class TestGroupFit:
         assert np.sqrt(np.mean(off**2)) < 0.02
         assert np.sqrt(np.mean((found[:, :2] - truth[frames, :2]) ** 2)) < 0.02
         assert noise >= 1e-5
+
+    def test_each_group_is_fitted_from_the_cameras_of_each_start(self):
+        """The fits are those of single groups; none depends on the other cameras."""
+        scene, _ = self.scene()
+        cameras = scene.motion, scene.motion[::-1]
+        distances = cdist(scene.first[0].T, scene.first[0].T)
+        starts = list(zip((1.0, 0.5), cameras, strict=True))
+        tasks, fits = group_fits(scene, starts, distances, 2, SETTINGS)
+        assert [start for _, _, start in tasks] == [0, 1]
+        assert tasks[1][1] == 0.5 * tasks[0][1]
+        for (points, *_), motion, fit in zip(tasks, cameras, fits, strict=True):
+            rows, first = scene.rows.take(points, 2), scene.first.take(points, 2)
+            own = scene._replace(rows=rows, first=first, motion=motion)
+            for part, expected in zip(fit, group_fit(own, 2, SETTINGS), strict=True):
+                assert_allclose(part, expected)
 
     def test_frames_with_few_points_are_left_out(self):
         """Frames show at least four points of a group; more than basis shapes do."""
@@ -290,6 +329,22 @@ def test_precision_is_that_of_probabilistic_components(s2, rng):
     assert_allclose(found, expected, atol=1e-9 / s2)
     off = (shapes.mean(axis=2, keepdims=True) - shapes).reshape(12, -1)
     assert_allclose(slope.reshape(12, -1), expected @ off, atol=1e-9 / s2)
+
+
+def test_turns_are_gauss_newton_steps_with_the_gaussian_held(rng):
+    """They solve the normal equations of shapes that are turned, in each frame."""
+    shapes = rng.standard_normal((5, 3, 1)) + 0.1 * rng.standard_normal((5, 3, 40))
+    shapes -= shapes.mean(axis=0)
+    precision, slope, *_, w = _turns(shapes, 1e-3)
+    for i in (0, 17):
+        S, step = shapes[:, :, i], 1e-6
+        D = [
+            (S @ Rotation.from_rotvec(step * axis).as_matrix() - S).ravel() / step
+            for axis in np.eye(3)
+        ]
+        D = np.array(D).T
+        expected = np.linalg.solve(D.T @ precision @ D, D.T @ slope[:, :, i].ravel())
+        assert_allclose(w[:, i], expected, rtol=1e-4, atol=1e-6)
 
 
 def test_aligning_rotations_leave_the_deformation(rng):
