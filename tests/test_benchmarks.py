@@ -4,13 +4,13 @@ import json
 import runpy
 from contextlib import nullcontext, redirect_stderr, suppress
 from io import StringIO
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from isolated import measured_square
 from layers import may_not_converge, slow_after
+from project import ROOT
 from refusals import refusals_of
 from scenes import random_rotation
 from scipy.spatial.transform import Rotation
@@ -27,7 +27,6 @@ from isa_nrsfm.metrics import inverse_snr, mean_shape_error_3d
 # Tables of few points: that FastICA does not converge makes no difference here.
 pytestmark = may_not_converge
 
-ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = [
     path.stem
     for path in sorted((ROOT / "benchmarks").glob("[a-z]*.py"))

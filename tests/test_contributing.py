@@ -1,17 +1,9 @@
 """The pages for contributors name files, names and folders that exist."""
 
 import re
-from pathlib import Path
 
+from project import ROOT, text
 from refusals import refusals_of
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def text(page):
-    """Return the text of a page."""
-    return (ROOT / page).read_text(encoding="utf-8")
-
 
 TEXT = text("CONTRIBUTING.md")
 

@@ -7,15 +7,14 @@ import pkgutil
 import re
 import subprocess
 import sys
-from pathlib import Path
 from types import FunctionType
 
 import pytest
 from numpydoc.validate import validate
+from project import ROOT
 
 import isa_nrsfm
 
-ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
 TESTS = ROOT / "tests"
 FOLDERS = ["isa_nrsfm", "tests", "benchmarks", "docs"]

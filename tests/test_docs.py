@@ -13,6 +13,7 @@ import sklearn
 from fit_runs import JOINT
 from landmark_files import write_openface
 from layers import slow_after
+from project import ROOT, text
 from refusals import refusals_of
 from scipy.io import savemat
 from sklearn.base import clone
@@ -29,15 +30,9 @@ from isa_nrsfm.io import save_model
 from isa_nrsfm.plotting import BasisShapeDisplay
 from isa_nrsfm.skeletons import SKELETONS  # noqa: F401  in refusals.txt
 
-ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.lint
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-
-
-def text(page):
-    """Return the text of a page."""
-    return (ROOT / page).read_text(encoding="utf-8")
 
 
 def listed(page, pattern):

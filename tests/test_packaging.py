@@ -6,21 +6,14 @@ import sys
 import tarfile
 import tomllib
 from importlib import metadata
-from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
+from project import ROOT, text
 
 from isa_nrsfm import __version__
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def text(name):
-    """Return the text of a file of the project."""
-    return (ROOT / name).read_text(encoding="utf-8")
 
 
 def files(pattern):

@@ -318,12 +318,12 @@ class FrameModel:
         if self.joint:
             unit = rows / sizes[:, None, None]
             return self.shown(self.posterior(unit, deviations, weights), sizes)
-        K, (patterns, pattern) = len(self.shapes) - 1, point_patterns(seen_points(rows))
+        K, (_, pattern) = len(self.shapes) - 1, point_patterns(seen_points(rows))
         empty = (np.full((len(rows), *n), np.nan) for n in ((2, 3), (2,), (K,), (K,)))
         fit = Decomposition(*empty)
         # Frames that show the same points together
-        for number in range(len(patterns)):
-            frames = np.flatnonzero(pattern == number)
+        order = np.argsort(pattern, kind="stable")
+        for frames in np.split(order, np.cumsum(np.bincount(pattern)))[:-1]:
             part = rigid_fit(rows[frames], self.shapes, self.camera)
             fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
         return fit._replace(motion=fit.motion @ np.linalg.inv(self.gauge.space))
