@@ -163,7 +163,7 @@ class TestLargeTables:
     @pytest.mark.parametrize("gaps", slow_after(1, [False, True]))
     def test_end_where_small_ones_do(self, gaps, camera):
         seen_by = camera if camera == "orthographic" else "weak_perspective"
-        tracks, truth = random_table(seen_by, n_frames=120)
+        tracks, truth = random_table(seen_by, n_frames=200)
         tracks = with_gaps(tracks, 0.1) if gaps else tracks
         options = {"tol": 1e-3, "camera": camera}
         sampled = fitted(tracks, kind=SampledNRSfM, **options)
@@ -183,7 +183,7 @@ class TestLargeTables:
         assert depth_error(model, X, points)[1] < 0.11
 
     def test_points_that_the_sample_does_not_show(self):
-        tracks, _ = random_table(n_frames=120)
+        tracks, _ = random_table(n_frames=200)
         tracks[8:, 5] = np.nan
         assert np.isfinite(fitted(tracks, kind=SampledNRSfM).basis_).all()
 
