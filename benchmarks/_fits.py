@@ -35,19 +35,20 @@ motion capture, and `camera="affine"` if images may be stretched.
 
 PI, BMM and Kong-Lucey assume orthographic cameras. Those of shark, ICT-68, drink,
 pickup and yoga are orthographic, and the methods are told if rows are successive
-frames. "ISA, joint refinement" has affine cameras, which absorb part of a deformation,
-most with too few basis shapes (shark, flag); the paper's refinement has rigid ones.
-Both are calibrated after the fit (`isa_nrsfm.calibration`) for the errors that count
-angles. Orthographic cameras are wrong for the synthetic tables, and the flag is seen in
-perspective. With affine true cameras, angles have no meaning; if true shapes are in the
-axes of the camera (shark, flag), there is no `affine_shape_error`.
+frames. They and "ISA, joint refinement", with affine cameras, have K basis shapes.
+Weak-perspective and orthographic fits have all directions of deformation that the table
+supports, whatever K is: these are the shapes of `reconstruct`. Affine cameras absorb
+part of a deformation, most with too few basis shapes (shark, flag); the paper's
+refinement has rigid ones. Both are calibrated after the fit (`isa_nrsfm.calibration`)
+for the errors that count angles. Orthographic cameras are wrong for the synthetic
+tables, and the flag is seen in perspective. With affine true cameras, angles have no
+meaning; if true shapes are in the axes of the camera (shark, flag), there is no
+`affine_shape_error`.
 
 Images do not determine a rotation that goes with the deformation. Errors that count
 angles are therefore measured in the axes of the cameras, as in the literature. In
 `affine_shape_error`, such rotations count: true shapes turned onto their mean move by
-0.05 (ICT-68), 0.09 (drink) and 0.10 (pickup, yoga) of their extents. Bodies have more
-basis shapes than are fitted here; `python -m benchmarks.accuracy calibrated` has the
-errors with twelve.
+0.05 (ICT-68), 0.09 (drink) and 0.10 (pickup, yoga) of their extents.
 
 Numbers are medians over the seeds and, if they differ, ranges.
 """
@@ -153,7 +154,7 @@ def truth_page(records):
             parts += [f"{title}. Lower is better.\n"]
             parts += [grid(judged[has_it], *titles, name)]
     parts += [
-        "Inverse SNR of the same fits in percent.\n",
+        "Inverse SNR of the same fits in percent. The floor is that of rank 3K + 3.\n",
         grid(records, *titles, "inverse_snr"),
         "Seconds of the fit.\n",
         grid(records, *titles, "seconds"),

@@ -140,16 +140,17 @@ def images_of(model, shapes):
 
 
 def found_by_ours(model, X):
-    """Return what AffineNRSfM has found in its table."""
-    shapes = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
-    images = images_of(model, shapes)
+    """Return what AffineNRSfM has found in its table, with all directions of shapes."""
+    frames = model.decompose(X)
+    shapes, images = model.reconstruct(X), model.reproject(X)
     if model.camera != "affine":
-        return Found(images, shapes, shapes, model.rotations_, model.scales_)
+        cameras = rotations_and_scales(frames.motion)
+        return Found(images, shapes, shapes, *cameras)
     metric = deformation_metric(model.motion_, model.alpha_)
-    frames = euclidean_frames(
+    euclidean = euclidean_frames(
         metric, model.motion_, model.alpha_, model.mean_shape_, model.basis_
     )
-    return Found(images, shapes, *frames)
+    return Found(images, shapes, *euclidean)
 
 
 def found_by_baseline(model, X):

@@ -821,8 +821,10 @@ default="affine"
         Parameters
         ----------
         X : array-like of shape (n_frames, 2 * n_points), or Decomposition
-            A table with the points of the fitted one, or the result of `decompose`,
-            whose frames are not fitted again.
+            A table with the points of the fitted one: with calibrated cameras, shapes
+            have all directions of deformation that the fit has. Or the result of
+            `decompose`, whose frames are not fitted again: its shapes have the K
+            directions of `basis_`.
         camera : {"orthographic", "weak_perspective"} or None, default=None
             Calibrated camera model of the images, for a model that was fitted with
             affine cameras. None returns shapes in the space of `mean_shape_`. Otherwise
@@ -934,8 +936,8 @@ default="affine"
         Returns
         -------
         ndarray of shape (n_shapes, n_points, 3)
-            ``S_i = mean_shape_ + sum_k alpha_ik basis_[k]``, NaN for rows with NaN. For
-            the coefficients of `decompose` it is the same as `reconstruct`.
+            ``S_i = mean_shape_ + sum_k alpha_ik basis_[k]``, NaN for rows with NaN: what
+            `reconstruct` returns for the result of `decompose`.
 
         Raises
         ------
