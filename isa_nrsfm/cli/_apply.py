@@ -47,13 +47,9 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
     _report.write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **weights, **drawn)
-    files = "  ".join(map(str, outputs))
-    rows = [
-        ["model", "", args.model],
-        quality,
-        _report.left_out_row(_report.table_report(args, frames)),
-        ["output", "", f"{files}  {len(frames.points)} rows"],
-    ]
+    left_out = _report.left_out_row(_report.table_report(args, frames))
+    written = f"{'  '.join(map(str, outputs))}  {len(frames.points)} rows"
+    rows = [["model", "", args.model], quality, left_out, ["output", "", written]]
     return _report.text_of(f"{n_components} coefficients of {len(X)} frames", rows)
 
 

@@ -64,9 +64,9 @@ def asked_columns(args: Namespace, frames: Frames) -> Frames:
 
 def column_results(
     args: Namespace, estimator: AffineNRSfM, frames: Frames
-) -> tuple[dict[str, Any], "pd.DataFrame", Any]:
+) -> tuple[dict[str, Any], dict[str, NDArray], Any]:
     """Return entries of the report, columns of alpha.csv and smoothed coefficients."""
-    X, alpha, smooth = frames.X, estimator.alpha_, None
+    alpha, smooth = estimator.alpha_, None
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
     if frames.labels:
@@ -82,8 +82,8 @@ def column_results(
     if frames.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
         of_rows = {"groups": frames.groups} | frames.weighting
-        smooth = estimator.smooth(X, time=frames.times, **of_rows)
-        found, images = smooth.alpha, frames.images[X.index]
+        smooth = estimator.smooth(frames.X, time=frames.times, **of_rows)
+        found, images = smooth.alpha, frames.images[frames.X.index]
         report["time"] = {
             "column": args.time or images.name,
             "frames": None if args.time else [images.min(), images.max()],
@@ -96,23 +96,22 @@ def column_results(
     has_unit = args.unit is not None or args.length != DEFAULTS["length"]
     if args.distance or (has_positions and has_unit):
         names = [f"distance_{a}_{b}" for a, b in args.distance]
-        a, b = args.unit or EYES
+        ends = args.unit or EYES  # of the unit of positions as well
         try:
-            pairs = [*args.distance, (a, b)]  # the unit of positions as well
             length = {"unit": args.unit, "length": args.length}
-            found = point_distances(estimator, pairs, **length)
+            found = point_distances(estimator, [*args.distance, ends], **length)
             columns |= zip(names, found.T[:-1], strict=True)
             if has_positions:
-                size = np.linalg.norm(np.subtract(*estimator.mean_shape_[[a, b]]))
+                size = np.linalg.norm(np.subtract(*estimator.mean_shape_[[*ends]]))
                 report["position_unit"] = {
-                    "points": [a, b],
+                    "points": ends,
                     "length": args.length,
                     "per_unit_of_shapes": args.length / size,
                 }
         except ValueError as error:
             what = "alpha.csv has no distances" if names else "--length has no effect"
             warn_caller(f"{what}: {error}")
-    return report, X[[]].assign(**columns), smooth
+    return report, columns, smooth
 
 
 def has_classes(label: "pd.Series", most: float = np.inf) -> bool:

@@ -102,14 +102,12 @@ def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
-    alpha = alpha[:, :MOST_DRAWN]
-    display = plotting.CoefficientsDisplay(
-        alpha=alpha,
-        alpha_std=None if deviation is None else deviation[:, :MOST_DRAWN],
-        time=frames.times,
-        groups=frames.groups,
-        component_names=names_of_components(None, alpha.shape[1]),
-    ).plot(kind="time")
+    names = names_of_components(None, alpha.shape[1])[:MOST_DRAWN]
+    options = {"time": frames.times, "groups": frames.groups, "component_names": names}
+    if deviation is not None:
+        options["alpha_std"] = deviation[:, :MOST_DRAWN]
+    display = plotting.CoefficientsDisplay(alpha=alpha[:, :MOST_DRAWN], **options)
+    display.plot(kind="time")
     if frames.time_unit == "seconds" and np.asarray(frames.times).dtype.kind != "M":
         display.axes_[-1].set_xlabel("time, seconds")
     return display
@@ -125,14 +123,12 @@ def _shapes_by_label(label: "pd.Series", fit: Fit) -> plotting.BasisShapeDisplay
     (limits,), _ = _views.block_limits([np.concatenate([mean[None], shapes])])
     axes = _views.new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
     counts = label.value_counts(sort=False)
+    same = {"edges": whole.skeleton, "origin": whole.origin}
+    same["basis"] = np.empty((0, *mean.shape))
     for shape, pair, (name, count) in zip(shapes, axes, counts.items(), strict=True):
         for points, colour in ((mean, "0.8"), (shape, _views.MEAN_COLOUR)):
-            display = plotting.BasisShapeDisplay(
-                mean_shape=points,
-                basis=np.empty((0, *points.shape)),
-                edges=whole.skeleton,
-                origin=whole.origin,
-            ).plot(pair, point_kw={"color": colour})
+            display = plotting.BasisShapeDisplay(mean_shape=points, **same)
+            display.plot(pair, point_kw={"color": colour})
         for axis, view in zip(pair, _views.VIEWS, strict=True):
             _views.show_view(axis, view, limits, whole.origin)
         pair[1].set_xlabel(whole.depth_note, loc="right", fontsize="x-small")

@@ -67,11 +67,11 @@ def fit_table(
     A given table is written to the path in the options. `warned` has the warnings so
     far, and grows.
     """
-    prior = args.prior
+    prior, folder, inputs = args.prior, Path(args.output), []
     _check_options(args)
     if prior not in (None, NONE, *FACE_PRIORS):
         args.prior = load_model(prior)
-    folder = Path(args.output)
+        inputs.append(prior)
     frames = _moving_points(args, _reading.read_frames(args, table=table), table)
     if prior in FACE_PRIORS:
         layout = _reading.face_layout(args, frames)
@@ -103,9 +103,9 @@ def fit_table(
     figures = {} if args.no_figures else _figures.figures_of(frames)
     drawn = _reading.drawing(args, frames.columns.points, frames.skeleton)
     results = dict.fromkeys(_report.RESULTS, "")
-    inputs = [prior] * (prior not in (None, NONE, *FACE_PRIORS))
-    inputs += [args.table] * (table is None)
-    if table is not None:
+    if table is None:
+        inputs.append(args.table)
+    else:
         results[Path(args.table).name] = ""
     with files.folder_for_writing(folder):
         targets = [folder / name for name in (*results, *figures, _report.REPORT)]
@@ -116,8 +116,8 @@ def fit_table(
             files.check_replaceable(target)
         old = _report.entry_of_report(folder, "files")
         removed = {*figures, *(name for name in old if name.endswith(".png"))}
-        used = {args.group, args.time, frames.images.name}
-        used |= {label.name for label in frames.labels}
+        labels = {label.name for label in frames.labels}
+        used = {args.group, args.time, frames.images.name, *labels}
         unused = [name for name in frames.other if name and name not in used]
         unused.sort(key=lambda name: not LABEL.search(str(name)))
         estimator, trials, choice, diagnostics = _fitted(args, frames)
@@ -128,14 +128,13 @@ def fit_table(
             if table is not None:
                 write_table(table, new / Path(args.table).name)
             alpha, std = estimator.alpha_, estimator.alpha_std_ if args.std else None
-            _report.write_alpha(new / "alpha.csv", frames, alpha, std, columns)
-            labels = _columns.first_classes(frames.labels)
-            viewer_data = {"labels": labels, "times": frames.times}
-            viewer_data |= _report.depth_std(args, estimator, X, frames.weighting)
+            _report.write_alpha(new / "alpha.csv", frames, alpha, std, **columns)
+            shown = _report.depth_std(args, estimator, X, frames.weighting)
+            shown["labels"] = _columns.first_classes(frames.labels)
             unit = answers.get("position_unit", {}).get("per_unit_of_shapes", 1.0)
             explained = estimator.reproject(X, **frames.weighting)
             fit = _report.Fit(estimator, frames, smooth, drawn, explained)
-            _report.write_results(new, fit, unit, **viewer_data)
+            _report.write_results(new, fit, unit, times=frames.times, **shown)
             if (std := getattr(estimator, "prior_std_", None)) is not None:
                 answers["prior"] = {"name": prior or _options.FACE_PRIOR, "std": std}
             report = {
@@ -161,8 +160,7 @@ def fit_table(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
                 )
-            captions = _figures.write_figures(new, figures, fit)
-            report |= {"files": results | captions}
+            report["files"] = results | _figures.write_figures(new, figures, fit)
             report = _report.write_report(new, report)
     return report, estimator
 
@@ -190,15 +188,14 @@ def _moving_points(
 
 def _refuse_views(columns: LandmarkColumns) -> None:
     """Raise if points have the names of several individuals, or of views of one."""
-    if not (who := individuals_in(columns.x, MIN_POINTS)):
-        return
-    own, points = columns_of_individuals(columns.x, who)[who[0]], columns.points
-    some = [name for name, x in zip(points, columns.x, strict=True) if x in own]
-    raise ValueError(
-        f"{same_but_for(who, len(points))}. Fit those of one with --points "
-        f"{shlex.quote(','.join(some))}. If all are points of one body, use --points "
-        f"0-{len(points) - 1}"
-    )
+    if who := individuals_in(columns.x, MIN_POINTS):
+        own, points = columns_of_individuals(columns.x, who)[who[0]], columns.points
+        some = [name for name, x in zip(points, columns.x, strict=True) if x in own]
+        raise ValueError(
+            f"{same_but_for(who, len(points))}. Fit those of one with --points "
+            f"{shlex.quote(','.join(some))}. If all are points of one body, use "
+            f"--points 0-{len(points) - 1}"
+        )
 
 
 def _check_options(args: Namespace) -> None:
@@ -240,23 +237,18 @@ def _fitted(
 
     Also the report on its K and the diagnostics. Options that are given are kept.
     """
-    isa = None
-    if args.isa == "fast" or args.n_init is not None:
-        strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
-        isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
+    isa: Any = FastISA() if args.isa == "fast" else None
+    if args.n_init is not None:
+        isa = (isa or PooledFastICA()).set_params(n_init=args.n_init)
     given = {name: getattr(args, name) for name in (*FIRST, *_PARAMETERS)}
     given = {name: v for name, v in given.items() if v not in (None, (AUTO,))}
     given = {name: None if v == NONE else v for name, v in given.items()}
     if "n_components" in given:
         given["n_components"] = args.n_components[0]
     params, free = first_settings(given)
-    estimator = AffineNRSfM(
-        isa=isa,
-        scale_frames=not args.no_scale_frames,
-        hidden_points=not args.no_hidden_points,
-        remove_pose=args.remove_pose,
-        **params,
-    )
+    estimator = AffineNRSfM(isa=isa, remove_pose=args.remove_pose, **params)
+    estimator.scale_frames = not args.no_scale_frames
+    estimator.hidden_points = not args.no_hidden_points
     if estimator.camera == "perspective" or args.focal_length is not None:
         estimator.set_params(principal_point=frames.principal_point)
     choice: dict[str, Any] = {}
@@ -298,9 +290,8 @@ def _fitted(
 
 def choice_report(search: AffineNRSfMCV) -> dict[str, Any]:
     """Return the numbers tried, their held-out errors, and the one chosen."""
-    results, n_parts = search.cv_results_, search.n_splits_
-    scores = [results[f"split{part}_test_score"] for part in range(n_parts)]
-    of_parts = -np.transpose(scores)
+    results, parts = search.cv_results_, range(search.n_splits_)
+    of_parts = -np.transpose([results[f"split{i}_test_score"] for i in parts])
     return {
         "n_components": results["param_n_components"].tolist(),
         "held_out_error": -results["mean_test_score"],

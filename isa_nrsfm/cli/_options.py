@@ -9,6 +9,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -35,13 +36,11 @@ def _reader(
     """Return a function that reads allowed values, and names others in its error."""
 
     def reader(text: str) -> Any:
-        try:
+        with suppress(ValueError):
             value = read(text)
-        except ValueError:
-            value = None
-        if value is None or not is_allowed(value):
-            raise _wrong(expected, repr(text))
-        return value
+            if value is not None and is_allowed(value):
+                return value
+        raise _wrong(expected, repr(text))
 
     return reader
 
@@ -69,14 +68,12 @@ def _numbers_of_shapes(text: str) -> tuple[int | str, ...]:
     if text.strip() == AUTO:
         return (AUTO,)
     numbers: set[int] = set()
+    expected = "a range of at most 100 numbers, the smaller one first, such as 1-8"
     for part in text.split(","):
         bounds = re.fullmatch(r"(\d+)\s*-\s*(\d+)", part.strip())
         low, high = map(_whole_number(1), bounds.groups() if bounds else (part, part))
         if not low <= high < low + 100:
-            raise _wrong(
-                "a range of at most 100 numbers, the smaller one first, such as 1-8",
-                repr(part),
-            )
+            raise _wrong(expected, repr(part))
         numbers.update(range(low, high + 1))
     return tuple(sorted(numbers))
 
@@ -207,8 +204,7 @@ def _settings(command: str, name: str) -> dict[str, Any]:
         return {"help": help, "action": "store_true"}
     default = DEFAULTS.get(key)
     settings: dict[str, Any] = {"default": default, "choices": CHOICES.get(key)}
-    if metavar:
-        settings |= {"metavar": metavar, "type": TYPES.get(metavar)}
+    settings |= {"metavar": metavar or None, "type": TYPES.get(metavar)}
     if metavar == "X Y":
         settings |= {"metavar": ("X", "Y"), "nargs": 2}
     if name == "output":

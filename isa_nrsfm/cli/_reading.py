@@ -88,14 +88,12 @@ def read_frames(
     args.format = _format(args) if table is None else TABLE
     args.missing_value = sorted({*args.missing_value, *[0.0] * args.zeros_missing})
     if args.format != TABLE or (table is None and Path(args.table).is_dir()):
-        given = vars(args) | {"missing": args.missing_value}
-        known = FORMATS[args.format].options
-        options = {name: given[name] for name in known if given.get(name)}
-        found = FORMATS[args.format].read(args.table, **options)
-        table = pd.concat([found.frames, found.points], axis=1)
+        form, given = FORMATS[args.format], vars(args) | {"missing": args.missing_value}
+        options = {name: given[name] for name in form.options if given.get(name)}
+        found = form.read(args.table, **options)
+        table, layout = pd.concat([found.frames, found.points], axis=1), found.skeleton
         x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
         chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
-        layout = found.skeleton
         if found.confidence is not None:
             sure = found.confidence.set_axis(x, axis=1)
     elif table is None:
@@ -126,9 +124,7 @@ def read_frames(
     rows_kept = slice(None) if kept.all() else kept  # large tables are not copied
     tracks = tracks_in(table[rows_kept], names, args.missing_value)
     tracks = _tables.of_all_rows(tracks, kept)
-    confidence = np.full(tracks.shape[:2], np.nan)
-    if not sure.empty:
-        confidence = sure[list(columns.x)].to_numpy(np.float64)
+    confidence = sure.reindex(columns=list(columns.x)).to_numpy(np.float64)
     if args.min_confidence is not None:
         with errors_of(f"--min-confidence {args.min_confidence:g}"):
             tracks[unsure_points(confidence, args.min_confidence)] = np.nan
@@ -191,9 +187,8 @@ def _warn_of_unsure(confidence: NDArray, seen: NDArray) -> None:
     unsure = seen & (confidence < UNSURE)
     if unsure.any() and UNSURE <= np.nanmax(confidence) <= 1:
         before, after = seen.sum(axis=1), (seen & ~unsure).sum(axis=1)
-        enough = 2 * after.sum() >= before.sum()
         left, whole = (np.sum(each >= FEWEST_POINTS) for each in (after, before))
-        enough &= 2 * left >= whole
+        enough = 2 * after.sum() >= before.sum() and 2 * left >= whole
         way = f"leave them out with --min-confidence {UNSURE:g}"
         warn_caller(
             f"{100 * unsure.sum() / seen.sum():.3g} % of the points have a confidence "
@@ -216,11 +211,9 @@ def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
 def cells_of(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
     """Return a column, missing where its text is empty or a word for missing."""
     column = column_named(table, name, option)
-    if isinstance(column.dtype, pd.CategoricalDtype):
-        column = column.astype(object)
-    if column.dtype != object and not pd.api.types.is_string_dtype(column):
+    if column.dtype.kind != "O":  # neither texts nor categories
         return column
-    text = column.astype(str).str.strip()
+    text = column.astype(object).astype(str).str.strip()
     return text.where(column.notna() & ~text.str.lower().isin(_MISSING))
 
 
@@ -239,11 +232,10 @@ def _format(args: Namespace) -> str:
     found: str = args.format
     if found == "auto":
         found = TABLE if args.columns is not None else find_format(args.table)
+    near = args.command == "fit" and args.camera not in ("affine", "orthographic")
+    known = (*FORMATS[found].options, *["image_size"] * near)
     for name in _OF_FORMATS:
-        if getattr(args, name) is None or name in FORMATS[found].options:
-            continue
-        near = args.command == "fit" and args.camera not in ("affine", "orthographic")
-        if name != "image_size" or not near:
+        if getattr(args, name) is not None and name not in known:
             having = [each for each in FORMATS.values() if name in each.options]
             suffix = Path(args.table).suffix.lower()
             having = [each for each in having if suffix in each.suffixes] or having
@@ -330,15 +322,12 @@ def _left_out(reason: str, rows: NDArray, skipped: bool = False) -> dict[str, An
 
 def _reasons(report: _tables.FrameReport, failed: NDArray | None) -> dict[str, NDArray]:
     """Return reasons why frames cannot be fitted, and the frames of each."""
-    nothing = report.n_seen == 0
+    nothing, few = report.n_seen == 0, report.n_seen < FEWEST_POINTS
+    in_one_place = report.in_one_place & ~few
     reasons = {"all points missing": nothing}
     if failed is not None:
-        reasons = {
-            "tracking failed": failed,
-            "all points missing or uncertain": nothing & ~failed,
-        }
-    few = report.n_seen < FEWEST_POINTS
-    in_one_place = report.in_one_place & ~few
+        reasons = {"tracking failed": failed}
+        reasons["all points missing or uncertain"] = nothing & ~failed
     return reasons | {
         f"fewer than {FEWEST_POINTS} points": few & ~nothing,
         "all points in one place": in_one_place,
@@ -467,11 +456,10 @@ def _kept_points(
             )
         return layout.inner.tolist()
     numbers = _column_names.point_places(names)
-    named: set[int] = set()
-    for part in text.removeprefix(WITHOUT).split(","):
-        named.update(_range(part.strip(), numbers, names))
+    parts = map(str.strip, text.removeprefix(WITHOUT).split(","))
+    named = {j for part in parts for j in _range(part, numbers, names)}
     if text.startswith(WITHOUT):
-        return [j for j in range(len(names)) if j not in named]
+        named = {*range(len(names))} - named
     return sorted(named)
 
 
@@ -532,9 +520,8 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
     with reading(path, "a list of edges"):
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     edges: list[list[int]] = []
-    numbers = _column_names.point_places(names)
-    if not numbered:
-        numbers = {name: numbers[name] for name in names}
+    places = _column_names.point_places(names)
+    numbers = places if numbered else {name: places[name] for name in names}
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
@@ -553,11 +540,11 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
 # Times of frames: numbers, dates and durations, each in one reading for all rows.
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
 _DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
-_DATES, _OF_DAY = TIMES["dates"], TIMES["of_day"]
-_DAYS = [date.format(sign) for date, sign in product(_DATES, "/-. ")]
-_TIMES = [" ".join(pair) for pair in product(_DAYS, _OF_DAY)]
+_DAYS = [date.format(sign) for date, sign in product(TIMES["dates"], "/-. ")]
+_OF_DAY = TIMES["of_day"]
 # The ways in which dates and durations are usually written.
-_FORMATS = ("ISO8601", *_DAYS, *_TIMES, *_OF_DAY[3:], _MINUTES, _HOURS)
+_FORMATS = ["ISO8601", *_DAYS, *map(" ".join, product(_DAYS, _OF_DAY))]
+_FORMATS += [*_OF_DAY[3:], _MINUTES, _HOURS]
 _ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
 
 
@@ -569,8 +556,7 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
     if column.dtype.kind == "m":
         return np.asarray(column.dt.total_seconds()), "seconds"
     if column.dtype.kind == "M":
-        dates = pd.to_datetime(column, utc=True).dt.tz_localize(None)
-        return np.asarray(dates), "seconds"
+        return np.asarray(_read(column, None)), "seconds"
     cells = column.dropna().astype(str)
     numbers = as_numbers(cells)
     if format is None and numbers.notna().all():
@@ -625,28 +611,27 @@ def image_numbers(table: "pd.DataFrame", fps: float | None = None) -> "pd.Series
     It is the number of the frame, that in the name of the image, or that of the image
     among all. Otherwise rows count. Warn if times by fps leave out those in names.
     """
-    for expression in (FRAME, IMAGE_NAME, texts.IMAGE):
-        for name in table.columns:
-            if not re.fullmatch(expression, str(name).strip(), re.IGNORECASE):
-                continue
-            numbers: Any = pd.to_numeric(table[name], errors="coerce")
-            if expression == IMAGE_NAME:  # not of videos with many rows each
-                several = name == "file" and table[name].duplicated().any()
-                is_name = numbers.isna().all() and not several
-                names = [*map(str, table[name])]
-                numbers = texts.frame_numbers(names) if is_name else None
-                if fps and is_name and texts.have_times(names):
-                    warn_caller(
-                        f"--fps: the names of images in the column {name} have times "
-                        f"(first: {names[0]}) instead of numbers of frames. Images "
-                        "count as successive frames, in their order. For these times "
-                        f"use --time {name} with a --time-format, such as "
-                        "%Y-%m-%d_%H-%M-%S.png, or a column frame of numbers"
-                    )
-            elif expression == texts.IMAGE:
-                numbers = pd.factorize(table[name])[0]
-            if numbers is not None and np.isfinite(numbers).all():
-                return pd.Series(numbers, dtype=float, name=str(name).strip())
+    for expression, name in product((FRAME, IMAGE_NAME, texts.IMAGE), table.columns):
+        if not re.fullmatch(expression, str(name).strip(), re.IGNORECASE):
+            continue
+        numbers: Any = pd.to_numeric(table[name], errors="coerce")
+        if expression == IMAGE_NAME:  # not of videos with many rows each
+            several = name == "file" and table[name].duplicated().any()
+            is_name = numbers.isna().all() and not several
+            names = [*map(str, table[name])]
+            numbers = texts.frame_numbers(names) if is_name else None
+            if fps and is_name and texts.have_times(names):
+                warn_caller(
+                    f"--fps: the names of images in the column {name} have times "
+                    f"(first: {names[0]}) instead of numbers of frames. Images count "
+                    "as successive frames, in their order. For these times use --time "
+                    f"{name} with a --time-format, such as %Y-%m-%d_%H-%M-%S.png, or "
+                    "a column frame of numbers"
+                )
+        elif expression == texts.IMAGE:
+            numbers = pd.factorize(table[name])[0]
+        if numbers is not None and np.isfinite(numbers).all():
+            return pd.Series(numbers, dtype=float, name=str(name).strip())
     return pd.Series(range(len(table)))
 
 
@@ -674,10 +659,11 @@ def video_times(numbers: "pd.Series", groups: NDArray | None) -> NDArray:
     return np.asarray(numbers)
 
 
-def _read(cells: "pd.Series", format: str) -> "pd.Series":
+def _read(cells: "pd.Series", format: str | None) -> "pd.Series":
     """Return the dates or seconds of a format, missing where cells are not written so.
 
-    Minutes and seconds may have hours before them in some rows.
+    Without a format they are dates already. Minutes and seconds may have hours before
+    them in some rows.
     """
     if format not in _DURATIONS:
         dates = pd.to_datetime(cells, format=format, errors="coerce", utc=True)

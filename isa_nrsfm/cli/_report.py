@@ -80,7 +80,7 @@ def check_outputs(
 
 
 def write_alpha(
-    path: Path, frames: Frames, alpha: NDArray, std: NDArray | None, further: Any = None
+    path: Path, frames: Frames, alpha: NDArray, std: NDArray | None, **further: NDArray
 ) -> None:
     """Write coefficients after the row number and the other columns of the table.
 
@@ -91,9 +91,7 @@ def write_alpha(
     results = pd.DataFrame(alpha, index=frames.X.index, columns=names)
     if std is not None:
         results[[f"{name}_std" for name in names]] = std
-    if further is not None:
-        results = results.join(further)
-    results = results.reindex(frames.points.index)
+    results = results.assign(**further).reindex(frames.points.index)
     results.insert(0, "row", results.index)
     taken = {str(name) for name in frames.other.columns}
     if renamed := [name for name in results if name in taken]:
@@ -121,8 +119,7 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
     energy, error, _ = frame_energies(X, explained, estimator.layout)
     cameras["inverse_snr"] = error / energy
     if hasattr(estimator, "positions_"):
-        names = [f"position_{axis}" for axis in "xyz"]
-        cameras[names] = unit * estimator.positions_
+        cameras[[f"position_{axis}" for axis in "xyz"]] = unit * estimator.positions_
     shown["camera"] = None
     if frames_of(estimator).certainty.determined:  # otherwise the fit has warned
         try:
@@ -140,15 +137,13 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
             warn_caller(
                 f"viewer.html has affine shapes, and cameras.csv has no angles: {error}"
             )
-    cameras = cameras.reindex(frames.points.index)
-    cameras.insert(0, "row", cameras.index)
+    cameras = cameras.reindex(frames.points.index).reset_index(names="row")
     write_table(cameras, folder / "cameras.csv")
     shapes = [estimator.mean_shape_, *estimator.basis_]
     names = ["mean", *(f"basis_{k}" for k in range(1, len(shapes)))]
     columns = [f"{name}_{axis}" for name in names for axis in "XYZ"]
-    points = pd.DataFrame(np.hstack(shapes), columns=columns)
-    points.insert(0, "point", names_of_points(estimator))
-    write_table(points, folder / "shapes.csv")
+    points = pd.DataFrame(np.hstack(shapes), names_of_points(estimator), columns)
+    write_table(points.reset_index(names="point"), folder / "shapes.csv")
     export.write_shapes(estimator, folder / "shapes.npz")
     shown |= {"X": X, **frames.weighting, **drawn}
     export.write_viewer(estimator, folder / "viewer.html", **shown)
@@ -341,21 +336,20 @@ def summary(report: dict[str, Any], folder: Path | str) -> list[list[str]]:
         rows.append(["group", "", f"{groups['column']}: {text}"])
     if "time" in report:
         rows.append(["time", "", str(_time(report["time"])[0])])
-    tried = [each["text"] for each in report["tried"] if each["seconds"]]
-    others = [each for each in report["tried"] if not each["seconds"]]
-    if "choice" in report:
+    trials, tried = report["tried"], []
+    if choice := report.get("choice"):
         names = ("n_components", "held_out_error", "held_out_error_standard_error")
-        each = zip(*(report["choice"][name] for name in names), strict=True)
+        each = zip(*(choice[name] for name in names), strict=True)
         found = (f"{k} ({100 * error:.3g} +- {100 * s:.2g} %)" for k, error, s in each)
-        text = f"K = {first_items(found, 12)}: {report['choice']['chosen']} is used"
-        tried.insert(0, text)
-    listed = "; ".join(f"{each['setting']} ({each['result']})" for each in others)
-    tried += [f"not tried: {listed}"] * bool(others)
-    rows += [[f"{'tried' * (not i)}", "", text] for i, text in enumerate(tried)]
+        tried = [f"K = {first_items(found, 12)}: {choice['chosen']} is used"]
+    tried += [each["text"] for each in trials if each["seconds"]]
+    others = [f"{e['setting']} ({e['result']})" for e in trials if not e["seconds"]]
+    tried += [f"not tried: {'; '.join(others)}"] * bool(others)
+    rows += [["tried" * (not i), "", text] for i, text in enumerate(tried)]
     rows.append(left_out_row(table))
     if columns := table.get("other_columns"):
-        listed = first_items(map(str, columns), 6)
-        rows.append(["next", "", f"--label, --group or --time COLUMN: {listed}"])
+        text = f"--label, --group or --time COLUMN: {first_items(columns, 6)}"
+        rows.append(["next", "", text])
     return [*rows, ["open", "", f"{Path(folder, PAGE)}  viewer.html  alpha.csv"]]
 
 
@@ -411,15 +405,12 @@ def table_section(table: dict[str, Any]) -> Section:
     listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
     unused = [f"{name} ({n})" for name, n in table["coordinates_not_used"].items()]
     others = {"coordinates not used": unused, "other columns": table["other_columns"]}
+    shown = {what: first_items(names, MOST_LISTED) for what, names in others.items()}
     return [
         table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {listed}",
         f"{table['n_frames']} of {table['n_rows']} rows; left out: {out}",
-        *(
-            f"{what}: {first_items(map(str, names), MOST_LISTED)}"
-            for what, names in others.items()
-            if names
-        ),
+        *(f"{what}: {names}" for what, names in shown.items() if names),
     ]
 
 
@@ -447,9 +438,8 @@ def text_of(title: str, rows: Sequence[Sequence[str]]) -> str:
     """Return a summary as text: rows of a name, a mark, and a text that is wrapped."""
     lines = [title] * bool(title)
     for name, mark, text in rows:
-        first, *rest = WRAPPED.wrap(text) or [""]
-        lines.append(f"{name:9}{mark:6}{first}" if mark else f"{name:9}{first}")
-        lines += [f"{'':{15 if mark else 9}}{line}" for line in rest]
+        start = f"{name:9}{mark:6}" if mark else f"{name:9}"
+        lines.append(start + f"\n{'':{len(start)}}".join(WRAPPED.wrap(text)))
     return "\n".join(lines)
 
 
@@ -471,10 +461,8 @@ def _plain(value: Any) -> Any:
         return {as_utf8(str(key)): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if value is None or isinstance(value, int):
-        return value
+    if value is None or isinstance(value, int | float):
+        return None if value is None or not math.isfinite(value) else value
     return as_utf8(value if isinstance(value, str) else repr(value))
 
 
@@ -593,19 +581,11 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
 def _alpha(model: dict[str, Any]) -> Section:
     """Return the distribution of the coefficients, and what the pose predicts."""
     head = ["", "energy", "min", "row", "max", "row", "pose", "again"]
-    rows = [
-        [
-            row["name"],
-            f"{100 * row['energy_share']:.1f} %",
-            f"{row['min']:z.2f}",
-            f"{row['row_of_min']}",
-            f"{row['max']:z.2f}",
-            f"{row['row_of_max']}",
-            _pose_share(row),
-            row["stability_word"] or "",
-        ]
-        for row in model["alpha"]
-    ]
+    cells = "{name}|{energy:.1f} %|{min:z.2f}|{row_of_min}|{max:z.2f}|{row_of_max}"
+    rows = []
+    for row in model["alpha"]:
+        numbers = cells.format(energy=100 * row["energy_share"], **row).split("|")
+        rows.append([*numbers, _pose_share(row), row["stability_word"] or ""])
     columns = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
     table = [[*compress(line, columns)] for line in (head, *rows)]
     notes = [
@@ -709,9 +689,8 @@ def _time(time: dict[str, Any]) -> Section:
         return [f"{name}: no dynamics found, coefficients are not smoothed"]
     fading = scales[np.isfinite(scales)]
     listed = first_items(f"{each:.3g}" for each in fading)
-    found = [f"time constants of the deformation: {listed} {time['unit']}"] * (
-        len(fading) > 0
-    )
+    constants = f"time constants of the deformation: {listed} {time['unit']}"
+    found = [constants] * bool(listed)
     if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")
     return [

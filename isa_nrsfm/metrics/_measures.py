@@ -302,10 +302,8 @@ def basis_similarity(
     else:
         rows, columns, cosines = match_basis_up_to_affinity(truth, shapes)
 
-    similarity = np.zeros(len(truth))
-    matching = np.full(len(truth), -1)
-    similarity[rows] = cosines
-    matching[rows] = columns
+    similarity, matching = np.zeros(len(truth)), np.full(len(truth), -1)
+    similarity[rows], matching[rows] = cosines, columns
     return (similarity, matching) if return_matching else similarity
 
 
@@ -321,19 +319,17 @@ def match_basis(truth: NDArray, shapes: NDArray, affinity: NDArray) -> Matched:
 
 def match_basis_up_to_affinity(truth: NDArray, shapes: NDArray) -> Matched:
     """Match unit shapes under the best affinity for all of them together."""
-    starts = [np.eye(3)]
-    starts += [np.linalg.lstsq(x, s)[0] for s in truth for x in shapes]
-    best, tried = match_basis(truth, shapes, starts[0]), set()
+    starts = [np.eye(3), *(np.linalg.lstsq(x, s)[0] for s in truth for x in shapes)]
+    found, tried = [match_basis(truth, shapes, starts[0])], set()
     for start in starts:
-        rows, columns, cosines = match_basis(truth, shapes, start)
+        rows, columns, _ = match_basis(truth, shapes, start)
         # The next steps depend only on the pairs: stop if they repeat.
         while (pairs := (rows.tobytes(), columns.tobytes())) not in tried:
             tried.add(pairs)
             affinity = best_affinity(truth[rows], shapes[columns])
-            rows, columns, cosines = match_basis(truth, shapes, affinity)
-            if np.sum(cosines**2) > np.sum(best[2] ** 2):
-                best = rows, columns, cosines
-    return best
+            found.append(match_basis(truth, shapes, affinity))
+            rows, columns, _ = found[-1]
+    return max(found, key=lambda matched: np.sum(matched[2] ** 2))
 
 
 def without_mean_shape(shapes: NDArray, mean_shape: NDArray) -> NDArray:
