@@ -96,16 +96,13 @@ def run_export(args: Namespace, warned: list[str]) -> str:
 
 def _given(args: Namespace, content: str) -> dict[str, Any]:
     """Return the options that are given; raise if the content does not have them."""
-    given = {}
-    for name in [name for each in EXPORTS.values() for name in each["options"]]:
-        if getattr(args, name) in (None, False):
-            continue
+    names = dict.fromkeys(name for each in EXPORTS.values() for name in each["options"])
+    given = {n: vars(args)[n] for n in names if vars(args)[n] not in (None, False)}
+    for name in given:
         having = [kind for kind, each in EXPORTS.items() if name in each["options"]]
         if content not in having:
             raise ValueError(
                 f"{flag_of(name)} is an option of {' and '.join(having)}; "
                 f"{args.output} is {content}"
             )
-        if name not in ("skeleton", "mirrored"):
-            given[name] = getattr(args, name)
-    return given
+    return {n: v for n, v in given.items() if n not in ("skeleton", "mirrored")}

@@ -27,7 +27,7 @@ def asked_columns(args: Namespace, frames: Frames) -> Frames:
 
     The points of distances in the options become their numbers.
     """
-    table, names = frames.other[frames.usable], frames.columns.points
+    table, names = frames.other.loc[frames.X.index], frames.columns.points
     labels = [_label(table, text) for text in args.label]
     groups = None if args.group is None else _groups(table, args.group)
     times, unit = None, "seconds"
@@ -129,10 +129,8 @@ def class_means(label: "pd.Series", alpha: NDArray) -> dict[str, NDArray]:
 
 def first_classes(labels: "Sequence[pd.Series]") -> "pd.Series | None":
     """Return the first label of few classes, which colours the frames in the viewer."""
-    for label in labels:
-        if has_classes(label, MOST_LABELS):
-            return label.map(str, na_action="ignore").astype(object)
-    return None
+    few = [label for label in labels if has_classes(label, MOST_LABELS)]
+    return few[0].map(str, na_action="ignore").astype(object) if few else None
 
 
 def _numbered(
@@ -156,9 +154,8 @@ def _label(table: "pd.DataFrame", text: str) -> "pd.Series":
         kind = "number"
     if kind == "number" and numbers.isna().any():
         row = numbers.isna().idxmax()
-        raise ValueError(
-            f"--label {text}: labels must be numbers; got {names[row]!r} in row {row}"
-        )
+        wrong = f"got {names[row]!r} in row {row}"
+        raise ValueError(f"--label {text}: labels must be numbers; {wrong}")
     values = (numbers if kind == "number" else names).to_numpy()
     if values.dtype.kind not in "biuf":
         values = values.astype(str)
@@ -203,7 +200,8 @@ def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> dict[str, NDArray
     n_shapes = len(estimator.basis_)
     n_scores = min(3 * n_shapes + 3, *aligned.shape)
     scores = PCA(n_scores, random_state=0).fit_transform(aligned)
-    return {"pca": scores[:, :n_shapes], "pca_of_rank": scores}
+    key = "cross_validated_pca"
+    return {key: scores[:, :n_shapes], f"{key}_of_rank": scores}
 
 
 def _label_reports(
@@ -211,7 +209,7 @@ def _label_reports(
 ) -> Iterator[dict[str, Any]]:
     """Yield the association of coefficients with each label."""
     alpha, std = estimator.alpha_, getattr(estimator, "alpha_std_", None)
-    features = {"alpha": alpha} | _aligned_pca(estimator, frames.X)
+    features = {"cross_validated": alpha} | _aligned_pca(estimator, frames.X)
     for label in frames.labels:
         labelled, classes = label.notna().to_numpy(), has_classes(label)
         options: dict[str, Any] = {
@@ -243,9 +241,8 @@ def _label_reports(
             report["largest_class"] = counts.max() / counts.sum()
             report["class_means"] = class_means(label, alpha)
         try:
-            for name, values in features.items():
+            for key, values in features.items():
                 scores = analysis.predictability(values[labelled], **options)
-                key = "cross_validated" + f"_{name}" * (name != "alpha")
                 report[key], n = scores.mean(), len(scores)
                 report[f"{key}_standard_error"] = scores.std(ddof=1) / np.sqrt(n)
                 report[f"{key}_n_features"] = values.shape[1]

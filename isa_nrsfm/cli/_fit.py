@@ -15,18 +15,12 @@ import numpy as np
 from joblib import parallel_config
 from sklearn.model_selection import GroupKFold
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA, __version__
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, __version__, _parameters as choices
 from isa_nrsfm._compat import files, pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._fitted_model import hold_open
-from isa_nrsfm._parameters import (
-    CALIBRATED_CAMERAS,
-    FACE_PRIORS as LAYOUTS,
-    JOINT_REFINEMENTS,
-    check_requirements,
-)
 from isa_nrsfm._prepare.coordinates import TOLD, still_points
 from isa_nrsfm._selection import FIRST, Trial, decided, first_settings, standard_errors
 from isa_nrsfm.analysis._diagnostics import Diagnostics
@@ -37,15 +31,12 @@ from isa_nrsfm.datasets import load_face_prior, make_face_tracks
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._landmark_columns import MIN_POINTS, LandmarkColumns, same_but_for
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
+from isa_nrsfm.isa import FastISA, PooledFastICA
 from isa_nrsfm.metrics import affine_shape_error
-from isa_nrsfm.skeletons._column_names import (
-    WORDS,
-    columns_of_individuals,
-    individuals_in,
-)
+from isa_nrsfm.skeletons import _column_names
 
 # Columns that are probably labels or groups come first: action units, emotions, people.
-LABEL = re.compile(WORDS["labels"], re.IGNORECASE)
+LABEL = re.compile(_column_names.WORDS["labels"], re.IGNORECASE)
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
 N_PARTS = 3
@@ -77,8 +68,8 @@ def fit_table(
         layout = _reading.face_layout(args, frames)
         if layout is None:
             raise ValueError(
-                f"--prior {prior} has no points of this table, whose layout is "
-                f"not one of {', '.join(LAYOUTS)}. Name it with --skeleton, "
+                f"--prior {prior} has no points of this table, whose layout is not "
+                f"one of {', '.join(choices.FACE_PRIORS)}. Name it with --skeleton, "
                 "or give --prior the model.npz of a table in which the objects turn"
             )
         K = None if args.n_components in (None, (AUTO,)) else args.n_components[0]
@@ -87,9 +78,8 @@ def fit_table(
     X.attrs[TOLD] = True
     if X.empty:
         out = [f"{e['n_rows']} left out ({e['reason']})" for e in frames.left_out]
-        raise ValueError(
-            f"{args.table} has no row that can be fitted: {', '.join(out)}"
-        )
+        none = f"{args.table} has no row that can be fitted"
+        raise ValueError(f"{none}: {', '.join(out)}")
     frames = _columns.asked_columns(args, frames)
     needs_centre = args.camera == "perspective" or args.focal_length is not None
     if needs_centre and frames.principal_point is None:
@@ -188,9 +178,10 @@ def _moving_points(
 
 def _refuse_views(columns: LandmarkColumns) -> None:
     """Raise if points have the names of several individuals, or of views of one."""
-    if who := individuals_in(columns.x, MIN_POINTS):
-        own, points = columns_of_individuals(columns.x, who)[who[0]], columns.points
-        some = [name for name, x in zip(points, columns.x, strict=True) if x in own]
+    points, x = columns.points, columns.x
+    if who := _column_names.individuals_in(x, MIN_POINTS):
+        own = _column_names.columns_of_individuals(x, who)[who[0]]
+        some = [name for name, each in zip(points, x, strict=True) if each in own]
         raise ValueError(
             f"{same_but_for(who, len(points))}. Fit those of one with --points "
             f"{shlex.quote(','.join(some))}. If all are points of one body, use "
@@ -211,18 +202,15 @@ def _check_options(args: Namespace) -> None:
     given = {name: each for name, each in vars(args).items() if each is not None}
     given = {name: None if each == NONE else each for name, each in given.items()}
     auto = {"n_components": AUTO} if args.n_components == (AUTO,) else {}
-    check_requirements(given | auto | {"point_weight": args.weights})
-    lens = args.focal_length is not None or args.camera not in CALIBRATED_CAMERAS
+    choices.check_requirements(given | auto | {"point_weight": args.weights})
+    lens = args.focal_length or args.camera not in choices.CALIBRATED_CAMERAS
     if args.principal_point is not None and not lens:
-        raise ValueError(
-            f"--principal-point needs --focal-length with --camera {args.camera}"
-        )
-    one = {
-        "weights": "numbers are compared without weights",
-        "prior": "a fit has those of the prior",
-    }
+        needed = f"--focal-length with --camera {args.camera}"
+        raise ValueError(f"--principal-point needs {needed}")
+    several = args.n_components is not None and len(args.n_components) > 1
+    one = {"weights": "numbers are compared without weights"}
+    one["prior"] = "a fit has those of the prior"
     for name, why in one.items():
-        several = args.n_components and len(args.n_components) > 1
         if several and getattr(args, name) not in (None, NONE):
             raise ValueError(
                 f"{flag_of(name)} needs one number of basis shapes, because {why}; "
@@ -282,9 +270,8 @@ def _fitted(
     estimator.set_params(verbose=0)
     with parallel_config(n_jobs=2):  # threads for blocks of frames
         hold_open(estimator, X, **frames.weighting)
-    diagnostics = None
-    if estimator.refinement in JOINT_REFINEMENTS:
-        diagnostics = estimator.diagnostics(X, **frames.weighting)
+    joint = estimator.refinement in choices.JOINT_REFINEMENTS
+    diagnostics = estimator.diagnostics(X, **frames.weighting) if joint else None
     return estimator, trials, choice, diagnostics
 
 

@@ -76,7 +76,7 @@ def _as_option(args: Namespace, name: str, *values: Any) -> str:
     if name == "kind":
         return f"--label COLUMN:{values[0]}"
     option = {"point_weight": "weights", "missing": "missing_value"}.get(name, name)
-    if getattr(args, option, args) is args:
+    if option not in args:
         return in_python(name, *values)
     sizes = ("x".join(map(str, v)) if isinstance(v, tuple) else v for v in values)
     values = tuple(f"{v:.15g}" if isinstance(v, float) else v for v in sizes)

@@ -47,7 +47,7 @@ class Frames(NamedTuple):
 
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
     are not skipped, by the number of the row in the table. ``X`` has the landmarks of
-    ``usable`` rows, which can be fitted. ``left_out`` has the entries of the report on
+    usable rows, which can be fitted. ``left_out`` has the entries of the report on
     other rows, ``not_used`` the sizes of unused sets of coordinates.
     ``images`` are the numbers of the images that all rows show, under the name of their
     column, if any.
@@ -60,7 +60,6 @@ class Frames(NamedTuple):
     points: "pd.DataFrame"
     X: "pd.DataFrame"
     other: "pd.DataFrame"
-    usable: NDArray
     columns: LandmarkColumns
     not_used: dict[str, int]
     left_out: list[dict[str, Any]]
@@ -166,9 +165,8 @@ def read_frames(
     points = pd.DataFrame(_tables.tracks_to_table(tracks), index=rows, columns=titles)
     return Frames(
         points=points,
-        X=points if report.usable.all() else points[report.usable],
+        X=points[usable],
         other=other.loc[kept],
-        usable=report.usable,
         columns=columns,
         not_used=not_used,
         left_out=[out for out in left_out if out["n_rows"]],
@@ -239,11 +237,9 @@ def _format(args: Namespace) -> str:
             having = [each for each in FORMATS.values() if name in each.options]
             suffix = Path(args.table).suffix.lower()
             having = [each for each in having if suffix in each.suffixes] or having
-            names = " or ".join(each.name for each in having)
-            raise ValueError(
-                f"{flag_of(name)} needs --format {names}; {args.table} "
-                f"has format {found}"
-            )
+            needed = f"--format {' or '.join(each.name for each in having)}"
+            has = f"{args.table} has format {found}"
+            raise ValueError(f"{flag_of(name)} needs {needed}; {has}")
     return found
 
 
@@ -344,10 +340,8 @@ def _columns_of_model(
     if fitted is None:
         found = chosen or find_landmark_columns(table.columns)
         if len(found.points) != n_points:
-            raise ValueError(
-                f"the model has {n_points} points, the table has {len(found.points)} "
-                f"({found.pattern})"
-            )
+            has = f"{len(found.points)} ({found.pattern})"
+            raise ValueError(f"the model has {n_points} points, the table has {has}")
         return found
     names = [str(name).strip() for name in fitted]
     if estimator.layout == "planar":
@@ -367,14 +361,11 @@ def _columns_of_model(
             for some, where in ((absent, "model"), (surplus, "table"))
             if some
         ]
-        individuals = _column_names.individuals_with(table.columns, names[::2])
-        option = shlex.quote(",".join(individuals))
-        hint = f". Individuals in one row: --individuals {option}"
-        raise ValueError(
-            "the table does not have the points of the model: "
-            + "; ".join(differences)
-            + hint * bool(individuals)
-        )
+        text = "; ".join(differences)
+        if who := _column_names.individuals_with(table.columns, names[::2]):
+            option = f"--individuals {shlex.quote(','.join(who))}"
+            text += f". Individuals in one row: {option}"
+        raise ValueError(f"the table does not have the points of the model: {text}")
     columns = [in_table[name] for name in names]
     x, y = tuple(columns[::2]), tuple(columns[1::2])
     return LandmarkColumns("those of the model", names_of_points(estimator), x, y)
@@ -387,14 +378,13 @@ def _layout(
     stored: Skeleton | None,
 ) -> Skeleton | None:
     """Return the layout of all points of a table: given, stored, or recognised."""
-    names = columns.points
     if args.skeleton is not None:
-        stored = _given_layout(args.skeleton, names)
-        return stored if stored.n_points == len(names) else None
+        given = _given_layout(args.skeleton, columns.points)
+        return given if given.n_points == len(columns.points) else None
     if stored is not None:
         return stored
     tracks = tracks_in(table, columns.interleaved, args.missing_value)
-    return skeleton_in_images(tracks, names)
+    return skeleton_in_images(tracks, columns.points)
 
 
 def zeros_far_away(tracks: NDArray) -> NDArray:
@@ -505,10 +495,8 @@ def drawing(
     elif args.skeleton is not None and (args.points is None or stored is None):
         edges = _given_layout(args.skeleton, names)
         if edges.n_points != len(names):
-            raise ValueError(
-                f"--skeleton {args.skeleton} has {edges.n_points} points, the table "
-                f"{len(names)}"
-            )
+            numbers = f"{edges.n_points} points, the table {len(names)}"
+            raise ValueError(f"--skeleton {args.skeleton} has {numbers}")
     elif stored is not None:
         named = stored.point_names is not None and sorted(stored.point_names)
         edges = stored.reordered(names) if named == sorted(names) else stored
@@ -539,13 +527,13 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
 
 # Times of frames: numbers, dates and durations, each in one reading for all rows.
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
-_DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
+_DURATION = r"^(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)$"
 _DAYS = [date.format(sign) for date, sign in product(TIMES["dates"], "/-. ")]
 _OF_DAY = TIMES["of_day"]
 # The ways in which dates and durations are usually written.
 _FORMATS = ["ISO8601", *_DAYS, *map(" ".join, product(_DAYS, _OF_DAY))]
 _FORMATS += [*_OF_DAY[3:], _MINUTES, _HOURS]
-_ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
+_ZONE = r".*:\d\d.*(?:Z|[+-]\d\d:?\d*)"
 
 
 def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
@@ -563,17 +551,14 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
         of_frames = re.fullmatch(FRAME, str(column.name).strip(), re.IGNORECASE)
         unit = "frames" if of_frames else f"in the unit of the column {column.name}"
         return np.asarray(numbers.reindex(column.index), dtype=float), unit
-    zoned = cells.str.fullmatch(f".*{_ZONE}")
+    zoned = cells.str.fullmatch(_ZONE)
     if zoned.any() and not zoned.all():
         raise ValueError(
             f"{zoned.sum()} of {len(cells)} frames have a time zone, such as Z or "
             f"+01:00, and others have none (first: {_cell(cells, ~zoned)})"
         )
-    readings = {
-        each: _read(cells, each)
-        for each in ([format] if format else _FORMATS)
-        if format or _read(cells.iloc[:1], each).notna().all()
-    }
+    likely = [each for each in _FORMATS if _read(cells.iloc[:1], each).notna().all()]
+    readings = {each: _read(cells, each) for each in ([format] if format else likely)}
     whole = {each: read for each, read in readings.items() if read.notna().all()}
     if not whole:  # the format that reads most rows before it fails
         unread = [read.isna() for read in readings.values()]
@@ -585,12 +570,10 @@ def read_times(column: "pd.Series", format: str | None) -> tuple[NDArray, str]:
             "written with --time-format, such as %d.%m.%Y, or use numbers"
         )
     chosen, first = next(iter(whole.items()))
-    if others := {name: read for name, read in whole.items() if not read.equals(first)}:
-        row = (next(iter(others.values())) != first).idxmax()
-        listed = [
-            f"{_shown(read[row])} (--time-format '{name}')"
-            for name, read in ({chosen: first} | others).items()
-        ]
+    if others := [name for name, read in whole.items() if not read.equals(first)]:
+        row = (whole[others[0]] != first).idxmax()
+        times = {name: _shown(whole[name][row]) for name in (chosen, *others)}
+        listed = [f"{time} (--time-format '{name}')" for name, time in times.items()]
         raise ValueError(
             f"{cells[row]!r} in row {row} can be {' or '.join(listed)}, and no other "
             "row decides it: choose one with --time-format"
@@ -668,7 +651,7 @@ def _read(cells: "pd.Series", format: str | None) -> "pd.Series":
     if format not in _DURATIONS:
         dates = pd.to_datetime(cells, format=format, errors="coerce", utc=True)
         return dates.dt.tz_localize(None)
-    parts = cells.str.extract(f"^{_DURATION}$").astype(float)
+    parts = cells.str.extract(_DURATION).astype(float)
     seconds = 3600 * parts[0].fillna(0.0) + 60 * parts[1] + parts[2]
     if format == _MINUTES:
         return seconds

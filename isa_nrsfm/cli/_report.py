@@ -14,7 +14,6 @@ import textwrap
 import warnings
 from argparse import Namespace
 from collections.abc import Iterable, Sequence
-from importlib.resources import files
 from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -125,8 +124,7 @@ def write_results(folder: Path, fit: Fit, unit: float = 1.0, **shown: Any) -> No
         try:
             with warnings.catch_warnings(action="error", category=UserWarning):
                 poses = export.frame_poses(estimator, X, **frames.weighting, **drawn)
-            columns = pd.DataFrame(poses._asdict(), index=X.index)
-            columns = columns.dropna(axis="columns", how="all")
+            columns = pd.DataFrame(poses._asdict(), X.index).dropna(axis=1, how="all")
             shown["camera"] = "weak_perspective" if len(columns.columns) else None
             if smooth is not None:
                 poses = export.frame_poses(estimator, smooth.decomposition, **drawn)
@@ -423,8 +421,7 @@ def quality_row(quality: dict[str, Any]) -> list[str]:
 
 def left_out_row(table: dict[str, Any]) -> list[str]:
     """Return the rows that are left out, and missing points, as a row of a summary."""
-    reasons = table["rows_left_out"]
-    out = [f"{each['n_rows']} rows: {each['reason']}" for each in reasons]
+    out = [f"{e['n_rows']} rows: {e['reason']}" for e in table["rows_left_out"]]
     numbers = [f"({n:.15g}, {n:.15g})" for n in table["missing_values"]]
     out += [f"points at {place} count as missing" for place in numbers]
     if n_missing := table["n_missing_points"]:
@@ -485,7 +482,7 @@ def _write_page(folder: Path, report: dict[str, Any]) -> None:
                 f'<figure><img src="data:image/png;base64,{image}" alt="{caption}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
-    page = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
+    page = Path(__file__).with_name(PAGE).read_text(encoding="utf-8")
     page = page.replace("{{title}}", title).replace("{{content}}", "\n".join(parts))
     write_whole(folder / PAGE, page.encode(errors="replace"))
 

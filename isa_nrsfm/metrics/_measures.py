@@ -16,7 +16,6 @@ from sklearn.utils import check_array
 
 from isa_nrsfm import _tables
 from isa_nrsfm._linalg import OF_STEPS
-from isa_nrsfm._tables import CHECKS, FrameBlocks, unmasked
 
 
 def inverse_snr(
@@ -94,9 +93,9 @@ def frame_energies(
     X: ArrayLike, X_hat: ArrayLike, layout: _tables.Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return energies of frames and of their errors, and the mask of seen points."""
-    checks = CHECKS | {"dtype": np.float64}
-    truth = check_array(unmasked(X), input_name="X", **checks)
-    fitted = check_array(unmasked(X_hat), input_name="X_hat", **checks)
+    checks = _tables.CHECKS | {"dtype": np.float64}
+    truth = check_array(_tables.unmasked(X), input_name="X", **checks)
+    fitted = check_array(_tables.unmasked(X_hat), input_name="X_hat", **checks)
     check_same_shape("X", truth, "X_hat", fitted)
     both = (_tables.table_to_tracks(table, layout).mT for table in (truth, fitted))
     truth, fitted = (_tables.without_half_points(rows)[0] for rows in both)
@@ -117,15 +116,14 @@ def frame_energies(
         error = np.nansum((truth - fitted) ** 2, axis=(1, 2))
         return np.nansum(truth**2, axis=(1, 2)), error
 
-    blocks = FrameBlocks.of_array(truth, 1024)  # copies that stay in the cache
+    blocks = _tables.FrameBlocks.of_array(truth, 1024)  # copies that stay in the cache
     return *blocks.joined(energies, fitted), seen
 
 
 def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
     """Return an array of floats; refuse NaN and infinity."""
-    values = np.asarray(unmasked(array), dtype=np.float64)
-    if not np.isfinite(values).all():
-        n_bad = int(np.sum(~np.isfinite(values)))
+    values = np.asarray(_tables.unmasked(array), dtype=np.float64)
+    if n_bad := np.count_nonzero(~np.isfinite(values)):
         raise ValueError(f"{name} must be finite; {n_bad} entries are NaN or infinite")
     return values
 
@@ -133,9 +131,9 @@ def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
 def check_same_shape(name_a: str, a: NDArray, name_b: str, b: NDArray) -> None:
     """Refuse arrays of different shapes."""
     if a.shape != b.shape:
+        names = f"{name_a} and {name_b}"
         raise ValueError(
-            f"{name_a} and {name_b} must be of the same shape; got {a.shape} and "
-            f"{b.shape}"
+            f"{names} must be of the same shape; got {a.shape} and {b.shape}"
         )
 
 
@@ -386,10 +384,9 @@ def _climb(start: NDArray, cross: NDArray, scatter: NDArray) -> tuple[float, NDA
     return -float(found.fun), found.x
 
 
-def quotient(numerator: NDArray, denominator: NDArray) -> NDArray[np.float64]:
-    """Divide; zero where the denominator is zero up to rounding."""
-    result, usable = np.zeros_like(denominator), denominator > OF_STEPS**2
-    return np.divide(numerator, denominator, out=result, where=usable)
+def quotient(a: NDArray, b: NDArray, smallest: float = OF_STEPS**2) -> NDArray:
+    """Divide a by b; zero where b is at most the smallest, by default by rounding."""
+    return np.divide(a, b, out=np.zeros_like(a), where=b > smallest)
 
 
 CONVENTIONS = ("sequence", "frame", "camera")
@@ -557,7 +554,7 @@ def _rest(truth: NDArray, shapes: NDArray, scale: bool) -> NDArray:
     aligned = shapes @ (left @ right)
     if scale:
         energy = np.sum(shapes**2, axis=(1, 2))
-        factor = shared.sum(axis=1) / np.where(energy > 0, energy, 1.0)
+        factor = quotient(shared.sum(axis=1), energy, 0.0)
         aligned = factor[:, None, None] * aligned
     return truth - aligned
 
@@ -607,14 +604,15 @@ def unit_shapes(shapes: NDArray) -> NDArray[np.float64]:
     """Return shapes centred over the points and of unit norm; zero if all are equal."""
     # Shapes of unit size first: squares of very large or small numbers overflow.
     size = np.abs(shapes).max(axis=(1, 2), keepdims=True, initial=0.0)
-    shapes = np.divide(shapes, size, out=np.zeros_like(shapes), where=size > 0)
+    shapes = quotient(shapes, size, 0.0)
     return normalise(shapes - shapes.mean(axis=1, keepdims=True), OF_STEPS)
 
 
 def normalise(shapes: NDArray, smallest: float) -> NDArray[np.float64]:
     """Return shapes of unit norm, and zero for those with a norm up to the smallest."""
-    norms = np.linalg.norm(shapes, axis=(1, 2), keepdims=True)
-    return np.divide(shapes, norms, out=np.zeros_like(shapes), where=norms > smallest)
+    return quotient(
+        shapes, np.linalg.norm(shapes, axis=(1, 2), keepdims=True), smallest
+    )
 
 
 def subspace_distance(
