@@ -208,19 +208,16 @@ def _label_reports(
     args: Namespace, estimator: AffineNRSfM, frames: Frames
 ) -> Iterator[dict[str, Any]]:
     """Yield the association of coefficients with each label."""
-    alpha, std = estimator.alpha_, getattr(estimator, "alpha_std_", None)
+    alpha = estimator.alpha_
+    of_frames = frames.groups, frames.times, getattr(estimator, "alpha_std_", None)
     features = {"cross_validated": alpha} | _aligned_pca(estimator, frames.X)
     for label in frames.labels:
         labelled, classes = label.notna().to_numpy(), has_classes(label)
-        options: dict[str, Any] = {
-            "y": label.dropna().to_numpy(),
-            "groups": None if frames.groups is None else frames.groups[labelled],
-            "time": None if frames.times is None else frames.times[labelled],
-            "kind": "classes" if classes else "number",
-            "random_state": args.random_state,
-        }
-        deviations = None if std is None else std[labelled]
-        found = analysis.association(alpha[labelled], alpha_std=deviations, **options)
+        groups, time, std = (x if x is None else x[labelled] for x in of_frames)
+        options: dict[str, Any] = {"groups": groups, "time": time}
+        options |= {"y": label.dropna().to_numpy(), "random_state": args.random_state}
+        options["kind"] = "classes" if classes else "number"
+        found = analysis.association(alpha[labelled], alpha_std=std, **options)
         report: dict[str, Any] = {
             "column": label.name,
             "kind": found.kind,

@@ -240,7 +240,7 @@ def _fitted(
     if estimator.camera == "perspective" or args.focal_length is not None:
         estimator.set_params(principal_point=frames.principal_point)
     choice: dict[str, Any] = {}
-    X, groups = frames.X, frames.groups
+    X, groups, weights = frames.X, frames.groups, frames.weighting
     if args.n_components and len(args.n_components) > 1:
         show_stage("choice of the number of basis shapes")
         splitter: Any = N_PARTS
@@ -259,19 +259,15 @@ def _fitted(
         estimator, choice["choice"] = search.best_estimator_, choice_report(search)
     else:  # for `shown_progress`; the model that is written does not have it
         estimator.set_params(verbose=2)
-    estimator, trials = decided(
-        *(estimator, X, free),
-        principal_point=frames.principal_point,
-        face_layout=_reading.face_layout(args, frames),
-        show=show_stage,
-        groups=groups,
-        **frames.weighting,
-    )
+    known: dict[str, Any] = {"groups": groups, **weights}
+    known["principal_point"] = frames.principal_point
+    known["face_layout"] = _reading.face_layout(args, frames)
+    estimator, trials = decided(estimator, X, free, show=show_stage, **known)
     estimator.set_params(verbose=0)
     with parallel_config(n_jobs=2):  # threads for blocks of frames
-        hold_open(estimator, X, **frames.weighting)
+        hold_open(estimator, X, **weights)
     joint = estimator.refinement in choices.JOINT_REFINEMENTS
-    diagnostics = estimator.diagnostics(X, **frames.weighting) if joint else None
+    diagnostics = estimator.diagnostics(X, **weights) if joint else None
     return estimator, trials, choice, diagnostics
 
 
@@ -294,22 +290,17 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
     table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)
     table.insert(0, "frame", [f"face{i:03d}" for i in range(len(table))])
     folder = Path(args.output)
-    options = [
-        *("fit", str(folder / "tracks.csv"), "--output", str(folder)),
-        *["--force"] * args.force,
-        *["--no-figures"] * args.no_figures,
-        *_reading.drawing_options(args),
-    ]
+    options = ["fit", str(folder / "tracks.csv"), "--output", str(folder)]
+    options += ["--force"] * args.force + ["--no-figures"] * args.no_figures
+    options += _reading.drawing_options(args)
     started = Namespace(arguments=options, since=args.since)
     parsed = _options.build_parser().parse_args(options, started)
     report, model = fit_table(parsed, warned, table=table)
     shapes = model.shapes(model.alpha_)
     rigid = np.broadcast_to(model.mean_shape_, shapes.shape)
     error, alone = (affine_shape_error(faces.shapes, each) for each in (shapes, rigid))
-    truth = (
-        f"the 3D shapes of the frames are off by {100 * error:.1f} % (the mean shape "
-        f"alone: {100 * alone:.1f} %)"
-    )
+    errors = f"{100 * error:.1f} % (the mean shape alone: {100 * alone:.1f} %)"
+    truth = f"the 3D shapes of the frames are off by {errors}"
     again = shlex.join([_options.PROGRAM, *options])
     rows = [*report["summary"], ["truth", "", truth], ["again", "", again]]
     return _report.text_of(_report.fit_title(report), rows)

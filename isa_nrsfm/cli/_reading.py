@@ -336,16 +336,15 @@ def _columns_of_model(
 ) -> LandmarkColumns:
     """Return the columns of a model's points; chosen are the landmarks, if known."""
     fitted = getattr(estimator, "feature_names_in_", None)
-    n_points = len(estimator.mean_shape_)
     if fitted is None:
         found = chosen or find_landmark_columns(table.columns)
+        n_points = len(estimator.mean_shape_)
         if len(found.points) != n_points:
             has = f"{len(found.points)} ({found.pattern})"
             raise ValueError(f"the model has {n_points} points, the table has {has}")
         return found
-    names = [str(name).strip() for name in fitted]
-    if estimator.layout == "planar":
-        names = np.reshape(names, (2, n_points)).T.ravel().tolist()
+    stripped = np.array([[str(name).strip() for name in fitted]])
+    names = _tables.table_to_tracks(stripped, estimator.layout).ravel().tolist()
     in_table = {str(name).strip(): name for name in table.columns}
     present = list(in_table)
     coordinates = [name for name in present if parse_coordinate(name) is not None]
