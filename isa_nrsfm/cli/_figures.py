@@ -102,8 +102,8 @@ def _in_time(fit: Fit) -> plotting.CoefficientsDisplay:
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
-    names = names_of_components(None, alpha.shape[1])[:MOST_DRAWN]
-    options = {"time": frames.times, "groups": frames.groups, "component_names": names}
+    options: dict[str, Any] = {"time": frames.times, "groups": frames.groups}
+    options["component_names"] = names_of_components(None, alpha.shape[1])[:MOST_DRAWN]
     if deviation is not None:
         options["alpha_std"] = deviation[:, :MOST_DRAWN]
     display = plotting.CoefficientsDisplay(alpha=alpha[:, :MOST_DRAWN], **options)
@@ -123,7 +123,7 @@ def _shapes_by_label(label: "pd.Series", fit: Fit) -> plotting.BasisShapeDisplay
     (limits,), _ = _views.block_limits([np.concatenate([mean[None], shapes])])
     axes = _views.new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
     counts = label.value_counts(sort=False)
-    same = {"edges": whole.skeleton, "origin": whole.origin}
+    same: dict[str, Any] = {"edges": whole.skeleton, "origin": whole.origin}
     same["basis"] = np.empty((0, *mean.shape))
     for shape, pair, (name, count) in zip(shapes, axes, counts.items(), strict=True):
         for points, colour in ((mean, "0.8"), (shape, _views.MEAN_COLOUR)):
