@@ -134,11 +134,10 @@ def read_deeplabcut(path: Path) -> Landmarks:
     try:
         frames: dict[str, list[Any]] = {"frame": [int(label) for label in labels]}
     except (TypeError, ValueError):
-        frames = {"image": [str(label) for label in labels]}
-    known: dict[str, Any] = {"format": "deeplabcut"}
-    if (where[..., 2] >= 0).any():
-        known["confidence"] = found[..., 2]
+        frames = {"image": [*map(_text, labels)]}
+    sure = found[..., 2] if (where[..., 2] >= 0).any() else None
     names = list(places) if len(columns[0]) == len(_LEVELS_OF_MANY) else None
+    known: dict[str, Any] = {"format": "deeplabcut", "confidence": sure}
     return assemble_individuals(found[..., :2], names, list(first), frames, **known)
 
 
@@ -159,17 +158,16 @@ def _read_text(path: Path) -> tuple[NDArray, Columns, list[Any]]:
     n_index = next(i for i, n in enumerate([*header[-1][first:], "x"], first) if n)
     if levels[0] != "scorer":
         header.insert(0, [""] * len(header[0]))
-    columns = list(zip(*header, strict=True))
-    numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
-    names = [str(i) for i in range(len(columns))]
-    coordinates = [names[i] for i in numbers]
+    columns = {str(i): each for i, each in enumerate(zip(*header, strict=True))}
+    names = list(columns)
     index = names[n_before:n_index]
+    coordinates = [name for name in names[n_index:] if columns[name][-1] in _COORDS]
     left_out = {*names}.difference(index, coordinates)
     known: dict[str, Any] = {"text": index, "n_header": len(levels), "names": names}
     frame = read_columns(path, leave_out=left_out, numbers=coordinates, **known)
     labels = ["/".join(row) for row in frame[index].fillna("").to_numpy()]
     values = frame[coordinates].to_numpy(dtype=np.float64)
-    return values, [columns[i] for i in numbers], labels
+    return values, [columns[name] for name in coordinates], labels
 
 
 def _levels_of(header: Sequence[Sequence[str]]) -> tuple[list[str] | None, int]:
@@ -192,14 +190,13 @@ def _places(columns: Sequence[tuple[str, ...]]) -> dict[str, dict[str, dict[str,
     """
     places: dict[str, dict[str, dict[str, int]]] = {}
     for number, (_, *individual, bodypart, coord) in enumerate(columns):
-        parts = places.setdefault("".join(individual), {})
         if coord == "z":
             raise ValueError(
                 f"{bodypart!r} has a z: these are points in space, not in an image"
             )
-        if coord in parts.setdefault(bodypart, {}):
+        of_point = places.setdefault("".join(individual), {}).setdefault(bodypart, {})
+        if of_point.setdefault(coord, number) != number:
             raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
-        parts[bodypart][coord] = number
     if not places:
         raise ValueError("it has no columns x and y")
     for parts in places.values():
@@ -212,8 +209,8 @@ def _places(columns: Sequence[tuple[str, ...]]) -> dict[str, dict[str, dict[str,
             f"the points {', '.join(places.pop(_UNIQUE))} belong to no animal "
             f"(individual {_UNIQUE!r}) and are left out"
         )
-    first, *rest = places
-    for name in rest:
+    first = next(iter(places))
+    for name in places:
         if {*places[name]} != {*places[first]}:
             raise ValueError(
                 f"the individuals {first!r} and {name!r} have different bodyparts"
@@ -236,21 +233,19 @@ def _read_h5(path: Path) -> tuple[NDArray, Columns, list[Any]]:
             raise ValueError(f"{_KEY} is no table of pandas")
         read = _table_blocks if kind == "frame_table" else _fixed_blocks
         blocks, labels = read(group)
-    for values, columns in blocks:
-        if values.shape != (len(labels), len(columns)):
+    arrays, columns = [np.empty((len(labels), 0))], []
+    for values, names in blocks:
+        if values.shape != (len(labels), len(names)):
             raise ValueError(
-                f"a block of {len(labels)} rows and {len(columns)} columns has the "
-                f"shape {values.shape}"
+                f"a block of {len(labels)} rows and {len(names)} columns has the shape "
+                f"{values.shape}"
             )
-    arrays = [np.empty((len(labels), 0)), *(values for values, _ in blocks)]
-    table = np.concatenate(arrays, axis=1).astype(np.float64)
-    columns = [column for _, columns in blocks for column in columns]
-    numbers = [i for i, column in enumerate(columns) if column[-1] in _COORDS]
-    columns = [columns[i] for i in numbers]
+        arrays.append(values[:, [name[-1] in _COORDS for name in names]])
+        columns += [name for name in names if name[-1] in _COORDS]
     for column in columns:
         if len(column) not in (len(_LEVELS), len(_LEVELS_OF_MANY)):
             raise ValueError(f"its columns have {len(column)} levels")
-    return table[:, numbers], columns, labels
+    return np.concatenate(arrays, axis=1).astype(np.float64), columns, labels
 
 
 def _table_blocks(group: Any) -> tuple[list[tuple[NDArray, Columns]], list[Any]]:
@@ -258,11 +253,10 @@ def _table_blocks(group: Any) -> tuple[list[tuple[NDArray, Columns]], list[Any]]
     rows, table = content_of(group, "table"), group["table"]
     blocks = []
     for name in rows.dtype.names or ():
-        is_number = rows.dtype[name].base.kind in "fiu"
-        if name.startswith("values_block_") and is_number:
+        if name.startswith("values_block_") and rows.dtype[name].base.kind in "fiu":
             columns = _labels(table.attrs[f"{name}_kind"])
             blocks.append((rows[name].reshape(len(rows), -1), columns))
-    return blocks, [_label(label) for label in rows["index"]]
+    return blocks, rows["index"].tolist()
 
 
 def _fixed_blocks(group: Any) -> tuple[list[tuple[NDArray, Columns]], list[Any]]:
@@ -270,14 +264,13 @@ def _fixed_blocks(group: Any) -> tuple[list[tuple[NDArray, Columns]], list[Any]]
     blocks = []
     for i in range(int(group.attrs["nblocks"])):
         name = f"block{i}_values"
-        values = content_of(group, name)
-        if values.dtype.kind in "fiu":
+        if (values := content_of(group, name)).dtype.kind in "fiu":
             if not group[name].attrs.get("transposed", False):
                 values = values.T
             blocks.append((values, _levels(group, f"block{i}_items")))
     if _text(group.attrs["axis1_variety"]) == "multi":
         return blocks, ["/".join(label) for label in _levels(group, "axis1")]
-    return blocks, [_label(label) for label in content_of(group, "axis1")]
+    return blocks, content_of(group, "axis1").tolist()
 
 
 def _levels(group: Any, name: str) -> Columns:
@@ -292,11 +285,6 @@ def _levels(group: Any, name: str) -> Columns:
             raise ValueError(f"{name} has labels that are not among its texts")
         parts.append([texts[code] for code in codes])
     return list(zip(*parts, strict=True))
-
-
-def _label(label: Any) -> Any:
-    """Return the label of a row, a number or a text."""
-    return _text(label) if isinstance(label, bytes) else label.item()
 
 
 def _text(value: Any) -> str:
@@ -336,29 +324,23 @@ def read_sleap(path: Path) -> Landmarks:
     counted from 0.
     """
     with opened(path) as file:
-        absent = _NEEDED.difference(file)
-        if absent:
+        if absent := _NEEDED.difference(file):
             raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
         nodes = _texts(content_of(file, "node_names"))
         names = _texts(content_of(file, "track_names"))
         tracks, dims = _array(file, "tracks", {"xy": 2, "node": len(nodes)}, _ORDERS)
         lengths = dict(zip(_DIMS, tracks.shape, strict=True))
-        scores = {}
+        known: dict[str, Any] = {"format": "sleap", "skeleton": _skeleton(file, nodes)}
         for name, n_dims in (("point_scores", 3), ("instance_scores", 2)):
             if name in file:
                 order = [dim for dim in dims if dim in _DIMS[:n_dims]]
-                scores[name], _ = _array(file, name, lengths, [order])
-        skeleton = _skeleton(file, nodes)
+                known[name], _ = _array(file, name, lengths, [order])
     n_tracks = tracks.shape[1]
     if names and len(names) != n_tracks:
         raise ValueError(f"tracks holds {n_tracks} tracks, track_names {len(names)}")
-    of_instances = scores.pop("instance_scores", np.array(np.nan))
-    scored = {} if np.isnan(of_instances).all() else {"instance_score": of_instances}
-    known: dict[str, Any] = {"of_instances": scored, "format": "sleap"}
-    known |= {"confidence": scores.get("point_scores"), "skeleton": skeleton}
     who = names or (range(n_tracks) if n_tracks > 1 else None)
-    frames = {"frame": range(len(tracks))}
-    return assemble_individuals(tracks, who, nodes, frames, **known)
+    frames, sure = {"frame": range(len(tracks))}, known.pop("point_scores", None)
+    return assemble_individuals(tracks, who, nodes, frames, confidence=sure, **known)
 
 
 def is_facemap(path: Path) -> bool:
@@ -388,29 +370,26 @@ def _array(
 
     Without the attribute ``dims`` this is one of `orders`.
     """
-    stored, named = numbers_of(file, name), _named_dims(file[name])
+    stored, attributes = numbers_of(file, name), file[name].attrs
     wanted = [dim for dim in _DIMS if dim in orders[0]]
     known = {dim: length for dim, length in lengths.items() if dim in wanted}
-    for dims in orders if named is None else [named]:
+    if "dims" in attributes:
+        dims = json.loads(attributes["dims"])
+        if not isinstance(dims, list) or not all(isinstance(dim, str) for dim in dims):
+            raise ValueError(
+                f"its attribute dims should be a list of names; got {dims}"
+            )
+        orders = [dims]
+    for dims in orders:
         sizes = dict(zip(dims, stored.shape, strict=False))
-        fits = all(sizes.get(dim) == length for dim, length in known.items())
-        if sorted(dims) == sorted(wanted) and stored.ndim == len(dims) and fits:
+        fits = known.items() <= sizes.items() and stored.ndim == len(dims)
+        if fits and sorted(dims) == sorted(wanted):
             return stored.transpose([dims.index(dim) for dim in wanted]), dims
     raise ValueError(
-        f"{name} should have the axes {', '.join(named or orders[0])}, with "
+        f"{name} should have the axes {', '.join(orders[0])}, with "
         f"{' and '.join(map(str, known.values()))} for {' and '.join(known)}; got the "
         f"shape {stored.shape}"
     )
-
-
-def _named_dims(dataset: Any) -> list[str] | None:
-    """Return the names of the axes in the attributes of a dataset, or None."""
-    if "dims" not in dataset.attrs:
-        return None
-    named = json.loads(dataset.attrs["dims"])
-    if not isinstance(named, list) or not all(isinstance(dim, str) for dim in named):
-        raise ValueError(f"its attribute dims should be a list of names; got {named}")
-    return named
 
 
 def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:

@@ -1,8 +1,9 @@
 """Read the csv tables of OpenFace, py-feat and MediaPipe's face mesh."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,11 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.coordinates import are_shares
+from isa_nrsfm.io import _landmark_columns, _tables
 from isa_nrsfm.io._keypoints import entries_as_rows, json_kind, read_json
-from isa_nrsfm.io._landmark_columns import (
-    LandmarkColumns,
-    find_landmark_columns,
-    landmark_sets,
-)
+from isa_nrsfm.io._landmark_columns import LandmarkColumns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, checked_sizes
-from isa_nrsfm.io._tables import (
-    Missing,
-    confidences_in,
-    header_names,
-    read_columns,
-    tracks_in,
-)
+from isa_nrsfm.io._tables import header_names, read_columns, tracks_in
 
 # OpenFace names points in space, in millimetres, by capital letters.
 _NOT_OPENFACE = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
@@ -61,8 +53,8 @@ def read_openface(path: Path) -> Landmarks:
         )
     of_video = names[:1] != ["face"]
     _need(names, ["success"] if of_video else ["confidence"])
-    scores = [name for name in ("confidence", "success") if name in names]
     found = find_landmark_columns(names, "x_#,y_#" if "x_0" in first else "x#,y#")
+    scores = [name for name in ("confidence", "success") if name in names]
     numbers = [*found.interleaved, *scores]
     table = read_columns(path, leave_out=_NOT_OPENFACE, numbers=numbers)
     if of_video:
@@ -70,8 +62,7 @@ def read_openface(path: Path) -> Landmarks:
             raise ValueError("the column success must hold 0 and 1 only")
         table["success"] = table["success"].astype(int)
         table.loc[table["success"] == 0, found.interleaved] = np.nan
-    scores = [name for name in scores if name == "confidence"]
-    return _assembled(table, found, "openface", scores=scores)
+    return _of_faces(table, found, "openface", "confidence")
 
 
 def is_pyfeat(path: Path) -> bool:
@@ -90,24 +81,23 @@ def read_pyfeat(path: Path) -> Landmarks:
     names = header_names(path)
     _need(names, _PYFEAT_BOX)
     found = find_landmark_columns(names, "x_#,y_#")
-    scores = [name for name in names if name == "FaceScore"]
-    numbers = [*found.interleaved, *scores]
+    numbers = [*found.interleaved, *{"FaceScore"}.intersection(names)]
     table = read_columns(path, leave_out=_NOT_PYFEAT, numbers=numbers, text=["input"])
-    return _assembled(table, found, "pyfeat", scores=scores)
+    return _of_faces(table, found, "pyfeat", "FaceScore")
 
 
 def is_mediapipe(path: Path) -> bool:
     """Return whether the header has as many points as MediaPipe's face mesh."""
     # Without and with the points of the irises
-    sizes = {468, 478}.intersection(landmark_sets(header_names(path)).values())
-    return bool(sizes) and not is_pyfeat(path)
+    sets = _landmark_columns.landmark_sets(header_names(path))
+    return bool({468, 478}.intersection(sets.values())) and not is_pyfeat(path)
 
 
 def read_mediapipe(
     path: Path,
     image_size: tuple[float, float] | None = None,
     columns: str | None = None,
-    missing: Missing = None,
+    missing: _tables.Missing = None,
 ) -> Landmarks:
     """Read a csv file with the points of MediaPipe.
 
@@ -120,12 +110,11 @@ def read_mediapipe(
     numbers = [*found.interleaved, *sizes]
     text = {*names}.difference(numbers, found.z)
     table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
-    sure = confidences_in(table, found.x, found.y)
-    table, scores = table.assign(**sure), [*sure]
     tracks = tracks_in(table, found.interleaved, missing)
     scale = table[sizes].to_numpy(float) if len(sizes) == 2 else None
     tracks = _in_pixels(tracks, image_size, scale)
-    return _assembled(table, found, "mediapipe", tracks=tracks, scores=scores)
+    titles, frames = found.interleaved, table.drop(columns=found.interleaved)
+    return _tables.with_confidences(tracks, found.points, titles, frames, "mediapipe")
 
 
 def is_mediapipe_json(path: Path) -> bool:
@@ -159,17 +148,17 @@ def read_mediapipe_json(
         )
     every = [p for _, found in entries for each in found.values() for p in each]
     seen = any(point.get("visibility") for points in every for point in points)
-    persons = (enumerate(found.get(chosen[0]) or [[]]) for _, found in entries)
-    rows = [
-        known | {"person": k, "keypoints": [v for p in points for v in _xyv(p, seen)]}
-        for (known, _), each in zip(entries, persons, strict=True)
-        for k, points in each
-    ]
+    rows = []
+    for known, found in entries:
+        for k, points in enumerate(found.get(chosen[0]) or [[]]):
+            sure = (p.get("visibility", 1.0) if seen else 1.0 for p in points)
+            xyv = ((p["x"], p["y"], v) for p, v in zip(points, sure, strict=True))
+            values = [*map(float, chain.from_iterable(xyv))]
+            rows.append(known | {"person": k, "keypoints": values})
     read = entries_as_rows(rows, "mediapipe_json", "result")
-    tracks = read.points.to_numpy().reshape(len(rows), -1, 2)
-    points = read.points.copy()
-    points[:] = _in_pixels(tracks, image_size, None).reshape(len(rows), -1)
-    return replace(read, points=points, confidence=read.confidence if seen else None)
+    tracks = _in_pixels(read.points.to_numpy().reshape(len(rows), -1, 2), image_size)
+    moved = pd.DataFrame(tracks.reshape(len(rows), -1), columns=read.points.columns)
+    return replace(read, points=moved, confidence=read.confidence if seen else None)
 
 
 def _frames_in(content: Any) -> list[dict[str, Any]]:
@@ -193,13 +182,7 @@ def _persons(value: Any) -> list[list[dict[str, Any]]]:
     return [each[0] for each in inner] if all(len(i) == 1 for i in inner) else []
 
 
-def _xyv(point: dict[str, Any], seen: bool) -> Iterator[float]:
-    """Return x, y and the visibility of a point, 1 if there is none."""
-    visibility = point.get("visibility", 1.0) if seen else 1.0
-    return map(float, (point["x"], point["y"], visibility))
-
-
-def _in_pixels(tracks: NDArray, image_size: Any, sizes: NDArray | None) -> NDArray:
+def _in_pixels(tracks: NDArray, image_size: Any, sizes: Any = None) -> NDArray:
     """Return tracks (n_frames, n_points, 2) in pixels, by the size of the images."""
     n_known = np.count_nonzero(~np.isnan(tracks))
     # Pixels of a face reach beyond this, and fractions of the image's size do not.
@@ -210,12 +193,18 @@ def _in_pixels(tracks: NDArray, image_size: Any, sizes: NDArray | None) -> NDArr
                 f"{named('image_size', (1920, 1080))} in pixels, or columns "
                 "image_width and image_height"
             )
-        _check_inside(tracks)
-        scale = sizes
+        beyond = np.maximum(-tracks, tracks - 1).max(axis=2)
+        n_outside, n_shown = np.sum(beyond > 0), np.sum(~np.isnan(beyond))
+        if 2 * n_outside > n_shown and not are_shares(tracks):
+            raise ValueError(
+                f"{n_outside} of {n_shown} points are outside the image: the "
+                "coordinates are no fractions of the width and height of an image. "
+                "Read them without image_size, in the format table"
+            )
         if image_size is not None:
-            scale = checked_sizes("image_size", image_size, 1)
+            sizes = checked_sizes("image_size", image_size, 1)
         with np.errstate(over="ignore"):  # `assemble` refuses infinite numbers
-            return np.asarray(tracks * np.asarray(scale).reshape(-1, 1, 2))
+            return np.asarray(tracks * sizes.reshape(-1, 1, 2))
     if image_size is not None:
         raise ValueError(
             "image_size is for coordinates that are fractions of the image's width and "
@@ -227,42 +216,21 @@ def _in_pixels(tracks: NDArray, image_size: Any, sizes: NDArray | None) -> NDArr
     return tracks
 
 
-def _check_inside(shares: NDArray[np.float64]) -> None:
-    """Refuse points (n_frames, n_points, 2) if most are outside the image."""
-    beyond = np.maximum(-shares, shares - 1).max(axis=2)
-    n_outside, n_shown = np.sum(beyond > 0), np.sum(~np.isnan(beyond))
-    if 2 * n_outside > n_shown and not are_shares(shares):
-        raise ValueError(
-            f"{n_outside} of {n_shown} points are outside the image: the coordinates "
-            "are no fractions of the width and height of an image. Read them without "
-            "image_size, in the format table"
-        )
-
-
-def _assembled(
-    table: "pd.DataFrame",
-    found: LandmarkColumns,
-    format: str,
-    *,
-    tracks: NDArray[np.float64] | None = None,
-    scores: Sequence[str] = (),
+def _of_faces(
+    table: "pd.DataFrame", found: LandmarkColumns, format: str, score: str
 ) -> Landmarks:
-    """Return points under the names of their columns, with scores of frame or points.
+    """Return points under the names of their columns.
 
-    The score of a frame is among its other columns.
+    The score of a face, if there is one, is that of its points, and among its columns.
     """
-    n_each, used = len(found.points) // max(len(scores), 1), found.interleaved
-    confidence = table[[*scores] * n_each].to_numpy(np.float64) if scores else None
-    used += scores if n_each == 1 else []
-    if tracks is None:
-        tracks = tracks_in(table, found.interleaved)
-    known: dict[str, Any] = {"columns": found.interleaved, "confidence": confidence}
-    frames = table.drop(columns=used)
-    return assemble(tracks, found.points, frames, format=format, **known)
+    n_points, names = len(found.points), found.interleaved
+    sure = table[[score] * n_points].to_numpy(np.float64) if score in table else None
+    known: dict[str, Any] = {"columns": names, "confidence": sure, "format": format}
+    frames = table.drop(columns=names)
+    return assemble(tracks_in(table, names), found.points, frames, **known)
 
 
 def _need(names: list[str], needed: Iterable[str]) -> None:
     """Raise if a column is missing."""
-    absent = [name for name in needed if name not in names]
-    if absent:
+    if absent := [name for name in needed if name not in names]:
         raise ValueError(f"it has no column {', '.join(absent)}")

@@ -119,8 +119,7 @@ class LandmarkFormat:
             If the file cannot be opened.
         """
         path = Path(path)
-        unknown = set(options).difference(self.options)
-        if unknown:
+        if unknown := set(options).difference(self.options):
             raise ValueError(
                 f"the format {self.name} has no option {', '.join(sorted(unknown))}; "
                 + (f"it has {', '.join(self.options)}" if self.options else "")
@@ -260,7 +259,7 @@ def find_format(path: str | os.PathLike[str]) -> str:
     others = [each for each in possible if each.name != TABLE]
     matching = [each.name for each in others if each.matches(path)]
     if path.is_dir() and not matching:
-        matching = [*{form.name: form for _, form in _members(path)}]
+        matching = [*dict.fromkeys(form.name for _, form in _members(path))]
     if len(matching) > 1:
         raise ValueError(
             f"{path} matches more than one format: {', '.join(matching)}. Choose with "
@@ -300,19 +299,17 @@ def _joined(folder: Path, form: LandmarkFormat, **options: Any) -> "Landmarks":
     from isa_nrsfm._compat.caller import warn_caller
     from isa_nrsfm.io._landmarks import joined
 
-    files = [file for file, found in _members(folder) if found == form]
-    if not files:
+    if not (files := [file for file, found in _members(folder) if found == form]):
         raise ValueError(f"{folder} has no {form.name} files: expected {form.expected}")
     beside = sorted({*folder.glob(f"[!.]*{files[0].suffix}")}.difference(files))
     others = first_items(file.name for file in beside)
     known = {re.sub(r"\d+", "", file.name) for file in files}
-    # Others are such as classes.txt, or labels of an image without any.
-    damaged = files[0].suffix != ".txt" or any(
-        re.sub(r"\d+", "", file.name) in known and file.stat().st_size
-        for file in beside
-    )
+    alike = [f for f in beside if re.sub(r"\d+", "", f.name) in known]
     with errors_of(str(folder)):
-        if beside and damaged:
+        # Others are such as classes.txt, or labels of an image without any.
+        if beside and (
+            files[0].suffix != ".txt" or any(f.stat().st_size for f in alike)
+        ):
             raise ValueError(f"{others} cannot be read as {form.name}")
         if beside:
             warn_caller(f"not of {form.name}, and left out: {others}")

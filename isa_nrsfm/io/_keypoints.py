@@ -5,7 +5,7 @@ import re
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -76,8 +76,7 @@ def read_coco(path: Path, part: str | None = None) -> Landmarks:
     without any has one without points, in the order of the numbers in their names.
     ``part`` is a part of whole bodies.
     """
-    content = read_json(path)
-    if isinstance(content, list):
+    if isinstance(content := read_json(path), list):
         return entries_as_rows(_results(content), "coco", "result", part=part)
     entries, names = _annotations(content)
     found = entries_as_rows(entries, "coco", "annotation", names, part)
@@ -192,19 +191,17 @@ def _chosen_categories(categories: Entries) -> tuple[dict[Any, dict[str, Any]], 
     Where no category has names of keypoints, all are read.
     """
     used = [entry for entry in categories if entry.get("keypoints")] or categories
-    names = [str(entry.get("name")) for entry in used]
-    points: list[str] = []
-    for entry in used:
-        found = entry.get("keypoints") or []
+    names = ", ".join(str(entry.get("name")) for entry in used)
+    lists = [entry.get("keypoints") or [] for entry in used] or [[]]
+    for found in lists:
         if not isinstance(found, list) or not all(isinstance(p, str) for p in found):
             raise ValueError("the keypoints of a category must be a list of names")
-        if found != (points or found):
+        if found != lists[0]:
             raise ValueError(
-                f"the categories {', '.join(names)} have different keypoints: remove "
-                "the others from the categories of the file"
+                f"the categories {names} have different keypoints: remove the others "
+                "from the categories of the file"
             )
-        points = found
-    return _by_id(used, "categories"), points or None
+    return _by_id(used, "categories"), lists[0] or None
 
 
 def _by_id(entries: Entries, what: str) -> dict[Any, dict[str, Any]]:
@@ -212,10 +209,9 @@ def _by_id(entries: Entries, what: str) -> dict[Any, dict[str, Any]]:
     if not all(isinstance(entry.get("id"), int | str) for entry in entries):
         raise ValueError(f"each of the {what} needs an id")
     found = {entry["id"]: entry for entry in entries}
-    twice = next((each for each in entries if each != found[each["id"]]), None)
-    if twice is not None:
+    if twice := [each["id"] for each in entries if each != found[each["id"]]]:
         raise ValueError(
-            f"two of the {what} have the id {twice['id']!r}, as in files that were "
+            f"two of the {what} have the id {twice[0]!r}, as in files that were "
             "joined: give each its own id, also in the annotations"
         )
     return found
@@ -239,15 +235,11 @@ def _keypoints(
     for number, entry in enumerate(entries):
         of_file = f" of {entry['file']}" if "file" in entry else ""
         name = f"{what} {number} (counted from 0){of_file}"
-        lists = {key: entry.get(key, gap[key]) for key in keys}
-        points = [_triples(lists[key], f"{key} of {name}", True) for key in keys]
-        found.append(np.concatenate(points))
+        lists = [(entry.get(key, gap[key]), f"{key} of {name}") for key in keys]
+        found.append(np.concatenate([_triples(*each, True) for each in lists]))
         n_points = n_points or len(found[0])
-        if len(found[-1]) != max(n_points, 1):
-            raise ValueError(
-                f"{name} should have {max(n_points, 1)} keypoints; got {len(found[-1])}"
-            )
-    values = np.reshape(found, (len(entries), n_points, 3))
+        if (n_given := len(found[-1])) != n_points:
+            raise ValueError(f"{name} should have {n_points} keypoints; got {n_given}")
     places: dict[str, tuple[int, int]] = dict.fromkeys(("body", "all"), (0, n_points))
     places |= _DATA["places"].get(str(n_points), {})
     if part is not None and part not in places:
@@ -256,9 +248,8 @@ def _keypoints(
             f"points; whole bodies have {' or '.join(_DATA['places'])}"
         )
     chosen = slice(*places[part or "all"])
-    if names and len(names) == n_points:
-        return values[:, chosen], names[chosen]
-    return values[:, chosen], None
+    names = names[chosen] if names and len(names) == n_points else None
+    return np.reshape(found, (len(entries), n_points, 3))[:, chosen], names
 
 
 def _triples(numbers: Any, what: str, gaps: bool) -> NDArray[np.float64]:
@@ -318,9 +309,9 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
             f"part must be one of {', '.join(OPENPOSE_PARTS)}; got {part!r}"
         )
     absent = "the folder has no files with names ..._keypoints.json, or of people"
-    names, people = _each_file(path, _openpose_files(path), absent, _people_in)
-    names_in = {name for persons in people for person in persons for name in person}
-    parts = [name for name in OPENPOSE_PARTS if name in names_in]
+    people = _each_file(path, _openpose_files(path), absent, _people_in)
+    persons = [person for found in people.values() for person in found]
+    parts = [name for name in OPENPOSE_PARTS if any(name in p for p in persons)]
     listed = ", ".join(parts)
     if not parts:
         raise ValueError("it has no visible points in pose_keypoints_2d, ...")
@@ -329,41 +320,40 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     part = part or listed
     if part not in parts:
         raise ValueError(f"it has no points of {part}, but of {listed}")
-    of_files = frame_numbers(names) or []
-    if len(set(of_files)) < len(names):
-        of_files = list(range(len(names)))
+    numbers = frame_numbers(list(people)) or []
+    if len(set(numbers)) < len(people):
+        numbers = list(range(len(people)))
     entries: list[dict[str, Any]] = []
-    for name, number, persons in zip(names, of_files, people, strict=True):
+    for (name, found), number in zip(people.items(), numbers, strict=True):
         of_file = {"file": as_utf8(name), "frame": number}
         rows = [
             of_file | {"person": k} | each | {"keypoints": each[part].ravel().tolist()}
-            for k, each in enumerate(persons)
+            for k, each in enumerate(found)
             if part in each
         ]
         entries += rows or [of_file]
-    found = entries_as_rows(entries, "openpose", "person")
+    landmarks = entries_as_rows(entries, "openpose", "person")
     # Points that are cut off can be outside of the image.
-    if np.nanmedian(np.abs(found.points)) <= 1:
+    if np.nanmedian(np.abs(landmarks.points)) <= 1:
         raise ValueError(
             "the coordinates are fractions of the image's size, which stretch the "
             "shapes. Run OpenPose with --keypoint_scale 0 for pixels"
         )
-    return found
+    return landmarks
 
 
 def _each_file(
     path: Path, files: Sequence[Path], absent: str, read: Callable[[Path], Any]
-) -> tuple[list[str], list[Any]]:
-    """Read a file, or those found in a folder; return names and what they hold."""
-    files = files if path.is_dir() else [path]
-    if not files:
+) -> dict[str, Any]:
+    """Read a file, or those found in a folder; return what they hold by their names."""
+    if not (files := files if path.is_dir() else [path]):
         raise ValueError(absent)
-    contents = []
+    contents = {}
     for file in files:
         refuse_special(file)
         with errors_of(file.name):
-            contents.append(read(file))
-    return [file.name for file in files], contents
+            contents[file.name] = read(file)
+    return contents
 
 
 def _openpose_files(path: Path) -> list[Path]:
@@ -385,8 +375,7 @@ def _people_in(file: Path) -> list[dict[str, Any]]:
         found.append({} if who == -1 else {"person_id": who})
         for part in OPENPOSE_PARTS:
             key = f"{part}_keypoints_2d"
-            points = _triples(person.get(key, []), key, False)
-            if points[:, 2].any():
+            if (points := _triples(person.get(key, []), key, False))[:, 2].any():
                 found[-1][part] = points
     return found
 
@@ -406,8 +395,8 @@ def read_mmpose(path: Path, part: str | None = None) -> Landmarks:
     """
     # An image without instances has an empty list.
     files = json_files(path, "mmpose", "none")
-    _, contents = _each_file(path, files, "no file is of MMPose", _instances_in)
-    entries = [entry for found in contents for entry in found]
+    contents = _each_file(path, files, "no file is of MMPose", _instances_in)
+    entries = list(chain(*contents.values()))
     return entries_as_rows(entries, "mmpose", "instance", part=part)
 
 
@@ -448,8 +437,7 @@ def read_pts(path: Path) -> Landmarks:
     point. Coordinates are as they are written; iBUG counts pixels from 1.
     """
     text = path.read_bytes().decode("utf-8-sig")
-    match = _PTS.fullmatch(text)
-    if match is None:
+    if (match := _PTS.fullmatch(text)) is None:
         raise ValueError(
             "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
             f"got {text[:40]!r}"
@@ -511,32 +499,28 @@ def read_wflw(path: Path) -> Landmarks:
     occlusion, blur) and the name of the image. Box and attributes may be missing.
     """
     fields = np.loadtxt(path, dtype=str, comments=None, encoding="utf-8-sig", ndmin=2)
-    n_fields = fields.shape[1]
-    if n_fields not in (197, 207):  # without and with the box and the attributes
-        raise ValueError(
-            f"the lines have {n_fields} fields; all must have 197 or all 207"
-        )
+    n = fields.shape[1]
+    if n not in (197, 207):  # without and with the box and the attributes
+        raise ValueError(f"the lines have {n} fields; all must have 197 or all 207")
     numbers = np.stack([floats_of(row) for row in fields[:, :-1].tolist()])
     frames: dict[str, object] = {"image": fields[:, -1]}
     points, box, attributes = np.split(numbers, [196, 200], axis=1)
-    if n_fields == 207:
-        if not np.isin(attributes, (0, 1)).all():
-            raise ValueError("the six attributes before the image must be 0 or 1")
-        frames |= zip(_DATA["wflw_box"], box.T, strict=True)
-        frames |= zip(_DATA["wflw_attributes"], attributes.T.astype(int), strict=True)
+    if not np.isin(attributes, (0, 1)).all():
+        raise ValueError("the six attributes before the image must be 0 or 1")
+    frames |= zip(_DATA["wflw_box"], box.T, strict=False)
+    frames |= zip(_DATA["wflw_attributes"], attributes.T.astype(int), strict=False)
     return assemble(points.reshape(-1, 98, 2), None, frames, format="wflw")
 
 
 def floats_of(fields: list[str]) -> NDArray[np.float64]:
     """Return the numbers that fields hold."""
     # Python reads 1_0 as a number.
-    bad = next((field for field in fields if "_" in field), None)
-    if bad is not None:
-        raise ValueError(f"a coordinate should be a number; got {bad!r}")
+    if bad := [field for field in fields if "_" in field]:
+        raise ValueError(f"a coordinate should be a number; got {bad[0]!r}")
     numbers = np.array(fields, dtype=np.float64)
-    if np.isinf(numbers).any():
-        infinite = fields[int(np.isinf(numbers).argmax())]
-        raise ValueError(f"a coordinate should be finite; got {infinite!r}")
+    if (infinite := np.isinf(numbers)).any():
+        first = fields[int(infinite.argmax())]
+        raise ValueError(f"a coordinate should be finite; got {first!r}")
     return numbers
 
 
@@ -654,15 +638,14 @@ def read_imglab(path: Path) -> Landmarks:
 
     An image without a box has one row without points.
     """
-    content = path.read_bytes()
-    if b"<!" in content.replace(b"<!--", b""):
+    if b"<!" in (content := path.read_bytes()).replace(b"<!--", b""):
         raise ValueError("it has declarations (<!...): delete them")
     rows: list[Row] = []
     for image in ElementTree.fromstring(content).iter("image"):
         for box in image.findall("box") or [ElementTree.Element("box")]:
             sides = {side: float(box.get(side, "nan")) for side in _SIDES}
             parts = [
-                (p.get("name"), (p.get("x"), p.get("y"))) for p in box.iter("part")
+                (p.get("name"), [p.get(a) for a in "xy"]) for p in box.iter("part")
             ]
             rows.append(({"image": image.get("file"), **sides}, _named(parts)))
     return _rows_of_names(rows, "imglab")

@@ -115,8 +115,7 @@ def find_landmark_columns(names: Columns, columns: Given = None) -> LandmarkColu
             "the same names: give each point its own name, such as x0, y0, x1, y1"
         )
     patterns, others = pattern.split(","), {*all_names}.difference(names)
-    of_set = [n for n in others if any(matches(n, each) for each in patterns)]
-    if of_set:
+    if of_set := [n for n in others if any(matches(n, each) for each in patterns)]:
         warn_caller(
             f"the columns {first_items(sorted(of_set))} are no points by their names, "
             f"and are left out. If they are, give {named('columns', pattern)}"
@@ -153,8 +152,7 @@ def _refuse_copies(names: Columns) -> None:
             other = keys.get(" ".join([*each[:i], *each[i + 1 :]]).lower())
             if other is not None and not word.isdigit():
                 pairs.setdefault(word.lower(), []).append((other, text))
-    plain = len(texts) - sum(map(len, pairs.values()))
-    minimum = max(MIN_POINTS, 0.8 * plain)
+    minimum = max(MIN_POINTS, 0.8 * (len(texts) - sum(map(len, pairs.values()))))
     copies = [found[0] for found in pairs.values() if len(found) >= minimum]
     words = []
     for point, copy in copies:
@@ -224,9 +222,8 @@ def _likely_pattern(names: Iterable[Hashable]) -> str:
         numbered = [re.sub(r"\d+", "#", part) for part in (before, after)]
         for one, other in (numbered, ("*" if before else "", after), (before, "*")):
             found[f"{one}{x[i]}{other},{one}{y[i]}{other}"] += 1
-    likely = ((pattern, n) for pattern, n in found.items() if pattern.count(",") == 1)
-    pattern, size = max(likely, key=lambda each: each[1], default=("", 0))
-    return pattern if size >= MIN_POINTS else "px_#,py_#"
+    likely = [pattern for pattern, n in found.most_common() if n >= MIN_POINTS]
+    return next((each for each in likely if each.count(",") == 1), "px_#,py_#")
 
 
 def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
@@ -237,8 +234,7 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
     members: dict[tuple[str, str, str], list[set[int | str]]] = {}
     for axis, _, memberships in filter(None, map(parse_coordinate, names)):
         for columns, key in memberships:
-            keys = members.setdefault(columns, [set(), set(), set()])
-            keys[axis].add(key)
+            members.setdefault(columns, [set(), set(), set()])[axis].add(key)
     sizes = {
         (before + axes[0] + after, before + axes[1] + after): len(x | y)
         for (before, axes, after), (x, y, _) in members.items()
@@ -282,18 +278,15 @@ def confidence_columns(
 
 def _refuse_individuals(names: Columns, sets: dict[str, int]) -> None:
     """Raise if points have the names of several individuals in one row."""
-    patterns = [pattern.split(",")[0] for pattern in sets]
-    lists = [_columns_matching(names, pattern).values() for pattern in patterns]
-    x = list(dict.fromkeys(chain.from_iterable(lists)))
+    found = (_columns_matching(names, pattern.split(",")[0]) for pattern in sets)
+    x = list(dict.fromkeys(name for each in found for name in each.values()))
     if not (who := _column_names.individuals_in(x, MIN_POINTS)):
         return
     if any(map(_COPY.fullmatch, who)):
-        found = [
-            re.search(rf"[ _.\-]*{re.escape(w)}[ _.\-]*", " ".join(x)) for w in who
-        ]
-        _ask_which(
-            names, " and ".join(who), [each[0].strip(" ") for each in found if each]
-        )
+        text, ends = " ".join(x), r"[ _.\-]*"
+        matched = [re.search(f"{ends}{re.escape(w)}{ends}", text) for w in who]
+        words = [match[0].strip(" ") for match in matched if match]
+        _ask_which(names, " and ".join(who), words)
     largest = max(sets, key=sets.__getitem__)
     whole = largest if sets[largest] == len(x) else ",".join(sets)
     listed, n_points = ",".join(who), len(x) // len(who)
@@ -318,8 +311,7 @@ def same_but_for(who: Sequence[str], n_points: int) -> str:
 
 def _select(names: Columns, patterns: Sequence[str]) -> LandmarkColumns:
     """Return the columns that match pairs of patterns of x and y columns."""
-    x: list[str] = []
-    y: list[str] = []
+    x, y = [], []
     for x_pattern, y_pattern in zip(patterns[::2], patterns[1::2], strict=True):
         x_by_key = _columns_matching(names, x_pattern)
         y_by_key = _columns_matching(names, y_pattern)
@@ -335,9 +327,8 @@ def _select(names: Columns, patterns: Sequence[str]) -> LandmarkColumns:
         x += [x_by_key[key] for key in keys]
         y += [y_by_key[key] for key in keys]
     chosen, joined = x + y, ",".join(patterns)
-    if len(set(chosen)) < len(chosen):
-        twice = next(name for name in chosen if chosen.count(name) > 1)
-        raise ValueError(f"the patterns {joined} match {twice!r} twice")
+    if twice := [name for name, n in Counter(chosen).items() if n > 1]:
+        raise ValueError(f"the patterns {joined} match {twice[0]!r} twice")
     if not {"#", "*"}.isdisjoint(joined):
         _warn_of_left_out(names, chosen, joined)
     points, z = _column_names.point_names(x), _z_of(names, x)
@@ -355,21 +346,17 @@ def _columns_matching(names: Columns, pattern: str) -> dict[tuple, str]:
     if len(exact) == 1:
         return {(): exact[0]}
     expression = regular_expression(pattern)
-    wildcards = re.findall("[#*]", pattern)
+    kinds = [int if sign == "#" else str for sign in re.findall("[#*]", pattern)]
     found: dict[tuple, str] = {}
     for name in texts:
-        match = expression.fullmatch(name.strip())
-        if match is None:
-            continue
-        key = tuple(
-            int(text) if wildcard == "#" else text
-            for text, wildcard in zip(match.groups(), wildcards, strict=True)
-        )
-        if key in found:
-            raise ValueError(
-                f"the columns {found[key]!r} and {name!r} name the same coordinate"
-            )
-        found[key] = str(name)
+        if match := expression.fullmatch(name.strip()):
+            parts = zip(kinds, match.groups(), strict=True)
+            key = tuple(kind(text) for kind, text in parts)
+            if key in found:
+                raise ValueError(
+                    f"the columns {found[key]!r} and {name!r} name the same coordinate"
+                )
+            found[key] = str(name)
     if not found:
         raise ValueError(f"no column matches {pattern!r}; {_first_columns(names)}")
     return found
@@ -433,8 +420,7 @@ def _several_found(names: Columns, candidates: dict[str, int]) -> str:
 
 def _first_columns(names: Columns) -> str:
     """List the first columns of a table."""
-    listed = ", ".join(map(repr, names[:4])) + ", ..." * (len(names) > 4)
-    return f"the table's {len(names)} columns are {listed}"
+    return f"the table's {len(names)} columns are {first_items(map(repr, names))}"
 
 
 # Columns that name points, and frames or who is shown.
@@ -501,9 +487,8 @@ def _cells_apart(frame: "pd.DataFrame") -> Apart:
         if not cells.empty and re.search(r"[\[({=]", cells.iloc[0]):
             for pattern, other in _WRITTEN:
                 cells = cells.str.replace(pattern, other, regex=True)
-        if cells.empty or len(_NUMBER.findall(cells.iloc[0])) < 2:
-            continue
-        if cells.map(_NUMBERS.fullmatch).isna().any():
+        several = not cells.empty and len(_NUMBER.findall(cells.iloc[0])) > 1
+        if not several or cells.map(_NUMBERS.fullmatch).isna().any():
             continue
         if cells.str.contains("...", regex=False).any():
             raise ValueError(
@@ -532,11 +517,10 @@ def _cells_apart(frame: "pd.DataFrame") -> Apart:
         used, tracks = pairs[0], np.stack([found[name] for name in pairs[0]], axis=2)
     elif len(lists) == 1 and found[lists[0]].shape[1] % 2 == 0:
         used, tracks = lists, found[lists[0]].reshape(len(frame), -1, 2)
-    elif (
-        len(points) == 1 and frame[points[0]].astype(str).str.contains(r"[\[({]").all()
-    ):
+    elif len(points) == 1:
         x, y = found[points[0]].T
-        return frame.drop(columns=points).assign(x=x, y=y), None
+        brackets = frame[points[0]].astype(str).str.contains(r"[\[({]").all()
+        return (frame.drop(columns=points).assign(x=x, y=y), None) if brackets else None
     else:
         return None
     warn_caller(
@@ -695,9 +679,8 @@ def _keys_of(frame: "pd.DataFrame", keys: list[str]) -> Keys | None:
         # Parts, such as hands and face, have other points; people have the same.
         for name in sorted(by_frame, key=lambda n: -sizes[n])[1:]:
             few = sizes[point] < MIN_POINTS
-            if not is_frame[name] and (
-                few or count([name, point]) < 0.75 * sizes[name] * sizes[point]
-            ):
+            other = few or count([name, point]) < 0.75 * sizes[name] * sizes[point]
+            if other and not is_frame[name]:
                 by_frame.remove(name)
                 by_point.insert(0, name)
         for name in by_point[::-1]:

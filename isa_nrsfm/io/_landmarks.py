@@ -99,8 +99,7 @@ class Landmarks:
 
 def unsure_points(confidence: NDArray, least: float) -> NDArray[np.bool_]:
     """Return which points (n_frames, n_points) have a lower confidence; not all."""
-    unsure = confidence < least
-    if unsure.all():
+    if (unsure := confidence < least).all():
         raise ValueError(
             f"no point has a confidence of {least:g} or more: they are from "
             f"{confidence.min():.3g} to {confidence.max():.3g}"
@@ -139,28 +138,21 @@ def assemble(
         columns = [f"{axis}_{j}" for j in point_names for axis in "xy"]
     elif columns is None:
         columns = [f"{name}_{axis}" for name in point_names for axis in "xy"]
-    infinite = np.isinf(tracks)
-    if infinite.any():
-        frame, point, axis = (int(i) for i in np.argwhere(infinite)[0])
-        raise ValueError(
-            f"{columns[2 * point + axis]} is infinite in row {frame} (counted from 0)"
-        )
+    table = tracks.reshape(n_frames, -1)
+    if (infinite := np.argwhere(np.isinf(table))).size:
+        row, place = infinite[0]
+        raise ValueError(f"{columns[place]} is infinite in row {row} (counted from 0)")
     frames = pd.DataFrame(frames)
     refuse_same_names([*map(str, frames.columns), *columns])
     if skeleton is None and (format in LAYOUTS_OF_READERS or not numbered(point_names)):
         skeleton = find_skeleton(n_points, point_names, format)
     if confidence is not None:
         confidence = pd.DataFrame(np.asarray(confidence), columns=list(point_names))
-    return Landmarks(
-        points=pd.DataFrame(tracks.reshape(n_frames, -1), None, columns, copy=False),
-        # The copy is in one piece, so that further columns can be added quickly.
-        frames=frames.set_axis(pd.RangeIndex(n_frames), axis=0).copy(),
-        confidence=confidence,
-        failed=np.asarray(np.isnan(tracks).all(axis=(1, 2))),
-        format=format,
-        point_names=tuple(point_names),
-        skeleton=skeleton,
-    )
+    points, names = pd.DataFrame(table, None, columns, copy=False), tuple(point_names)
+    # The copy is in one piece, so that further columns can be added quickly.
+    frames = frames.set_axis(pd.RangeIndex(n_frames), axis=0).copy()
+    failed = np.asarray(np.isnan(table).all(axis=1))
+    return Landmarks(points, frames, confidence, failed, format, names, skeleton)
 
 
 def joined(parts: Mapping[str, Landmarks]) -> Landmarks:
@@ -191,7 +183,7 @@ def assemble_individuals(
     frames: Mapping[str, Sequence[Any]],
     *,
     confidence: NDArray[np.float64] | None = None,
-    of_instances: dict[str, NDArray[np.float64]] | None = None,
+    instance_scores: NDArray[np.float64] | None = None,
     **known: Any,
 ) -> Landmarks:
     """Give each individual that a frame shows its own row.
@@ -213,8 +205,9 @@ def assemble_individuals(
     columns: dict[str, Any] = {n: [v[i] for i in places] for n, v in frames.items()}
     if names is not None:
         columns["individual"] = [None if absent else names[i] for i, absent in who]
-    for name, of_each in (of_instances or {}).items():
-        columns[name] = np.where(nobody, np.nan, of_each[frame, individual])
+    if instance_scores is not None and not np.isnan(instance_scores).all():
+        scores = np.where(nobody, np.nan, instance_scores[frame, individual])
+        columns["instance_score"] = scores
     if confidence is not None:
         known["confidence"] = confidence[frame, individual]
     return assemble(tracks[frame, individual], point_names, columns, **known)
@@ -339,9 +332,8 @@ def from_mediapipe(
     frames = {"frame": frame, "individual": individual}
     if part == "hand":
         hands = (_entry(result, "handedness") or () for result in results)
-        sides = [[*map(_side, each)] for each in hands]
-        places = zip(frame, pd.Series(individual).fillna(-1), strict=True)
-        side = [sides[i][k] if 0 <= k < len(sides[i]) else None for i, k in places]
+        sides = [dict(enumerate(map(_side, each))) for each in hands]
+        side = [sides[i].get(k) for i, k in zip(frame, individual, strict=True)]
         frames |= {"handedness": side} if any(side) else {}
     # Faces and hands have no visibility, though some versions set it to zero.
     sure = values[..., 2]
@@ -461,9 +453,8 @@ def from_sleap_io(labels: Any) -> Landmarks:
     frames["individual"] = [getattr(track, "name", None) for track in tracks]
     frames["instance_score"] = [getattr(each, "score", None) for each in instances]
     frames = {name: each for name, each in frames.items() if {*each} != {None}}
-    known: dict[str, Any] = {"format": "sleap-io"}
-    if "instance_score" in frames:
-        known["confidence"] = values[..., 2]
+    sure = values[..., 2] if "instance_score" in frames else None
+    known: dict[str, Any] = {"format": "sleap-io", "confidence": sure}
     if edges:
         given = {"name": "SLEAP", "source": "labels of sleap-io"}
         known["skeleton"] = skeleton_of_names(edges, nodes, **given)
@@ -534,7 +525,6 @@ def _by_axes(dataset: Any, name: str, wanted: tuple[str, ...]) -> Any:
 
 def _names(variable: Any, axis: int) -> list[str]:
     """Return the names along an axis."""
-    dim = variable.dims[axis]
-    if dim not in variable.coords:
+    if (dim := variable.dims[axis]) not in variable.coords:
         raise ValueError(f"the axis {dim} of the dataset has no names")
     return [str(name) for name in variable.coords[dim].values]

@@ -212,11 +212,9 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     estimator.frames_scaled_ = entries["unit"] is None
     if entries["sizes"] is not None:
         estimator._frame_sizes = entries["sizes"]
-    if (output := header["set_output"]) is not None:
-        if output not in ("default", "pandas", "polars"):
-            raise ValueError(f"its set_output is not known: {output}")
-        estimator.set_output(transform=output)
-    return estimator
+    if (output := header["set_output"]) not in (None, "default", "pandas", "polars"):
+        raise ValueError(f"its set_output is not known: {output}")
+    return estimator.set_output(transform=output)
 
 
 def _check_shapes(values: dict[str, Any]) -> None:
@@ -312,15 +310,14 @@ def _frame_model(entries: dict[str, Any]) -> FrameModel:
     total, deformation, *errors, residual, images, weighted = certainty
     certainty = [float(total), float(deformation), *errors, float(residual)]
     certainty += [tuple(images), weighted is True]
-    return FrameModel(
-        shapes=entries["shapes"],
-        noise_variance=entries["noise_variance"],
-        starts=entries["coefficient_starts"],
-        loss=entries["loss"],
-        gauge=FrameMap(entries["mixing"], entries["space"]),
-        camera=entries["camera"],
-        certainty=DepthCertainty(*certainty),
+    numbers = (
+        entries["shapes"],
+        entries["noise_variance"],
+        entries["coefficient_starts"],
     )
+    gauge = FrameMap(entries["mixing"], entries["space"])
+    kinds = entries["loss"], gauge, entries["camera"]
+    return FrameModel(*numbers, *kinds, DepthCertainty(*certainty))
 
 
 def packed(value: Any, name: str, arrays: Arrays) -> Any:
@@ -328,8 +325,7 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
     if value is None or type(value) in (bool, int, float, str):
         return value
     if isinstance(value, np.ndarray | np.generic):
-        array = np.asarray(value)
-        if array.dtype.kind in "biufU":
+        if (array := np.asarray(value)).dtype.kind in "biufU":
             arrays[name] = array
             return {"array": name}
         if array.ndim == 1 and all(isinstance(item, str) for item in array.tolist()):
@@ -339,8 +335,7 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
     elif isinstance(value, Path):
         return {"path": str(value)}
     elif type(value) in (tuple, list):
-        numbers = np.array(value)
-        if numbers.ndim == 1 and numbers.dtype.kind in "iuf":
+        if (numbers := np.array(value)).ndim == 1 and numbers.dtype.kind in "iuf":
             return {type(value).__name__: numbers.tolist()}
     elif type(value) in STORED.values():
         parts = packed_parts(value, f"{name}.", arrays)

@@ -114,8 +114,7 @@ def read_table(path: str | os.PathLike[str]) -> "pd.DataFrame":
 
 def parse_table(path: Path) -> "pd.DataFrame":
     """Read a table as `read_table` does; errors do not name the file."""
-    suffix = table_suffix(path)
-    if suffix == ".parquet":
+    if (suffix := table_suffix(path)) == ".parquet":
         return read_parquet(path)
     with path.open("rb") as file:
         if file.read(2) in (b"PK", b"\x1f\x8b"):
@@ -241,14 +240,13 @@ def individuals_as_rows(
         return frame
     columns_of = _column_names.columns_of_individuals(frame.columns, individuals)
     frame = frame.reset_index(drop=True)
-    common = frame.drop(columns=[*chain.from_iterable(columns_of.values())])
+    common = frame.drop(columns=[*chain(*columns_of.values())])
     if "individual" in common:
         raise ValueError(
             "the table has a column 'individual' already, which individuals would "
             "replace: rename it"
         )
-    others = [name for name in common if parse_coordinate(name) is not None]
-    if others:
+    if others := [name for name in common if parse_coordinate(name) is not None]:
         warn_caller(
             f"{len(others)} columns of coordinates are not those of all individuals "
             f"(first: {others[0]!r}): they are left out"
@@ -292,13 +290,19 @@ def read_named_columns(
     """Read a table whose landmark columns are recognised by their names."""
     table = parse_table(path)
     points, other = landmark_table(table, columns=columns, missing=missing, **shape)
-    names = points.columns
-    sure = confidences_in(other, names[::2], names[1::2])
-    known: dict[str, Any] = {"format": "table", "columns": list(names)}
+    tracks, titles = points.to_numpy().reshape(len(points), -1, 2), list(points)
+    names = _column_names.point_names(titles[::2])
+    return with_confidences(tracks, names, titles, other, "table")
+
+
+def with_confidences(
+    tracks: NDArray, names: Sequence[str], columns: list[str], other: Any, format: str
+) -> Landmarks:
+    """Return the landmarks of a table with the confidences among its other columns."""
+    sure = confidences_in(other, columns[::2], columns[1::2])
+    known: dict[str, Any] = {"columns": columns, "format": format}
     known["confidence"] = None if sure.empty else sure
-    tracks = points.to_numpy().reshape(len(points), -1, 2)
-    frames = other.drop(columns=sure.columns)
-    return assemble(tracks, _column_names.point_names(names[::2]), frames, **known)
+    return assemble(tracks, names, other.drop(columns=sure.columns), **known)
 
 
 def confidences_in(
@@ -309,7 +313,8 @@ def confidences_in(
     No columns if there are none, or, unless strict, if they are no confidences.
     """
     names = _landmark_columns.confidence_columns(frame, x, y)
-    try:
+    passed_over = () if strict else (ValueError,)
+    with contextlib.suppress(*passed_over):
         with warnings.catch_warnings(action="ignore"):  # of commas, as in coordinates
             frame = with_points(frame, names)
         texts = [name for name in names if frame[name].dtype.kind not in "iuf"]
@@ -328,10 +333,7 @@ def confidences_in(
             empty = "0" if len(numbers) else "empty"
             raise ValueError(f"{names[0]}, ... are no confidences: all are {empty}")
         return values
-    except ValueError:
-        if strict:
-            raise
-        return frame[[]]
+    return frame[[]]
 
 
 def table_suffix(path: str | os.PathLike[str]) -> str:
@@ -347,13 +349,10 @@ def table_suffix(path: str | os.PathLike[str]) -> str:
 def first_lines(path: Path, n_lines: int) -> list[str]:
     """Return the first lines of a text file, while they are UTF-8 and not too long."""
     lines: list[str] = []
-    with path.open("rb") as file:
+    with contextlib.suppress(UnicodeDecodeError), path.open("rb") as file:
         for _ in range(n_lines):
             line = file.readline(_LONGEST_LINE)
-            try:
-                text = line.decode("utf-8" if lines else "utf-8-sig")
-            except UnicodeDecodeError:
-                break
+            text = line.decode("utf-8" if lines else "utf-8-sig")
             if not text or (not text.endswith(("\n", "\r")) and len(line) > 2**19):
                 break
             lines.append(text.rstrip("\r\n"))
@@ -375,19 +374,17 @@ def separator_of(path: Path) -> str:
         weight = {",": 2, " ": 4}.get(sign, 1)
         return 1 < min(lengths) == max(lengths), (lengths[0] - 1) / weight
 
-    try:
+    with contextlib.suppress(csv.Error, ValueError):
         return max((usual, *";\t,|", *" " * (suffix == ".txt")), key=better)
-    except (csv.Error, ValueError):
-        return usual
+    return usual
 
 
 def header_rows(path: Path, n_rows: int) -> list[list[str]]:
     """Return the cells of the first rows of a file; fewer if it is no csv file."""
-    try:
+    with contextlib.suppress(csv.Error):
         lines = first_lines(path, n_rows)
         return list(csv.reader(lines, delimiter=separator_of(path), strict=True))
-    except csv.Error:
-        return []
+    return []
 
 
 def header_names(path: Path) -> list[str]:
@@ -395,10 +392,9 @@ def header_names(path: Path) -> list[str]:
     if path.suffix.lower() == ".parquet":
         pyarrow = import_optional("pyarrow", extra="parquet")
         parquet = import_optional("pyarrow.parquet", extra="parquet")
-        try:
+        with contextlib.suppress(OSError, pyarrow.ArrowException):
             return [name.strip() for name in parquet.read_schema(path).names]
-        except (OSError, pyarrow.ArrowException):
-            return []
+        return []
     return [name.strip() for row in header_rows(path, 1) for name in row]
 
 
@@ -474,8 +470,7 @@ def read_parquet(path: Path) -> "pd.DataFrame":
     """Read a parquet file."""
     import_optional("pyarrow", extra="parquet")
     path.open("rb").close()  # opening errors as for text files
-    frame = pd.read_parquet(path)
-    if frame.empty:
+    if (frame := pd.read_parquet(path)).empty:
         raise ValueError("it has no rows")
     return frame.reset_index(drop=not any(frame.index.names))
 
@@ -585,8 +580,7 @@ def with_points(
 def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     """Read a file of separated values."""
     rows = checked_rows(path, separator)
-    header = next(rows, None)
-    if header is None:
+    if (header := next(rows, None)) is None:
         raise ValueError("it is empty; a first line with column names is needed")
     if len(header) == 1:
         _refuse_one_column(path, separator, header[0])
@@ -604,8 +598,7 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
         )
     if second.count("x") == second.count("y") > 1:
         index = "" if second[0] in ("x", "y") else ", index_col=0"
-        commas = any("," in cell for cell in next(rows, []))
-        decimal = ", decimal=','" * commas
+        decimal = ", decimal=','" * any("," in cell for cell in next(rows, []))
         way = (
             f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}, "
             f"sep={separator!r}{decimal}), "
@@ -649,11 +642,9 @@ def _refuse_one_column(path: Path, separator: str, line: str) -> None:
 
 def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     """Return a landmark column as finite numbers and NaN."""
-    types = pd.api.types
+    types, name = pd.api.types, column.name
     if types.is_bool_dtype(column) or types.is_complex_dtype(column):
-        raise ValueError(
-            f"column {column.name!r} should hold numbers; got {column.dtype}"
-        )
+        raise ValueError(f"column {name!r} should hold numbers; got {column.dtype}")
     numbers = column
     if not types.is_numeric_dtype(column):
         text = column
@@ -664,16 +655,13 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
         bad = bad[~bad.str.strip().str.lower().isin(_MISSING)]
         if len(bad):
             raise ValueError(
-                f"column {column.name!r} should hold numbers, but in row "
-                f"{bad.index[0]} (counted from 0) it has {bad.iloc[0]!r}. Write "
-                "numbers like 1234.5, leave the cells of missing points empty, and "
-                "delete rows of units, means or repeated names"
+                f"column {name!r} should hold numbers, but in row {bad.index[0]} "
+                f"(counted from 0) it has {bad.iloc[0]!r}. Write numbers like 1234.5, "
+                "leave the cells of missing points empty, and delete rows of units, "
+                "means or repeated names"
             )
     values = numbers.to_numpy(dtype=np.float64, na_value=np.nan)
-    if np.isinf(values).any():
-        row = int(np.flatnonzero(np.isinf(values))[0])
-        raise ValueError(
-            f"column {column.name!r} is infinite in row {column.index[row]} "
-            "(counted from 0)"
-        )
+    if (infinite := np.isinf(values)).any():
+        row = column.index[infinite.argmax()]
+        raise ValueError(f"column {name!r} is infinite in row {row} (counted from 0)")
     return values

@@ -72,9 +72,10 @@ def parse_coordinate(name: Hashable) -> Coordinate | None:
     return axes.index(axis), point, memberships
 
 
-def names_layout(
-    names: Iterable[Hashable],
-) -> Literal["interleaved", "planar", "other"] | None:
+Arrangement = Literal["interleaved", "planar", "other"]
+
+
+def names_layout(names: Iterable[Hashable]) -> Arrangement | None:
     """Return the arrangement of a table's landmark columns.
 
     "interleaved" is x0, y0, x1, y1, ..., "planar" x0, x1, ..., y0, y1, ..., "other" any
@@ -83,13 +84,12 @@ def names_layout(
     """
     axes, points, stems = [], [], []
     for name in names:
-        coordinate = parse_coordinate(name)
-        if coordinate is None:
+        if coordinate := parse_coordinate(name):
+            axis, _, [((before, _, after), key), *_] = coordinate
+            axes.append(axis)
+            points.append((before, after, key))
+        else:
             stems.append(str(name).lower().replace("x", "y"))
-            continue
-        axis, _, [((before, _, after), key), *_] = coordinate
-        axes.append(axis)
-        points.append((before, after, key))
     pairs = [a == b for a, b in zip_longest(stems[0::2], stems[1::2])]
     if 0 not in axes or 1 not in axes:
         # lx1, ly1 beside columns that are no pairs
@@ -108,28 +108,24 @@ def names_layout(
 def point_names(x_columns: Iterable[str]) -> tuple[str, ...]:
     """Name points after their x columns, without the axis if this stays unique."""
     x_columns = [name.strip() for name in x_columns]
-    coordinates = map(parse_coordinate, x_columns)
-    points = tuple(point for _, point, _ in filter(None, coordinates))
+    points = tuple(found[1] for found in map(parse_coordinate, x_columns) if found)
     return points if len(set(points)) == len(x_columns) else tuple(x_columns)
 
 
 def names_of_points(model: Any, n_points: int | None = None) -> tuple[str, ...]:
     """Return the names of a model's points, or their numbers."""
     n_points = len(model.mean_shape_) if n_points is None else n_points
-    columns = getattr(model, "feature_names_in_", None)
-    if columns is None:
+    if (columns := getattr(model, "feature_names_in_", None)) is None:
         return tuple(map(str, range(n_points)))
     names = [str(name).strip() for name in columns]
     return point_names(names[:n_points] if model.layout == "planar" else names[::2])
 
 
-def checked_names(parameter: str, names: Any, default: Any) -> list[str]:
+def checked_names(name: str, names: Any, default: Any) -> list[str]:
     """Return names as text, by default the given ones; their number must agree."""
-    names = [str(name) for name in (default if names is None else names)]
+    names = [*map(str, default if names is None else names)]
     if len(names) != len(default):
-        raise ValueError(
-            f"{parameter} must hold {len(default)} names; got {len(names)}"
-        )
+        raise ValueError(f"{name} must hold {len(default)} names; got {len(names)}")
     return names
 
 
@@ -186,8 +182,7 @@ def individuals_in(names: Sequence[Hashable], least: int) -> list[str]:
         whole = len(rests) * len(common) >= 0.8 * len(names)
         whole &= max(map(len, rests)) <= 1.1 * len(common) + 1  # others are sets
         few = len(rests) < 4 and all(key[-1:].isdigit() for key in keys)
-        enough = len(rests) > 1 and len(common) >= (4 if few else least)
-        if whole and enough:
+        if whole and len(rests) > 1 and len(common) >= (4 if few else least):
             groups = frozenset(frozenset(division[key].values()) for key in keys)
             found.append((groups, keys))
             if _are_parts(keys, common):
@@ -229,8 +224,8 @@ def columns_of_individuals(
         divisions = [division.get(name, {}) for name in who]
         common = [stem for stem in divisions[0] if all(stem in d for d in divisions)]
         if len(common) > max(map(len, best.values()), default=0):
-            pairs = zip(who, divisions, strict=True)
-            best = {name: {each[stem]: stem for stem in common} for name, each in pairs}
+            found = [{each[stem]: stem for stem in common} for each in divisions]
+            best = dict(zip(who, found, strict=True))
     if not best or len({*who}) < len(who):
         raise ValueError(
             f"no columns have the same names but for {', '.join(who)} (individuals)"

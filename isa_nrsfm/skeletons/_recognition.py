@@ -101,26 +101,23 @@ class Skeleton:
 
     def __post_init__(self) -> None:
         """Check that the parts fit together."""
+        n, names = self.n_points, self.point_names
         if self.kind not in KINDS:
             raise ValueError(f"kind must be one of {KINDS}; got {self.kind!r}")
         parts = *self.curves, *self.up, *self.front, *self.across
         named = chain(*parts, self.left, self.right, self.contour)
-        strange = [j for j in named if not 0 <= j < self.n_points]
-        if strange:
+        if strange := [j for j in named if not 0 <= j < n]:
             raise ValueError(
-                f"the points of {self.name!r} are 0 to {self.n_points - 1}; got "
-                f"{strange[0]}"
+                f"the points of {self.name!r} are 0 to {n - 1}; got {strange[0]}"
             )
         if len(self.left) != len(self.right):
             raise ValueError(
                 "left and right must be mirror images, point by point; got "
                 f"{len(self.left)} and {len(self.right)} points"
             )
-        names = self.point_names
-        if names is not None and len({*names}) != self.n_points:
+        if names is not None and len({*names}) != n:
             raise ValueError(
-                f"point_names must hold {self.n_points} different names; got "
-                f"{len({*names})}"
+                f"point_names must hold {n} different names; got {len({*names})}"
             )
 
     @property
@@ -563,9 +560,8 @@ def _plain(name: str) -> str:
 
 def numbered(names: Sequence[str]) -> bool:
     """Return whether names are numbers in turn, after the same word or nothing."""
-    matches = [_NUMBERED.fullmatch(name.strip()) for name in names]
-    found = [match for match in matches if match is not None]
-    if len(found) < len(names) or len({match[1] for match in found}) > 1:
-        return False
-    numbers = [int(match[2]) for match in found]
-    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    matches = (_NUMBERED.fullmatch(name.strip()) for name in names)
+    found = [match.groups() for match in matches if match is not None]
+    numbers = [int(number) for _, number in found]
+    first, words = min(numbers, default=0), {word for word, _ in found}
+    return len(words) == 1 and numbers == list(range(first, first + len(names)))
