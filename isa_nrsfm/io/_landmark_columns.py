@@ -268,8 +268,7 @@ def confidence_columns(
         same = [a == b for a, b in zip(*pair, strict=False)]
         place = [*same, False].index(False)  # of the axis letter
         parts.append((pair[0][:place], pair[0][place + 1 :]))
-    words = ((w, w.capitalize(), w.upper()) for w in CONFIDENCES)
-    for word in chain.from_iterable(words):
+    for word in (w for c in CONFIDENCES for w in (c, c.capitalize(), c.upper())):
         found = [f"{before}{word}{after}" for before, after in parts]
         if by_name.keys() >= {*found}:
             return [by_name[name] for name in found]

@@ -256,14 +256,12 @@ def checked_sizes(name: str, sizes: Any, n_images: int) -> NDArray[np.float64]:
 
 def refuse_same_names(names: Sequence[str]) -> None:
     """Raise if two columns have the same name."""
-    names_before: set[str] = set()
-    for name in map(str.strip, names):
-        if name and name in names_before:
-            raise ValueError(
-                f"more than one column is called {name!r}: each needs its own name, "
-                "such as x0, y0, x1, y1"
-            )
-        names_before.add(name)
+    stripped = pd.Index(filter(None, map(str.strip, names)), dtype=object)
+    if len(twice := stripped[stripped.duplicated()]):
+        raise ValueError(
+            f"more than one column is called {twice[0]!r}: each needs its own name, "
+            "such as x0, y0, x1, y1"
+        )
 
 
 def from_mediapipe(

@@ -304,20 +304,17 @@ def _pinhole(entry: NDArray | None) -> Pinhole | None:
 def _frame_model(entries: dict[str, Any]) -> FrameModel:
     """Return the model of a frame of `_frame_entries`."""
     if "loss" not in entries:
-        shapes = entries["mean_shape"], entries["basis"]
-        return FrameModel.rigid(*shapes, entries["camera"])
+        rigid = entries["mean_shape"], entries["basis"], entries["camera"]
+        return FrameModel.rigid(*rigid)
     certainty = [entries[name] for name in PARTS["certainty"]]
-    total, deformation, *errors, residual, images, weighted = certainty
-    certainty = [float(total), float(deformation), *errors, float(residual)]
+    total, deformation, *further, residual, images, weighted = certainty
+    certainty = [float(total), float(deformation), *further, float(residual)]
     certainty += [tuple(images), weighted is True]
-    numbers = (
-        entries["shapes"],
-        entries["noise_variance"],
-        entries["coefficient_starts"],
-    )
+    names = "shapes", "noise_variance", "coefficient_starts", "loss"
+    shapes, noise, starts, loss = (entries[name] for name in names)
     gauge = FrameMap(entries["mixing"], entries["space"])
-    kinds = entries["loss"], gauge, entries["camera"]
-    return FrameModel(*numbers, *kinds, DepthCertainty(*certainty))
+    errors = DepthCertainty(*certainty)
+    return FrameModel(shapes, noise, starts, loss, gauge, entries["camera"], errors)
 
 
 def packed(value: Any, name: str, arrays: Arrays) -> Any:

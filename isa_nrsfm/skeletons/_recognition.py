@@ -521,8 +521,7 @@ def edge_length(shape: NDArray, edges: NDArray) -> float:
 
     Points that are not seen, NaN, do not count; infinite where nothing is known.
     """
-    ends = shape[edges]
-    lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    lengths = np.linalg.norm(np.diff(shape[edges], axis=1), axis=2)
     distances = pdist(shape[np.isfinite(shape).all(axis=1)])
     lengths = lengths[np.isfinite(lengths)]
     if not lengths.size or not distances.any():
