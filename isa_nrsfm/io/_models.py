@@ -226,31 +226,13 @@ def _check_shapes(values: dict[str, Any]) -> None:
     N = (*np.shape(values.get("sizes", ())), 0)[0]
     sizes = {"K": K, "P": P, "D": D, "N": N, "D+1": D + 1, "D-K": D - K}
     sizes |= {"2P": 2 * P, "3K": 3 * K, "*": None}
-    shapes = {
-        name: tuple(sizes[n] if n in sizes else int(n) for n in shape.split())
-        for shape, names in PARTS["shapes"].items()
-        for name in names
-    }
-    finite, positive = {*PARTS["finite"], *PARTS["positive"]}, PARTS["positive"]
-    for name, shape in shapes.items():
-        if (value := values.get(name)) is None:
-            if name in {*values}.intersection(PARTS["finite"]):
+    for text, names in PARTS["shapes"].items():
+        shape = tuple(sizes[n] if n in sizes else int(n) for n in text.split())
+        for name in names:
+            if (value := values.get(name)) is not None:
+                _check_numbers(name, value, shape)
+            elif name in values and name in PARTS["finite"]:
                 raise ValueError(f"{name} is missing")
-            continue
-        found, kinds = np.shape(value), "f" if shape else "iuf"
-        kinds = {"feature_names_in_": "O", "stable_sets_": "b"}.get(name, kinds)
-        fits = len(found) == len(shape) and all(
-            n in (None, m) for n, m in zip(shape, found, strict=True)
-        )
-        numbers = np.asarray(value)
-        if not fits or numbers.dtype.kind not in kinds:
-            raise ValueError(f"{name} should be of shape {shape}; it has {found}")
-        if numbers.dtype.kind == "f" and numbers.dtype.itemsize not in (4, 8):
-            raise ValueError(f"{name} is of type {numbers.dtype}")
-        if name in finite and not np.isfinite(numbers).all():
-            raise ValueError(f"{name} is not finite")
-        if name in positive and (numbers < 0).any():
-            raise ValueError(f"{name} is negative")
     if not K or values["n_features_in_"] != 2 * P:
         raise ValueError(f"it has {K} basis shapes of {P} points")
     if "space" in values and np.linalg.matrix_rank(values["space"]) < 3:
@@ -260,6 +242,23 @@ def _check_shapes(values: dict[str, Any]) -> None:
         focal, *centre = values.get(name, (1.0,))[:3]
         if small or not (focal > 0 and np.isfinite(centre).all()):
             raise ValueError("its unit, or its pinhole camera, is not possible")
+
+
+def _check_numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> None:
+    """Raise if numbers have another shape or type, or values that are not possible."""
+    numbers, kinds = np.asarray(value), "f" if shape else "iuf"
+    kinds = {"feature_names_in_": "O", "stable_sets_": "b"}.get(name, kinds)
+    pairs = zip(shape, numbers.shape, strict=False)
+    fits = numbers.ndim == len(shape) and all(n in (None, m) for n, m in pairs)
+    if not fits or numbers.dtype.kind not in kinds:
+        raise ValueError(f"{name} should be of shape {shape}; it has {numbers.shape}")
+    if numbers.dtype.kind == "f" and numbers.dtype.itemsize not in (4, 8):
+        raise ValueError(f"{name} is of type {numbers.dtype}")
+    positive = name in PARTS["positive"]
+    if (positive or name in PARTS["finite"]) and not np.isfinite(numbers).all():
+        raise ValueError(f"{name} is not finite")
+    if positive and (numbers < 0).any():
+        raise ValueError(f"{name} is negative")
 
 
 def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:

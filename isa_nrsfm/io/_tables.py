@@ -20,6 +20,7 @@ from isa_nrsfm._compat.files import reading, whole_file
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._compat.texts import FRAME, IMAGE_NAME
 from isa_nrsfm.io import _landmark_columns
+from isa_nrsfm.io._landmark_columns import Given
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
 from isa_nrsfm.skeletons import _column_names
 from isa_nrsfm.skeletons._column_names import parse_coordinate
@@ -232,9 +233,7 @@ def landmark_table(
     return LandmarkTable(points, frame.drop(columns=names))
 
 
-def individuals_as_rows(
-    frame: "pd.DataFrame", individuals: str | Sequence[str] | None
-) -> "pd.DataFrame":
+def individuals_as_rows(frame: "pd.DataFrame", individuals: Given) -> "pd.DataFrame":
     """Return a table with a row for each individual of each row, if there are any."""
     if individuals is None:
         return frame
@@ -282,10 +281,7 @@ def tracks_in(
 
 
 def read_named_columns(
-    path: Path,
-    columns: str | None = None,
-    missing: Missing = None,
-    **shape: str | Sequence[str] | None,
+    path: Path, columns: str | None = None, missing: Missing = None, **shape: Given
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
     table = parse_table(path)
