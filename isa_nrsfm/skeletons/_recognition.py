@@ -414,10 +414,9 @@ def get_skeleton(name: str) -> Skeleton:
 def checked_skeleton(given: Any, n_points: int) -> Skeleton:
     """Return a layout that is given itself or by name, of so many points, or raise."""
     skeleton = given if isinstance(given, Skeleton) else get_skeleton(given)
-    if skeleton.n_points != n_points:
+    if (n := skeleton.n_points) != n_points:
         raise ValueError(
-            f"the skeleton {skeleton.name!r} has {skeleton.n_points} points, the shape "
-            f"{n_points}"
+            f"the skeleton {skeleton.name!r} has {n} points, the shape {n_points}"
         )
     return skeleton
 
