@@ -68,27 +68,23 @@ class Factorisation(NamedTuple):
 
 
 def factorise(
-    W: NDArray,
-    n_components: int,
-    precision: float = 0.0,
-    triplets: Triplets | None = None,
+    W: NDArray, K: int, precision: float = 0.0, triplets: Triplets | None = None
 ) -> Factorisation:
     """Return the rigid and the non-rigid factors of centred W (2 * n_frames, n_points).
 
-    `precision` is the rounding error of its entries, relative to their RMS. `triplets`
-    are at least the 3K + 3 leading ones of a larger matrix, by default of W.
+    K is the number of basis shapes, `precision` the rounding error of the entries,
+    relative to their RMS. `triplets` are at least the 3K + 3 leading ones of a larger
+    matrix, by default of W.
     """
     n_points = W.shape[1]
-    S, Vt, _ = triplets or leading_triplets(W, 3 * n_components + 3)
+    S, Vt, _ = triplets or leading_triplets(W, 3 * K + 3)
     # Rows of Vt above rounding errors, centred, their signs fixed.
-    rank = int(np.sum(S > max(OF_RANKS, precision) * S[0]))
-    rank = min(rank, 3 * n_components + 3)
+    rank = min(np.sum(S > max(OF_RANKS, precision) * S[0]), 3 * K + 3)
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
     Vt *= orientations(Vt)[:, None]
     # The first three are the rigid shape, the next ones the signals.
     root = np.sqrt(n_points)
-    B_0 = np.zeros((3, n_points))
-    B_0[: min(rank, 3)] = root * Vt[:3]
+    B_0 = np.pad(root * Vt[:3], ((0, max(3 - rank, 0)), (0, 0)))
     signals = Vt[3:]
     n_missing = 3 * max(1, -(-(rank - 3) // 3)) - len(signals)
     if n_missing:  # completed by centred, orthonormal rows, orthogonal to Vt
@@ -229,14 +225,11 @@ def run_paper_pipeline(
     n_iter, converged = 1, True
     if settings.refinement:
         # The joint refinement only starts from this result.
-        start_limits, limits = (200, 1e-5), (settings.max_iter, settings.tol)
-        max_iter, tol = start_limits if settings.joint else limits
+        limits = (200, 1e-5) if settings.joint else (settings.max_iter, settings.tol)
         lifted = leading_blocks(moments, components.reshape(len(E), 3, -1))
         plain = np.broadcast_to(np.eye(3), (len(E), 1, 3, 3))
         starts = np.concatenate([E[:, None], lifted, plain], axis=1)
-        E, n_iter, converged = refine_alternating(
-            products, starts, max_iter=max_iter, tol=tol
-        )
+        E, n_iter, converged = refine_alternating(products, starts, *limits)
     report("block structure and refinement")
 
     # Shapes. Subspaces beyond the rank of W stay zero.
@@ -286,9 +279,8 @@ MotionProducts = tuple[NDArray, NDArray, NDArray]
 def motion_products(rigid_motion: NDArray, motion: NDArray) -> MotionProducts:
     """Return the products for M_0 (2 n_frames, 3) and M (2 n_frames, n_signals)."""
     M_0 = rigid_motion.reshape(-1, 2, 3)
-    transposed = M_0.mT
-    cross = transposed @ motion.reshape(len(M_0), 2, -1)
-    return cross, (transposed @ M_0).reshape(-1, 9), motion.T @ motion
+    cross = M_0.mT @ motion.reshape(len(M_0), 2, -1)
+    return cross, (M_0.mT @ M_0).reshape(-1, 9), motion.T @ motion
 
 
 def _blocks_of(cross: NDArray) -> NDArray:
@@ -380,7 +372,7 @@ def leading_blocks(moments: NDArray, subspaces: NDArray, n_leading: int = 2) -> 
 
 
 def refine_alternating(
-    products: MotionProducts, starts: NDArray, *, max_iter: int, tol: float
+    products: MotionProducts, starts: NDArray, max_iter: int, tol: float
 ) -> tuple[NDArray, int, bool]:
     """Return the blocks that explain most of the motion, each from several starts.
 

@@ -7,6 +7,7 @@ and the grouping of signals into subspaces by greedy pairwise swaps.
 import warnings
 from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
 from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
@@ -26,7 +27,6 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._linalg import OF_DIFFERENCES, OF_PRODUCTS, polar
 from isa_nrsfm._tables import unmasked
 
@@ -46,7 +46,7 @@ class BaseSubspaceAnalysis(
     }
 
     # For matrices of this size, threads take more time than they save.
-    @one_blas_thread()
+    @scikit_learn.one_blas_thread()
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals, size = unmasked(signals), self.subspace_size
@@ -65,11 +65,11 @@ class BaseSubspaceAnalysis(
         return self
 
     @abstractmethod
-    def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
+    def _unmix(self, Z: NDArray, whitening: NDArray, *args: Any, **kw: Any) -> NDArray:
         """Return the orthogonal matrix that unmixes white Z (n_signals, n_samples).
 
         ``Z = whitening @ (signals - mean_).T``; both matrices are (n_signals,
-        n_signals).
+        n_signals). Further arguments are those of `_fit_signals`.
         """
 
     def transform(self, signals: Any) -> NDArray:
@@ -99,8 +99,7 @@ def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
     """
     n_samples, n_signals = centred.shape
     scale = centred.std(axis=0)
-    varies = scale > OF_PRODUCTS * np.abs(centred).max(axis=0)
-    scale = np.where(varies, scale, 1.0)
+    scale[scale <= OF_PRODUCTS * np.abs(centred).max(axis=0)] = 1.0
     standard = centred / scale
     variance, axes = np.linalg.eigh(standard.T @ standard / n_samples)
     rank = int(np.sum(variance > OF_PRODUCTS * variance[-1]))
@@ -285,6 +284,7 @@ def likelihoods(signals: NDArray) -> Values:
 AGREEING = 3
 
 
+@dataclass(eq=False, repr=False)
 class FastISA(BaseSubspaceAnalysis):
     """
     Independent subspace analysis by fixed-point iteration from many starts.
@@ -368,24 +368,14 @@ class FastISA(BaseSubspaceAnalysis):
         "verbose": ["verbose"],
     }
 
-    def __init__(
-        self,
-        subspace_size: int = 3,
-        *,
-        n_init: int = 30,
-        max_iter: int = 500,
-        tol: float = 1e-4,
-        random_state: Any = None,
-        n_jobs: int | None = None,
-        verbose: int = 0,
-    ):
-        self.subspace_size = subspace_size
-        self.n_init = n_init
-        self.max_iter = max_iter
-        self.tol = tol
-        self.random_state = random_state
-        self.n_jobs = n_jobs
-        self.verbose = verbose
+    subspace_size: int = 3
+    _: KW_ONLY
+    n_init: int = 30
+    max_iter: int = 500
+    tol: float = 1e-4
+    random_state: Any = None
+    n_jobs: int | None = None
+    verbose: int = 0
 
     @scikit_learn.fit_context(nested=False)
     def fit(self, signals: Any, y: Any = None) -> Self:
@@ -413,10 +403,8 @@ class FastISA(BaseSubspaceAnalysis):
         return self._fit_signals(signals)
 
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
-        random_state = check_random_state(self.random_state)
-        n_signals = len(Z)
-        shape = (self.n_init, n_signals, n_signals)
-        starts = orthogonalise(random_state.standard_normal(shape))
+        normal = check_random_state(self.random_state).standard_normal
+        starts = orthogonalise(normal((self.n_init, len(Z), len(Z))))
         # Few starts at first, as they often agree. Then batches that reduce overhead of
         # NumPy, with arrays that fit into the cache.
         ends = [AGREEING, 2 * AGREEING, *range(2 * AGREEING + 16, self.n_init, 16)]
@@ -424,14 +412,11 @@ class FastISA(BaseSubspaceAnalysis):
         results: list[Any] = []
         for group in filter(None, (batches[:1], batches[1:2], batches[2:])):
             n_jobs = min(effective_n_jobs(self.n_jobs), len(group))
-            runs = Parallel(n_jobs=n_jobs, return_as="generator")(
-                delayed(self._run)(batch, Z) for batch in group
-            )
-            for run in runs:
+            runs = (delayed(self._run)(batch, Z) for batch in group)
+            for run in Parallel(n_jobs=n_jobs, return_as="generator")(runs):
                 results.append(run)
-                W, log_likelihoods, n_iters, converged = map(
-                    np.concatenate, zip(*results, strict=True)
-                )
+                joined = map(np.concatenate, zip(*results, strict=True))
+                W, log_likelihoods, n_iters, converged = joined
                 highest = log_likelihoods.max()
                 if self.verbose:
                     done = f"{len(W)}/{self.n_init} starts"
@@ -445,15 +430,11 @@ class FastISA(BaseSubspaceAnalysis):
                 "best start still changes. Increase max_iter or tol",
                 ConvergenceWarning,
             )
-        self.log_likelihoods_ = log_likelihoods
-        self.log_likelihood_ = float(log_likelihoods[best])
-        self.n_iters_ = n_iters
-        self.n_iter_ = int(n_iters[best])
+        self.log_likelihoods_, self.log_likelihood_ = log_likelihoods, float(highest)
+        self.n_iters_, self.n_iter_ = n_iters, int(n_iters[best])
         return W[best]
 
-    def _run(
-        self, starts: NDArray, Z: NDArray
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def _run(self, starts: NDArray, Z: NDArray) -> tuple[NDArray, ...]:
         """Return unmixing, likelihood, steps, convergence of starts (n_batch, n, n)."""
         size, max_iter, tol = self.subspace_size, self.max_iter, self.tol
         # FastICA: subspaces of size one. Inside a subspace the components may be
@@ -470,6 +451,7 @@ class FastISA(BaseSubspaceAnalysis):
         return W, values, n_iter_ica + n_iter, converged
 
 
+@dataclass(eq=False, repr=False)
 class PooledFastICA(BaseSubspaceAnalysis):
     """
     Independent subspace analysis by FastICA and pooling of its components.
@@ -531,20 +513,12 @@ class PooledFastICA(BaseSubspaceAnalysis):
     (6, 6)
     """
 
-    def __init__(
-        self,
-        subspace_size: int = 3,
-        *,
-        n_init: int = 16,
-        max_iter: int = 200,
-        tol: float = 1e-4,
-        random_state: Any = None,
-    ):
-        self.subspace_size = subspace_size
-        self.n_init = n_init
-        self.max_iter = max_iter
-        self.tol = tol
-        self.random_state = random_state
+    subspace_size: int = 3
+    _: KW_ONLY
+    n_init: int = 16
+    max_iter: int = 200
+    tol: float = 1e-4
+    random_state: Any = None
 
     @scikit_learn.fit_context(nested=False)
     def fit(
@@ -592,11 +566,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         return self._fit_signals(signals, covariance=covariance, criterion=criterion)
 
     def _unmix(
-        self,
-        Z: NDArray,
-        whitening: NDArray,
-        covariance: Any = None,
-        criterion: Values | None = None,
+        self, Z: NDArray, whitening: NDArray, covariance: Any, criterion: Values | None
     ) -> NDArray:
         n_signals, size = len(Z), self.subspace_size
         if covariance is not None:
@@ -618,15 +588,13 @@ class PooledFastICA(BaseSubspaceAnalysis):
                 value = energy_shares(W @ covariance @ W.T)
             orders = swap_until_best(groupings, value)
             sums = [float(np.sum(value(rows.reshape(-1, size)))) for rows in orders]
-            best = int(np.argmax(sums))
-            W = W[orders[best]]
+            W, total = W[orders[int(np.argmax(sums))]], max(sums)
             if criterion is not None:
                 subspaces = (W @ whitening).reshape(-1, size, n_signals)
-                sums[best] = float(np.sum(criterion(subspaces)))
-            runs.append((sums[best], W, n_iter, converged))
+                total = float(np.sum(criterion(subspaces)))
+            runs.append((total, W, n_iter, converged))
         self.criteria_ = np.array([run[0] for run in runs])
-        _, W, n_iter, converged = runs[int(np.argmax(self.criteria_))]
-        self.n_iter_ = n_iter
+        _, W, self.n_iter_, converged = runs[int(np.argmax(self.criteria_))]
         if criterion is not None:
             # All swaps between subspaces that raise the criterion
             found = W @ whitening
