@@ -143,9 +143,8 @@ def _messages(facts: Facts) -> Iterator[str]:
             "the mean shape: affine cameras absorb such deformation. Record more "
             f"frames, best of objects that turn further{facts.compare}"
         )
-    if facts.few and n_supported == n_components:
-        what = "Look for wrong landmarks in the frames with the largest coefficients"
-        yield f"{facts.few}. {what}"
+    if n_supported == n_components:
+        yield facts.few
     if not depth:
         yield facts.pose
 
@@ -165,8 +164,8 @@ def poor_fit(facts: Facts) -> str:
     )
 
 
-def with_outliers(facts: Facts, distance: NDArray, rows: NDArray) -> Facts:
-    """Return facts with the outliers among distances (n, J) of some rows (n,)."""
+def facts_of_rows(model: Any, distance: NDArray, rows: NDArray) -> Facts:
+    """Return a model and the outliers among distances (n, J) of some rows (n,)."""
     share, energy, found = gross_residuals(distance)
     wrong = list(dict.fromkeys(rows[found[:, 0]].tolist()))
     text = (
@@ -174,7 +173,7 @@ def with_outliers(facts: Facts, distance: NDArray, rows: NDArray) -> Facts:
         f"rows are more than {GROSS:g} standard deviations from where the others of "
         f"their frame have them, most in the rows {first_items(wrong, 5)}"
     )
-    return facts._replace(outlier_energy=energy, outliers=text)
+    return Facts(model, outlier_energy=energy, outliers=text)
 
 
 def outlier_advice(facts: Facts) -> str:
@@ -271,13 +270,10 @@ def warn_after_fit(
             f"Make sure that the points are those of the prior, and that {SAME_UNIT}; "
             "or fit the table without a prior"
         )
-    facts = Facts(model)
-    if left_out is not None:
-        facts = with_outliers(facts, *left_out)
-    advice = filter(None, (outlier_advice(facts), depth_advice(facts)))
-    for text in (message, ". ".join(advice)):
-        if text:
-            warn_caller(text)
+    facts = Facts(model) if left_out is None else facts_of_rows(model, *left_out)
+    advice = ". ".join(filter(None, (outlier_advice(facts), depth_advice(facts))))
+    for text in filter(None, (message, advice)):
+        warn_caller(text)
 
 
 def mirrored_rows(model: Any, prior: Any, motion: NDArray) -> tuple[NDArray, str]:

@@ -17,7 +17,7 @@ asymptotically robust permutation tests", 2013; DiCiccio, Romano, "Robust permut
 tests for correlation and regression coefficients", 2017).
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from numbers import Integral
 from typing import Any, NamedTuple
 
@@ -28,16 +28,11 @@ from scipy.sparse import csr_array, hstack
 from scipy.sparse.linalg import lsmr
 from scipy.spatial import cKDTree
 from scipy.special import softmax
-from scipy.stats import norm, rankdata
+from scipy.stats import multivariate_normal, norm, rankdata
+from sklearn import model_selection
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import RidgeCV
-from sklearn.model_selection import (
-    GroupKFold,
-    KFold,
-    StratifiedGroupKFold,
-    StratifiedKFold,
-    cross_val_score,
-)
+from sklearn.model_selection import cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
@@ -95,15 +90,12 @@ def independent_length(rest: NDArray) -> int:
     slow drifts that single frames hide. Otherwise five times the length of the shortest
     means that are.
     """
-    n_scales = max(1, int(np.log2(len(rest) / 8)) + 1)
-    threshold = norm.isf(0.05 / (rest.shape[1] * n_scales))
-    length, scale = 1, 1
-    while len(rest) >= 8:
-        energy = np.sum(rest**2, axis=0)
+    length, n_scales = 1, len(rest).bit_length() - 3  # of eight means or more
+    for scale in range(1, n_scales + 1):
+        threshold = norm.isf(0.05 / (rest.shape[1] * n_scales))
         r = np.sum(rest[1:] * rest[:-1], axis=0) * np.sqrt(len(rest))
-        scale *= 2
-        if np.any(r > threshold * energy):
-            length = 5 * scale
+        if np.any(r > threshold * np.sum(rest**2, axis=0)):
+            length = 5 * 2**scale
         rest = rest[: len(rest) // 2 * 2].reshape(-1, 2, rest.shape[1]).mean(axis=1)
         rest = rest - rest.mean(axis=0)
     return length
@@ -131,26 +123,22 @@ def permuted_energies(
     order: FrameOrder,
     n_permutations: int,
     rng: np.random.RandomState,
-) -> tuple[NDArray, str, str]:
+) -> tuple[list[NDArray], list[str], str]:
     """
     Compute squared covariances of coefficients with labels, and with permuted labels.
 
     Coefficients are given as values, and as ranks or values of norm one (alpha).
-    Returns them (n_permutations + 1, n_components), the given labels first; the
-    permuted units; and why they are no test, or nothing. The parts between and within
-    groups are summed, each divided by its mean over the permutations.
+    Returns those between and within groups, each (n_permutations + 1, n_components)
+    with the given labels first; the permuted units; and why they are no test, or "".
     """
     alpha, labels = alpha[order.rows], labels[order.rows]
-    n_components = alpha.shape[1]
     sizes, by_group = order.sizes[:, None], indicators(order.groups).T
-    means = by_group @ alpha / sizes
+    means, n_groups = by_group @ alpha / sizes, len(sizes)
     # Sparse: there may be as many classes as groups.
     of_labels = (by_group @ labels).multiply(1.0 / sizes).tocsr()
-    alpha = alpha - means[order.groups]
     square = np.sum(labels.data**2)
     total = square - len(alpha) * np.sum((sizes.T @ of_labels / len(alpha)) ** 2)
-    energies, permuted = np.zeros((n_permutations + 1, n_components)), []
-    untested = ""
+    energies, permuted, untested = [], [], ""
     inside = square - np.sum(sizes.T @ of_labels.power(2)) > OF_DIFFERENCES * total
     weights = _weights(labels, of_labels, order)
     between = of_labels.multiply(weights).tocsr()
@@ -158,52 +146,51 @@ def permuted_energies(
     along = weights / np.sqrt(np.sum(weights**2))
     part = along.T @ between
     mean = between.sum(axis=0) - np.sum(along) * part
-    energy = np.sum(between.data**2) - np.sum(part**2) - np.sum(mean**2) / len(means)
+    energy = np.sum(between.data**2) - np.sum(part**2) - np.sum(mean**2) / n_groups
     if energy > OF_DIFFERENCES * total:
         centres = _standard(means, weights)
-        orders = (rng.permutation(len(means)) for _ in range(n_permutations))
-        permuted_centres = (centres[i] for i in orders)
+        shuffled = (centres[rng.permutation(n_groups)] for _ in range(n_permutations))
         if inside:
-            energies += _energies(centres, between, permuted_centres, along)
+            energies.append(_energies(centres, between, shuffled, along))
         else:
-            energies += _studentised(centres, _unit(of_labels), permuted_centres)
+            energies.append(_studentised(centres, _unit(of_labels), shuffled))
         permuted.append("groups")
-    if inside:
-        residuals = unexplained(alpha, labels, order)
-        length, in_runs = independent_length(residuals), _are_sorted(labels, order)
-    runs = _runs(labels, order) if inside and len(means) > 1 else None
+    if not inside:
+        return energies, permuted, untested
+    alpha = alpha - means[order.groups]
+    residuals = unexplained(alpha, labels, order)
+    length = independent_length(residuals)
+    runs = _runs(labels, order) if n_groups > 1 else None
     varying = np.sum((by_group @ labels.power(2)) - sizes * of_labels.power(2), axis=1)
     many = np.sum(varying > OF_DIFFERENCES) >= MANY_GROUPS
-    if inside and many and (length > 1 or runs is not None):
-        signs = rng.choice([-1.0, 1.0], (n_permutations + 1, len(means)))
+    if many and (length > 1 or runs is not None):
+        signs = rng.choice([-1.0, 1.0], (n_permutations + 1, n_groups))
         signs[0] = 1.0
-        energies += _signed(alpha, labels, by_group, signs)
-        permuted.append("signs of groups within them")
-    elif inside:
-        units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
-        # Blocks of frames, permuted within groups
-        block = order.blocks(length) if runs is None or length > 1 else runs
-        draws = (rng.random_sample(block[-1] + 1) for _ in range(n_permutations))
-        orders = (np.lexsort((draw[block], order.groups)) for draw in draws)
-        shuffled: Iterator[NDArray] = (alpha[i] for i in orders)
-        if length == 1:
-            units = "frames" if runs is None else "runs of a label"
-        elif not in_runs:
-            units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
-            one_event = _one_event(alpha, labels, order)
-        if length > 1 and not permuted:
-            untested = TEXTS["untested"]["one_event"] * one_event
-            if len(means) == 1:
-                cuts = np.intersect1d(seams(values[order.rows]), seams(residuals))
-                if len(cuts):
-                    untested = TEXTS["untested"]["jumps"].format(len(cuts), cuts[0])
-        if length == len(means) == 1 and _people_repeat(alpha, labels):
+        energies.append(_signed(alpha, labels, by_group, signs))
+        return energies, [*permuted, "signs of groups within them"], untested
+    units, one_event = f"blocks of {length} frames", 8 * length > len(alpha)
+    # Blocks of frames, permuted within groups
+    block = order.blocks(length) if runs is None or length > 1 else runs
+    draws = (rng.random_sample(block[-1] + 1) for _ in range(n_permutations))
+    shuffled = (alpha[np.lexsort((draw[block], order.groups))] for draw in draws)
+    if length == 1:
+        units = "frames" if runs is None else "runs of a label"
+    elif not _are_sorted(labels, order):
+        units, shuffled = "frequencies", _waves(alpha, order, n_permutations, rng)
+        one_event = _one_event(alpha, labels, order)
+    if length > 1 and not permuted:
+        untested = TEXTS["untested"]["one_event"] * one_event
+    if n_groups == 1:
+        cuts = np.intersect1d(seams(values[order.rows]), seams(residuals))
+        if length > 1 and len(cuts):
+            untested = TEXTS["untested"]["jumps"].format(len(cuts), cuts[0])
+        elif length == 1 and _people_repeat(alpha, labels):
             untested = TEXTS["untested"]["repeated"]
-        if not untested:
-            statistic = _studentised if length == 1 else _energies
-            energies += statistic(alpha, labels, shuffled)
-        permuted.append(f"{units} within groups" if len(means) > 1 else units)
-    return energies, ", and ".join(permuted), untested
+    if not untested:
+        statistic = _studentised if length == 1 else _energies
+        energies.append(statistic(alpha, labels, shuffled))
+    permuted.append(f"{units} within groups" if n_groups > 1 else units)
+    return energies, permuted, untested
 
 
 def indicators(numbers: NDArray) -> csr_array:
@@ -253,7 +240,7 @@ def _one_event(alpha: NDArray, labels: csr_array, order: FrameOrder) -> bool:
 
 def _waves(
     alpha: NDArray, order: FrameOrder, n_permutations: int, rng: np.random.RandomState
-) -> Iterator[NDArray]:
+) -> Generator[NDArray, None, None]:
     """Yield ordered coefficients whose frequencies have random signs and sizes.
 
     Random signs alone keep the power of each frequency. But neighbouring frequencies of
@@ -303,28 +290,27 @@ def _standard(means: NDArray, weights: NDArray) -> NDArray:
 def _energies(
     alpha: NDArray, labels: csr_array, permuted: Iterable[NDArray], without: Any = 0.0
 ) -> NDArray:
-    """Return squared covariances (n_permutations + 1, n_components) of mean one.
+    """Return squared covariances (n_permutations + 1, n_components).
 
     The part of the labels along a column `without` (n, 1) of norm one does not count.
     """
     energy = np.sum(alpha**2, axis=0)
     rests = (a - without * np.sum(without * a, axis=0) for a in (alpha, *permuted))
     energies = np.array([np.sum((labels.T @ a) ** 2, axis=0) for a in rests])
-    energies /= np.where(energy > 0, energy, 1.0)
-    return np.asarray(energies / (energies.mean() or 1.0))
+    return np.asarray(energies / np.where(energy > 0, energy, 1.0))
 
 
 def _unit(labels: csr_array) -> csr_array:
     """Return indicators, or a centred column, with norm one."""
     if labels.shape[1] == 1:
-        labels = csr_array(labels.toarray() - labels.mean())
+        return csr_array(unit_columns(labels.toarray()))
     return csr_array(labels / np.sqrt(labels.power(2).sum(axis=0)))
 
 
 def _studentised(
     alpha: NDArray, labels: csr_array, permuted: Iterable[NDArray]
 ) -> NDArray:
-    """Return statistics (n_permutations + 1, n_components) of mean one.
+    """Return statistics (n_permutations + 1, n_components).
 
     Of indicators of classes, of norm one, that of Welch ("On the comparison of several
     mean values", 1951) without the factor for the degrees of freedom; of a centred
@@ -345,8 +331,7 @@ def _studentised(
         centre = _ratio(np.sum(weights * means, axis=0), weights.sum(axis=0))
         return np.asarray(np.sum(weights * (means - centre) ** 2, axis=0))
 
-    found = np.array([statistic(a) for a in (alpha, *permuted)])
-    return np.asarray(found / (found.mean() or 1.0))
+    return np.array([statistic(a) for a in (alpha, *permuted)])
 
 
 def _ratio(above: NDArray, below: NDArray) -> NDArray:
@@ -358,7 +343,7 @@ def _ratio(above: NDArray, below: NDArray) -> NDArray:
 def _signed(
     alpha: NDArray, labels: csr_array, by_group: csr_array, signs: NDArray
 ) -> NDArray:
-    """Return statistics (n, n_components) of mean one for signs (n, n_groups).
+    """Return statistics (n, n_components) for signs (n, n_groups).
 
     ``sum_c (sum_g s_g u_gc)^2 / sum_g u_gc^2`` with the covariances u_gc of a group and
     a label, of coefficients less their means over groups.
@@ -368,8 +353,7 @@ def _signed(
         covariances = (by_group @ labels.multiply(a[:, None])).toarray()
         shares = _ratio((signs @ covariances) ** 2, np.sum(covariances**2, axis=0))
         found.append(shares.sum(axis=1))
-    energies = np.stack(found, axis=1)
-    return np.asarray(energies / (energies.mean() or 1.0))
+    return np.stack(found, axis=1)
 
 
 def _people_repeat(alpha: NDArray, labels: csr_array) -> bool:
@@ -392,9 +376,8 @@ def _people_repeat(alpha: NDArray, labels: csr_array) -> bool:
         members = z[classes == number]
         residuals = members - members.mean(axis=0)
         covariance = (residuals.T @ residuals + np.eye(K)) / (size + 1)
-        d = z - members.mean(axis=0)
-        off = np.vecdot(d, d @ np.linalg.inv(covariance))
-        scores.append(np.log(size) - (off + np.linalg.slogdet(covariance)[1]) / 2)
+        density = multivariate_normal(members.mean(axis=0), covariance)
+        scores.append(np.log(size) + density.logpdf(z))
     errors = (classes[:, None] == np.arange(len(scores))) - softmax(scores, axis=0).T
     near = cKDTree(z).query(z, NEAREST + 1)[1][:, 1:]
     pairs = np.column_stack([np.repeat(np.arange(len(z)), NEAREST), near.ravel()])
@@ -444,11 +427,10 @@ class Association(NamedTuple):
     def __repr__(self) -> str:
         """Return the results as a table and what they are."""
         name, meaning = TEXTS["statistics"][self.kind]
-        values = {name: self.statistic}
-        if self.corrected is not None:
-            values["corrected"] = self.corrected
         columns = {"": [f"alpha_{k + 1}" for k in range(len(self.p_value))]}
-        columns |= {name: [f"{v:.2f}" for v in each] for name, each in values.items()}
+        columns[name] = [f"{value:.2f}" for value in self.statistic]
+        if self.corrected is not None:
+            columns["corrected"] = [f"{value:.2f}" for value in self.corrected]
         columns["p"] = ["" if self.untested else f"{p:.3f}" for p in self.p_value]
         test = f"p-values: permutations of {self.permuted}"
         if self.untested:
@@ -580,10 +562,12 @@ def association(
     energies, permuted, untested = permuted_energies(
         alpha, standard, columns, order, n_permutations, rng
     )
-    p_value = _step_down_p_values(energies)
-    if untested:
-        p_value[:] = np.nan
-    found = Association(kind, statistic, p_value, len(alpha), permuted, untested)
+    p_value = np.full(len(statistic), np.nan)
+    if not untested:  # the sum of the parts between and within groups, of mean one
+        total = np.sum([each / (each.mean() or 1.0) for each in energies], axis=0)
+        p_value = _step_down_p_values(total)
+    units = ", and ".join(permuted)
+    found = Association(kind, statistic, p_value, len(alpha), units, untested)
     if alpha_std is None:
         return found
     ratio = _reliability(given, alpha_std)
@@ -641,20 +625,19 @@ def predictability(
         if (length := independent_length(residuals)) > 1:
             numbers = np.empty(len(labels), dtype=int)
             numbers[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
-    most, model = len(labels), RidgeCV(np.logspace(-3, 3, 13))
-    splitter = KFold if numbers is None else GroupKFold
-    if kind == "classes":
-        most = int(np.unique(labels, return_counts=True)[1].min())
-        model = LinearDiscriminantAnalysis()
-        splitter = StratifiedKFold if numbers is None else StratifiedGroupKFold
+    most, model, splitter = len(labels), RidgeCV(np.logspace(-3, 3, 13)), "KFold"
     if numbers is not None:
-        most = min(most, len(np.unique(numbers)))
+        most, splitter = len(np.unique(numbers)), "GroupKFold"
+    if kind == "classes":
+        most = min(most, np.unique(labels, return_counts=True)[1].min())
+        model, splitter = LinearDiscriminantAnalysis(), f"Stratified{splitter}"
     if most < 2:
         raise ValueError(
             "two folds need two frames of each class, and two groups where there are "
             f"groups; got {most}"
         )
-    folds = splitter(min(n_folds, most), shuffle=True, random_state=random_state)
+    options = {"shuffle": True, "random_state": random_state}
+    folds = getattr(model_selection, splitter)(int(min(n_folds, most)), **options)
     model = make_pipeline(StandardScaler(), model)
     return cross_val_score(model, features, labels, groups=numbers, cv=folds)
 
@@ -684,12 +667,8 @@ def _known_frames(
 
 def _reliability(alpha: Any, alpha_std: Any) -> NDArray:
     """Return the shares (K,) of the variance of coefficients that are no errors."""
-    alpha, deviations = np.asarray(alpha, float), np.asarray(alpha_std, float)
-    if deviations.shape != alpha.shape:
-        raise ValueError(
-            f"alpha_std must have the shape {alpha.shape} of alpha; got "
-            f"{deviations.shape}"
-        )
+    alpha = np.asarray(alpha, float)
+    deviations = _frame_columns.checked_std(alpha_std, alpha)
     variance = np.nanvar(alpha, axis=0)
     total = variance + np.nanmean(deviations**2, axis=0)
     return np.asarray(variance / np.where(total > 0, total, np.nan))
@@ -713,9 +692,8 @@ def _step_down_p_values(energies: NDArray) -> NDArray:
     largest = np.maximum.accumulate(energies, axis=1)
     # Tolerance for rounding: equal energies count as large.
     larger = (largest >= energies[0] * (1 - OF_DIFFERENCES)).mean(axis=0)
-    p_value = np.empty(len(larger))
-    p_value[weakest_first] = np.maximum.accumulate(larger[::-1])[::-1]
-    return p_value
+    p_value = np.maximum.accumulate(larger[::-1])[::-1]
+    return p_value[np.argsort(weakest_first)]
 
 
 def _label_columns(labels: NDArray, kind: str) -> csr_array:
@@ -725,6 +703,5 @@ def _label_columns(labels: NDArray, kind: str) -> csr_array:
     the square of Spearman's rank correlation.
     """
     if kind == "number":
-        return csr_array(unit_columns(rankdata(labels)[:, None]))
-    columns = indicators(np.unique(labels, return_inverse=True)[1])
-    return csr_array(columns / np.sqrt(columns.sum(axis=0)))
+        return _unit(csr_array(rankdata(labels)[:, None]))
+    return _unit(indicators(np.unique(labels, return_inverse=True)[1]))

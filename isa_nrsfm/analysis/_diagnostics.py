@@ -27,9 +27,8 @@ from isa_nrsfm._linalg import OF_RANKS, polar
 from isa_nrsfm._parameters import named
 from isa_nrsfm._tables import FrameBlocks
 from isa_nrsfm.analysis import _advice
-from isa_nrsfm.analysis._advice import camera_meaning
+from isa_nrsfm.analysis._advice import SAME_UNIT, camera_meaning
 from isa_nrsfm.analysis._frame_columns import unit_columns
-from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._column_names import names_of_points
 
 # Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
@@ -128,9 +127,9 @@ class Diagnostics(NamedTuple):
 
     def __repr__(self) -> str:
         """Return the messages, the figures of the table and those of coefficients."""
-        certainty = "not estimated"
+        error = "not estimated"
         if math.isfinite(self.depth_uncertainty):
-            certainty = f"{percent(self.depth_uncertainty)} of the depth"
+            error = f"{percent(self.depth_uncertainty)} of the depth"
         shares = first_items((f"{share:.2f}" for share in self.reliability), 12)
         shown = ["" if math.isnan(s) else percent(max(s, 0.0)) for s in self.pose_share]
         columns: dict[str, Sequence[str]] = {
@@ -148,7 +147,7 @@ class Diagnostics(NamedTuple):
             f"depth: {self.depth.upper() or 'not known for affine cameras'}",
             *(self.messages or ["no warning"]),
             f"cameras: {self.camera_meaning}",
-            f"depth error: {certainty}",
+            f"depth error: {error}",
             f"deformation: {percent(self.deformation_amplitude)} of the mean shape",
             f"reliability, along uncorrelated directions: {shares}",
             aligned(columns),
@@ -200,9 +199,9 @@ def diagnose(
     `table` is that of the fit, with weights of its points, if any, and `rows` are the
     names of the rows.
     """
-    frames, sizes = estimator._model.frames, estimator._frame_sizes
-    distance = None
     model = estimator._model  # with the directions that are not reported
+    frames, sizes = model.frames, estimator._frame_sizes
+    distance, held_out_error = None, np.nan
     if table is not None:
         if table.n_frames != len(sizes):
             raise ValueError(
@@ -211,6 +210,7 @@ def diagnose(
             )
         fit = table.joined(partial(model.decompose, deviations=False), *weights)[:3]
         distance = table.joined(model.distances, *fit, *weights)
+        held_out_error = model.held_out_error(table, *weights)
     fitted = np.isfinite(sizes)
     motion = np.asarray(estimator.motion_)[fitted] / sizes[fitted, None, None]
     remaining = np.asarray(estimator.alpha_, dtype=np.float64)
@@ -218,11 +218,9 @@ def diagnose(
     alpha, remaining = coefficients[fitted], remaining[fitted]
     mean_shape = estimator.mean_shape_.astype(np.float64)
     basis = estimator.basis_.astype(np.float64)
-    images = motion.reshape(-1, 3)
-    flat = basis.reshape(len(basis), -1)
+    images, flat = motion.reshape(-1, 3), basis.reshape(len(basis), -1)
     deformation = np.vdot(alpha.T @ alpha, flat @ flat.T) / len(alpha)
-    fourth = np.sum(alpha**4, axis=0)
-    square = np.sum(alpha**2, axis=0) ** 2
+    square, fourth = np.sum(alpha**2, axis=0) ** 2, np.sum(alpha**4, axis=0)
     # The traces of the V_k, one direction each, are not determined. Leave them out.
     information = weak_information(mean_shape, basis, motion, alpha)
     eigenvalues = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
@@ -248,24 +246,20 @@ def diagnose(
         share,
         np.divide(removed, variance, where=variance > 0, out=np.zeros_like(variance)),
         *_advice.gross_residuals(distance),
+        held_out_error=held_out_error,
+        fit=_advice.verdict(held_out_error, *_advice.FIT),
+        depth=_advice.verdict(frames.certainty.total, *_advice.DEPTH),
     )
-    names, layout = names_of_points(estimator), _advice.layout_of(estimator)
-    error = np.nan if table is None else model.held_out_error(table, *weights)
     facts = _advice.Facts(
         estimator,
-        held_out_error=error,
+        held_out_error=held_out_error,
         deviation=found.weak_deviations[-1],
         outlier_energy=found.outlier_energy,
-        outliers=outlier_text(found, rows, names),
+        outliers=outlier_text(found, rows, names_of_points(estimator)),
         few=_few_frames(found, coefficients, rows),
-        pose=_of_pose(found, layout, estimator, removable),
+        pose=_of_pose(found, estimator, removable),
     )
-    return found._replace(
-        messages=_advice.advice(facts),
-        held_out_error=error,
-        fit=_advice.verdict(error, *_advice.FIT),
-        depth=_advice.verdict(found.depth_uncertainty, *_advice.DEPTH),
-    )
+    return found._replace(messages=_advice.advice(facts))
 
 
 def pose_share(motion: NDArray, alpha: NDArray, error: float = 0.0) -> NDArray:
@@ -321,13 +315,14 @@ def _few_frames(found: Diagnostics, alpha: NDArray, rows: Any) -> str:
         f"{rows[np.nanargmax(np.abs(alpha[:, k]))]})"
         for k in np.flatnonzero(few)
     ]
-    text = f"a few of the {n_frames} frames determine {first_items(phrases, 5)}"
+    text = (
+        f"a few of the {n_frames} frames determine {first_items(phrases, 5)}. Look for "
+        "wrong landmarks in the frames with the largest coefficients"
+    )
     return text if phrases else ""
 
 
-def _of_pose(
-    found: Diagnostics, layout: Skeleton | None, model: Any, removable: bool
-) -> str:
+def _of_pose(found: Diagnostics, model: Any, removable: bool) -> str:
     """Describe coefficients that the pose predicts; empty if there are none.
 
     removable: whether none is left with `remove_pose`.
@@ -340,9 +335,7 @@ def _of_pose(
     shape, mean_shape = model.basis_[np.nanargmax(found.pose_share)], model.mean_shape_
     deformation = shape - mean_shape @ np.linalg.lstsq(mean_shape, shape)[0]
     if 2 * np.sum(deformation**2) < np.sum(shape**2):
-        return (
-            f"{text}: they stretch the whole shape. Make sure that {_advice.SAME_UNIT}"
-        )
+        return f"{text}: they stretch the whole shape. Make sure that {SAME_UNIT}"
     if model.remove_pose:
         return (
             f"{text}, beyond what {named('remove_pose')} has removed. Compare "
@@ -353,6 +346,7 @@ def _of_pose(
         way = "use isa_nrsfm.AutoNRSfM(AffineNRSfM(remove_pose=True)).fit(X)"
     elif not removable:
         way = "compare coefficients of similar views only"
+    layout = _advice.layout_of(model)
     if layout is None or not layout.contour or model.prior is not None:
         return (
             f"{text}: points slide over the surface as the view changes, or the object "
@@ -395,15 +389,13 @@ def weak_information(
 def summary_html(model: Any) -> str:
     """Return the key figures and the diagnostics of a fitted model as HTML."""
     n_components, n_points, _ = model.basis_.shape
-    lines = [
-        f"{n_components} basis shapes of {n_points} points",
-        f"inverse SNR: {percent(model.inverse_snr_)}, rank floor "
-        f"{percent(model.rank_floor_)}",
-    ]
+    text = (
+        f"{n_components} basis shapes of {n_points} points\ninverse SNR: "
+        f"{percent(model.inverse_snr_)}, rank floor {percent(model.rank_floor_)}"
+    )
     if hasattr(model, "noise_variance_") and hasattr(model, "motion_"):
-        lines.append(repr(model.diagnostics()))
-    text = html.escape("\n".join(lines))
-    return f'<pre class="isa-nrsfm-summary">{text}</pre>'
+        text += f"\n{model.diagnostics()!r}"
+    return f'<pre class="isa-nrsfm-summary">{html.escape(text)}</pre>'
 
 
 # Least correlation of what counts as the same coefficient, as for the congruence of
@@ -415,9 +407,7 @@ MOST_TOGETHER = 3
 
 
 @one_blas_thread()
-def stability(
-    tables: HalfTables, gauge: FrameMap, n_components: int
-) -> tuple[NDArray, NDArray]:
+def stability(tables: HalfTables, gauge: FrameMap, K: int) -> tuple[NDArray, NDArray]:
     """Return root mean squares (K,) of correlations between halves, and stable sets.
 
     The set of a coefficient, a row of a mask (K, K), has the fewest coefficients, it
@@ -427,7 +417,7 @@ def stability(
     def scores(gauge: FrameMap) -> NDArray:
         """Return coefficients (I, K) with mean zero and norm one; zero if constant."""
         cameras, alpha, _ = gauge.apply(tables.motion, tables.alpha, None)
-        alpha = alpha[:, :n_components]
+        alpha = alpha[:, :K]
         if tables.kind[-1]:
             alpha = alpha - pose_part(cameras, pose_effect(cameras, alpha))
         return unit_columns(alpha)
@@ -438,7 +428,7 @@ def stability(
         other = scores(independent_gauge(shapes, motion, alpha, *tables.kind)[2])
         pairs = linear_sum_assignment(-np.abs(whole.T @ other))
         found.append(other[:, pairs[1]])
-    every, n, K = np.hstack(found), len(found), n_components
+    every, n = np.hstack(found), len(found)
     cross = (every.T @ every).reshape(n, K, n, K).swapaxes(1, 2)
     within, others = cross[np.arange(n), np.arange(n)], ~np.eye(n, dtype=bool)
 

@@ -38,6 +38,17 @@ def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
     return column.astype(str)
 
 
+def checked_std(alpha_std: Any, alpha: NDArray) -> NDArray:
+    """Return the standard deviations of coefficients, which have their shape."""
+    deviations = np.asarray(alpha_std, float)
+    if deviations.shape != alpha.shape:
+        raise ValueError(
+            f"alpha_std must have the shape {alpha.shape} of alpha; got "
+            f"{deviations.shape}"
+        )
+    return deviations
+
+
 def is_missing(value: Any) -> bool:
     """Return whether an entry of a column is None, NaN, NaT or NA."""
     try:
@@ -139,24 +150,20 @@ def sequences_of(
     A gap of more than max_gap steps begins a new sequence. Refuses times that do not
     rise within groups, and groups that have only one row each.
     """
-    rows_of = [np.flatnonzero(groups == group) for group in range(groups.max() + 1)]
-    for rows in rows_of:
-        falling = np.flatnonzero(np.diff(time[rows]) <= 0)
-        if len(falling):
-            first, second = rows[falling[0]], rows[falling[0] + 1]
-            raise ValueError(
-                f"times must increase within a group; row {second} has "
-                f"{time[second]:g} after {time[first]:g} of row {first}"
-            )
-    differences = np.concatenate([np.diff(time[rows]) for rows in rows_of])
-    if not len(differences):
+    order = np.argsort(groups, kind="stable")
+    apart, together = np.diff(time[order]), np.diff(groups[order]) == 0
+    falling = np.flatnonzero(together & (apart <= 0))
+    if len(falling):
+        first, second = order[falling[0] : falling[0] + 2]
+        raise ValueError(
+            f"times must increase within a group; row {second} has "
+            f"{time[second]:g} after {time[first]:g} of row {first}"
+        )
+    if not together.any():
         raise ValueError("no group has two rows, so that there is no sequence")
-    unit = float(np.median(differences))
-    found = []
-    for rows in rows_of:
-        lengths = np.maximum(np.rint(np.diff(time[rows]) / unit), 1).astype(int)
-        gaps = np.flatnonzero(lengths > max_gap) + 1
-        for part in np.split(np.arange(len(rows)), gaps):
-            steps = np.cumsum(np.append(0, lengths[part[:-1]]))
-            found.append((rows[part], steps))
-    return found, unit
+    unit = float(np.median(apart[together]))
+    lengths = np.maximum(np.rint(apart / unit), 1).astype(int)
+    steps = np.cumsum(np.append(0, lengths))
+    starts = np.flatnonzero(~together | (lengths > max_gap)) + 1
+    parts = zip(np.split(order, starts), np.split(steps, starts), strict=True)
+    return [(rows, places - places[0]) for rows, places in parts], unit

@@ -157,9 +157,8 @@ def smooth(
     )
     frames, rates = _smoothed_frames(alone, camera, sequences, estimate)
     scales = np.where(rates > LEAST_RATE * (1 + 1e-6), unit / rates, np.inf)
-    fit = frames.motion, frames.alpha, frames.covariance
-    motion, alpha, deviation = gauge.apply(*fit)
-    parts = motion, frames.translation, alpha, deviation
+    motion, *coefficients = gauge.apply(frames.motion, frames.alpha, frames.covariance)
+    parts = motion, frames.translation, *coefficients
     found = Decomposition(*(part.astype(dtype) for part in parts))
     return SmoothedCoefficients(found.alpha, found.alpha_std, scales, found)
 
@@ -321,12 +320,12 @@ def expected_gradient(
     over coefficients and cameras: central differences of all at once.
     """
 
+    def density(name: str, change: float) -> NDArray:
+        near = dynamics._replace(**{name: getattr(dynamics, name) + change})
+        return expected_log_density(near, moments, n_pairs, n_sequences)
+
     def difference(name: str) -> NDArray:
-        ends = []
-        for change in (1e-4, -1e-4):
-            near = dynamics._replace(**{name: getattr(dynamics, name) + change})
-            ends.append(expected_log_density(near, moments, n_pairs, n_sequences))
-        return (ends[0] - ends[1]) / 2e-4
+        return (density(name, 1e-4) - density(name, -1e-4)) / 2e-4
 
     K = len(dynamics.rates)
     shares = difference("shares")[:K] if len(dynamics.shares) else np.empty(0)

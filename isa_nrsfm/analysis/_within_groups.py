@@ -181,14 +181,13 @@ def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArra
     found, numbers = np.unique(names, return_inverse=True)
     sizes = np.bincount(numbers[used], minlength=len(found))
     if not sizes.all():
-        empty = [str(each) for each in found[sizes == 0]]
         what, remedy = "frame with coefficients", ""
         if neutral is not None:
             what, remedy = "neutral frame", ", or mark one of their frames as neutral"
         raise ValueError(
-            f"groups without a {what}: {len(empty)} of {len(found)} (first: "
-            f"{', '.join(empty[:5])}). Their coefficients have nothing to be compared "
-            f"with. Remove these groups{remedy}"
+            f"groups without a {what}: {np.sum(sizes == 0)} of {len(found)} (first: "
+            f"{', '.join(map(str, found[sizes == 0][:5]))}). Their coefficients have "
+            f"nothing to be compared with. Remove these groups{remedy}"
         )
     return found, indicators(numbers[used]).T @ X[used] / sizes[:, None]
 
@@ -313,15 +312,12 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
             The transformer.
         """
         points = _unit_points(validate_data(self, X, dtype=np.float64))
-        mean = points[0]
+        self.mean_ = points[0]
         for _ in range(100):
-            turned = _nearest_turns(points, mean).mean(axis=0)
-            turned /= np.sqrt(np.mean(np.abs(turned) ** 2))
-            change = np.abs(turned - mean).max()
-            mean = turned
-            if change < 1e-10:  # of its size
+            before, mean = self.mean_, _nearest_turns(points, self.mean_).mean(axis=0)
+            self.mean_ = mean / np.sqrt(np.mean(np.abs(mean) ** 2))
+            if np.abs(self.mean_ - before).max() < 1e-10:  # of its size
                 break
-        self.mean_ = mean
         return self
 
     def transform(self, X: Any) -> NDArray:
@@ -340,8 +336,7 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         """
         check_is_fitted(self)
         points = _unit_points(validate_data(self, X, dtype=np.float64, reset=False))
-        turned = _nearest_turns(points, self.mean_)
-        return np.ascontiguousarray(turned).view(float)
+        return np.ascontiguousarray(_nearest_turns(points, self.mean_)).view(float)
 
 
 def _unit_points(X: NDArray) -> NDArray:
