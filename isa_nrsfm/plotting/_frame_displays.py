@@ -1,8 +1,6 @@
 """Figures of frames: their coefficients, and their observed and reprojected points."""
 
-from __future__ import annotations
-
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +9,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables import FEWEST_POINTS, table_to_tracks, tracks_to_table, unmasked
-from isa_nrsfm.analysis._frame_columns import checked_column, kind_of
+from isa_nrsfm.analysis._frame_columns import checked_column, checked_std, kind_of
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import _views
 from isa_nrsfm.plotting._views import Edges, Origin, choose_lines, view_and_layout
@@ -99,12 +97,9 @@ class CoefficientsDisplay:
                 "alpha must have a row for each frame and a column for each basis "
                 f"shape; got shape {self.alpha.shape}"
             )
-        self.alpha_std = None if alpha_std is None else np.asarray(alpha_std, float)
-        if self.alpha_std is not None and self.alpha_std.shape != self.alpha.shape:
-            raise ValueError(
-                f"alpha_std must have the shape {self.alpha.shape} of alpha; "
-                f"got {self.alpha_std.shape}"
-            )
+        self.alpha_std = (
+            None if alpha_std is None else checked_std(alpha_std, self.alpha)
+        )
         n_frames, n_components = self.alpha.shape
         self.y, self.time, self.groups = (
             None if values is None else checked_column(name, values, n_frames)
@@ -130,7 +125,7 @@ class CoefficientsDisplay:
         component_names: list[str] | None = None,
         ax: Any = None,
         **kw: Any,
-    ) -> CoefficientsDisplay:
+    ) -> Self:
         """
         Draw the coefficients of a fitted estimator.
 
@@ -177,9 +172,7 @@ class CoefficientsDisplay:
         given["component_names"] = component_names
         return cls(alpha=alpha, alpha_std=deviation, **given).plot(ax, **kw)
 
-    def plot(
-        self, ax: Any = None, *, kind: Literal["auto"] | Kind = "auto"
-    ) -> CoefficientsDisplay:
+    def plot(self, ax: Any = None, *, kind: Literal["auto"] | Kind = "auto") -> Self:
         """
         Draw the coefficients.
 
@@ -230,8 +223,7 @@ class CoefficientsDisplay:
 
     def _draw_classes(self, axes: Any, k: int) -> None:
         """Draw box plots and the frames of each class, scattered sideways."""
-        assert self.y is not None
-        classes, members = _rows_of_largest(self.y)
+        classes, members = _rows_of_largest(np.asarray(self.y))
         finite_rows = [rows[np.isfinite(self.alpha[rows, k])] for rows in members]
         rng = np.random.default_rng(0)  # horizontal positions have no meaning
         x = np.repeat(np.arange(0.0, len(classes)), [len(rows) for rows in finite_rows])
@@ -417,8 +409,7 @@ class ReprojectionDisplay:
                 f"frames must name the {shape[0]} frames; got shape {self.frames.shape}"
             )
         self.frame_names = checked_names("frame_names", frame_names, self.frames)
-        first = self.reprojected[0]
-        _, self.skeleton, self.origin = choose_lines(edges, origin, first)
+        _, self.skeleton, self.origin = choose_lines(edges, origin, self.reprojected[0])
         self.edges = None if self.skeleton is None else self.skeleton.edges
         tables = map(tracks_to_table, (self.observed, self.reprojected))
         rows = zip(*tables, strict=True)
@@ -437,7 +428,7 @@ class ReprojectionDisplay:
         origin: Origin = "auto",
         ax: Any = None,
         **kw: Any,
-    ) -> ReprojectionDisplay:
+    ) -> Self:
         """
         Draw some frames of a table and their reprojection by a fitted estimator.
 
@@ -504,13 +495,10 @@ class ReprojectionDisplay:
             for each in (unmasked(table), estimator.reproject(table))
         )
         given: dict[str, Any] = {"frames": rows, "edges": skeleton, "origin": origin}
-        if hasattr(X, "iloc"):  # pandas: rows have names
-            given["frame_names"] = [*map(str, X.index[rows])]
+        given["frame_names"] = X.index[rows] if hasattr(X, "iloc") else None
         return cls(observed=observed, reprojected=reprojected, **given).plot(ax, **kw)
 
-    def plot(
-        self, ax: Any = None, *, n_columns: int | None = None
-    ) -> ReprojectionDisplay:
+    def plot(self, ax: Any = None, *, n_columns: int | None = None) -> Self:
         """
         Draw the frames.
 
@@ -539,40 +527,35 @@ class ReprojectionDisplay:
             ax, n_frames, "one for each frame", n_columns, figsize=size
         )
         self.figure_ = self.axes_[0].figure
-        self.observed_: list[Any] = []
-        self.reprojected_: list[Any] = []
-        self.errors_: list[Any] = []
-        self.edges_: list[Any] = []
-        for i, axes in enumerate(self.axes_):
-            self._plot_frame(axes, i)
+        panels = (self._plot_frame(axes, i) for i, axes in enumerate(self.axes_))
+        artists = ([*filter(None, each)] for each in zip(*panels, strict=True))
+        self.observed_, self.reprojected_, self.errors_, self.edges_ = artists
         if ax is None:
             entries = [self.observed_[0], self.reprojected_[0]]
             scale = 4.0 if _views.is_dense(self.observed[0]) else 1.0
             _views.add_legend(self.figure_, entries, self.skeleton, markerscale=scale)
         return self
 
-    def _plot_frame(self, axes: Any, i: int) -> None:
-        """Draw one frame."""
+    def _plot_frame(self, axes: Any, i: int) -> tuple[Any, ...]:
+        """Draw one frame; return both kinds of points, and errors and edges if any."""
         observed, reprojected = self.observed[i], self.reprojected[i]
+        errors = edges = None
         if self.skeleton is not None:
             colours = _views.side_colours(self.skeleton.edge_sides, _views.PLUS_COLOUR)
-            style = {"colors": colours, "alpha": 0.8}
             segments = reprojected[self.skeleton.edges]
-            self.edges_.append(_views.draw_segments(axes, segments, **style))
+            edges = _views.draw_segments(axes, segments, colors=colours, alpha=0.8)
         colour, thin = _views.OBSERVED_COLOUR, {"linewidths": 0.6}
-        style = {"color": colour}
+        style: dict[str, Any] = {"color": colour}
         if not _views.is_dense(observed):
             style = {"s": 14.0, "facecolors": "none", "edgecolors": colour} | thin
-            error = np.stack([observed, reprojected], axis=1)
-            self.errors_.append(
-                _views.draw_segments(axes, error, colors=colour, **thin)
-            )
-        drawn = _views.draw_points(axes, observed, label="observed", **style)
-        self.observed_.append(drawn)
+            segments = np.stack([observed, reprojected], axis=1)
+            errors = _views.draw_segments(axes, segments, colors=colour, **thin)
+        shown = _views.draw_points(axes, observed, label="observed", **style)
         style = {"color": _views.PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
-        self.reprojected_.append(_views.draw_points(axes, reprojected, **style))
+        fitted = _views.draw_points(axes, reprojected, **style)
         _views.hide_frame(axes)
         axes.set_aspect("equal", adjustable="datalim")
         axes.yaxis.set_inverted(self.origin == "upper")
         share = f"inverse SNR {_views.percent(self.inverse_snr[i])}"
         axes.set_title(f"row {self.frame_names[i]}\n{share}", fontsize="small")
+        return shown, fitted, errors, edges

@@ -1,8 +1,6 @@
 """Figures of a model: mean shape, drift along each basis shape, mode covariance."""
 
-from __future__ import annotations
-
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -172,7 +170,7 @@ class BasisShapeDisplay:
         origin: Origin = "auto",
         ax: Any = None,
         **kw: Any,
-    ) -> BasisShapeDisplay:
+    ) -> Self:
         """
         Draw the mean shape and the basis shapes of a fitted estimator.
 
@@ -237,7 +235,7 @@ class BasisShapeDisplay:
         components: ArrayLike | None = None,
         n_columns: int | None = None,
         point_kw: dict[str, Any] | None = None,
-    ) -> BasisShapeDisplay:
+    ) -> Self:
         """
         Draw the shapes.
 
@@ -272,8 +270,8 @@ class BasisShapeDisplay:
         )
         n_drawn = len(self.components_)
         drift, mean = n_std * self.basis[self.components_], self.mean_shape
-        moved = [np.stack([mean, mean + d, mean - d]) for d in drift]
-        limits, reduction = _views.block_limits([mean[None], *moved])
+        blocks = [mean[None], *(np.stack([mean, mean - d, mean + d]) for d in drift)]
+        limits, reduction = _views.block_limits(blocks)
         page = ax
         if ax is None:
             page = _views.new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
@@ -281,34 +279,28 @@ class BasisShapeDisplay:
         self.axes_, self.figure_ = axes.reshape(-1, 2), axes[0].figure
 
         size = f"{n_std:g} standard deviations"
-        below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
-        self.mean_: list[Any] = []
-        self.minus_: list[Any] = []
-        self.plus_: list[Any] = []
-        self.arrows_: list[Any] = []
-        for block, (pair, d) in enumerate(zip(self.axes_, [0, *drift], strict=True)):
-            shapes = [(self.mean_, mean, _views.MEAN_COLOUR, "mean shape")]
-            if block:
-                shapes.append((self.minus_, mean - d, _views.MINUS_COLOUR, below))
-                shapes.append((self.plus_, mean + d, _views.PLUS_COLOUR, above))
+        labels = "mean shape", f"\N{MINUS SIGN}{size}", f"+{size}"
+        colours = _views.MEAN_COLOUR, _views.MINUS_COLOUR, _views.PLUS_COLOUR
+        looks = [{"color": c, "label": t} for c, t in zip(colours, labels, strict=True)]
+        artists: list[list[Any]] = [[], [], [], []]
+        self.mean_, self.minus_, self.plus_, self.arrows_ = artists
+        for block, (pair, shapes) in enumerate(zip(self.axes_, blocks, strict=True)):
             for view, axis in zip(_views.VIEWS, pair, strict=True):
                 _views.hide_frame(axis)
                 _views.show_view(axis, view, limits[block], self.origin)
                 if not mean[:, view[0]].any():  # no depth, no side view
                     continue
-                for artists, shape, colour, label in shapes:
-                    style = {"color": colour, "label": label} | (point_kw or {})
-                    drawn = self._draw(axis, shape[:, view], style, not block)
-                    artists.append(drawn)
+                for drawn, shape, look in zip(artists, shapes, looks, strict=False):
+                    style = look | (point_kw or {})
+                    drawn.append(self._draw(axis, shape[:, view], style, not block))
                 if block and not _views.is_dense(mean):
-                    ends = (*mean[:, view].T, *d[:, view].T)
+                    ends = (*mean[:, view].T, *drift[block - 1][:, view].T)
                     self.arrows_.append(axis.quiver(*ends, **ARROW_STYLE))
-            title = self._title(block, reduction[block])
-            title = _views.wrap_title(title, pair)
+            title = _views.wrap_title(self._title(block, reduction[block]), pair)
             pair[0].set_title(title, loc="left", fontsize="small")
             pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
         if ax is None:
-            entries = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
+            entries = [drawn[-1] for drawn in artists[:3]]
             _views.add_legend(self.figure_, entries, self.skeleton, markerscale=3.0)
         return self
 
@@ -425,7 +417,7 @@ class ModeCovarianceDisplay:
     @classmethod
     def from_estimator(
         cls, estimator: Any, *, component_names: list[str] | None = None, ax: Any = None
-    ) -> ModeCovarianceDisplay:
+    ) -> Self:
         """
         Draw the mode covariance matrix of a fitted estimator.
 
@@ -455,7 +447,7 @@ class ModeCovarianceDisplay:
         matrix = estimator.mode_covariance_
         return cls(mode_covariance=matrix, component_names=component_names).plot(ax)
 
-    def plot(self, ax: Any = None) -> ModeCovarianceDisplay:
+    def plot(self, ax: Any = None) -> Self:
         """
         Draw the matrix: blue is negative, red positive and white zero.
 
@@ -493,11 +485,10 @@ class ModeCovarianceDisplay:
         # Of 16 labels of two digits some touch in the default figure.
         step = -(-len(names) // 12)
         cuts = np.arange(BLOCK, n_modes, BLOCK) - 0.5
-        ends = [-0.5, n_modes - 0.5]
-        lines = [[(cut, end) for end in ends] for cut in cuts]
-        lines += [[(end, cut) for end in ends] for cut in cuts]
+        upright = np.array([[(x, y) for y in (-0.5, n_modes - 0.5)] for x in cuts])
+        lines = np.concatenate([upright, upright[..., ::-1]])
         style = {"colors": "0.35", "linewidths": 0.6 / step, "capstyle": "butt"}
-        self.boundaries_ = _views.draw_segments(self.ax_, np.array(lines), **style)
+        self.boundaries_ = _views.draw_segments(self.ax_, lines, **style)
         centres = np.arange(0, len(names), step) * BLOCK + (BLOCK - 1) / 2
         for axis in (self.ax_.xaxis, self.ax_.yaxis):
             axis.set_ticks(centres, labels=names[::step])
@@ -510,9 +501,8 @@ class ModeCovarianceDisplay:
         # In the linear part, numbers beside zero would overlap.
         linear = 10 * LINEAR_SHARE * largest
         ticks = ticker.SymmetricalLogLocator(base=10, linthresh=linear)
-        bar = self.figure_.colorbar(
+        self.colorbar_ = self.figure_.colorbar(
             self.im_, ax=self.ax_, label="covariance", ticks=ticks
         )
-        bar.minorticks_off()
-        self.colorbar_ = bar
+        self.colorbar_.minorticks_off()
         return self

@@ -16,6 +16,7 @@ from scipy.spatial.distance import pdist, squareform
 
 from isa_nrsfm._compat.lazy import import_optional
 from isa_nrsfm._fitted_model import frames_of
+from isa_nrsfm._linalg import polar
 from isa_nrsfm.calibration import _metric, canonical_pose
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._column_names import checked_names, names_of_points
@@ -227,8 +228,7 @@ def viewing_rotation(cameras: NDArray, reference: NDArray, spread: NDArray) -> N
         axis, turned = np.outer(left[:, 0], right[0]), np.outer(left[:, 1], broadest)
         axes = axis + turned * (1 if np.sum(turned * reference) >= 0 else -1)
     else:
-        left, _, right = np.linalg.svd(reference, full_matrices=False)
-        axes = left @ right
+        axes = polar(reference)[0]
     return np.vstack([axes, np.cross(*axes)])
 
 
@@ -248,16 +248,13 @@ def view_and_layout(
     return view, *lines_of_model(estimator, edges, origin, shape)
 
 
-def lines_of_model(
-    estimator: Any, edges: Edges, origin: Origin, shape: NDArray
-) -> Lines:
+def lines_of_model(model: Any, edges: Edges, origin: Origin, shape: NDArray) -> Lines:
     """Return layout, lines and origin of a model with a mean shape (n_points, 3).
 
     Points without a layout are near each other if they are near in the images.
     """
-    gram = _metric.mean_gram(_metric.unit_cameras(np.asarray(estimator.motion_)))
-    points = estimator.mean_shape_ @ _metric.symmetric_power(gram, 0.5)
-    return choose_lines(edges, origin, shape, names_of_points(estimator), points)
+    points = model.mean_shape_ @ isotropic(np.asarray(model.motion_))
+    return choose_lines(edges, origin, shape, names_of_points(model), points)
 
 
 def depth_note(estimator: Any) -> str:
@@ -287,16 +284,18 @@ def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
     and y axes are those of `viewing_rotation`; T has a non-negative determinant.
     """
     G = _metric.metric_quadric(motion)
-    if G is None:
-        gram = _metric.mean_gram(_metric.unit_cameras(motion))
-        metric = _metric.symmetric_power(gram, 0.5)
-    else:
-        metric = _metric.symmetric_power(G, -0.5)
+    metric = isotropic(motion) if G is None else _metric.symmetric_power(G, -0.5)
     from_metric = np.linalg.pinv(metric)
     reference, spread = reference_motion @ from_metric, metric @ metric.T
     transform = viewing_rotation(motion @ from_metric, reference, spread) @ metric
     size = np.linalg.norm(motion @ np.linalg.pinv(transform), axis=(1, 2)) / np.sqrt(2)
     return transform * np.median(size[np.isfinite(size) & (size > 0)])
+
+
+def isotropic(motion: NDArray) -> NDArray:
+    """Return the transform (3, 3) of space whose lengths are those in the images."""
+    gram = _metric.mean_gram(_metric.unit_cameras(motion))
+    return _metric.symmetric_power(gram, 0.5)
 
 
 def choose_lines(
