@@ -90,7 +90,7 @@ def independent_length(rest: NDArray) -> int:
     slow drifts that single frames hide. Otherwise five times the length of the shortest
     means that are.
     """
-    length, n_scales = 1, len(rest).bit_length() - 3  # of eight means or more
+    length, n_scales = 1, len(rest).bit_length() - 3  # each of eight values or more
     for scale in range(1, n_scales + 1):
         threshold = norm.isf(0.05 / (rest.shape[1] * n_scales))
         r = np.sum(rest[1:] * rest[:-1], axis=0) * np.sqrt(len(rest))
