@@ -7,7 +7,6 @@ and the grouping of signals into subspaces by greedy pairwise swaps.
 import warnings
 from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
 from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
@@ -284,7 +283,6 @@ def likelihoods(signals: NDArray) -> Values:
 AGREEING = 3
 
 
-@dataclass(eq=False, repr=False)
 class FastISA(BaseSubspaceAnalysis):
     """
     Independent subspace analysis by fixed-point iteration from many starts.
@@ -368,14 +366,24 @@ class FastISA(BaseSubspaceAnalysis):
         "verbose": ["verbose"],
     }
 
-    subspace_size: int = 3
-    _: KW_ONLY
-    n_init: int = 30
-    max_iter: int = 500
-    tol: float = 1e-4
-    random_state: Any = None
-    n_jobs: int | None = None
-    verbose: int = 0
+    def __init__(
+        self,
+        subspace_size: int = 3,
+        *,
+        n_init: int = 30,
+        max_iter: int = 500,
+        tol: float = 1e-4,
+        random_state: Any = None,
+        n_jobs: int | None = None,
+        verbose: int = 0,
+    ):
+        self.subspace_size = subspace_size
+        self.n_init = n_init
+        self.max_iter = max_iter
+        self.tol = tol
+        self.random_state = random_state
+        self.n_jobs = n_jobs
+        self.verbose = verbose
 
     @scikit_learn.fit_context(nested=False)
     def fit(self, signals: Any, y: Any = None) -> Self:
@@ -451,7 +459,6 @@ class FastISA(BaseSubspaceAnalysis):
         return W, values, n_iter_ica + n_iter, converged
 
 
-@dataclass(eq=False, repr=False)
 class PooledFastICA(BaseSubspaceAnalysis):
     """
     Independent subspace analysis by FastICA and pooling of its components.
@@ -513,12 +520,20 @@ class PooledFastICA(BaseSubspaceAnalysis):
     (6, 6)
     """
 
-    subspace_size: int = 3
-    _: KW_ONLY
-    n_init: int = 16
-    max_iter: int = 200
-    tol: float = 1e-4
-    random_state: Any = None
+    def __init__(
+        self,
+        subspace_size: int = 3,
+        *,
+        n_init: int = 16,
+        max_iter: int = 200,
+        tol: float = 1e-4,
+        random_state: Any = None,
+    ):
+        self.subspace_size = subspace_size
+        self.n_init = n_init
+        self.max_iter = max_iter
+        self.tol = tol
+        self.random_state = random_state
 
     @scikit_learn.fit_context(nested=False)
     def fit(
