@@ -936,7 +936,7 @@ default="affine"
         Returns
         -------
         ndarray of shape (n_shapes, n_points, 3)
-            ``S_i = mean_shape_ + sum_k alpha_ik basis_[k]``, NaN for rows with NaN: what
+            ``S_i = mean_shape_ + sum_k alpha_ik basis_[k]``, NaN for rows with NaN, as
             `reconstruct` returns for the result of `decompose`.
 
         Raises

@@ -34,6 +34,9 @@ SAME_UNIT = (
 # above which it is poor; errors of depths likewise, of which the second withholds them.
 # Few points and frames: docs/benchmarks/README.md, "Thresholds".
 FIT, DEPTH = (0.02, 0.2), (0.2, LARGEST_SHARE)
+# Error of depths above which most true ones were larger: docs/depth.md, "Undetermined
+# depth".
+DOUBTFUL = 0.4
 FEW_POINTS = 10
 # What to do if other settings may be better; the command line does it by itself.
 COMPARE = "isa_nrsfm.AutoNRSfM().fit(X) compares other settings by held-out points"
@@ -112,7 +115,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         yield poor_fit(facts)
         return
     yield outlier_advice(facts)
-    yield (depth := depth_advice(facts))
+    yield depth_advice(facts)
     if facts.bent:  # outliers may cause all that follows
         return
     model, n_components = facts.model, len(facts.model.reliability_)
@@ -145,7 +148,7 @@ def _messages(facts: Facts) -> Iterator[str]:
         )
     if n_supported == n_components:
         yield facts.few
-    if not depth:
+    if frames_of(model).certainty.determined:
         yield facts.pose
 
 
@@ -184,12 +187,16 @@ def outlier_advice(facts: Facts) -> str:
 
 
 def depth_advice(facts: Facts) -> str:
-    """Return the message on depths that calibrated cameras do not determine."""
+    """Return the message on depths that calibrated cameras hardly determine, or not."""
     certainty = frames_of(facts.model).certainty
-    if facts.model.camera_ == "affine" or certainty.determined:
+    if facts.model.camera_ == "affine" or not certainty.total > DOUBTFUL:
         return ""
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
-    text = f"the depth of the shapes is not determined: {error}"
+    state, result = "not determined", "Angles and proportions are withheld"
+    if certainty.determined:
+        error += ", and larger for most such fits in tests"
+        state, result = "doubtful", "Compare angles and proportions with known ones"
+    text = f"the depth of the shapes is {state}: {error}"
     if facts.bent:
         return f"{text}. The outliers may be the reason"
     why, lacking = "parts of the points lead to different depths", "more points"
@@ -197,7 +204,7 @@ def depth_advice(facts: Facts) -> str:
         why = "deformation explains the images as well as rotations do"
         lacking = "the objects also from further sides, or turning further"
     return (
-        f"{text}, because {why}. Angles and proportions are withheld. Record {lacking}"
+        f"{text}, because {why}. {result}. Record {lacking}"
         f'{facts.compare}. See "How reliable is the depth?" in the documentation'
     )
 
