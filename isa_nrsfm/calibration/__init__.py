@@ -22,42 +22,32 @@ axes and the sign of the depth remain unknown: the mirror image, ``z -> -z``, ha
 same images.
 """
 
-from isa_nrsfm.calibration._canonical_pose import (
-    CanonicalPose,
-    ViewAngles,
-    angle_deviations,
-    canonical_pose,
-    view_angles,
-)
-from isa_nrsfm.calibration._deformation_metric import (
-    DeformationMetric,
-    EuclideanFrames,
-    deformation_metric,
-    euclidean_frames,
-)
-from isa_nrsfm.calibration._metric_upgrade import (
-    MetricUpgrade,
-    euclidean_shapes,
-    metric_upgrade,
-)
-from isa_nrsfm.calibration._orthonormal_cameras import (
-    OrthonormalCameras,
-    orthonormal_cameras,
-)
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "CanonicalPose",
-    "DeformationMetric",
-    "EuclideanFrames",
-    "MetricUpgrade",
-    "OrthonormalCameras",
-    "ViewAngles",
-    "angle_deviations",
-    "canonical_pose",
-    "deformation_metric",
-    "euclidean_frames",
-    "euclidean_shapes",
-    "metric_upgrade",
-    "orthonormal_cameras",
-    "view_angles",
-]
+from isa_nrsfm._compat.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from isa_nrsfm.calibration._canonical_pose import (
+        CanonicalPose as CanonicalPose,
+        ViewAngles as ViewAngles,
+        angle_deviations as angle_deviations,
+        canonical_pose as canonical_pose,
+        view_angles as view_angles,
+    )
+    from isa_nrsfm.calibration._deformation_metric import (
+        DeformationMetric as DeformationMetric,
+        EuclideanFrames as EuclideanFrames,
+        deformation_metric as deformation_metric,
+        euclidean_frames as euclidean_frames,
+    )
+    from isa_nrsfm.calibration._metric_upgrade import (
+        MetricUpgrade as MetricUpgrade,
+        euclidean_shapes as euclidean_shapes,
+        metric_upgrade as metric_upgrade,
+    )
+    from isa_nrsfm.calibration._orthonormal_cameras import (
+        OrthonormalCameras as OrthonormalCameras,
+        orthonormal_cameras as orthonormal_cameras,
+    )
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

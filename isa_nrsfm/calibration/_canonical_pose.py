@@ -10,6 +10,9 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
 
+# What determines the x, y and z axes: the last two are opposite to their axes.
+DIRECTIONS = ("left_right", "up", "front")
+
 
 class CanonicalPose(NamedTuple):
     """
@@ -113,46 +116,39 @@ def canonical_pose(
             "shape must be of the shape (n_points, 3) and finite; got the shape "
             f"{points.shape} with {np.sum(~np.isfinite(points))} entries that are not"
         )
+    given: dict[str, Any] = {"left_right": left_right, "up": up, "front": front}
     if scheme is not None:
         layout = checked_skeleton(scheme, len(points))
         if not layout.up:
             raise ValueError(f"scheme={layout.name!r} does not define which way is up")
-        up = layout.up if up is None else up
-        if left_right is None and len(layout.left_right):
-            left_right = layout.left_right
-        if front is None and layout.front:
-            front = layout.front
-        if left_right is None and front is None:
-            front = (0.0, 0.0, -1.0)  # to the viewer
-    right = None if left_right is None else _principal_direction(points, left_right)
-    down = None if up is None else -_direction("up", points, up)
-    away = None if front is None else -_direction("front", points, front)
-    axes: Any = [right, down, away]
-    n_given = sum(axis is not None for axis in axes)
-    if n_given == 1:
+        for name in DIRECTIONS:
+            if given[name] is None and len(getattr(layout, name)):
+                given[name] = getattr(layout, name)
+        if given["left_right"] is None and given["front"] is None:
+            given["front"] = (0.0, 0.0, -1.0)  # to the viewer
+    axes = {n: _axis(n, points, d) for n, d in given.items() if d is not None}
+    if len(axes) == 1:
         raise ValueError(
             "two of left_right, up and front determine the pose; only one is given"
         )
-    rotation = _frame(axes) if n_given else _principal_axes(points)
-    mirrored = n_given == 3 and bool(rotation[2] @ axes[2] < 0)
+    rotation = _frame(axes) if axes else _principal_axes(points)
+    mirrored = len(axes) == 3 and bool(rotation[2] @ axes["front"] < 0)
     if mirrored:
         rotation[2] *= -1
     return CanonicalPose(points @ rotation.T, rotation, mirrored)
 
 
-def _frame(axes: list[Any]) -> NDArray:
+def _frame(axes: dict[str, NDArray]) -> NDArray:
     """Return the rotation whose rows are the first two axes that are known."""
-    first, second, *_ = (i for i, axis in enumerate(axes) if axis is not None)
-    pair = [axes[first], axes[second]]
+    (first, second), pair = [*axes][:2], [*axes.values()][:2]
     sine = np.linalg.norm(np.cross(*pair))
     if sine < 1e-6:
-        names = ("left_right", "up", "front")
         raise ValueError(
-            f"{names[first]} and {names[second]} must not be parallel; the sine of "
-            f"their angle is {sine:.1e}"
+            f"{first} and {second} must not be parallel; the sine of their angle is "
+            f"{sine:.1e}"
         )
     # An infinite weight: the first axis becomes the coordinate axis, exactly.
-    rows = np.eye(3)[[first, second]]
+    rows = np.eye(3)[[DIRECTIONS.index(first), DIRECTIONS.index(second)]]
     return Rotation.align_vectors(rows, pair, weights=[np.inf, 1])[0].as_matrix()
 
 
@@ -169,18 +165,18 @@ def _principal_axes(points: NDArray) -> NDArray:
     return rotation
 
 
-def _principal_direction(points: NDArray, pairs: ArrayLike) -> NDArray:
-    """Return the unit vector from left to right points."""
-    difference = _differences("left_right", points, pairs)
-    axis = np.linalg.svd(difference, full_matrices=False)[2][0]
-    along = axis @ difference.sum(axis=0)
-    if not along:
-        raise ValueError("the pairs of left_right have no direction in common")
-    return axis * np.sign(along)
+def _axis(name: str, points: NDArray, given: Any) -> NDArray:
+    """Return the unit vector that becomes the x, y or z axis, of a direction.
 
-
-def _direction(name: str, points: NDArray, given: ArrayLike) -> NDArray:
-    """Return the unit vector of a direction, given itself or by pairs of points."""
+    It is given itself or by pairs of points: to the right, up or to the front.
+    """
+    if name == "left_right":
+        difference = _differences(name, points, given)
+        axis = np.linalg.svd(difference, full_matrices=False)[2][0]
+        along = axis @ difference.sum(axis=0)
+        if not along:
+            raise ValueError("the pairs of left_right have no direction in common")
+        return axis * np.sign(along)
     vector = np.asarray(given)
     if vector.shape == (3,):
         vector = vector.astype(np.float64)
@@ -194,7 +190,7 @@ def _direction(name: str, points: NDArray, given: ArrayLike) -> NDArray:
     size = np.linalg.norm(vector)
     if not 0 < size < np.inf:
         raise ValueError(f"{name} must be a direction other than zero; got {vector}")
-    return vector / size
+    return -vector / size
 
 
 def _differences(name: str, points: NDArray, pairs: ArrayLike) -> NDArray:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._frames.camera_models import full_rotations, nearest_calibrated
+from isa_nrsfm._frames.camera_models import compose, full_rotations, nearest_calibrated
 from isa_nrsfm._linalg import OF_DIFFERENCES, procrustes
 from isa_nrsfm._tables import of_all_rows
 from isa_nrsfm.calibration._metric import MetricFit, refine_metric
@@ -13,7 +13,7 @@ from isa_nrsfm.calibration._metric_upgrade import (
     fit_metric,
     quality,
     symmetric_upgrade,
-    usable_cameras,
+    usable_frames,
 )
 
 
@@ -112,10 +112,7 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     :math:`0.3^2` for the strains. Few frames, or cameras that are not weak-perspective
     ones, lead to small strains.
     """
-    cameras, usable = usable_cameras(motion)
-    weights = np.asarray(alpha, dtype=np.float64)
-    usable = usable & np.isfinite(weights).all(axis=1)
-    cameras, weights = cameras[usable], weights[usable]
+    cameras, weights, _ = usable_frames(motion, alpha)
     fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
     # The symmetric Q is the fitted one times a rotation, which turns the strains.
     turn, Q = symmetric_upgrade(fit[0][0], cameras)
@@ -188,20 +185,15 @@ def euclidean_frames(
     >>> mean_shape_error_3d(faces.shapes, frames.shapes, convention="frame") < 0.02
     True
     """
-    cameras, usable = usable_cameras(motion, least=0)
-    weights = np.asarray(alpha, dtype=np.float64)
+    cameras, weights, usable = usable_frames(motion, alpha, least=0)
     mean = np.asarray(mean_shape, dtype=np.float64)
-    directions = np.asarray(basis, dtype=np.float64)
-    usable = usable & np.isfinite(weights).all(axis=1)
-    cameras, weights = cameras[usable], weights[usable]
-
     # The metric of each frame. Unusual coefficients stretch no direction by more than
     # exp(1 / 2).
     stretch, axes = np.linalg.eigh(np.tensordot(weights, metric.strain, 1))
     growth = np.exp(np.clip(stretch, -1.0, 1.0) / 2)
     Q = metric.Q @ (axes * growth[:, None]) @ axes.mT
     cameras = cameras @ Q
-    shapes = mean + np.tensordot(weights, directions, 1)
+    shapes = compose(mean, np.asarray(basis, dtype=np.float64), weights)
     shapes = shapes @ np.linalg.inv(Q).mT
     # A camera is a stretch times rows of a rotation. In the axes of the image, the
     # stretch is moved to the shape, and the scaled rotation remains.

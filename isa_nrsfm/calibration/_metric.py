@@ -104,8 +104,7 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     """
     cameras = unit_cameras(motion)
     gram = mean_gram(cameras)
-    eigenvalues = np.linalg.eigvalsh(gram)
-    if eigenvalues[0] <= OF_RANKS * eigenvalues[-1]:
+    if np.linalg.matrix_rank(gram, rtol=OF_RANKS, hermitian=True) < 3:
         return None
     # In coordinates where the mean of M_i^T M_i is the identity, the fixed mean is the
     # trace of G. So G is I / 3 plus a matrix of trace zero with five unknowns.

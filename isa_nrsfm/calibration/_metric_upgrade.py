@@ -140,17 +140,16 @@ def metric_upgrade(
     >>> np.round(ratio, 3)
     array([1.502, 0.781, 0.781])
     """
-    cameras, usable = usable_cameras(motion)
+    cameras, _, usable = usable_frames(motion)
     if camera not in CALIBRATED_CAMERAS:
         raise ValueError(f"camera must be one of {CALIBRATED_CAMERAS}; got {camera!r}")
-    fit = fit_metric(cameras[usable], camera)
-    _, Q = symmetric_upgrade(fit[0][0], cameras[usable])
-    rows, scales = nearest_calibrated(cameras[usable] @ Q)
+    fit = fit_metric(cameras, camera)
+    _, Q = symmetric_upgrade(fit[0][0], cameras)
+    rows, scales = nearest_calibrated(cameras @ Q)
     if camera == "orthographic":
         scales = np.ones_like(scales)
-    parts = full_rotations(rows)[0], scales
-    rotations, scales = (of_all_rows(values, usable) for values in parts)
-    return MetricUpgrade(Q, rotations, scales, *quality(*fit, usable.sum()))
+    parts = (of_all_rows(each, usable) for each in (full_rotations(rows)[0], scales))
+    return MetricUpgrade(Q, *parts, *quality(*fit, len(cameras)))
 
 
 def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
@@ -191,8 +190,13 @@ def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
     return points @ np.linalg.inv(matrix).T
 
 
-def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]:
-    """Return cameras (I, 2, 3) and the mask of usable ones, at least `least`."""
+def usable_frames(
+    motion: ArrayLike, alpha: ArrayLike | None = None, least: int = 1
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the usable cameras (I, 2, 3) and coefficients (I, K), and their mask.
+
+    At least `least` cameras must be given. There are no coefficients without `alpha`.
+    """
     cameras = np.asarray(motion, dtype=np.float64)
     if cameras.ndim != 3 or cameras.shape[1:] != (2, 3) or len(cameras) < least:
         raise ValueError(
@@ -202,8 +206,10 @@ def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]
         raise ValueError(
             f"motion must not be infinite; {np.isinf(cameras).sum()} entries are"
         )
+    weights = np.zeros((len(cameras), 0)) if alpha is None else np.asarray(alpha, float)
     usable = np.isfinite(cameras).all(axis=(1, 2)) & cameras.any(axis=(1, 2))
-    return cameras, np.asarray(usable)
+    usable &= np.isfinite(weights).all(axis=1)
+    return cameras[usable], weights[usable], usable
 
 
 def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> _metric.MetricFit:
@@ -211,8 +217,7 @@ def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> _metric.MetricFit:
     gram = np.zeros((3, 3))
     if len(cameras):
         gram = _metric.mean_gram(_metric.unit_cameras(cameras))
-    eigenvalues = np.linalg.eigvalsh(gram)
-    n_seen = np.count_nonzero(eigenvalues > OF_RANKS * eigenvalues[-1])
+    n_seen = np.linalg.matrix_rank(gram, rtol=OF_RANKS, hermitian=True)
     if n_seen < 3:
         raise ValueError(
             "a metric upgrade needs cameras that together see three directions of "
@@ -231,12 +236,12 @@ def best_metric(motion: NDArray) -> NDArray:
 
     The identity if they do not see three directions of space.
     """
-    cameras, usable = usable_cameras(motion)
+    cameras, *_ = usable_frames(motion)
     try:
-        metric, *_ = fit_metric(cameras[usable], "weak_perspective")
+        metric, *_ = fit_metric(cameras, "weak_perspective")
     except ValueError:
         return np.eye(3)
-    return symmetric_upgrade(metric[0], cameras[usable])[1]
+    return symmetric_upgrade(metric[0], cameras)[1]
 
 
 def symmetric_upgrade(Q: NDArray, cameras: NDArray) -> tuple[NDArray, NDArray]:

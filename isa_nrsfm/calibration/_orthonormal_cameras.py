@@ -118,13 +118,11 @@ def orthonormal_cameras(
     if not noise_variance >= 0:
         raise ValueError(f"noise_variance must not be negative; got {noise_variance}")
     kept, basis, inverse = _orthonormal_columns(P)
-    price = NOISE_PRICE * noise_variance
-    n_columns = basis.shape[1]
+    roots = np.sqrt(NOISE_PRICE * noise_variance) * inverse
     mixing, lowest_cost = np.eye(3), np.inf
-    for n in range(3, n_columns + STEP, STEP):
-        n = min(n, n_columns)
-        roots = np.sqrt(price) * inverse[:n, :n]
-        wider, cost = orthonormal_mixture(basis[:, :n], mixing, roots, max_iter)
+    for n in range(3, len(kept) + STEP, STEP):
+        columns, penalty = basis[:, :n], roots[:n, :n]
+        wider, cost = orthonormal_mixture(columns, mixing, penalty, max_iter)
         if not cost < lowest_cost:
             break
         mixing, lowest_cost = wider, cost
