@@ -84,7 +84,7 @@ def _within_unit_norm(rows: NDArray, n_atoms: int) -> NDArray:
 
 def code_frames(
     frames: NDArray, atoms: NDArray, sparsity: int, ridge: float
-) -> tuple[NDArray, NDArray]:
+) -> NDArray:
     """Find at most `sparsity` blocks for each frame by reweighted ridge regression.
 
     Alternately ``||W_i - sum_l P_il D_l||_F^2 + ridge * ||W_i||_F^2 sum_l ||P_il||_F^2
@@ -93,34 +93,31 @@ def code_frames(
     from limited data using FOCUSS", 1997). A block that alone explains a share x of the
     frame ends with the share ``(x + sqrt(x^2 - 4 x ridge)) / 2 - ridge``, or zero if x
     is below four times `ridge`. A frame without blocks gets that of its best atom.
-    Atoms have orthonormal rows, frames are non-zero. Returns blocks and a mask of
-    active ones.
+    Atoms have orthonormal rows, frames are non-zero. Returns blocks (n_frames, n_atoms,
+    2, 3), zero where an atom is not active.
     """
     n_frames, n_atoms = len(frames), len(atoms)
     rows = atoms.reshape(3 * n_atoms, -1)
     gram = (rows @ rows.T).reshape(n_atoms, 3, n_atoms, 3).transpose(0, 2, 1, 3)
     blocks = np.zeros((n_frames, n_atoms, 2, 3))
-    active = np.zeros((n_frames, n_atoms), dtype=bool)
     for part in gen_batches(n_frames, 1000):
         norms = np.linalg.norm(frames[part], axis=(1, 2))[:, None, None]
         right = (frames[part] / norms) @ rows.T
         right = right.reshape(-1, 2, n_atoms, 3).transpose(0, 2, 3, 1)
-        found, chosen, kept = _reweighted_ridge(gram, right, sparsity, ridge)
-        np.put_along_axis(active[part], chosen, kept, 1)
-        found = found * (norms[..., None] * kept[..., None, None])
+        found, chosen = _reweighted_ridge(gram, right, sparsity, ridge)
+        found *= norms[..., None]
         np.put_along_axis(blocks[part], chosen[..., None, None], found, 1)
 
-        lost = np.flatnonzero(~kept.any(axis=1))
+        lost = np.flatnonzero(~found.any(axis=(1, 2, 3)))
         best = np.linalg.norm(right[lost], axis=(2, 3)).argmax(axis=1)
-        active[part][lost, best] = True
         blocks[part][lost, best] = right[lost, best].transpose(0, 2, 1) * norms[lost]
-    return blocks, active
+    return blocks
 
 
 def _reweighted_ridge(
     gram: NDArray, right: NDArray, sparsity: int, ridge: float
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Return blocks of frames of norm one, their atoms, and which of them are active.
+) -> tuple[NDArray, NDArray]:
+    """Return blocks of frames of norm one, zero if not active, and their atoms.
 
     From ``D_l D_m^T`` (n_atoms, n_atoms, 3, 3) and ``D_l W_i^T`` (n_frames, n_atoms, 3,
     2). With ``P_il = w_il Z_il`` the equations ``(w G w + ridge) Z = w D W^T`` stay
@@ -149,29 +146,29 @@ def _reweighted_ridge(
         right = np.take_along_axis(right, kept[..., None, None], 1)
     # At convergence the norm of a block is ridge over that of its product with the
     # residual, which is less than one: a smaller block is vanishing.
-    return blocks.transpose(0, 1, 3, 2), chosen, weights > ridge
+    active = weights[..., None, None] > ridge
+    return np.where(active, blocks, 0.0).transpose(0, 1, 3, 2), chosen
 
 
 def update_atoms(
-    frames: NDArray, atoms: NDArray, blocks: NDArray, active: NDArray, replace: bool
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    frames: NDArray, atoms: NDArray, blocks: NDArray, replace: bool
+) -> tuple[NDArray, NDArray, NDArray]:
     """Fit each atom and its blocks in turn to the residual of the others.
 
-    Returns atoms, blocks, active, and residuals. An atom becomes the orthonormal rows
+    Returns atoms, blocks and residuals. An atom becomes the orthonormal rows
     of the best approximation of rank three; the sum of squared residuals never
     increases. With `replace`, an atom of fewer than three frames becomes the three main
     directions of the two frames with the largest residuals, and is inactive.
     """
-    atoms, blocks, active = atoms.copy(), blocks.copy(), active.copy()
+    atoms, blocks = atoms.copy(), blocks.copy()
     residuals = frames - np.einsum("ilrc,lcp->irp", blocks, atoms, optimize=True)
     n_replaced = 0
     for atom in range(len(atoms)):
-        users = np.flatnonzero(active[:, atom])
+        users = np.flatnonzero(blocks[:, atom].any(axis=(1, 2)))
         targets = residuals[users] + blocks[users, atom] @ atoms[atom]
         # An atom and its metric need three frames.
         if replace and len(users) < 3:
-            active[users, atom], blocks[users, atom] = False, 0.0
-            residuals[users] = targets
+            blocks[users, atom], residuals[users] = 0.0, targets
             worst = np.argsort(-np.sum(residuals**2, axis=(1, 2)), kind="stable")
             pair = np.take(worst, 2 * n_replaced + np.arange(2), mode="wrap")
             atoms[atom] = _main_directions(frames[pair])
@@ -181,7 +178,7 @@ def update_atoms(
             atoms[atom] = _main_directions(targets)
         blocks[users, atom] = targets @ atoms[atom].T
         residuals[users] = targets - blocks[users, atom] @ atoms[atom]
-    return atoms, blocks, active, residuals
+    return atoms, blocks, residuals
 
 
 def _main_directions(frames: NDArray) -> NDArray:
@@ -230,9 +227,7 @@ def align_blocks(blocks: NDArray, cameras: NDArray) -> NDArray:
     return O
 
 
-def chain_atoms(
-    atoms: NDArray, blocks: NDArray, active: NDArray
-) -> tuple[NDArray, NDArray, NDArray]:
+def chain_atoms(atoms: NDArray, blocks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Make cameras of the blocks of all atoms, in one orientation of space.
 
     Returns cameras R_i (I, 2, 3), coefficients c_il (I, n_atoms) and corrected atoms
@@ -243,6 +238,7 @@ def chain_atoms(
     first. R_i is the camera nearest to the block of the frame's first atom, ``c_il =
     <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
     """
+    active = blocks.any(axis=(2, 3))
     n_frames, n_atoms = active.shape
     cameras, has_camera = np.zeros((n_frames, 2, 3)), np.zeros(n_frames, dtype=bool)
     coefficients, shapes = np.zeros((n_frames, n_atoms)), np.zeros_like(atoms)
@@ -459,31 +455,28 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         frames = (W @ basis.T).reshape(n_frames, 2, -1) / unit
         random_state = check_random_state(self.random_state)
         atoms = group_sparse_atoms(frames, n_atoms, self.penalty, random_state)
-        atoms, blocks, active = self._block_ksvd(frames, atoms)
-        self.n_users_ = active.sum(axis=0)
-        cameras, coefficients, atoms = chain_atoms(atoms, blocks, active)
+        atoms, blocks = self._block_ksvd(frames, atoms)
+        self.n_users_ = blocks.any(axis=(2, 3)).sum(axis=0)
+        cameras, coefficients, atoms = chain_atoms(atoms, blocks)
         shapes = np.tensordot(coefficients, unit * (atoms @ basis), 1)
         return cameras, shapes.transpose(0, 2, 1)
 
-    def _block_ksvd(
-        self, frames: NDArray, atoms: NDArray
-    ) -> tuple[NDArray, NDArray, NDArray]:
+    def _block_ksvd(self, frames: NDArray, atoms: NDArray) -> tuple[NDArray, NDArray]:
         """Learn a dictionary by which a frame is a sum of at most `sparsity` blocks.
 
         A sweep codes the frames, then updates the atoms. Sweeps end one after the
         relative change of the residual falls to `tol`; in the last one no atom is
-        replaced. Returns atoms, blocks and active.
+        replaced. Returns atoms and blocks.
         """
         atoms = np.linalg.svd(atoms, full_matrices=False)[2]
         energy, residual, settled = float(np.sum(frames**2)), np.inf, False
         for n_iter in range(1, self.max_iter + 1):
             last = settled or n_iter == self.max_iter
-            blocks, active = code_frames(frames, atoms, self.sparsity, self.ridge)
-            updated = update_atoms(frames, atoms, blocks, active, not last)
-            atoms, blocks, active, residuals = updated
+            blocks = code_frames(frames, atoms, self.sparsity, self.ridge)
+            atoms, blocks, residuals = update_atoms(frames, atoms, blocks, not last)
             before, residual = residual, float(np.sum(residuals**2)) / energy
             if last:
                 break
             settled = abs(before - residual) <= self.tol * residual
         self.dictionary_residual_, self.n_iter_ = residual, n_iter
-        return atoms, blocks, active
+        return atoms, blocks

@@ -20,7 +20,6 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm import _tables
 from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import compose
 from isa_nrsfm._frames.gauge import canonical_rotation
@@ -87,7 +86,7 @@ class ShapeSequenceNRSfM(
         """
 
     @scikit_learn.fit_context(nested=False)
-    @one_blas_thread()
+    @scikit_learn.one_blas_thread()
     def fit(self, X: Any, y: Any = None) -> Self:
         """
         Factorise a table.
@@ -128,31 +127,29 @@ class ShapeSequenceNRSfM(
         space = canonical_rotation(shapes.mean(axis=0), cameras)
         cameras, shapes = cameras @ space.T, shapes @ space.T
         components, coefficients, _ = principal_shapes(shapes, self.n_components)
-        mean_shape, basis = components[0], components[1:]
-        # Smaller deformations are rounding errors.
-        moving = np.linalg.norm(basis, axis=(1, 2)) > 1e-12 * np.linalg.norm(mean_shape)
+        sizes = np.linalg.norm(components, axis=(1, 2))
+        moving = sizes[1:] > 1e-12 * sizes[0]  # others are rounding errors
         signs = np.where(moving, orientations(coefficients.T), 0.0)
-        basis = signs[:, None, None] * basis
-        model = compose(mean_shape, basis, signs * coefficients)
+        components[1:] *= signs[:, None, None]
+        model = compose(components[0], components[1:], signs * coefficients)
         rests = [W - (cameras @ each.mT).reshape(W.shape) for each in (model, shapes)]
         noise, error = np.mean(np.square(rests), axis=(1, 2))
         self.inverse_snr_ = float(error / np.mean(W**2))
 
         # Without the scaling of frames the shapes have the unit of the table.
         unit, dtype, K = table.unit or 1.0, X.dtype, self.n_components
-        self.mean_shape_ = (unit * mean_shape).astype(dtype)
-        self.basis_ = (unit * basis).astype(dtype)
+        public = (unit * components).astype(dtype)
+        self.mean_shape_, self.basis_ = parts = public[0], public[1:]
         self.shapes_ = (unit * shapes).astype(dtype)
         self.motion_ = (table.sizes[:, None, None] / unit * cameras).astype(dtype)
         self.translation_ = table.translation.astype(dtype)
         # At least a share of the mean square of the coordinates.
         noise = max(float(noise), 1e-12)
         self.noise_variance_ = unit**2 * noise
-        shapes = np.concatenate([mean_shape[None], basis]).mT
         gauge, starts = FrameMap(np.eye(K + 1), unit * np.eye(3)), np.empty((0, K))
-        frames = FrameModel(shapes, noise, starts, "linear", gauge, "orthographic")
-        public = self.mean_shape_, self.basis_
-        self._model = TableModel(frames, *public, K, self.layout, table.unit)
+        camera = "orthographic"
+        frames = FrameModel(components.mT, noise, starts, "linear", gauge, camera)
+        self._model = TableModel(frames, *parts, K, self.layout, table.unit)
         self.alpha_ = self._decompose(X).alpha
         self._n_features_out = self.n_components
         return self
@@ -173,7 +170,7 @@ class ShapeSequenceNRSfM(
         """
         return self.decompose(X).alpha
 
-    @one_blas_thread()
+    @scikit_learn.one_blas_thread()
     def decompose(self, X: Any) -> Decomposition:
         """
         Return camera and coefficients of each frame of a table.
@@ -288,10 +285,11 @@ def _sign(values: NDArray) -> NDArray:
     return np.where(values < 0, -1.0, 1.0)
 
 
-def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
-    """Return the orthographic cameras (I, 2, 3) nearest to `orthonormal_cameras` of W.
+def least_norm_factors(W: NDArray, rank: int) -> tuple[NDArray, NDArray]:
+    """Return orthographic cameras R_i (I, 2, 3) and flat shapes that reproduce W.
 
-    The latter are in the span of the first ``3 * rank`` left singular vectors.
+    The cameras are nearest to `orthonormal_cameras` in the span of the first ``3 *
+    rank`` left singular vectors. The shapes have the least norm, ``S_i = R_i^+ W_i``.
     """
     S, Vt, residual = leading_triplets(W, 3 * rank)
     n_columns = int(np.sum(S > OF_RANKS * S[0]))
@@ -303,12 +301,8 @@ def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
     n_left = (len(W) - 3 * rank) * (W.shape[1] - 1 - 3 * rank)
     noise_variance = residual / n_left if n_left > 0 else 0.0
     motion = W @ Vt[:n_columns].T
-    return polar(orthonormal_cameras(motion, noise_variance).cameras)[0]
-
-
-def least_norm_shapes(W: NDArray, cameras: NDArray) -> NDArray:
-    """Return the flat shapes of least norm ``S_i = R_i^+ W_i`` that reproduce W."""
-    return W.reshape(len(cameras), 2, -1).transpose(0, 2, 1) @ cameras
+    cameras = polar(orthonormal_cameras(motion, noise_variance).cameras)[0]
+    return cameras, W.reshape(len(cameras), 2, -1).transpose(0, 2, 1) @ cameras
 
 
 def shrink(shapes: NDArray, amount: float, rank: int | None = None) -> NDArray:
@@ -421,8 +415,8 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
     def _factorise(self, W: NDArray) -> tuple[NDArray, NDArray]:
         """Return cameras and the shapes of least norm, of rank K + 1."""
         rank = self.n_components + 1
-        cameras = orthographic_cameras(W, rank)
-        return cameras, shrink(least_norm_shapes(W, cameras), 0.0, rank)
+        cameras, shapes = least_norm_factors(W, rank)
+        return cameras, shrink(shapes, 0.0, rank)
 
 
 class BlockMatrixNRSfM(ShapeSequenceNRSfM):
@@ -565,8 +559,7 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
     def _factorise(self, W: NDArray) -> tuple[NDArray, NDArray]:
         """Return cameras and the shapes of least nuclear norm, of rank K + 1."""
         rank = self.n_components + 1
-        cameras = orthographic_cameras(W, rank)
-        shapes = least_norm_shapes(W, cameras)
+        cameras, shapes = least_norm_factors(W, rank)
         self.n_iter_, converged = 0, True
         for price in 4.0 ** -np.arange(18):
             shapes, n_iter, settled = self._minimised(W, cameras, price, shapes)

@@ -34,14 +34,12 @@ if TYPE_CHECKING:
         canonical_pose as canonical_pose,
         view_angles as view_angles,
     )
-    from isa_nrsfm.calibration._deformation_metric import (
+    from isa_nrsfm.calibration._metric_upgrade import (
         DeformationMetric as DeformationMetric,
         EuclideanFrames as EuclideanFrames,
+        MetricUpgrade as MetricUpgrade,
         deformation_metric as deformation_metric,
         euclidean_frames as euclidean_frames,
-    )
-    from isa_nrsfm.calibration._metric_upgrade import (
-        MetricUpgrade as MetricUpgrade,
         euclidean_shapes as euclidean_shapes,
         metric_upgrade as metric_upgrade,
     )

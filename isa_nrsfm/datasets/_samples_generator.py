@@ -26,6 +26,10 @@ from isa_nrsfm.skeletons import get_skeleton
 FlatCamera = Literal["weak_perspective", "affine", "orthographic"]
 Camera = FlatCamera | Literal["perspective"]
 FLAT_CAMERAS = get_args(FlatCamera)
+Range = tuple[float, float]
+# Returns the shapes (n, n_points, 3) of a new person, x to the right, y down, z away,
+# at times (n,) for weights (n, n_poses) of poses that add up to one.
+Build = Callable[[NDArray, NDArray, RandomState], NDArray[np.float64]]
 
 # Constraints of the parameters that all generated tables have in common.
 PARAMETERS: dict[str, list[Any]] = {
@@ -48,11 +52,11 @@ IMAGE, NEAREST, FARTHEST = np.array([1280.0, 720.0]), 0.85, 1.15
 
 def lens_of(
     camera: Camera,
-    focal_length: float | None,
-    distance: float | None,
-    scales: tuple[float, float],
+    focal_length: Any,
+    distance: Any,
+    scales: Range,
     usual_distance: float,
-) -> tuple[tuple[float, float], float | None]:
+) -> tuple[Range, float | None]:
     """Return the scales of cameras, other ones if perspective, and a focal length."""
     if camera == "perspective":
         focal_length = float(focal_length or 1000.0)
@@ -185,10 +189,8 @@ SIGNED_COMPONENTS = ("face width",)
 
 
 @checked_parameters(
-    {
-        **PARAMETERS,
-        "n_components": [Interval(Integral, 0, len(COMPONENT_NAMES), closed="both")],
-    }
+    PARAMETERS
+    | {"n_components": [Interval(Integral, 0, len(COMPONENT_NAMES), closed="both")]}
 )
 def make_face_tracks(
     n_frames: int = 400,
@@ -916,17 +918,9 @@ def _hand(time: NDArray, weights: NDArray, rng: RandomState) -> NDArray[np.float
 
 
 def perform(
-    n_frames: int,
-    n_people: int,
-    poses: tuple[str, ...],
-    build: Callable[[NDArray, NDArray, RandomState], NDArray],
-    rng: RandomState,
+    n_frames: int, n_people: int, poses: Sequence[str], build: Build, rng: RandomState
 ) -> tuple[NDArray, NDArray, dict[str, NDArray]]:
-    """Return shapes of people who take poses in turn, a path (n, 6), and the truths.
-
-    ``build(time, weights, rng)`` returns the shapes (n, n_points, 3) of a new person, x
-    to the right, y down, z away, for weights (n, n_poses) that add up to one.
-    """
+    """Return shapes of people who take poses in turn, a path (n, 6), and the truths."""
     if n_frames < 2 * n_people:
         raise ValueError(
             f"n_frames must be at least 2 frames for each of {n_people} people; got "

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -275,9 +276,19 @@ def point_distribution_model(
         shapes = _aligned(shapes)
     mean = shapes.mean(axis=0)
     modes, variances = _principal_axes((shapes - mean).reshape(len(shapes), -1))
-    n_kept = _number_of_modes(n_modes, len(model.basis_), variances)
-    modes = modes[:n_kept].reshape(-1, *mean.shape)
-    return PointDistributionModel(mean, modes, variances[:n_kept])
+    kept: Any = n_modes
+    if n_modes is None:
+        kept = len(model.basis_)
+    elif not isinstance(n_modes, Integral):
+        share = np.cumsum(variances) / variances.sum()
+        kept = np.searchsorted(share, n_modes) + 1
+    elif n_modes > len(variances):
+        raise ValueError(
+            f"n_modes must be at most {len(variances)}, the number of principal axes "
+            f"of the shapes; got {n_modes}"
+        )
+    modes = modes[:kept].reshape(-1, *mean.shape)
+    return PointDistributionModel(mean, modes, variances[:kept])
 
 
 def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None:
@@ -387,31 +398,14 @@ def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
         try:
             n_rows, n_columns, _ = map(int, words[:3])
             size = n_rows * n_columns
-            matrices.append(np.array(words[3 : 3 + size], float).reshape(n_rows, -1))
-            if matrices[-1].shape[1] != n_columns:
-                raise ValueError(f"{matrices[-1].shape[1]} columns for {n_columns}")
+            numbers = np.array(words[3 : 3 + size], float)
+            matrices.append(numbers.reshape(n_rows, n_columns))
         except ValueError as error:
             raise ValueError(
                 f"where there should be {comment.partition(':')[0].lower()}: {error}"
             ) from error
         words = words[3 + size :]
     return matrices
-
-
-def _number_of_modes(n_modes: Any, n_components: int, variances: NDArray) -> int:
-    """Return how many of the principal axes are wanted."""
-    n_axes = len(variances)
-    if n_modes is None:
-        return min(n_components, n_axes)
-    if not isinstance(n_modes, Integral):
-        share = np.cumsum(variances) / variances.sum()
-        return int(np.searchsorted(share, n_modes)) + 1
-    if int(n_modes) > n_axes:
-        raise ValueError(
-            f"n_modes must be at most {n_axes}, the number of principal axes of the "
-            f"shapes; got {n_modes}"
-        )
-    return int(n_modes)
 
 
 def _aligned(shapes: NDArray) -> NDArray:
@@ -581,15 +575,13 @@ def write_points(
             sign = np.float64(getattr(model, "mirror_certainty_", np.nan))
             _write_netcdf(folder / path.name, points, names, fps, sign)
             return
-        deviations = folder / f"{path.stem}_std{path.suffix}"
-        if suffix == ".trc":
-            _write_trc(folder / path.name, points.position, names, fps)
-            _write_trc(deviations, points.position_std, names, fps)
-            return
-        flag = points.determined[..., None].astype(float)
-        std = np.concatenate([points.position_std, flag], axis=2)
-        _write_deeplabcut(folder / path.name, points.position, names, ("x", "y", "z"))
-        _write_deeplabcut(deviations, std, names, ("x", "y", "z", "determined"))
+        write: Any = partial(_write_trc, fps=fps)
+        std = points.position_std
+        if suffix != ".trc":
+            write = _write_deeplabcut
+            std = np.dstack([std, points.determined.astype(float)])
+        write(folder / path.name, points.position, names)
+        write(folder / f"{path.stem}_std{path.suffix}", std, names)
 
 
 def _write_netcdf(
@@ -625,11 +617,10 @@ def _write_netcdf(
                 setattr(file, name, value)
 
 
-def _write_deeplabcut(
-    path: Path, values: NDArray, names: Sequence[str], coords: tuple[str, ...]
-) -> None:
-    """Write values (n_frames, n_points, n_coords) as DeepLabCut does."""
-    levels = ["scorer", "bodyparts", "coords"]
+def _write_deeplabcut(path: Path, values: NDArray, names: Sequence[str]) -> None:
+    """Write x, y, z, and what is determined, (n_frames, n_points, n) as DeepLabCut."""
+    levels, coords = ["scorer", "bodyparts", "coords"], ["x", "y", "z", "determined"]
+    coords = coords[: values.shape[2]]
     columns = pd.MultiIndex.from_product([[_SCORER], names, coords], names=levels)
     frame = pd.DataFrame(values.reshape(len(values), -1), columns=columns)
     if path.suffix.lower() == ".csv":

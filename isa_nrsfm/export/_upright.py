@@ -76,20 +76,14 @@ def upright_space(
     else:
         metric = calibration.deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
-        transform = _views.viewing_rotation(
-            model.motion_ @ metric.Q,
-            model.reference_motion_ @ metric.Q,
-            to_metric @ to_metric.T,
-        )
+        views = model.motion_ @ metric.Q, model.reference_motion_ @ metric.Q
+        transform = _views.viewing_rotation(*views, to_metric @ to_metric.T)
     shape = model.mean_shape_ @ (transform @ to_metric).T
-    image_axes = np.eye(3)
     layout, lines, origin = _views.lines_of_model(model, edges, origin, shape)
-    if origin == "lower":
-        image_axes[1, 1] = -1
-        transform, shape = _views.UPSIDE_DOWN @ transform, shape @ _views.UPSIDE_DOWN
-    transform = _views.upright_turn(shape, layout, "upper") @ transform
+    over = _views.UPSIDE_DOWN if origin == "lower" else np.eye(3)
+    transform = over @ _views.upright_turn(shape, layout, origin) @ transform
     # Rotations stay rotations.
-    image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
+    image_axes = over * [1.0, 1.0, np.sign(np.linalg.det(transform))]
     return UprightSpace(calibrated, metric, transform, image_axes, lines)
 
 

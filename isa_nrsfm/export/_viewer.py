@@ -284,9 +284,9 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
         )
     keys: list[tuple[Any, ...]] = []  # numbers first, those without a label last
     for value in values.tolist():
-        number = not is_missing(value) and isinstance(value, Real)
-        text = UNLABELLED if is_missing(value) else str(value)
-        keys.append((is_missing(value), not number, value if number else 0, text))
+        kind = 2 if is_missing(value) else int(not isinstance(value, Real))
+        text = UNLABELLED if kind == 2 else str(value)
+        keys.append((kind, 0 if kind else value, text))
     found = sorted(set(keys))
     if len(found) > MOST_LABELS:
         raise ValueError(
