@@ -270,7 +270,7 @@ def point_distribution_model(
     ((68, 3), (1, 68, 3), (1,))
     """
     space = _upright.upright_space(model, camera, origin)
-    shapes = _upright.upright_shapes(space, model, None)
+    shapes = space.shapes(None)
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
     if space.camera is not None:
         shapes = _aligned(shapes)

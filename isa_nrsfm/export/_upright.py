@@ -7,7 +7,6 @@ table determine them. Shapes of calibrated cameras are only rotated.
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -34,7 +33,7 @@ Camera = Literal["weak_perspective"] | None
 
 
 class UprightSpace(NamedTuple):
-    """The transform from the space of a model to the upright space.
+    """A model, and the transform from its space to the upright space.
 
     ``shape @ transform.T`` is upright; the transform of Euclidean shapes is orthogonal.
     `camera` is None for affine shapes; `metric`, or None, makes shapes of affine
@@ -42,11 +41,91 @@ class UprightSpace(NamedTuple):
     upright ones; `lines` are those to draw, of the layout if it is known.
     """
 
+    model: Any
     camera: str | None
     metric: calibration.DeformationMetric | None
     transform: NDArray
     image_axes: NDArray
     lines: Skeleton | None
+
+    def decompose(self, X: Any, point_weight: Any = None) -> tuple[NDArray, NDArray]:
+        """Return cameras and coefficients of a table or of frames that are fitted.
+
+        Rotations lead to the axes of the camera, if known. None is the fitted table.
+        """
+        model = self.model
+        if X is None:
+            alpha = model.alpha_ + removed_part(model, model.motion_)
+            return in_camera_axes(model, model.motion_, model.translation_), alpha
+        if not isinstance(X, Decomposition):
+            X = model.decompose(X, point_weight=point_weight)
+        return in_camera_axes(model, X.motion, X.translation), X.alpha
+
+    def frames(self, motion: NDArray, alpha: NDArray) -> calibration.EuclideanFrames:
+        """Return upright Euclidean shapes, rotations and scales of frames.
+
+        NaN for frames without a camera. Rotations lead to the image turned upright.
+        """
+        if self.metric is None:
+            rotations, scales = full_rotations(np.asarray(motion, dtype=np.float64))
+            shapes = compose(self.model.mean_shape_, self.model.basis_, alpha)
+        else:
+            shapes, rotations, scales = calibration.euclidean_frames(
+                self.metric, motion, alpha, self.model.mean_shape_, self.model.basis_
+            )
+        rotations = self.image_axes @ rotations @ self.transform.T
+        return calibration.EuclideanFrames(shapes @ self.transform.T, rotations, scales)
+
+    def shapes(self, X: Any) -> NDArray:
+        """Return the upright shapes of the frames of `decompose`."""
+        return self.frames(*self.decompose(X)).shapes
+
+    def viewed_shapes(self) -> NDArray[np.float64]:
+        """Return the centred mean shape and the basis shapes (K + 1, J, 3) to look at.
+
+        They are upright, but y points up and z to the viewer. Euclidean shapes of
+        affine cameras are not exactly linear in the coefficients. For these, the result
+        is a least squares fit to the frames of the table, in blocks.
+        """
+        model = self.model
+        shapes = np.stack([model.mean_shape_, *model.basis_])
+        if self.metric is None:
+            shapes = shapes @ self.transform.T
+        else:
+            n_shapes, size = len(shapes), shapes[0].size
+            gram, product = (np.zeros((n_shapes, n)) for n in (n_shapes, size))
+            for block in gen_batches(len(model.alpha_), max(1, 2**23 // size)):
+                motion, alpha = model.motion_[block], model.alpha_[block]
+                frames = self.frames(motion, alpha).shapes
+                finite = np.isfinite(frames).all(axis=(1, 2))
+                weights = np.insert(alpha[finite].astype(np.float64), 0, 1.0, axis=1)
+                gram += weights.T @ weights
+                product += weights.T @ frames[finite].reshape(-1, size)
+            # Basis shapes of zeros have coefficients of zero.
+            fit = np.linalg.pinv(gram, hermitian=True) @ product
+            shapes = fit.reshape(shapes.shape)
+        shapes[0] -= shapes[0].mean(axis=0)
+        return shapes @ _views.UPSIDE_DOWN
+
+    def poses(self, X: Any, point_weight: Any = None) -> "FramePoses":
+        """Return the poses of frames."""
+        motion, alpha = self.decompose(X, point_weight)
+        shaped = alpha[:0] if self.metric is None else alpha  # no shapes are needed
+        _, rotations, scales = self.frames(motion, shaped)
+        # The fitted table must determine the depth.
+        determined = frames_of(self.model).certainty.determined
+        if self.metric is not None:
+            determined = self.metric.condition_number <= LARGEST_CONDITION
+        if not determined:
+            rotations = np.full_like(rotations, np.nan)
+        angles = calibration.view_angles(rotations)
+        deviations = np.full((3, len(scales)), np.nan)
+        joint = self.metric is None and self.model.refinement in JOINT_REFINEMENTS
+        if joint and not (X is None or isinstance(X, Decomposition)):
+            covariance = self.model.rotation_covariance(X, point_weight=point_weight)
+            turned = self.transform @ covariance @ self.transform.T
+            deviations = np.array(calibration.angle_deviations(angles, turned))
+        return FramePoses(*angles, np.asarray(scales), *deviations)
 
 
 def upright_space(
@@ -84,57 +163,7 @@ def upright_space(
     transform = over @ _views.upright_turn(shape, layout, origin) @ transform
     # Rotations stay rotations.
     image_axes = over * [1.0, 1.0, np.sign(np.linalg.det(transform))]
-    return UprightSpace(calibrated, metric, transform, image_axes, lines)
-
-
-def upright_frames(
-    space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
-) -> calibration.EuclideanFrames:
-    """Return upright Euclidean shapes, rotations and scales of frames.
-
-    NaN for frames without a camera. Rotations lead to the image turned upright.
-    """
-    if space.metric is None:
-        rotations, scales = full_rotations(np.asarray(motion, dtype=np.float64))
-        shapes = compose(model.mean_shape_, model.basis_, alpha)
-    else:
-        shapes, rotations, scales = calibration.euclidean_frames(
-            space.metric, motion, alpha, model.mean_shape_, model.basis_
-        )
-    rotations = space.image_axes @ rotations @ space.transform.T
-    return calibration.EuclideanFrames(shapes @ space.transform.T, rotations, scales)
-
-
-def upright_shapes(space: UprightSpace, model: Any, X: Any) -> NDArray:
-    """Return the upright shapes of the frames of `frames_of_table`."""
-    return upright_frames(space, model, *frames_of_table(model, X)).shapes
-
-
-def viewed_shapes(space: UprightSpace, model: Any) -> NDArray[np.float64]:
-    """Return the centred mean shape and the basis shapes (K + 1, J, 3) for a viewer.
-
-    They are upright, but y points up and z to the viewer. Euclidean shapes of affine
-    cameras are not exactly linear in the coefficients. For these, the result is a least
-    squares fit to the frames of the table, in blocks.
-    """
-    shapes = np.stack([model.mean_shape_, *model.basis_])
-    if space.metric is None:
-        shapes = shapes @ space.transform.T
-    else:
-        n_shapes, size = len(shapes), shapes[0].size
-        gram, product = (np.zeros((n_shapes, n)) for n in (n_shapes, size))
-        for block in gen_batches(len(model.alpha_), max(1, 2**23 // size)):
-            motion, alpha = model.motion_[block], model.alpha_[block]
-            frames = upright_frames(space, model, motion, alpha).shapes
-            finite = np.isfinite(frames).all(axis=(1, 2))
-            weights = np.insert(alpha[finite].astype(np.float64), 0, 1.0, axis=1)
-            gram += weights.T @ weights
-            product += weights.T @ frames[finite].reshape(-1, size)
-        # Basis shapes of zeros have coefficients of zero.
-        fit = np.linalg.pinv(gram, hermitian=True) @ product
-        shapes = fit.reshape(shapes.shape)
-    shapes[0] -= shapes[0].mean(axis=0)
-    return shapes @ _views.UPSIDE_DOWN
+    return UprightSpace(model, calibrated, metric, transform, image_axes, lines)
 
 
 def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:
@@ -145,21 +174,6 @@ def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:
             f"path must end in {' or '.join(suffixes)}; got {os.fspath(path)}"
         )
     return suffix
-
-
-def frames_of_table(
-    model: Any, X: Any, point_weight: Any = None
-) -> tuple[NDArray, NDArray]:
-    """Return cameras and coefficients of a table or of frames that are fitted.
-
-    Rotations lead to the axes of the camera, if known. None is the fitted table.
-    """
-    if X is None:
-        alpha = model.alpha_ + removed_part(model, model.motion_)
-        return in_camera_axes(model, model.motion_, model.translation_), alpha
-    if not isinstance(X, Decomposition):
-        X = model.decompose(X, point_weight=point_weight)
-    return in_camera_axes(model, X.motion, X.translation), X.alpha
 
 
 # The outer corners of the eyes, of the 68 points of a face.
@@ -313,31 +327,7 @@ def pose_function(
     """
     if camera is None:
         raise ValueError("angles need calibrated cameras; got camera=None")
-    space = upright_space(model, camera, origin, edges)
-    return partial(_poses, space, model)
-
-
-def _poses(
-    space: UprightSpace, model: Any, X: Any, point_weight: Any = None
-) -> FramePoses:
-    """Return the poses of frames in an upright space."""
-    motion, alpha = frames_of_table(model, X, point_weight)
-    shaped = alpha[:0] if space.metric is None else alpha  # no shapes are needed
-    _, rotations, scales = upright_frames(space, model, motion, shaped)
-    # The fitted table must determine the depth.
-    determined = frames_of(model).certainty.determined
-    if space.metric is not None:
-        determined = space.metric.condition_number <= LARGEST_CONDITION
-    if not determined:
-        rotations = np.full_like(rotations, np.nan)
-    angles = calibration.view_angles(rotations)
-    deviations = np.full((3, len(scales)), np.nan)
-    is_table = not (X is None or isinstance(X, Decomposition))
-    if is_table and space.metric is None and model.refinement in JOINT_REFINEMENTS:
-        covariance = model.rotation_covariance(X, point_weight=point_weight)
-        turned = space.transform @ covariance @ space.transform.T
-        deviations = np.array(calibration.angle_deviations(angles, turned))
-    return FramePoses(*angles, np.asarray(scales), *deviations)
+    return upright_space(model, camera, origin, edges).poses
 
 
 def point_distances(
@@ -407,7 +397,7 @@ def point_distances(
             )
         unit = EYES
     a, b = point_numbers(unit, names)
-    shapes = upright_shapes(space, model, X)
+    shapes = space.shapes(X)
     mean = np.nanmean(shapes, axis=0)
     size = np.linalg.norm(mean[a] - mean[b])
     if not size > 0:

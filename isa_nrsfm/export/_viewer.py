@@ -167,21 +167,21 @@ def write_viewer(
     # The first and the last row are among those shown.
     rows = np.linspace(0, max(n_rows - 1, 0), min(n_rows, n_frames)).astype(np.intp)
     if X is None or not len(rows):
-        motion, alpha = (part[rows] for part in _upright.frames_of_table(model, None))
+        motion, alpha = (part[rows] for part in space.decompose(None))
     else:
         weights = None if point_weight is None else taken_rows(point_weight, rows)
-        motion, alpha = _upright.frames_of_table(model, taken_rows(X, rows), weights)
+        motion, alpha = space.decompose(taken_rows(X, rows), weights)
     motion, alpha = np.asarray(motion), np.asarray(alpha)
     finite = np.isfinite(alpha).all(axis=1)
     rows, motion, alpha = rows[finite], motion[finite], alpha[finite]
     seconds = np.empty(0) if times is None else _seconds(times, n_rows)[rows]
 
-    shapes = _upright.viewed_shapes(space, model)
+    shapes = space.viewed_shapes()
     lines = space.lines
     size = np.linalg.norm(shapes[0], axis=1).max()
     rotations = np.empty((0, 3, 3))
     if space.camera is not None and len(motion):
-        rotations = _upright.upright_frames(space, model, motion, alpha).rotations
+        rotations = space.frames(motion, alpha).rotations
         rotations = UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
     labelled = hasattr(X, "iloc")  # pandas: rows have names
     kind = space.camera if frames_of(model).certainty.determined else "unknown"
@@ -363,7 +363,7 @@ def write_glb(
     _upright.suffix_of(path, [".glb"])
     space = _upright.upright_space(model, camera, origin, edges)
     targets = names_of_components(names, len(model.basis_))
-    shapes = _upright.viewed_shapes(space, model)
+    shapes = space.viewed_shapes()
     factor = 1 / np.ptp(shapes[0], axis=0).max()
     shapes = factor * shapes
     lines, surface = space.lines, None
