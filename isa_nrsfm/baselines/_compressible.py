@@ -238,7 +238,7 @@ def chain_atoms(atoms: NDArray, blocks: NDArray) -> tuple[NDArray, NDArray, NDAr
     first. R_i is the camera nearest to the block of the frame's first atom, ``c_il =
     <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
     """
-    active = blocks.any(axis=(2, 3))
+    active = np.asarray(blocks.any(axis=(2, 3)))
     n_frames, n_atoms = active.shape
     cameras, has_camera = np.zeros((n_frames, 2, 3)), np.zeros(n_frames, dtype=bool)
     coefficients, shapes = np.zeros((n_frames, n_atoms)), np.zeros_like(atoms)

@@ -138,7 +138,7 @@ def canonical_pose(
     return CanonicalPose(points @ rotation.T, rotation, mirrored)
 
 
-def _frame(axes: dict[str, NDArray]) -> NDArray:
+def _frame(axes: dict[str, Any]) -> NDArray:
     """Return the rotation whose rows are the first two axes that are known."""
     (first, second), pair = [*axes][:2], [*axes.values()][:2]
     sine = np.linalg.norm(np.cross(*pair))

@@ -148,8 +148,9 @@ def metric_upgrade(
     rows, scales = nearest_calibrated(cameras @ Q)
     if camera == "orthographic":
         scales = np.ones_like(scales)
-    parts = (of_all_rows(each, usable) for each in (full_rotations(rows)[0], scales))
-    return MetricUpgrade(Q, *parts, *quality(*fit, len(cameras)))
+    rotations = of_all_rows(full_rotations(rows)[0], usable)
+    scales = of_all_rows(scales, usable)
+    return MetricUpgrade(Q, rotations, scales, *quality(*fit, len(cameras)))
 
 
 def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:

@@ -90,11 +90,10 @@ def model_of_points(
     share, size = square / square_in_file, np.sqrt(np.mean(some[0] ** 2))
     C, shapes = C * size**2 / share, some / size
     mean_shape, basis = shapes[0], shapes[1 : K + 1]
-    noise, inverse_snr, rank_floor, total, *errors = stored["numbers"].tolist()
+    noise, inverse_snr, floor, total, residual, *images = stored["numbers"].tolist()
     # Components that are left out become noise of the two coordinates of an image.
     others = shapes[K + 1 :]
     left = np.einsum("ab,kja,kjb->", C, others, others) / (2 * len(mean_shape))
-    residual, *images = errors
     known = {"residual": residual / share + 2.0 * left, "images": tuple(images)}
     variances = stored["points"][points] / share
     certainty = DepthCertainty(total, 0.0, stored["turns"], variances, **known)
@@ -102,13 +101,13 @@ def model_of_points(
     shapes = np.ascontiguousarray(shapes[: K + 1].mT)
     gauge, starts = FrameMap.identity(K), np.zeros((0, K))
     frames = FrameModel(shapes, noise, starts, "linear", gauge, camera, certainty)
-    share, n_features = stored["energy_share"][:K], 2 * len(mean_shape)
+    share = stored["energy_share"][:K]
     model = AffineNRSfM(K, camera="weak_perspective")
     model.__dict__ |= {
         "_model": TableModel(frames, mean_shape, basis, K, "interleaved", None),
         "_n_features_out": K,
         "n_components_": K,
-        "n_features_in_": n_features,
+        "n_features_in_": 2 * len(mean_shape),
         "camera_": camera,
         "frames_scaled_": True,
         "mean_shape_": mean_shape,
@@ -121,7 +120,7 @@ def model_of_points(
         "mode_covariance_": np.kron(np.eye(K), C) / 2,
         "singular_values_": stored["singular_values"][: 3 * K + 3],
         "inverse_snr_": inverse_snr,
-        "rank_floor_": rank_floor,
+        "rank_floor_": floor,
         "reference_motion_": stored["view"],
         "reference_translation_": np.zeros(2),
         "isa_": None,

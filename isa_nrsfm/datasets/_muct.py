@@ -18,7 +18,6 @@ Recognition Association of South Africa, 2010. http://www.milbo.org/muct
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import checked_parameters
@@ -111,34 +110,29 @@ def fetch_muct(
     (3755, 136)
     """
     path = fetch_file(URL, SHA256, data_home, download_if_missing)
-    header, *cells = np.loadtxt(path, dtype=np.str_, delimiter=",")
+    header, *rows = np.loadtxt(path, dtype=np.str_, delimiter=",")
     # Without the mirror images of all photos, which are called ir...
-    faces = _labelled(np.array([row for row in cells if not row[0].startswith("ir")]))
+    cells = np.array([row for row in rows if not row[0].startswith("ir")])
+    names, tags, data = *cells[:, :2].T.copy(), cells[:, 2:].astype(float)
+    tracks = table_to_tracks(data)  # a view
+    visible = tracks.any(axis=2)  # others are at (0, 0)
+    tracks[~visible] = np.nan
+    # One column a letter: i000qa-fn.
+    letters = names.astype("U9").view("U1").reshape(-1, 9)
+    subjects = letters[:, 1:4].astype(int) @ [100, 10, 1]
     return Bunch(
-        **faces,
-        target=faces["subjects"],
-        tracks=table_to_tracks(faces["data"]),
+        data=data,
+        visible=visible,
+        subjects=subjects,
+        lighting=letters[:, 4],
+        camera=letters[:, 5],
+        sex=letters[:, 7],
+        glasses=np.array([int(tag, 16) & 0x2 > 0 for tag in tags]),
+        names=names,
+        tags=tags,
+        target=subjects,
+        tracks=tracks,
         feature_names=header[2:].tolist(),
         filename=str(path),
         DESCR=DESCR,
     )
-
-
-def _labelled(cells: NDArray) -> dict[str, NDArray]:
-    """Return the rows of the file, NaN where a point is at (0, 0), and their labels."""
-    names, tags, data = *cells[:, :2].T.copy(), cells[:, 2:].astype(float)
-    visible = table_to_tracks(data).any(axis=2)
-    table_to_tracks(data)[~visible] = np.nan
-    # One column a letter: i000qa-fn.
-    letters = names.astype("U9").view("U1").reshape(-1, 9)
-    return {
-        "data": data,
-        "visible": visible,
-        "subjects": letters[:, 1:4].astype(int) @ [100, 10, 1],
-        "lighting": letters[:, 4],
-        "camera": letters[:, 5],
-        "sex": letters[:, 7],
-        "glasses": np.array([int(tag, 16) & 0x2 > 0 for tag in tags]),
-        "names": names,
-        "tags": tags,
-    }

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.random import RandomState
@@ -48,26 +48,113 @@ FRAMES_A_SECOND = 25.0
 MIDDLE, REACH = np.array([640.0, 480.0]), np.array([320.0, 240.0])
 # Perspective cameras: pixels of the image; nearest and largest relative distance
 IMAGE, NEAREST, FARTHEST = np.array([1280.0, 720.0]), 0.85, 1.15
+FOCAL_LENGTH = 1000.0
 
 
-def lens_of(
-    camera: Camera,
-    focal_length: Any,
-    distance: Any,
-    scales: Range,
-    usual_distance: float,
-) -> tuple[Range, float | None]:
-    """Return the scales of cameras, other ones if perspective, and a focal length."""
-    if camera == "perspective":
-        focal_length = float(focal_length or 1000.0)
-        scale = focal_length / (distance or usual_distance)
-        return (scale / FARTHEST, scale / NEAREST), focal_length
-    if focal_length is not None or distance is not None:
-        raise ValueError(
-            "focal_length and distance are for camera='perspective'; got "
-            f"camera={camera!r}, focal_length={focal_length!r}, distance={distance!r}"
-        )
-    return scales, None
+class Recording(NamedTuple):
+    """How shapes are recorded: parameters of all tables, and random numbers."""
+
+    camera: Camera
+    focal_length: float | None
+    distance: float | None
+    noise: float
+    missing: float
+    layout: Layout
+    rng: RandomState
+
+    def scales(self, usual: Range, distance: float) -> Range:
+        """Return the smallest and the largest scale, other ones if perspective."""
+        if self.camera == "perspective":
+            scale = (self.focal_length or FOCAL_LENGTH) / (self.distance or distance)
+            return scale / FARTHEST, scale / NEAREST
+        if self.focal_length is not None or self.distance is not None:
+            raise ValueError(
+                "focal_length and distance are for camera='perspective'; got "
+                f"camera={self.camera!r}, focal_length={self.focal_length!r}, "
+                f"distance={self.distance!r}"
+            )
+        return usual
+
+    def motion(self, rotations: NDArray, scales: Range) -> NDArray[np.float64]:
+        """Return cameras (n_frames, 2, 3) that look along the z axis of the rotations.
+
+        Scales are log-uniform, orthographic ones the geometric mean. Affine cameras
+        stretch the image along a random axis, by 0.5 to 1 at constant area.
+        """
+        per_frame = (len(rotations), 1, 1)
+        shortest, longest = np.log(scales)
+        # Drawn for each kind of camera, so that the rest of the scene is the same.
+        log_scales = self.rng.uniform(shortest, longest, per_frame)
+        ratios = self.rng.uniform(0.5, 1.0, per_frame)
+        axes = self.rng.uniform(0.0, np.pi, per_frame)
+        if self.camera == "orthographic":
+            log_scales = np.full(per_frame, (shortest + longest) / 2)
+        motion = np.exp(log_scales) * rotations[:, :2]
+        if self.camera == "affine":
+            # Symmetric matrices of determinant 1 and the given singular ratios
+            along = np.concatenate([np.cos(axes), np.sin(axes)], axis=1)
+            across = along[:, ::-1] * [[-1.0], [1.0]]
+            longer, shorter = ratios**-0.5, ratios**0.5
+            motion = (longer * along * along.mT + shorter * across * across.mT) @ motion
+        return motion
+
+    def table(
+        self, shapes: NDArray, motion: NDArray, translation: NDArray
+    ) -> dict[str, Any]:
+        """Return the table of shapes seen by cameras, and its ground truth.
+
+        Perspective cameras: translations up to `REACH` are places up to the image's
+        edge.
+        """
+        truth: dict[str, Any] = {"translation": translation}
+        if self.camera == "perspective":
+            place = (translation - MIDDLE) / REACH
+            focal_length = float(self.focal_length or FOCAL_LENGTH)
+            clean, truth = see_in_perspective(shapes, motion, place, focal_length)
+        else:
+            clean = shapes @ motion.transpose(0, 2, 1) + translation[:, None]
+        centred = clean - clean.mean(axis=1, keepdims=True)
+        noise_variance = self.noise**2 * np.mean(centred**2)
+
+        # Always drawn, so that noise and missing change nothing else.
+        tracks = clean + np.sqrt(noise_variance) * self.rng.standard_normal(clean.shape)
+        order = self.rng.permutation(clean[..., 0].size).reshape(clean.shape[:2])
+        visible = order >= round(self.missing * order.size)
+        tracks[~visible] = np.nan
+
+        names = [f"{axis}_{j}" for j in range(clean.shape[1]) for axis in "xy"]
+        columns = tracks_to_table(np.reshape(names, (1, -1, 2)), self.layout)[0]
+        return {
+            "data": tracks_to_table(tracks, self.layout),
+            "tracks": tracks,
+            "clean": clean,
+            "visible": visible,
+            "motion": motion,
+            "shapes": shapes,
+            "noise_variance": float(noise_variance),
+            "feature_names": columns.tolist(),
+            **truth,
+        }
+
+    def film(
+        self, shapes: NDArray, path: NDArray, largest: Sequence[float], scales: Range
+    ) -> dict[str, Any]:
+        """Return the table and the truth of a film: also yaw, pitch, roll in degrees.
+
+        The path (n, 6) of angles, scale and place is between -1 and 1. `largest` are
+        angles, `scales` the smallest and the largest number of pixels per unit.
+        """
+        angles = path[:, :3] * largest
+        shortest, longest = np.log(scales)
+        sizes = np.exp(shortest + (longest - shortest) * ((1 + path[:, 3]) / 2))
+        if self.camera == "orthographic":
+            sizes = np.full(len(path), np.sqrt(np.prod(scales)))
+        rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+        motion = self.motion(rotations, (1.0, 1.0))
+        reach = REACH if self.camera == "perspective" else (160.0, 100.0)
+        translation = MIDDLE + path[:, 4:] * reach
+        motion = sizes[:, None, None] * motion
+        return self.table(shapes, motion, translation) | {"angles": angles}
 
 
 def see_in_perspective(
@@ -101,32 +188,6 @@ def see_in_perspective(
     }
 
 
-def draw_motion(
-    rotations: NDArray, camera: Camera, scales: tuple[float, float], rng: RandomState
-) -> NDArray[np.float64]:
-    """Return cameras (n_frames, 2, 3) that look along the z axis of the rotations.
-
-    Scales are log-uniform, orthographic ones the geometric mean. Affine cameras stretch
-    the image along a random axis, by 0.5 to 1 at constant area.
-    """
-    n_frames = len(rotations)
-    shortest, longest = np.log(scales)
-    # Drawn for each kind of camera, so that the rest of the scene is the same.
-    log_scales = rng.uniform(shortest, longest, n_frames)
-    ratios = rng.uniform(0.5, 1.0, n_frames)
-    axes = rng.uniform(0.0, np.pi, n_frames)
-    if camera == "orthographic":
-        log_scales = np.full(n_frames, (shortest + longest) / 2)
-    motion = np.exp(log_scales)[:, None, None] * rotations[:, :2]
-    if camera == "affine":
-        # Symmetric matrices of determinant 1 and the given singular ratios
-        along = np.stack([np.cos(axes), np.sin(axes)], axis=1)[:, :, None]
-        across = along[:, ::-1] * [[-1.0], [1.0]]
-        longer, shorter = ratios[:, None, None] ** -0.5, ratios[:, None, None] ** 0.5
-        motion = (longer * along * along.mT + shorter * across * across.mT) @ motion
-    return motion
-
-
 def standardise(coefficients: NDArray) -> NDArray[np.float64]:
     """Return coefficients with zero mean and unit variance over the frames."""
     return (coefficients - coefficients.mean(axis=0)) / coefficients.std(axis=0)
@@ -137,55 +198,10 @@ def centre_shapes(shapes: NDArray) -> NDArray[np.float64]:
     return shapes - shapes.mean(axis=-2, keepdims=True)
 
 
-def observe(
-    shapes: NDArray,
-    motion: NDArray,
-    translation: NDArray,
-    rng: RandomState,
-    noise: float,
-    missing: float,
-    layout: Layout,
-    focal_length: float | None = None,
-) -> dict[str, Any]:
-    """Return the table of shapes seen by cameras, and its ground truth.
-
-    With a focal length, translations up to `REACH` are places up to the image's edge.
-    """
-    truth: dict[str, Any] = {"translation": translation}
-    if focal_length is None:
-        clean = shapes @ motion.transpose(0, 2, 1) + translation[:, None]
-    else:
-        place = (translation - MIDDLE) / REACH
-        clean, truth = see_in_perspective(shapes, motion, place, focal_length)
-    centred = clean - clean.mean(axis=1, keepdims=True)
-    noise_variance = noise**2 * np.mean(centred**2)
-
-    # Always drawn, so that noise and missing change nothing else.
-    tracks = clean + np.sqrt(noise_variance) * rng.standard_normal(clean.shape)
-    order = rng.permutation(clean[..., 0].size).reshape(clean.shape[:2])
-    visible = order >= round(missing * order.size)
-    tracks[~visible] = np.nan
-
-    names = np.array([[f"{axis}_{j}" for axis in "xy"] for j in range(clean.shape[1])])
-    return {
-        "data": tracks_to_table(tracks, layout),
-        "tracks": tracks,
-        "clean": clean,
-        "visible": visible,
-        "motion": motion,
-        "shapes": shapes,
-        "noise_variance": float(noise_variance),
-        "feature_names": tracks_to_table(names[None], layout)[0].tolist(),
-        **truth,
-    }
-
-
 COMPONENT_NAMES = (
     *("jaw open", "smile", "brow raise", "blink"),
     *("lip pucker", "brow lower", "nose wrinkle", "face width"),
 )
-# As often negative as positive; the others are expressions.
-SIGNED_COMPONENTS = ("face width",)
 
 
 @checked_parameters(
@@ -346,7 +362,8 @@ default="weak_perspective"
     rng = check_random_state(random_state)
     names = COMPONENT_NAMES[:n_components]
     strength = rng.beta(0.4, 2.0, (n_frames, n_components))
-    signed = np.isin(names, SIGNED_COMPONENTS)
+    # As often negative as positive; the others are expressions.
+    signed = np.isin(names, ["face width"])
     strength[:, signed] = 2 * rng.beta(2.0, 2.0, (n_frames, signed.sum())) - 1
     labels = np.full(n_frames, "rest")
     if not signed.all():
@@ -359,13 +376,12 @@ default="weak_perspective"
 
     angles = rng.uniform(-1.0, 1.0, (n_frames, 3)) * (45.0, 25.0, 20.0)
     rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
-    scales, focal = lens_of(camera, focal_length, distance, (1.0, 4.0), 500.0)
-    motion = draw_motion(rotations, camera, scales, rng)
+    seen = Recording(camera, focal_length, distance, noise, missing, layout, rng)
+    motion = seen.motion(rotations, seen.scales((1.0, 4.0), 500.0))
     translation = rng.uniform((320.0, 240.0), (960.0, 720.0), size=(n_frames, 2))
     shapes = mean_shape + np.tensordot(alpha, basis, 1)
-    table = observe(shapes, motion, translation, rng, noise, missing, layout, focal)
     return Bunch(
-        **table,
+        **seen.table(shapes, motion, translation),
         mean_shape=mean_shape,
         basis=basis,
         alpha=alpha,
@@ -537,10 +553,11 @@ def make_nonrigid_tracks(
         square = np.sum(np.tensordot(alpha, basis, 1) ** 2, axis=-1)
         basis *= amplitude / np.sqrt(np.mean(square))
     rotations = Rotation.from_quat(rng.standard_normal((n_frames, 4))).as_matrix()
-    motion = draw_motion(rotations, camera, (2 / 3, 3 / 2), rng)
+    seen = Recording(camera, None, None, noise, missing, layout, rng)
+    motion = seen.motion(rotations, (2 / 3, 3 / 2))
     translation = rng.standard_normal((n_frames, 2))
     frames = mean_shape + np.tensordot(alpha, basis, 1)
-    table = observe(frames, motion, translation, rng, noise, missing, layout)
+    table = seen.table(frames, motion, translation)
     return Bunch(**table, mean_shape=mean_shape, basis=basis, alpha=alpha)
 
 
@@ -686,10 +703,10 @@ default="weak_perspective"
 
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, ACTIONS, build, rng)
-    scales, focal = lens_of(camera, focal_length, distance, (0.2, 0.5), 3500.0)
-    angles, motion, translation = film(path, (80.0, 20.0, 8.0), scales, camera, rng)
-    table = observe(shapes, motion, translation, rng, noise, missing, layout, focal)
-    return Bunch(**table, **truths, angles=angles, point_names=list(names))
+    seen = Recording(camera, focal_length, distance, noise, missing, layout, rng)
+    scales = seen.scales((0.2, 0.5), 3500.0)
+    table = seen.film(shapes, path, (80.0, 20.0, 8.0), scales)
+    return Bunch(**table, **truths, point_names=list(names))
 
 
 def _angles(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDArray]:
@@ -887,13 +904,13 @@ default="weak_perspective"
     (['fist', 'open', 'point'], [0, 1])
     """
     rng = check_random_state(random_state)
-    poses = tuple(FIGURES["poses"])
+    poses = [*FIGURES["poses"]]
     shapes, path, truths = perform(n_frames, n_people, poses, _hand, rng)
-    scales, focal = lens_of(camera, focal_length, distance, (1.0, 3.0), 500.0)
-    angles, motion, translation = film(path, (60.0, 35.0, 35.0), scales, camera, rng)
-    table = observe(shapes, motion, translation, rng, noise, missing, layout, focal)
-    point_names = list(get_skeleton("hand-21").point_names or ())
-    return Bunch(**table, **truths, angles=angles, point_names=point_names)
+    seen = Recording(camera, focal_length, distance, noise, missing, layout, rng)
+    scales = seen.scales((1.0, 3.0), 500.0)
+    table = seen.film(shapes, path, (60.0, 35.0, 35.0), scales)
+    names = get_skeleton("hand-21").point_names or ()
+    return Bunch(**table, **truths, point_names=list(names))
 
 
 def _hand(time: NDArray, weights: NDArray, rng: RandomState) -> NDArray[np.float64]:
@@ -937,30 +954,6 @@ def perform(
     shapes, path, labels, groups, time = map(np.concatenate, zip(*people, strict=True))
     truths = {"labels": labels, "groups": groups, "time": time}
     return shapes, path, truths | {"mean_shape": shapes.mean(axis=0)}
-
-
-def film(
-    path: NDArray,
-    largest_angles: tuple[float, float, float],
-    scales: tuple[float, float],
-    camera: Camera,
-    rng: RandomState,
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Return yaw, pitch and roll in degrees, the motion and translation of a path.
-
-    The path (n, 6) is between -1 and 1. `scales` are the smallest and the largest
-    number of pixels per unit.
-    """
-    angles = path[:, :3] * largest_angles
-    shortest, longest = np.log(scales)
-    sizes = np.exp(shortest + (longest - shortest) * ((1 + path[:, 3]) / 2))
-    if camera == "orthographic":
-        sizes = np.full(len(path), np.sqrt(np.prod(scales)))
-    rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
-    motion = draw_motion(rotations, camera, (1.0, 1.0), rng)
-    reach = REACH if camera == "perspective" else (160.0, 100.0)
-    translation = MIDDLE + path[:, 4:] * reach
-    return angles, sizes[:, None, None] * motion, translation
 
 
 def wander(time: NDArray, n: int, rng: RandomState) -> NDArray[np.float64]:

@@ -279,10 +279,10 @@ def point_distribution_model(
     kept: Any = n_modes
     if n_modes is None:
         kept = len(model.basis_)
-    elif not isinstance(n_modes, Integral):
+    elif not isinstance(kept, Integral):
         share = np.cumsum(variances) / variances.sum()
-        kept = np.searchsorted(share, n_modes) + 1
-    elif n_modes > len(variances):
+        kept = np.searchsorted(share, kept) + 1
+    elif kept > len(variances):
         raise ValueError(
             f"n_modes must be at most {len(variances)}, the number of principal axes "
             f"of the shapes; got {n_modes}"
