@@ -562,8 +562,7 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         cameras, shapes = least_norm_factors(W, rank)
         self.n_iter_, converged = 0, True
         for price in 4.0 ** -np.arange(18):
-            shapes, n_iter, settled = self._minimised(W, cameras, price, shapes)
-            self.n_iter_ += n_iter
+            shapes, settled = self._minimised(W, cameras, price, shapes)
             converged &= settled
         if not converged:
             warn_caller(
@@ -575,22 +574,23 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
 
     def _minimised(
         self, W: NDArray, cameras: NDArray, price: float, shapes: NDArray
-    ) -> tuple[NDArray, int, bool]:
+    ) -> tuple[NDArray, bool]:
         """Minimise ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2`` over the shapes.
 
         S has one row for each frame, mu is the price. Proximal gradient steps of length
         one have Nesterov's momentum, reset when it leads up (Beck, Teboulle 2009;
-        O'Donoghue, Candes 2015). Returns shapes (I, J, 3), the number of steps, and
-        whether the last relative change was at most `tol`.
+        O'Donoghue, Candes 2015). Returns shapes (I, J, 3), and whether the last
+        relative change was at most `tol`.
         """
         images = W.reshape(len(cameras), 2, -1).transpose(0, 2, 1)
         # The curvature of the images is one, as the cameras have orthonormal rows.
         ahead, momentum = shapes, 1.0
-        for n_iter in range(1, self.max_iter + 1):
+        for _ in range(self.max_iter):
+            self.n_iter_ += 1
             error = ahead @ cameras.transpose(0, 2, 1) - images
             moved = shrink(ahead - error @ cameras, price)
             change = moved - shapes
-            size = np.linalg.norm(shapes)
+            settled = bool(np.linalg.norm(change) <= self.tol * np.linalg.norm(shapes))
             if np.vdot(ahead - moved, change) > 0:
                 ahead, momentum = moved, 1.0
             else:
@@ -598,6 +598,6 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
                 ahead = moved + (momentum - 1.0) / larger * change
                 momentum = larger
             shapes = moved
-            if np.linalg.norm(change) <= self.tol * size:
-                return shapes, n_iter, True
-        return shapes, self.max_iter, False
+            if settled:
+                break
+        return shapes, settled

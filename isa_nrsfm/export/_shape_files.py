@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from functools import partial
+from itertools import islice
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -282,7 +283,7 @@ def point_distribution_model(
     elif not isinstance(kept, Integral):
         share = np.cumsum(variances) / variances.sum()
         kept = np.searchsorted(share, kept) + 1
-    elif kept > len(variances):
+    elif int(kept) > len(variances):
         raise ValueError(
             f"n_modes must be at most {len(variances)}, the number of principal axes "
             f"of the shapes; got {n_modes}"
@@ -392,19 +393,17 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
 def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
     """Read the three matrices of a text."""
     lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
-    words = [word for line in lines if line[:1] != "#" for word in line.split()]
+    words = (word for line in lines if line[:1] != "#" for word in line.split())
     matrices = []
     for comment in COMMENTS:
         try:
-            n_rows, n_columns, _ = map(int, words[:3])
-            size = n_rows * n_columns
-            numbers = np.array(words[3 : 3 + size], float)
-            matrices.append(numbers.reshape(n_rows, n_columns))
+            n_rows, n_columns, _ = map(int, islice(words, 3))
+            numbers = [*map(float, islice(words, n_rows * n_columns))]
+            matrices.append(np.reshape(numbers, (n_rows, n_columns)))
         except ValueError as error:
             raise ValueError(
                 f"where there should be {comment.partition(':')[0].lower()}: {error}"
             ) from error
-        words = words[3 + size :]
     return matrices
 
 
@@ -634,17 +633,15 @@ def _write_trc(path: Path, values: NDArray, names: Sequence[str], fps: Any) -> N
     """Write values (n_frames, n_points, 3) as OpenSim writes them, NaN as nan."""
     n_frames, n_points, _ = values.shape
     axes = "\t".join(f"X{j}\tY{j}\tZ{j}" for j in range(1, n_points + 1))
-    numbers = map(str, (fps, fps, n_frames, n_points, "px", fps, 1, n_frames))
     head = [
         f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
         f"{_TRC} OrigNumFrames".replace(" ", "\t"),
-        "\t".join(numbers),
+        "\t".join(map(str, (fps, fps, n_frames, n_points, "px", fps, 1, n_frames))),
         "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
-        f"\t\t{axes}",
-        "",
+        f"\t\t{axes}\n",
     ]
     table = pd.DataFrame(values.reshape(n_frames, -1))
     table.insert(0, "time", np.arange(n_frames) / fps)
     table.index += 1
     rows = table.to_csv(sep="\t", header=False, lineterminator="\n", na_rep="nan")
-    path.write_text("\n".join(head) + "\n" + rows, encoding="utf-8")
+    path.write_text("\n".join([*head, rows]), encoding="utf-8")

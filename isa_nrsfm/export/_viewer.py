@@ -29,7 +29,6 @@ from isa_nrsfm.skeletons._column_names import names_of_components, names_of_poin
 
 # The colours of more labels than this look alike.
 MOST_LABELS = 30
-UNLABELLED = "(no label)"
 ABOUT = {
     None: "Affine shapes: angles and depth are not those of the object.",
     "unknown": "The depth is not determined: angles and proportions are not those of "
@@ -285,7 +284,7 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
     keys: list[tuple[Any, ...]] = []  # numbers first, those without a label last
     for value in values.tolist():
         kind = 2 if is_missing(value) else int(not isinstance(value, Real))
-        text = UNLABELLED if kind == 2 else str(value)
+        text = "(no label)" if kind == 2 else str(value)
         keys.append((kind, 0 if kind else value, text))
     found = sorted(set(keys))
     if len(found) > MOST_LABELS:
