@@ -110,10 +110,10 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     # trace of G. So G is I / 3 plus a matrix of trace zero with five unknowns.
     whitening = symmetric_power(gram, -0.5)
     equations = conformal_equations(cameras @ whitening)
-    unknowns, _, _, singular_values = np.linalg.lstsq(
-        equations[:, :5], -equations[:, 5] / np.sqrt(3)
+    unknowns, _, rank, _ = np.linalg.lstsq(
+        equations[:, :5], -equations[:, 5] / np.sqrt(3), rcond=1e-6
     )
-    if len(singular_values) < 5 or singular_values[-1] <= 1e-6 * singular_values[0]:
+    if rank < 5:
         return None
     G = np.tensordot(unknowns, strain_basis("weak_perspective"), 1) + np.eye(3) / 3
     G = whitening @ G @ whitening
@@ -168,9 +168,8 @@ def linearised(
         residuals = entries[:, :2] / entries[:, 2:]
         slopes = changes[:, :2] - changes[:, 2:] * residuals[:, :, None]
         slopes /= entries[:, 2:, None]
-    common, *strain_terms = np.split(slopes[:, :, None], 1 + len(strain_terms), axis=3)
-    strain_terms = [alpha[:, None, :, None] * each for each in strain_terms]
-    J = np.concatenate([common, *strain_terms], axis=2)
+    parts = np.split(slopes[:, :, None], 1 + len(strain_terms), axis=3)
+    J = np.concatenate([parts[0], alpha[:, None, :, None] * parts[-1]], axis=2)
     return residuals.ravel(), J.reshape(residuals.size, -1)
 
 
