@@ -146,14 +146,14 @@ class Recording(NamedTuple):
         """
         angles = path[:, :3] * largest
         shortest, longest = np.log(scales)
-        sizes = np.exp(shortest + (longest - shortest) * ((1 + path[:, 3]) / 2))
+        share = (1 + path[:, 3, None, None]) / 2
+        sizes = np.exp(shortest + (longest - shortest) * share)
         if self.camera == "orthographic":
-            sizes = np.full(len(path), np.sqrt(np.prod(scales)))
+            sizes = np.full_like(sizes, np.sqrt(np.prod(scales)))
         rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
-        motion = self.motion(rotations, (1.0, 1.0))
+        motion = sizes * self.motion(rotations, (1.0, 1.0))
         reach = REACH if self.camera == "perspective" else (160.0, 100.0)
         translation = MIDDLE + path[:, 4:] * reach
-        motion = sizes[:, None, None] * motion
         return self.table(shapes, motion, translation) | {"angles": angles}
 
 
@@ -704,8 +704,7 @@ default="weak_perspective"
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, ACTIONS, build, rng)
     seen = Recording(camera, focal_length, distance, noise, missing, layout, rng)
-    scales = seen.scales((0.2, 0.5), 3500.0)
-    table = seen.film(shapes, path, (80.0, 20.0, 8.0), scales)
+    table = seen.film(shapes, path, (80.0, 20.0, 8.0), seen.scales((0.2, 0.5), 3500.0))
     return Bunch(**table, **truths, point_names=list(names))
 
 
@@ -907,8 +906,7 @@ default="weak_perspective"
     poses = [*FIGURES["poses"]]
     shapes, path, truths = perform(n_frames, n_people, poses, _hand, rng)
     seen = Recording(camera, focal_length, distance, noise, missing, layout, rng)
-    scales = seen.scales((1.0, 3.0), 500.0)
-    table = seen.film(shapes, path, (60.0, 35.0, 35.0), scales)
+    table = seen.film(shapes, path, (60.0, 35.0, 35.0), seen.scales((1.0, 3.0), 500.0))
     names = get_skeleton("hand-21").point_names or ()
     return Bunch(**table, **truths, point_names=list(names))
 

@@ -617,7 +617,7 @@ def _write_netcdf(
 
 
 def _write_deeplabcut(path: Path, values: NDArray, names: Sequence[str]) -> None:
-    """Write x, y, z, and what is determined, (n_frames, n_points, n) as DeepLabCut."""
+    """Write values (n_frames, n_points, 3), or 4 with a flag, as DeepLabCut does."""
     levels, coords = ["scorer", "bodyparts", "coords"], ["x", "y", "z", "determined"]
     coords = coords[: values.shape[2]]
     columns = pd.MultiIndex.from_product([[_SCORER], names, coords], names=levels)
