@@ -390,12 +390,9 @@ def point_distances(
     space = upright_space(model, camera, "auto")
     names = names_of_points(model)
     first, second = np.array([point_numbers(pair, names) for pair in pairs]).T
-    if unit is None:
-        if space.lines is None or space.lines.name != "ibug-68":
-            raise ValueError(
-                "unit must name two points, as these are not the 68 of a face"
-            )
-        unit = EYES
+    if unit is None and getattr(space.lines, "name", None) != "ibug-68":
+        raise ValueError("unit must name two points, as these are not the 68 of a face")
+    unit = EYES if unit is None else unit
     a, b = point_numbers(unit, names)
     shapes = space.shapes(X)
     mean = np.nanmean(shapes, axis=0)
