@@ -5,6 +5,7 @@ import pickle
 import re
 import threading
 from contextlib import suppress
+from functools import partial
 from io import BytesIO
 from zipfile import ZipFile
 
@@ -55,10 +56,8 @@ def test_a_refit_that_fails_keeps_the_fit_and_numpys_settings_do_not_matter(name
             with suppress(ValueError):  # of other cameras
                 getattr(model, method)(table)
     before = vars(model).copy()
-    for bad, error in (
-        (np.full_like(table, np.nan), ValueError),
-        (Stop(table), Stopped),
-    ):
+    refits = (np.full_like(table, np.nan), ValueError), (Stop(table), Stopped)
+    for bad, error in refits:
         with pytest.raises(error):
             model.fit(bad)
         assert vars(model).keys() == before.keys()
@@ -106,23 +105,23 @@ def test_csv_files_that_end_in_a_number(digits, format, tmp_path):
     assert_array_equal(read_landmarks(path).points, whole)
 
 
+# What readers call while they read.
+OF_READERS = (np, "array"), (np, "reshape"), (json, "load"), (pd, "read_csv")
+
+
 @pytest.mark.parametrize("name", ["table", "pts-file", "coco", "tps", "trc", "yolo"])
 @pytest.mark.filterwarnings("ignore")
 def test_files_that_grow_while_they_are_read(name, tmp_path, monkeypatch):
     path = files.WRITERS[name](tmp_path)
     path = next(path.iterdir()) if path.is_dir() else path
-    called = np.array
 
-    def grows(*args, **options):
+    def growing(real, *args, **options):
         with path.open("a") as file:
             file.write(" ")
-        return called(*args, **options)
+        return real(*args, **options)
 
-    monkeypatch.setattr(np, "array", grows)
-    for module, function in ((json, "load"), (pd, "read_csv"), (np, "reshape")):
-        real = getattr(module, function)
-        again = lambda *a, real=real, **k: (grows([]), real(*a, **k))[1]  # noqa: E731
-        monkeypatch.setattr(module, function, again)
+    for owner, name in OF_READERS:
+        monkeypatch.setattr(owner, name, partial(growing, getattr(owner, name)))
     refused("was changed while|in the middle of a", read_landmarks, path)
 
 
@@ -139,9 +138,7 @@ def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
     frame.to_csv(path := tmp_path / "a.csv", index=False)
     options = ["fit", str(path), "-k1", "--no-figures", "-o", str(tmp_path / "b")]
     assert main([*options, "--label", "who"]) == 0
-    assert (
-        main(["fit", str(path), "--group", f"{text}x", "-o", str(tmp_path / "c")]) == 1
-    )
+    assert main([*options, "--force", "--group", f"{text}x"]) == 1
     frame.assign(x_3=text).to_csv(path, index=False)
     assert main(options) == 1
     with pytest.raises(SystemExit):
@@ -181,34 +178,25 @@ YOLO = "0 .5 .5 .2 .2" + " .5" * 10
     ],
 )
 def test_arrays_of_other_orders_are_told_the_way(shape, way, tmp_path):
-    np.save(path := tmp_path / "a.npy", np.zeros(shape))
+    np.save(path := tmp_path / "a.npy", array := np.zeros(shape))
     told = str(refused(way, read_landmarks, path))
     if len(shape) > 1:
-        array = eval(
-            re.search(r", (array.*?)\)\. E", told)[1], {"array": np.load(path)}
-        )
-        np.save(path, array[:, None])
+        advised = eval(re.search(r", (array.*?)\)\. E", told)[1], {"array": array})
+        np.save(path, advised[:, None])
         warned("is read as", read_landmarks, path)
 
 
 def test_folders_of_several_kinds(tmp_path):
     folder = files.write_yolo(tmp_path / "a", TRACKS, 2)
     files.write_text(folder / "classes.txt", "person")
-    found = warned(
-        "not of yolo, and left out: cl",
-        read_landmarks,
-        folder,
-        "yolo",
-        image_size=(500, 500),
-    )
+    read = partial(read_landmarks, image_size=(500, 500))
+    found = warned("not of yolo, and left out: cl", read, folder, "yolo")
     np.testing.assert_allclose(found.points, TRACKS.reshape(12, -1))
     files.write_trc(folder / "a.trc", TRACKS)
     refused("more than one format: trc, yolo", read_landmarks, folder)
-    refused(
-        "different z",
-        read_landmarks,
-        files.write_trc(tmp_path / "b.trc", TRACKS, np.arange(12.0)[:, None, None]),
-    )
+    depths = np.arange(12.0)[:, None, None]
+    path = files.write_trc(tmp_path / "b.trc", TRACKS, depths)
+    refused("different z", read_landmarks, path)
 
 
 def joined(folder, part, change):

@@ -7,9 +7,10 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
-from landmark_files import deeplabcut_frame, write_deeplabcut
+from landmark_files import deeplabcut_frame, saved, write_deeplabcut
 from layers import slow_after, with_limits
 from refusals import refusals_of
+from scenes import with_outliers
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
@@ -26,13 +27,6 @@ from isa_nrsfm.datasets import (
     make_nonrigid_tracks,
 )
 from isa_nrsfm.export import write_viewer
-
-
-def with_outliers(X):
-    """Return a table with a wrong point in every tenth number."""
-    rng = np.random.default_rng(0)
-    wrong = rng.random((len(X), X.shape[1] // 2)) < 0.01
-    return X + np.repeat(wrong, 2, axis=1) * X.std() * rng.normal(size=X.shape)
 
 
 def frontal():
@@ -61,7 +55,7 @@ TABLES = {
     "walks": walks,
     "stretched": lambda: points(60, 16, noise=0.005, **WEAK) * np.tile([1, 0.5], 16),
     "few frames": lambda: points(14, 24, noise=0.02),
-    "outliers": lambda: with_outliers(points(40, 14)),
+    "outliers": lambda: with_outliers(points(40, 14), points(40, 14).std(), 0.02),
     "bodies": lambda: make_body_tracks(80, random_state=0).data,
     "frontal faces": frontal,
     "few shapes": lambda: points(60, 14, n_components=1, noise=0.05, **WEAK),
@@ -128,9 +122,8 @@ def test_the_mean_image_of_a_face_does_not_make_a_table_one_of_faces():
     X = face + 0.6 * face.std() * rng.normal(size=(60, len(face)))
     found, model = tried(X, loss="linear")
     assert found["weak perspective cameras"].held_out_error > 0
-    assert "the table does not show the points of the prior" in (
-        found["face prior"].result
-    )
+    told = "the table does not show the points of the prior"
+    assert told in found["face prior"].result
     assert model.prior is None
 
 
@@ -196,10 +189,11 @@ def arena(n_still, jitter=0.7):
     rng = np.random.default_rng(0)
     body = make_nonrigid_tracks(150, 15, noise=0.01, **GIVEN).data.reshape(150, 15, 2)
     body = 40 * body + 300 + 12 * rng.normal(size=(150, 1, 2)).cumsum(axis=0)
-    still = rng.uniform(50, 600, (n_still, 2)) + jitter * rng.normal(
-        size=(150, n_still, 2)
+    places, moves = (
+        rng.uniform(50, 600, (n_still, 2)),
+        rng.normal(size=(150, n_still, 2)),
     )
-    return np.concatenate([body, still], axis=1)
+    return np.concatenate([body, places + jitter * moves], axis=1)
 
 
 def in_place():
@@ -209,17 +203,25 @@ def in_place():
     return tracks
 
 
+ROUGH = "--no-figures --refinement none -k 1".split()
+
+
+def named(X):
+    """Return a table whose columns have names."""
+    return pd.DataFrame(
+        X, columns=[f"{a}_{j}" for j in range(len(X.T) // 2) for a in "xy"]
+    )
+
+
 def test_the_command_line_leaves_them_out(fits, tmp_path):
-    names = [f"{axis}_{j}" for j in range(19) for axis in "xy"]
-    table = pd.DataFrame(arena(4).reshape(150, -1), columns=names)
-    table = table.assign(**{f"likelihood_{j}": 0.5 if j < 2 else 1 for j in range(19)})
-    table.to_csv(tmp_path / "maze.csv", index=False)
-    options = [tmp_path / "maze.csv", "--no-figures", "--refinement", "none", "-k", 1]
-    found = fits(*options)
+    scores = {f"likelihood_{j}": 0.5 if j < 2 else 1 for j in range(19)}
+    table = named(arena(4).reshape(150, -1)).assign(**scores)
+    path = saved(tmp_path / "maze.csv", table)
+    found = fits(path, *ROUGH)
     assert "4 points stand still while the others move through the image" in found.err
     assert found.err.count("have a confidence below 0.6") == 1
     assert len(found.model.mean_shape_) == 15
-    found = fits(*options, "--points", "0-18", "--force")
+    found = fits(path, *ROUGH, "--points", "0-18", "--force")
     assert len(found.model.mean_shape_) == 19
 
 
@@ -227,26 +229,22 @@ def test_two_views_in_a_row_of_a_tracker_are_asked_about(fits, fails, tmp_path):
     parts = [f"{part}_{view}" for view in ("top", "side") for part in "abcdefgh"]
     tracks = make_nonrigid_tracks(40, 16, **GIVEN).tracks
     table = deeplabcut_frame(tracks, 1.0, bodyparts=parts)
-    write_deeplabcut(tmp_path / "mouse.csv", table)
-    options = ["--no-figures", "--refinement", "none", "-k", 1]
-    message = fails("fit", tmp_path / "mouse.csv", "-o", tmp_path / "out", *options)
+    path = write_deeplabcut(tmp_path / "mouse.csv", table)
+    message = fails("fit", path, "-o", tmp_path / "out", *ROUGH)
     assert "the 16 points have the same names but for top, side, as those" in message
     one, both = re.findall("use --points ([0-9-]+)|with --points ([a-z_,]+)", message)
     for text, n_points in ((one[1], 8), (both[0], 16)):
-        found = fits(tmp_path / "mouse.csv", *options, "--points", text, "--force")
+        found = fits(path, *ROUGH, "--points", text, "--force")
         assert len(found.model.mean_shape_) == n_points
 
 
-@pytest.mark.parametrize("option", [None, "--keep-zeros"])
-def test_zeros_to_one_side_of_all_points_are_missing(fits, tmp_path, option):
+@pytest.mark.parametrize(("options", "expected"), [([], 3), (["--keep-zeros"], 0)])
+def test_zeros_to_one_side_of_all_points_are_missing(fits, tmp_path, options, expected):
     X = points(40, 16, noise=0.01)
     X += 0.1 - X.min()  # nearer to (0, 0) than points are spread
     X[[3, 8, 20], 4:6] = 0.0
-    names = [f"{axis}_{j}" for j in range(16) for axis in "xy"]
-    pd.DataFrame(X, columns=names).to_csv(tmp_path / "a.csv", index=False)
-    options = "--no-figures --refinement none -k 1".split() + [option] * bool(option)
-    table = fits(tmp_path / "a.csv", *options).report["table"]
-    assert table["n_missing_points"] == (0 if option else 3)
+    found = fits(saved(tmp_path / "a.csv", named(X)), *ROUGH, *options)
+    assert found.report["table"]["n_missing_points"] == expected
 
 
 def test_pages_are_shown_in_notebooks(tmp_path):
