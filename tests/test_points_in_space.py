@@ -1,5 +1,6 @@
 """Points in space with standard deviations, and their files."""
 
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -9,6 +10,7 @@ from layers import Quick, slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
+from scenes import table_of
 from scipy.io import netcdf_file
 
 from isa_nrsfm import AffineNRSfM
@@ -16,13 +18,12 @@ from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid
 from isa_nrsfm.export import frame_points, write_points
 
 AS_USERS = ["error_steps"]
+NEAR = {"n_components": 2, "camera": "perspective", "distance": 400}
 MAKE = {
-    "faces": lambda **k: make_face_tracks(50, n_components=3, noise=0.02, **k),
-    "bodies": lambda **k: make_body_tracks(150, noise=0.02, **k),
-    "clouds": lambda **k: make_nonrigid_tracks(150, 30, 2, noise=0.02, **k),
-    "near": lambda **k: make_face_tracks(
-        80, n_components=2, noise=0.01, camera="perspective", distance=400, **k
-    ),
+    "faces": partial(make_face_tracks, 50, n_components=3, noise=0.02),
+    "bodies": partial(make_body_tracks, 150, noise=0.02),
+    "clouds": partial(make_nonrigid_tracks, 150, 30, 2, noise=0.02),
+    "near": partial(make_face_tracks, 80, noise=0.01, **NEAR),
 }
 
 
@@ -40,40 +41,37 @@ def errors(table, points):
 
 @pytest.mark.parametrize(("name", "missing"), slow_after(1, product(MAKE, [0.0, 0.2])))
 def test_deviations_are_those_of_the_errors(name, missing):
-    camera = "perspective" if name == "near" else "weak_perspective"
+    params = {"camera": "weak_perspective", "random_state": 0}
+    if name == "near":
+        params |= {"camera": "perspective", "principal_point": (640, 360)}
     for seed in (0, 1) if name == "clouds" else (0,):
         table = MAKE[name](missing=missing, random_state=seed)
-        model = AffineNRSfM(3, camera=camera, random_state=0)
-        if name == "near":
-            model.set_params(principal_point=(640, 360))
-        points = frame_points(model.fit(table.data), table.data)
+        model = AffineNRSfM(3, **params).fit(table.data)
+        points = frame_points(model, table.data)
         assert points.determined.all()
-        ratio = np.sqrt(
-            np.mean((errors(table, points) / points.position_std) ** 2, (0, 1))
-        )
+        ratios = errors(table, points) / points.position_std
+        ratio = np.sqrt(np.mean(ratios**2, axis=(0, 1)))
         # Deviations of depths have the margins of docs/depth.md, "Accuracy".
         assert ((ratio > [0.7, 0.7, 0.4]) & (ratio < [1.2, 1.2, 1.4])).all()
         if name != "near":
-            assert_allclose(
-                points.position[..., :2].reshape(len(table.data), -1),
-                model.reproject(table.data),
-                rtol=1e-9,
-            )
+            images = table_of(points.position[..., :2])
+            assert_allclose(images, model.reproject(table.data), rtol=1e-9)
             _, std = model.reconstruct(table.data, return_std=True)
             depth = std * model.scales_[:, None]
             assert_allclose(points.position_std[..., 2], depth, rtol=1e-6)
 
 
+FACES = make_face_tracks(40, n_components=1, random_state=0, noise=0.01)
+TABLE = FACES.data
+
+
 @pytest.fixture(scope="module")
 def face():
-    table = make_face_tracks(40, n_components=1, random_state=0, noise=0.01).data
-    X = pd.DataFrame(
-        table[:, :60], columns=[f"p{j}_{a}" for j in range(30) for a in "xy"]
-    )
+    names = [f"p{j}_{axis}" for j in range(30) for axis in "xy"]
+    X = pd.DataFrame(TABLE[:, :60], columns=names)
     X.iloc[3] = np.nan
-    options = {"camera": "weak_perspective", "random_state": 0}
-    with pytest.warns(UserWarning, match="row"):
-        model = AffineNRSfM(1, **options).fit(X)
+    model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
+    warned("row", model.fit, X)
     return model, X, frame_points(model, X)
 
 
@@ -122,40 +120,25 @@ def test_files_of_opensim(face, tmp_path):
     refused("fps, the frames per second, is needed", write_points, model, "a.trc", X)
     write_points(model, tmp_path / "a.trc", X, fps=25)
     for name, values in (("a", points.position), ("a_std", points.position_std)):
-        head, table = read_trc(tmp_path / f"{name}.trc")
-        assert head[3].split("\t")[::3][1:3] == ["p1", "p2"] or "p1" in head[3]
-        assert head[2].split("\t")[2:4] == ["40", "30"]
-        # OpenSim reads rows of as many cells, none of which is empty at the end.
-        rows = (tmp_path / f"{name}.trc").read_text().splitlines()[6:]
-        assert {len(row.split("\t")) for row in rows} == {2 + 3 * 30}
-        assert "" not in "\t".join(rows).split("\t")
-        assert_allclose(table[:, 2:].reshape(values.shape), values, rtol=1e-12)
-
-
-def read_trc(path):
-    """Return the lines of the header, and the numbers, as OpenSim reads them."""
-    lines = path.read_text().split("\n")
-    rows = [[float(cell or "nan") for cell in line.split("\t")] for line in lines[6:-1]]
-    return lines[:6], np.array(rows)
+        lines = (tmp_path / f"{name}.trc").read_text().splitlines()
+        cells = [line.split("\t") for line in lines]
+        assert "p1" in cells[3]
+        assert cells[2][2:4] == ["40", "30"]
+        # OpenSim reads rows of as many cells, none of which is empty.
+        rows = np.array(cells[6:], dtype=float)
+        assert_allclose(rows[:, 2:].reshape(values.shape), values, rtol=1e-12)
 
 
 def test_depths_that_are_not_determined(face, tmp_path):
-    table = make_face_tracks(40, n_components=1, random_state=0, noise=0.01)
-    still = (
-        table.mean_shape @ table.motion[0].T
-        + table.alpha[:, :1, None] * table.basis[0] @ table.motion[0].T
-    )
+    still = FACES.shapes @ FACES.motion[0].T
     noise = np.random.default_rng(0).normal(size=still.shape)
-    X = (still + noise)[:, ::3].reshape(40, -1)
+    X = table_of((still + noise)[:, ::3])
     model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
     warned("depth .* not determined", model.fit, X)
     points = warned("depth .* not determined", frame_points, model, X)
     assert not points.determined.any()
     assert np.isnan([points.position[..., 2], points.position_std[..., 2]]).all()
     assert np.isfinite([points.position[..., :2], points.position_std[..., :2]]).all()
-
-
-TABLE = make_face_tracks(40, n_components=1, random_state=0, noise=0.01).data
 
 
 @made_once

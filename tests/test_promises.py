@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import JOINT, QUICK
+from landmark_files import saved
 from layers import slow_after
 from refusals import refused, warned
 
@@ -28,30 +29,26 @@ PROGRAM = [sys.executable, "-m", "isa_nrsfm"]
 
 @pytest.fixture
 def table(tmp_path):
-    path = tmp_path / "a.csv"
-    pd.DataFrame(X, columns=NAMES).to_csv(path, index=False)
-    return path
+    return saved(tmp_path / "a.csv", pd.DataFrame(X, columns=NAMES))
 
 
 def test_commands_replace_files_only_by_force(table, succeeds, fails, tmp_path):
     folder, page = tmp_path / "o", tmp_path / "thesis.html"
     succeeds("fit", table, "-k", 1, *JOINT, "-o", folder)
-    transform = ["transform", folder / "model.npz", table, "-o"]
-    export = ["export", folder / "model.npz", "-o"]
-    for argv in (
-        [*transform[:-1], "--std", "-o", folder / "alpha.csv"],
-        [*transform, tmp_path / "new.csv", "--viewer", page],
-        [*export, page],
-        [*export, folder / "report.html"],
+    model = folder / "model.npz"
+    transform, export = ["transform", model, table], ["export", model]
+    for *argv, path in (
+        [*transform, "--std", "-o", folder / "alpha.csv"],
+        [*transform, "-o", tmp_path / "new.csv", "--viewer", page],
+        [*export, "-o", page],
+        [*export, "-o", folder / "report.html"],
     ):
-        path = argv[-1]
-        if path == page:
-            page.write_text("mine")
+        page.write_text("mine")
         before = path.read_bytes()
-        message = fails(*argv)
+        message = fails(*argv, path)
         assert f"would be replaced: {path}. Choose another --output, or" in message
         assert path.read_bytes() == before
-        succeeds(*argv, *message.split()[-1:])  # --force
+        succeeds(*argv, path, *message.split()[-1:])  # --force
         assert path.read_bytes() != before
 
 
@@ -105,24 +102,22 @@ def test_pipes_and_devices_are_refused_at_once(read, tmp_path):
 
 def test_contents_of_other_files_are_refused(tmp_path):
     h5py = pytest.importorskip("h5py")
-    other, path = tmp_path / "other.h5", tmp_path / "a.h5"
+    other, path, shape = tmp_path / "other.h5", tmp_path / "a.h5", (1, 2, 2, 5)
     names = {"node_names": np.array([b"a", b"b"]), "track_names": np.array([b"t"])}
     with h5py.File(other, "w") as file:
-        file["tracks"] = np.ones((1, 2, 2, 5))
-    layout = h5py.VirtualLayout((1, 2, 2, 5), float)
-    layout[:] = h5py.VirtualSource(other, "tracks", (1, 2, 2, 5))
-    stored = {"shape": (1, 2, 2, 5), "dtype": float, "external": [(other, 0, 160)]}
-    for message, add in {
-        "tracks is a link": lambda f: f.update(
-            tracks=h5py.ExternalLink(other, "/tracks")
-        ),
-        "is stored in another file": lambda f: f.create_dataset("tracks", **stored),
-        "tracks is stored": lambda f: f.create_virtual_dataset("tracks", layout),
-    }.items():
+        file["tracks"] = np.ones(shape)
+    layout = h5py.VirtualLayout(shape, float)
+    layout[:] = h5py.VirtualSource(other, "tracks", shape)
+    for way in ("a link", "stored in another file", "stored"):
         with h5py.File(path, "w") as file:
             file.update(names)
-            add(file)
-        refused(message, read_landmarks, path)
+            if way == "a link":
+                file["tracks"] = h5py.ExternalLink(other, "/tracks")
+            elif way == "stored":
+                file.create_virtual_dataset("tracks", layout)
+            else:
+                file.create_dataset("tracks", shape, float, external=[(other, 0, 160)])
+        refused(f"tracks is {way}", read_landmarks, path)
 
 
 def test_an_entry_that_lies_about_its_size_is_not_unpacked(tmp_path):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused
 from scipy.spatial.transform import Rotation
 
@@ -51,30 +51,26 @@ def test_each_is_its_own_mirror_image(name):
         assert 0 not in {*skeleton.left, *skeleton.right}
 
 
+# Points that no edge joins
+ALONE = dict.fromkeys(("xm2vts-68", "muct-76"), (31, 36, 46, 47, 66, 67))
+ALONE |= dict.fromkeys(("xm2vts-53", "muct-61"), (16, 21, 31, 32, 51, 52))
+ALONE |= {"wflw-98": (96, 97), "wflw-65": (63, 64)}
+
+
 @ALL
-def test_each_has_a_source_and_joins_its_points(name):
+def test_each_has_a_source_joins_its_points_and_names_their_sides(name):
     skeleton = SKELETONS[name]
     assert "20" in skeleton.source or "1999" in skeleton.source
-    alone = set(range(skeleton.n_points)) - set(skeleton.edges.ravel().tolist())
-    known = {
-        **dict.fromkeys(("xm2vts-68", "muct-76"), (31, 36, 46, 47, 66, 67)),
-        **dict.fromkeys(("xm2vts-53", "muct-61"), (16, 21, 31, 32, 51, 52)),
-        **{"wflw-98": (96, 97), "wflw-65": (63, 64)},
-    }
     if not name.startswith("mediapipe-face"):
-        assert alone == set(known.get(name, ()))
-
-
-@ALL
-def test_names_with_sides_are_on_these_sides(name):
-    skeleton = SKELETONS[name]
-    for point, side in zip(skeleton.point_names or (), skeleton.sides, strict=False):
-        if "left" in point or "right" in point:
-            assert side == (1 if "left" in point else 2)
-            if "left" in point:
-                pairs = dict(zip(skeleton.left, skeleton.right, strict=True))
-                other = pairs[skeleton.point_names.index(point)]
-                assert skeleton.point_names[other] == point.replace("left", "right")
+        joined = set(skeleton.edges.ravel().tolist())
+        assert set(range(skeleton.n_points)) - joined == {*ALONE.get(name, ())}
+    points = skeleton.point_names or ()
+    for side in ("left", "right"):
+        named = {j for j, point in enumerate(points) if side in point}
+        assert named <= {*getattr(skeleton, side)}
+    for left, right in zip(skeleton.left, skeleton.right, strict=True):
+        if points and "left" in points[left]:
+            assert points[right] == points[left].replace("left", "right")
 
 
 @pytest.mark.parametrize("name", ["coco-17", "h36m-17"])
@@ -147,14 +143,9 @@ def test_names_in_another_order_are_the_layout_in_that_order():
     names = [coco.point_names[j] for j in order]
     found = find_skeleton(17, names)
     assert found.point_names == tuple(names)
-
-    def by_names(skeleton):
-        parts = skeleton.edges, skeleton.up, skeleton.front, skeleton.across
-        edges = (edge for part in parts for edge in np.asarray(part).tolist())
-        return {tuple(skeleton.point_names[j] for j in edge) for edge in edges}
-
-    assert by_names(found) == by_names(coco)
-    assert [names[j] for j in found.left] == [coco.point_names[j] for j in coco.left]
+    for part in ("edges", "up", "front", "across", "left", "right"):
+        places, expected = (np.array(getattr(each, part)) for each in (found, coco))
+        assert order[places].tolist() == expected.tolist()
     shape = make_body_tracks(100, random_state=0).mean_shape
     pose = canonical_pose(shape[order], scheme=found)
     assert_allclose(pose.rotation, canonical_pose(shape, scheme=coco).rotation)
@@ -174,22 +165,15 @@ WITH_CONTOUR = {
 def test_inner_points_are_a_layout(name, rest):
     whole, inner = get_skeleton(name), get_skeleton(rest)
     assert whole.contour == whole.curves[0]  # the jaw
-    others = SKELETONS.keys() - WITH_CONTOUR.keys() - {"coco-wholebody-133"}
+    others = SKELETONS.keys() - WITH_CONTOUR.keys() - {BODY.name}
     assert not any(SKELETONS[other].contour for other in others)
-    # The points of the face begin at 23.
-    body = get_skeleton("coco-wholebody-133")
-    assert body.contour == tuple(j + 23 for j in range(17))
+    assert BODY.contour == tuple(range(23, 40))  # where its face begins
     pose = {"name": rest, "up": inner.up, "front": inner.front}
     assert dataclasses.replace(whole.subset(whole.inner), **pose) == inner
-    assert inner.edges.tolist() == [
-        [whole.inner.tolist().index(j) for j in edge]
-        for edge in whole.edges.tolist()
-        if not {*edge} & {*whole.contour}
-    ]
-    table = np.arange(2 * whole.n_points)[None]
-    columns = table[:, whole.inner_columns].reshape(-1, 2)
-    assert columns[:, 0].tolist() == (2 * whole.inner).tolist()
-    assert columns[:, 1].tolist() == (2 * whole.inner + 1).tolist()
+    edges = [edge for edge in whole.edges.tolist() if not {*edge} & {*whole.contour}]
+    assert whole.inner[inner.edges].tolist() == edges
+    columns = np.stack([2 * whole.inner, 2 * whole.inner + 1], axis=1).ravel()
+    assert_array_equal(np.arange(2 * whole.n_points)[whole.inner_columns], columns)
 
 
 def sides_and_contour(skeleton):
@@ -206,9 +190,8 @@ MADE = Skeleton(
     contour=(2, 4),
 )
 PART = MADE.subset([6, 0, 1, 3, 4])
-MUCT, MESH, BODY = map(
-    get_skeleton, ("muct-76", "mediapipe-face-478", "coco-wholebody-133")
-)
+WHOLE = "muct-76", "mediapipe-face-478", "coco-wholebody-133"
+MUCT, MESH, BODY = map(get_skeleton, WHOLE)
 
 
 def skeleton(**change):

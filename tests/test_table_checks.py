@@ -8,7 +8,7 @@ import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
-from scenes import table_of
+from scenes import table_of, with_gaps
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -28,13 +28,12 @@ def fit(X, n_components=1, **params):
 class TestPoints:
     @pytest.mark.parametrize("layout", ["interleaved", "planar"])
     def test_half_points_are_named_by_their_columns(self, layout):
-        X = pd.DataFrame(table_of(FACES, layout), columns=[f"c{i}" for i in range(60)])
-        columns = {"interleaved": [14, 15], "planar": [7, 37]}[layout]
+        X = pd.DataFrame(table_of(FACES, layout)).add_prefix("c")
+        x, y = {"interleaved": (14, 15), "planar": (7, 37)}[layout]
         half, whole = X.copy(), X.copy()
-        half.iloc[3, columns[1]] = whole.iloc[3, columns] = np.nan
-        names = ", ".join(f"c{i}" for i in columns)
+        half.iloc[3, y] = whole.iloc[3, [x, y]] = np.nan
         message = r"in 1 of 40 rows points have only one of their two coordinates \(1 "
-        message += rf"in all; first: point 7 \({names}\) in row 3\). They count as "
+        message += rf"in all; first: point 7 \(c{x}, c{y}\) in row 3\). They count as "
         found = warned(message + "missing$", fit, half, layout=layout)
         assert_array_equal(found.alpha_, fit(whole, layout=layout).alpha_)
 
@@ -65,14 +64,12 @@ class TestPoints:
 
     @pytest.mark.parametrize(("unit", "dtype"), [(1e-9, np.float32), (1e9, float)])
     def test_one_place_is_a_matter_of_rounding(self, rng, unit, dtype):
-        place = 3.0 * np.ones((1, 2))
-        noise, eps = rng.normal(size=(30, 2)), np.finfo(dtype).eps
-        tracks = FACES.copy()
-        tracks[[7, 9]] = place + eps * noise
+        noise = np.finfo(dtype).eps * rng.normal(size=(30, 2))
+        equal, apart = FACES.copy(), FACES.copy()
+        equal[[7, 9]], apart[[7, 9]] = 3.0 + noise, 3.0 + 80 * noise
         message = r"all points are equal in 2 of 40 frames \(first: row 7\)"
-        refused(message, fit, table_of((unit * tracks).astype(dtype)))
-        tracks[[7, 9]] = place + 80 * eps * noise
-        fit(table_of((unit * tracks).astype(dtype)))
+        refused(message, fit, table_of((unit * equal).astype(dtype)))
+        fit(table_of((unit * apart).astype(dtype)))
 
 
 @pytest.mark.parametrize(("n_points", "n_components"), [(7, 3), (17, 10)])
@@ -103,18 +100,13 @@ LONG = np.tile(FACES, (100, 1, 1))
 HALF = make_face_tracks(60, missing=0.3, random_state=0).data
 
 
-class TestOtherLayout:
-    @pytest.mark.filterwarnings("ignore:in 60 of 60 rows points have only one")
-    def test_of_missing_points(self):
-        fit(HALF)
-        warned("layout='interleaved' explains", fit, HALF, layout="planar")
-
-    def test_tables_that_both_layouts_explain(self, rng):
-        fit(table_of(rng.normal(size=(20, 3)) @ rng.normal(size=(20, 3, 2))))
-        for missing in (0.0, 0.3):  # of noise, without warnings of arithmetic
-            X = rng.normal(size=(60, 30, 2))
-            X[rng.random(X.shape[:2]) < missing] = np.nan
-            fit(table_of(X))
+@pytest.mark.filterwarnings("ignore:in 60 of 60 rows points have only one")
+def test_layouts_of_tables_with_missing_points_and_of_those_that_both_explain(rng):
+    fit(HALF)
+    warned("layout='interleaved' explains", fit, HALF, layout="planar")
+    fit(table_of(rng.normal(size=(20, 3)) @ rng.normal(size=(20, 3, 2))))
+    for missing in (0.0, 0.3):  # of noise, without warnings of arithmetic
+        fit(with_gaps(rng.normal(size=(60, 60)), missing))
 
 
 # --- tables that are masked, hold NA, or are at the ends of the numbers' range --------
@@ -142,12 +134,15 @@ def model():
 def test_masked_entries_are_missing(model):
     masked = np.ma.masked_array(X, HIDDEN)
     assert_array_equal(estimator().fit(masked).alpha_, model.alpha_)
-    assert_array_equal(model.transform(masked), model.transform(HOLED))
     assert model.score(masked) == model.score(HOLED)
     fitted = model.reproject(HOLED)
     assert inverse_snr(masked, fitted) == inverse_snr(HOLED, fitted)
     assert_array_equal(masked.mask, HIDDEN)
     assert model.transform(masked.astype(np.float32)).dtype == np.float32
+    # Masked coefficients have no images.
+    alpha = np.ma.masked_array(model.alpha_, model.alpha_ > 0)
+    images = model.inverse_transform(alpha)
+    assert_array_equal(np.isnan(images).all(axis=1), alpha.mask.any(axis=1))
 
 
 @pytest.mark.parametrize("table", [MASKED, WITH_NA, WITH_NA.astype("Int64")], ids=type)
@@ -156,23 +151,16 @@ def test_whole_numbers_may_be_missing(model, table):
     assert_array_equal(model.transform(table), expected)
 
 
-def test_masked_coefficients_have_no_images(model):
-    alpha = np.ma.masked_array(model.alpha_, model.alpha_ > 0)
-    images = model.inverse_transform(alpha)
-    assert_array_equal(np.isnan(images).all(axis=1), alpha.mask.any(axis=1))
-
-
 KINDS_OF_FITS = [{"camera": name} for name in ("weak_perspective", "orthographic")]
 KINDS_OF_FITS += [{"loss": "cauchy"}, {"refinement": None, "scale_frames": False}]
 
 
 @pytest.mark.parametrize("size", slow_after(1, [2.0**-460, 2.0**460]))
 @pytest.mark.parametrize("params", KINDS_OF_FITS, ids=str)
+@pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")
 def test_sizes_within_the_range_change_no_coefficient(params, size):
     """Powers of two: the numbers of the larger table are the same but for exponents."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "the depth of the shapes is not determined")
-        usual, scaled = (estimator(**params).fit(s * X) for s in (1.0, size))
+    usual, scaled = (estimator(**params).fit(s * X) for s in (1.0, size))
     assert_allclose(scaled.alpha_, usual.alpha_, atol=1e-6)
     assert_allclose(scaled.inverse_snr_, usual.inverse_snr_, rtol=1e-6)
 
