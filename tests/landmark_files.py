@@ -79,14 +79,6 @@ def write_openface(
     return path
 
 
-def saved_again(path, suffix, **options):
-    """Save a csv file as another kind of table, as people do with pandas."""
-    frame = pd.read_csv(path)
-    path.unlink()
-    sign = "," if suffix == ".csv" else "\t"
-    return saved(path.with_suffix(suffix), frame, sep=sign, **options)
-
-
 def saved(path, frame, index=False, **options):
     """Save a table with pandas, with options of texts."""
     if path.suffix == ".parquet":
@@ -110,17 +102,12 @@ def write_pyfeat(path, tracks, *, detector="Detector"):
     for side in ("X", "Y", "Width", "Height"):
         columns[f"FaceRect{side}"] = np.where(seen, 100.25, np.nan)
     columns["FaceScore"] = np.where(seen, np.linspace(0.5, 1, n), np.nan)
+    names = [f"{axis}_{j}" for axis in "xy" for j in range(n_points)]
+    points = dict(zip(names, planar(tracks).T, strict=True))
     if detector == "MPDetector":
-        depths = np.broadcast_to(
-            np.where(seen, -3.5, np.nan)[:, None], tracks.shape[:2]
-        )
-        points, names = np.dstack([tracks, depths]).reshape(n, -1), "xyz"
+        points |= {f"z_{j}": np.where(seen, -3.5, np.nan) for j in range(n_points)}
         names = [f"{axis}_{j}" for j in range(n_points) for axis in "xyz"]
-    else:
-        points = planar(tracks)
-        names = [f"{axis}_{j}" for axis in "xy" for j in range(n_points)]
-    columns |= dict(zip(names, points.T, strict=True))
-    columns["AU01"] = np.linspace(0, 1, n)
+    columns |= {name: points[name] for name in names} | {"AU01": np.linspace(0, 1, n)}
     if detector == "Detectorv2":
         columns |= {f"Identity_{j}": np.zeros(n) for j in range(1, 513)}
         columns |= {f"mesh_{a}_{j}": np.full(n, 9.0) for a in "xyz" for j in range(478)}
@@ -162,13 +149,15 @@ def write_wflw(path, tracks, *, rest=True):
 def deeplabcut_frame(tracks, likelihood=0.9, *, bodyparts=BODYPARTS, individuals=()):
     """Return a table as DeepLabCut has it; tracks may have an axis of individuals."""
     values = tracks.reshape(len(tracks), -1, len(bodyparts), 2)
-    levels = {"scorer": ["DLC_resnet50_mice"], "individuals": list(individuals)}
-    levels |= {"bodyparts": list(bodyparts), "coords": ["x", "y"]}
+    coords = ["x", "y"]
     if likelihood is not None:
-        levels["coords"] += ["likelihood"]
-        scores = np.reshape(likelihood, (-1, 1, 1, 1))
-        scores = np.broadcast_to(scores, (*values.shape[:3], 1))
+        coords += ["likelihood"]
+        scores = np.broadcast_to(
+            np.reshape(likelihood, (-1, 1, 1, 1)), (*values.shape[:3], 1)
+        )
         values = np.concatenate([values, scores], axis=3)
+    levels = {"scorer": ["DLC_resnet50_mice"], "individuals": list(individuals)}
+    levels |= {"bodyparts": list(bodyparts), "coords": coords}
     levels = {name: words for name, words in levels.items() if words}
     columns = pd.MultiIndex.from_product(levels.values(), names=levels)
     return pd.DataFrame(values.reshape(len(tracks), -1), columns=columns)
@@ -198,13 +187,12 @@ def write_sleap(
     arrays["ft"] = "instance_scores", scores.mean(axis=2)
     with h5py.File(path, "w") as file:
         for own_order, (name, values) in arrays.items():
-            wanted = [letter for letter in order if letter in own_order]
-            axes = [own_order.index(letter) for letter in wanted]
-            data = file.create_dataset(name, data=values.transpose(axes))
+            wanted = "".join(letter for letter in order if letter in own_order)
+            file[name] = np.einsum(f"{own_order}->{wanted}", values)
             if named:
-                data.attrs["dims"] = json.dumps([words[letter] for letter in wanted])
-        occupied = ~np.isnan(tracks).all(axis=(2, 3))
-        file["track_occupancy"] = occupied.astype(np.uint8)
+                dims = [words[letter] for letter in wanted]
+                file[name].attrs["dims"] = json.dumps(dims)
+        file["track_occupancy"] = (~np.isnan(tracks).all(axis=(2, 3))).astype(np.uint8)
         for kind, texts in (("node", BODYPARTS), ("track", names), ("edge", edges)):
             if texts is not None:
                 file[f"{kind}_names"] = np.array(texts, dtype="S")
@@ -217,26 +205,17 @@ def coco_annotations(tracks, *, names=BODYPARTS, image=None):
     seen = ~np.isnan(tracks).any(axis=2)
     values = np.concatenate([np.nan_to_num(tracks), 2 * seen[..., None]], axis=2)
     image = range(1, len(tracks) + 1) if image is None else image
-    known = {"iscrowd": 0, "area": 1.5}
+    known = {"category_id": 1, "iscrowd": 0, "area": 1.5}
     rows = [
-        {
-            "id": 100 + i,
-            "image_id": of,
-            "category_id": 1,
-            "keypoints": row.ravel().tolist(),
-        }
+        {"id": 100 + i, "image_id": of, "keypoints": row.ravel().tolist()}
         | {"num_keypoints": int(seen[i].sum()), **known}
         for i, (of, row) in enumerate(zip(image, values, strict=True))
     ]
     size = {"width": 640, "height": 480}
-    return {
-        "info": {"description": "people"},
-        "images": [
-            {"id": i, "file_name": f"{i:012d}.jpg"} | size for i in sorted({*image})
-        ],
-        "annotations": rows,
-        "categories": [{"id": 1, "name": "person", "keypoints": list(names)}],
-    }
+    images = [{"id": i, "file_name": f"{i:012d}.jpg"} | size for i in sorted({*image})]
+    person = {"id": 1, "name": "person", "keypoints": list(names)}
+    content = {"info": {"description": "people"}, "images": images}
+    return content | {"annotations": rows, "categories": [person]}
 
 
 def write_json(path, content):
@@ -306,10 +285,9 @@ def write_yolo(folder, tracks, *thirds, after=()):
 
 def write_labelme(path, i, points):
     """Write a file of labelme for one image."""
-    shapes = [
-        {"label": name, "points": [point], "group_id": None, "shape_type": "point"}
-        for name, point in zip(BODYPARTS, points.tolist(), strict=True)
-    ]
+    named = zip(BODYPARTS, points.tolist(), strict=True)
+    known = {"group_id": None, "shape_type": "point"}
+    shapes = [{"label": name, "points": [point], **known} for name, point in named]
     known = {"version": "5.4.1", "flags": {}, "shapes": shapes, "imageData": None}
     known |= {"imagePath": f"{i}.jpg", "imageHeight": 480, "imageWidth": 640}
     write_json(path, known)
@@ -319,27 +297,24 @@ def write_imglab(path, tracks):
     """Write parts of boxes as dlib's imglab does."""
     lines = ["<?xml version='1.0' encoding='ISO-8859-1'?>", "<dataset><images>"]
     for i, points in enumerate(tracks):
-        head = f"<image file='{i}.jpg'>", "<box top='1' left='2' width='3' height='4'>"
-        parts = (
-            f"<part name='{j:02}' x='{x}' y='{y}'/>" for j, (x, y) in enumerate(points)
-        )
-        lines += [*head, *parts, "</box></image>"]
+        lines += [f"<image file='{i}.jpg'><box top='1' left='2' width='3' height='4'>"]
+        for j, (x, y) in enumerate(points):
+            lines.append(f"<part name='{j:02}' x='{x}' y='{y}'/>")
+        lines.append("</box></image>")
     return write_text(path, *lines, "</images></dataset>")
 
 
 def write_trc(path, tracks, z=0.0):
     """Write points in pixels as Sports2D does."""
     n, J, _ = tracks.shape
-    names = (
-        "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame"
-    )
-    head = [["PathFileType", 4, "(X/Y/Z)", path.name]]
-    head += [[*names.split(), "OrigNumFrames"], [30, 30, n, J, "px", 30, 0, n]]
-    head += [["Frame#", "Time", "\t\t\t".join(BODYPARTS), "", ""]]
-    head += [["", "", *(f"{axis}{j}" for j in range(1, J + 1) for axis in "XYZ")]]
+    names = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate".split()
+    rows = [["PathFileType", 4, "(X/Y/Z)", path.name]]
+    rows += [[*names, "OrigDataStartFrame", "OrigNumFrames"]]
+    rows += [[30, 30, n, J, "px", 30, 0, n]]
+    rows += [["Frame#", "Time", "\t\t\t".join(BODYPARTS), "", ""]]
+    rows += [["", "", *(f"{axis}{j}" for j in range(1, J + 1) for axis in "XYZ")]]
     spatial = np.concatenate([tracks, np.broadcast_to(z, (n, J, 1))], axis=2)
-    rows = enumerate(spatial.reshape(n, -1).tolist())
-    rows = [*head, *([i, i / 30, *row] for i, row in rows)]
+    rows += [[i, i / 30, *each.ravel().tolist()] for i, each in enumerate(spatial)]
     return write_text(path, *("\t".join(map(str, row)) for row in rows))
 
 
@@ -393,9 +368,23 @@ def to(name, write, *args, **options):
     return lambda folder: write(folder / name, *args, **options)
 
 
+def again(name, suffix, **options):
+    """Return what saves a csv file as another table, as people do with pandas."""
+
+    def write(folder):
+        frame = pd.read_csv(path := WRITERS[name](folder))
+        path.unlink()
+        sign = "," if suffix == ".csv" else "\t"
+        return saved(path.with_suffix(suffix), frame, sep=sign, **options)
+
+    return write
+
+
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
 XY = [f"{axis}{j}" for j in range(8) for axis in "xy"]
 FRAME = deeplabcut_frame(TRACKS)
+UNSCORED = FRAME.droplevel("scorer", axis=1)
+INDIVIDUAL = FRAME.rename_axis(columns={"scorer": "individuals"})
 SCORED = np.dstack([TRACKS, np.full((12, 8), 0.7)])
 RESULTS = [
     {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
@@ -405,6 +394,7 @@ VIDEO = [{"frame_id": i, "instances": [mmpose(row)]} for i, row in enumerate(SCO
 PREDICTIONS = [frame["instances"] for frame in VIDEO]
 POSES = [[openpose_person(pose=row)] for row in SCORED]
 POINTS = [[dict(zip("xy", p, strict=True)) for p in row] for row in TRACKS.tolist()]
+FOUND = [[detection(points)] for points in TRACKS]
 DETECTIONS = pd.DataFrame([detection(p, track_id=i) for i, p in enumerate(TRACKS)])
 COCO, TABLE = coco_annotations(TRACKS), pd.DataFrame(TRACKS.reshape(12, -1), columns=XY)
 # Of each format, files of one individual: what writes them into a folder and returns
@@ -413,10 +403,8 @@ WRITERS = {
     "openface": to("a.csv", write_openface, TRACKS),
     "openface-1": to("a.csv", write_openface, TRACKS, separator=", "),
     "openface-image": to("a.csv", write_openface, TRACKS, video=False),
-    "openface-tsv": lambda d: saved_again(write_openface(d / "a.csv", TRACKS), ".tsv"),
-    "openface-parquet": lambda d: saved_again(
-        write_openface(d / "a.csv", TRACKS, separator=", "), ".parquet"
-    ),
+    "openface-tsv": again("openface", ".tsv"),
+    "openface-parquet": again("openface-1", ".parquet"),
     "pyfeat": to("a.csv", write_pyfeat, TRACKS),
     "pyfeat-v2": to("a.csv", write_pyfeat, TRACKS, detector="Detectorv2"),
     "pyfeat-mp": to("a.csv", write_pyfeat, MESH, detector="MPDetector"),
@@ -430,16 +418,10 @@ WRITERS = {
     "deeplabcut-tsv": to("a.tsv", write_deeplabcut, FRAME),
     "deeplabcut-table": to("a.h5", write_deeplabcut, FRAME),
     "deeplabcut-fixed": to("a.h5", write_deeplabcut, FRAME, how="fixed"),
-    "deeplabcut-lines": to(
-        "a.csv", write_deeplabcut, FRAME.droplevel("scorer", axis=1)
-    ),
-    "deeplabcut-individuals": to(
-        "a.csv", write_deeplabcut, FRAME.rename_axis(columns={"scorer": "individuals"})
-    ),
-    "deeplabcut-pandas": lambda d: saved_again(WRITERS["deeplabcut"](d), ".csv"),
-    "deeplabcut-index": lambda d: saved_again(
-        WRITERS["deeplabcut"](d), ".csv", index=True
-    ),
+    "deeplabcut-lines": to("a.csv", write_deeplabcut, UNSCORED),
+    "deeplabcut-individuals": to("a.csv", write_deeplabcut, INDIVIDUAL),
+    "deeplabcut-pandas": again("deeplabcut", ".csv"),
+    "deeplabcut-index": again("deeplabcut", ".csv", index=True),
     "sleap": to("a.h5", write_sleap, TRACKS[:, None], names=["a"]),
     "coco": to("a.json", write_json, COCO),
     "coco-unnamed": to("a.json", write_json, COCO | {"categories": [{"id": 1}]}),
@@ -453,7 +435,7 @@ WRITERS = {
     "mmpose-demo": to("a.json", write_json, {"meta_info": {}, "instance_info": VIDEO}),
     "mmpose-results": to("a.json", write_json, {"predictions": PREDICTIONS}),
     "tps": to("a.tps", write_tps, TRACKS),
-    "ultralytics": to("a.json", write_json, [[detection(points)] for points in TRACKS]),
+    "ultralytics": to("a.json", write_json, FOUND),
     "ultralytics-csv": to("a.csv", saved, DETECTIONS),
     "ultralytics-folder": to("a", write_each, ".json", write_detection),
     "yolo": to("a", write_yolo, TRACKS, 2),
@@ -469,17 +451,14 @@ WRITERS = {
     "array": to("a.npy", write_array, xy=TRACKS),
     "array-columns": to("a.npz", write_array, xy=TRACKS.reshape(12, -1)),
     "array-planar": to("a.mat", write_array, xy=TRACKS.mT, fps=30.0),
-    "table-txt": lambda d: saved_again(
-        write_mesh(d / "a.csv", TRACKS, shares=False), ".txt"
-    ),
+    "table-txt": again("table", ".txt"),
     "table-blanks": to("a.txt", saved, TABLE, sep=" "),
     "table-parquet": to("a.parquet", saved, TABLE),
     "table-folder": to("a", write_each, ".csv", write_row),
     "table": to("a.csv", write_mesh, TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
-IN_MESH = [n for n in WRITERS if n[:10] in ("mediapipe", "mediapipe-", "pyfeat-mp")]
-EXPECTED = dict.fromkeys(IN_MESH, MESH)
+EXPECTED = dict.fromkeys(["mediapipe-pixels", "mediapipe-sizes", "pyfeat-mp"], MESH)
 EXPECTED |= dict.fromkeys(["pts-file", "openpose-file", "mmpose-image"], TRACKS[:1])
 EXPECTED |= {n: TRACKS / 500 for n in WRITERS if n.startswith("yolo")}
 EXPECTED |= {"facemap": TRACKS[:, np.argsort(BODYPARTS)]}
