@@ -1,30 +1,17 @@
 """All ways to group nine signals by three, and what a grouping holds inside."""
 
-from itertools import combinations
+from itertools import product
 
 import numpy as np
 
 
-def all_groupings(items):
-    """Return all ways to split items into groups of three."""
-    if not items:
-        return [[]]
-    first, *others = items
-    found = []
-    for pair in combinations(others, 2):
-        rest = [item for item in others if item not in pair]
-        found += [[(first, *pair), *tail] for tail in all_groupings(rest)]
-    return found
+def is_grouping(labels):
+    """Tell whether there are three of each label, which begin in their order."""
+    in_order = [*dict.fromkeys(labels)] == [0, 1, 2]
+    return in_order and np.bincount(labels).tolist() == [3, 3, 3]
 
 
-def as_assignment(groups):
-    assignment = np.empty(3 * len(groups), dtype=int)
-    for k, group in enumerate(groups):
-        assignment[list(group)] = k
-    return assignment
-
-
-GROUPINGS = [as_assignment(groups) for groups in all_groupings(list(range(9)))]
+GROUPINGS = np.array([*filter(is_grouping, product(range(3), repeat=9))])
 assert len(GROUPINGS) == 280
 
 

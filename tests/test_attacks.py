@@ -13,6 +13,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
+from fit_runs import QUICK
 from landmark_files import FRAME, TRACKS, XY
 from layers import slow_after
 from numpy.testing import assert_array_equal
@@ -136,7 +137,7 @@ def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
     frame.columns = [f"{axis}_{j}" for j in range(12) for axis in "xy"]
     frame = frame.assign(**{f"{text}note": "a", "who": [f"{text}a", f"{text}b"] * 8})
     frame.to_csv(path := tmp_path / "a.csv", index=False)
-    options = ["fit", str(path), "-k1", "--no-figures", "-o", str(tmp_path / "b")]
+    options = ["fit", str(path), *QUICK, "1", "-o", str(tmp_path / "b")]
     assert main([*options, "--label", "who"]) == 0
     assert main([*options, "--force", "--group", f"{text}x"]) == 1
     frame.assign(x_3=text).to_csv(path, index=False)

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
+from fit_runs import QUICK
 from landmark_files import deeplabcut_frame, saved, write_deeplabcut
 from layers import slow_after, with_limits
 from refusals import refusals_of
@@ -203,7 +204,7 @@ def in_place():
     return tracks
 
 
-ROUGH = "--no-figures --refinement none -k 1".split()
+ROUGH = [*QUICK, "1"]
 
 
 def named(X):

@@ -36,7 +36,7 @@ def test_missing_points_are_farther_away(side, kind):
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     # Points that turn away from the viewer, or towards them in the mirror image.
     missing = side * (face.shapes[..., :2] @ sight[:, :2, None]) > 20.0
-    X = np.where(missing, np.nan, face.tracks)[:, ::3].reshape(60, -1)
+    X = np.where(missing, np.nan, face.tracks)[:, ::4].reshape(60, -1)
     convention, model = fits(X, **options)
     assert model.mirror_certainty_ > 0.995
     # The skewness of the depths is right for this face.

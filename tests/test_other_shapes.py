@@ -11,6 +11,7 @@ from fit_runs import QUICK, begun, told_of_fit
 from landmark_files import BODYPARTS, TRACKS
 from numpy.testing import assert_array_equal
 from refusals import refusals_of, refused
+from scenes import table_of
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks
@@ -138,10 +139,11 @@ def test_a_fit_of_a_row_for_each_point(tmp_path, fits, transforms):
     tracks = make_face_tracks(40, random_state=0).data.reshape(40, 68, 2)[:, ::5]
     rows = [(i, j, *tracks[i, j]) for i in range(40) for j in range(14)]
     table = pd.DataFrame(rows, columns=["photo", "lm", "x", "y"])
-    table.to_csv(path := tmp_path / "a.csv", index=False)
-    option = ["--row-per-point", "photo,lm"]
-    model = fits(path, *QUICK, "1", *option).path
-    found, *_ = transforms(model, path, *option)
+    path, option = (
+        files.saved(tmp_path / "a.csv", table),
+        ["--row-per-point", "photo,lm"],
+    )
+    found, *_ = transforms(fits(path, *QUICK, "1", *option).path, path, *option)
     assert list(found["photo"]) == [*range(40)]
 
 
@@ -156,12 +158,17 @@ RANGE = (COLUMNS - COLUMNS.min(axis=0)) / np.ptp(COLUMNS, axis=0)
 LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
 
 
-def told_of_columns(folder, table):
-    """Return whether fit and reader tell that columns were scaled separately."""
-    wide("{axis}{part}", table, range(68)).to_csv(folder / "a.csv", index=False)
+def told_of_fit_to(table):
+    """Return what a fit warns of."""
     with warnings.catch_warnings(record=True, action="always") as caught:
         AffineNRSfM(1, refinement=None, random_state=0).fit(table)
-    texts = " ".join(str(each.message) for each in caught), read(folder / "a.csv")[0]
+    return [str(each.message) for each in caught]
+
+
+def told_of_columns(folder, table):
+    """Return whether fit and reader tell that columns were scaled separately."""
+    path = files.saved(folder / "a.csv", wide("{axis}{part}", table, range(68)))
+    texts = " ".join(told_of_fit_to(table)), read(path)[0]
     return ["Each column was scaled separately" in text for text in texts]
 
 
@@ -174,18 +181,17 @@ FURTHER = [[THIRD], [SEEN], [0 * SEEN], [THIRD, SEEN], [THIRD, 0 * SEEN]]
 def test_points_of_three_or_four_numbers(tracks, further):
     n = 2 + len(further)
     X = np.concatenate([tracks, *further], axis=2)
-    for layout, axes in (("interleaved", (0, 1, 2)), ("planar", (0, 2, 1))):
+    for layout in ("interleaved", "planar"):
         fit = AffineNRSfM(1, layout=layout, refinement=None).fit
-        flat, odd = (a.transpose(axes).reshape(60, -1) for a in (X, X[:, :21]))
-        for given, told in (
-            (pd.DataFrame(flat), f"{n} numbers for each point"),
-            (X, "the shape"),
-            (pd.DataFrame(odd), "an even number"),
-        )[: 3 if n == 3 else 2]:
+        cases = {"the shape": X}
+        cases[f"{n} numbers for each point"] = pd.DataFrame(table_of(X, layout))
+        if n == 3:
+            cases["an even number"] = pd.DataFrame(table_of(X[:, :21], layout))
+        for told, given in cases.items():
             way = re.split("[gG]ive ", str(refused(told, fit, given)))[-1]
             found = eval(way, {"X": given, "np": np})
-            points = tracks[:, : found.shape[1] // 2].transpose(axes)
-            assert_array_equal(found, points.reshape(60, -1))
+            points = tracks[:, : found.shape[1] // 2]
+            assert_array_equal(found, table_of(points, layout))
 
 
 def test_two_rows_of_points_are_no_visibilities():
@@ -201,10 +207,8 @@ def test_points_that_stand_still(still):
     walk = 30 * np.cumsum(np.random.default_rng(0).normal(size=(60, 1, 2)), axis=0)
     X = FACES + walk
     X[:, -still:] = FACES[:1, -still:] + 0.01 * FACES[:, -still:]
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        AffineNRSfM(1, refinement=None).fit(X.reshape(60, -1))
-    told = [str(each.message) for each in caught if "stand still" in str(each.message)]
-    assert [text.split()[0] for text in told] == [str(still)]
+    (told,) = (text for text in told_of_fit_to(table_of(X)) if "stand still" in text)
+    assert told.startswith(f"{still} ")
 
 
 SCORES = np.linspace(0.02, 0.4, N * J).reshape(N, J)
@@ -261,21 +265,19 @@ def test_failed_frames_of_the_first_openface(tmp_path):
     table = wide("{axis}{part}", parts=range(J)).add_prefix(" ")
     table.insert(0, "frame", range(N))
     table = table.assign(timestamp=0.1, confidence=0.9, success=1 - (table.frame == 3))
-    table.to_csv(path := tmp_path / "a.csv", index=False)
-    found = read_landmarks(path)
-    assert found.format == "openface"
-    assert list(np.flatnonzero(found.failed)) == [3]
-    table.to_csv(path := tmp_path / "a.txt", index=False)
-    assert list(np.flatnonzero(read_landmarks(path).failed)) == [3]
+    for name in ("a.csv", "a.txt"):
+        found = read_landmarks(files.saved(tmp_path / name, table))
+        assert found.format == "openface"
+        assert list(np.flatnonzero(found.failed)) == [3]
     table = wide("{axis}_{part}", files.scene(N, 68), range(68))  # parts of a table
-    table.assign(success=np.arange(N) % 2).to_csv(path, index=False)
+    path = files.saved(tmp_path / name, table.assign(success=np.arange(N) % 2))
     assert list(read_landmarks(path).failed) == [True, False] * (N // 2)
 
 
 @pytest.mark.parametrize("names", [["a.jpg"], ["a.jpg", "happy"]])
 def test_a_first_line_of_numbers_is_no_header(tmp_path, names):
     table = pd.DataFrame([[*names, *row] for row in FLAT])
-    table.to_csv(path := tmp_path / "a.csv", index=False, header=False)
+    path = files.saved(tmp_path / "a.csv", table, header=False)
     assert "its first line has numbers" in read(path)[0]
 
 
