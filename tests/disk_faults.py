@@ -6,7 +6,8 @@ import errno
 import io
 import os
 from pathlib import Path
-from unittest import mock
+
+import pytest
 
 # Operations that may fail, and those that clean up, during which one may be stopped.
 WRITING = ("replace", "mkdir", "chmod", "fsync", "open")
@@ -16,7 +17,7 @@ CLEANING = ("unlink", "remove", "rmdir")
 def disk_error(code):
     """Return what raises an error of the disk."""
 
-    def strike(path):
+    def strike(path=None):
         # As the system does: errors of open files do not say which file it is.
         named = [path] if isinstance(path, str | os.PathLike) else []
         raise OSError(code, os.strerror(code), *named)
@@ -24,7 +25,7 @@ def disk_error(code):
     return strike
 
 
-def interrupt(_path):
+def interrupt(_path=None):
     """Do what Ctrl-C does."""
     raise KeyboardInterrupt
 
@@ -56,9 +57,8 @@ class Faults:
 
     def concerns(self, *paths, dir_fd=None, **_):
         """Tell whether an operation is on files of the folder."""
-        paths = [p for p in paths if isinstance(p, str | os.PathLike)]
-        inside = (os.path.abspath(p).startswith(self.folder) for p in paths)
-        return dir_fd is not None or any(inside)
+        named = [os.path.abspath(p) for p in paths if isinstance(p, str | os.PathLike)]
+        return dir_fd is not None or any(p.startswith(self.folder) for p in named)
 
     def run(self, name, operation, *args, full=True, **keywords):
         """Run an operation, or let it fail."""
@@ -66,14 +66,13 @@ class Faults:
         number = len(self.operations)
         again = self.again == "all" or (self.again == "writes" and full)
         strikes = number == self.at or (again and number > self.at > 0)
-        path = args[0] if args else None
         if strikes and not self.after:
-            self.strike(path)
+            self.strike(*args[:1])
         result = operation(*args, **keywords)
         if strikes and self.after:
             if isinstance(result, io.FileIO):  # which nobody else has yet
                 io.FileIO.close(result)
-            self.strike(path)
+            self.strike(*args[:1])
         return result
 
 
@@ -147,12 +146,11 @@ def disk_faults(folder, strike, at):
 
         return operation
 
-    names = WRITING + (CLEANING if faults.stops else ())
-    with contextlib.ExitStack() as stack:
+    with pytest.MonkeyPatch.context() as patch:
         for module in (io, builtins):
-            stack.enter_context(mock.patch.object(module, "open", counting_open))
-        for name in names:
-            stack.enter_context(mock.patch.object(os, name, counting(name)))
+            patch.setattr(module, "open", counting_open)
+        for name in WRITING + CLEANING * faults.stops:
+            patch.setattr(os, name, counting(name))
         yield faults
 
 
@@ -161,16 +159,12 @@ def readable(folder):
 
     Hidden files and links that lead nowhere are not found.
     """
-    found = {path.relative_to(folder): path for path in sorted(Path(folder).rglob("*"))}
-    return {
-        str(name): path.read_bytes()
-        for name, path in found.items()
-        if path.is_file() and not any(part.startswith(".") for part in name.parts)
-    }
+    found = {str(p.relative_to(folder)): p for p in Path(folder).rglob("*")}
+    shown = {name: p for name, p in found.items() if "/." not in f"/{name}"}
+    return {name: p.read_bytes() for name, p in shown.items() if p.is_file()}
 
 
 def leftovers(folder):
     """Return the names of hidden files and of links in a folder."""
-    found = sorted(Path(folder).rglob("*"))
-    found = [path for path in found if path.name.startswith(".") or path.is_symlink()]
-    return [str(path.relative_to(folder)) for path in found]
+    found = [*Path(folder).rglob("*")]
+    return [p.name for p in found if p.name.startswith(".") or p.is_symlink()]

@@ -93,7 +93,7 @@ def spoilt(number=1.0):
 class TestFitted:
     @each
     @scaled_or_not
-    def test_definitions(self, method, scale_frames):
+    def test_definitions_and_transform(self, method, scale_frames):
         truth, model = table(), fitted(method, scale_frames=scale_frames)
         X = truth.data
         images = model.shapes_ @ model.motion_.swapaxes(1, 2)
@@ -119,11 +119,6 @@ class TestFitted:
         images = (model.mean_shape_ + nearest) @ model.motion_.swapaxes(1, 2)
         error = np.mean(((tracks - images) / size[:, None, None]) ** 2)
         assert model.noise_variance_ == pytest.approx(error)
-
-    @each
-    @scaled_or_not
-    def test_transform_gives_the_coefficients_again(self, method, scale_frames):
-        X, model = table().data, fitted(method, scale_frames=scale_frames)
         assert_array_equal(model.transform(X), model.alpha_)
         assert_allclose(model.transform(X[7:9]), model.alpha_[7:9], atol=1e-7)
 
