@@ -93,6 +93,7 @@ class TestAlone:
         recorder.assert_nested()
         assert recorder.tasks() == [*PAPER_STAGES, LAST, "fit"]
         # Also when a fit fails
+        recorder.told.clear()
         refused("loss='huber' needs", model.set_params(loss="huber").fit, TABLE)
         assert recorder.told[-1] == ("teardown", "AffineNRSfM", "")
 
