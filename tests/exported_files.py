@@ -15,18 +15,15 @@ class Read:
 
     def __init__(self, path):
         content = path.read_bytes()
-        magic, version, size = struct.unpack("<4sII", content[:12])
-        assert (magic, version, size) == (b"glTF", 2, len(content))
-        chunks, place = [], 12
-        while place < size:
-            length, kind = struct.unpack("<I4s", content[place : place + 8])
-            assert length % 4 == 0
-            chunks.append((kind, content[place + 8 : place + 8 + length]))
-            place += 8 + length
-        (json_kind, text), (binary_kind, self.binary) = chunks
-        assert (json_kind, binary_kind) == (b"JSON", b"BIN\0")
+        head = struct.unpack("<4sIII4s", content[:20])
+        start = 20 + head[3]
+        length, kind = struct.unpack("<I4s", content[start : start + 8])
+        text, self.binary = content[20:start], content[start + 8 :]
+        assert head == (b"glTF", 2, len(content), len(text), b"JSON")
+        assert (length, kind) == (len(self.binary), b"BIN\0")
+        assert len(text) % 4 == length % 4 == 0
         self.document = json.loads(text)
-        assert self.document["buffers"] == [{"byteLength": len(self.binary)}]
+        assert self.document["buffers"] == [{"byteLength": length}]
 
     def array(self, number):
         accessor = self.document["accessors"][number]

@@ -45,32 +45,20 @@ def blocks(page):
     return BLOCK.findall(text(page))
 
 
-def write_faces(n_frames, n_components, **others):
-    """Write the tables that the pages read, of three people; return the faces."""
-    faces = make_face_tracks(n_frames, n_components=n_components, random_state=0)
-    people = np.repeat(["Ada", "Ben", "Cyd"], n_frames // 3)
-    frame = pd.DataFrame(faces.data, columns=faces.feature_names)
-    frame = pd.concat([pd.DataFrame({"person": people} | others), frame], axis=1)
-    frame.to_csv("faces.csv", index=False)
-    frame[:5].to_csv("new_faces.csv", index=False)
-    return faces
-
-
 @pytest.fixture
 def tables(tmp_path, monkeypatch):
-    """Write tables of faces, and go where they are."""
+    """Write faces of three people in two conditions, and go where they are."""
     monkeypatch.chdir(tmp_path)
-    write_faces(36, 3)
-
-
-@pytest.fixture
-def video(tmp_path, monkeypatch):
-    """Write a video in two conditions, and a file with confidences."""
-    monkeypatch.chdir(tmp_path)
-    seconds = np.tile(np.arange(12) / 25, 3)
-    faces = write_faces(36, 4, condition=["before", "after"] * 18, seconds=seconds)
+    faces = make_face_tracks(36, n_components=4, random_state=0)
+    people = {"person": np.repeat(["Ada", "Ben", "Cyd"], 12)}
+    people |= {"condition": ["before", "after"] * 18}
+    people |= {"seconds": np.tile(np.arange(12) / 25, 3)}
+    points = pd.DataFrame(faces.data, columns=faces.feature_names)
+    frame = pd.DataFrame(people).join(points)
+    frame.to_csv("faces.csv", index=False)
+    frame[:5].to_csv("new_faces.csv", index=False)
     confidence = np.linspace(0.7, 1, 36)
-    write_openface(tmp_path / "openface.csv", faces.tracks, confidence=confidence)
+    write_openface(Path("openface.csv"), faces.tracks, confidence=confidence)
 
 
 @pytest.fixture
@@ -145,7 +133,7 @@ def test_the_readme_runs():
 @pytest.mark.usefixtures("tables")
 def test_getting_started_runs():
     names = run("docs/getting_started.md")
-    assert list(pd.read_csv("alpha.csv"))[:2] == ["person", "alpha_1"]
+    assert list(pd.read_csv("alpha.csv"))[2:4] == ["seconds", "alpha_1"]
     seen = names["points"].to_numpy()[0].reshape(-1, 2)
     np.testing.assert_allclose(names["row"], seen, atol=10)
     assert Path("shapes.png").stat().st_size
@@ -183,7 +171,7 @@ def codes_of_calls(column):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:no perspective")
-@pytest.mark.usefixtures("video")
+@pytest.mark.usefixtures("tables")
 def test_python_calls_for_questions_run():
     names = run("docs/which_call.md")
     names["weights"] = names["read_landmarks"]("openface.csv").confidence
@@ -196,7 +184,7 @@ def test_python_calls_for_questions_run():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("video")
+@pytest.mark.usefixtures("tables")
 def test_commands_for_questions_run():
     fit = ["fit", "--n-components", "1", *JOINT]
     codes = dict.fromkeys(codes_of_calls(2))
@@ -261,7 +249,7 @@ def fitted():
     return faces, *models
 
 
-@pytest.mark.usefixtures("video")
+@pytest.mark.usefixtures("tables")
 @pytest.mark.parametrize("page", slow_after(5, REFERENCE))
 def test_code_of_reference_pages_runs(page, fitted):
     faces, model, bodies, mice = fitted

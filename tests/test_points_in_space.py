@@ -129,7 +129,7 @@ def test_files_of_opensim(face, tmp_path):
         assert_allclose(rows[:, 2:].reshape(values.shape), values, rtol=1e-12)
 
 
-def test_depths_that_are_not_determined(face, tmp_path):
+def test_depths_that_are_not_determined():
     still = FACES.shapes @ FACES.motion[0].T
     noise = np.random.default_rng(0).normal(size=still.shape)
     X = table_of((still + noise)[:, ::3])
