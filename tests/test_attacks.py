@@ -137,9 +137,9 @@ def test_control_characters_reach_neither_terminal_nor_report(tmp_path, capsys):
     frame.columns = [f"{axis}_{j}" for j in range(12) for axis in "xy"]
     frame = frame.assign(**{f"{text}note": "a", "who": [f"{text}a", f"{text}b"] * 8})
     frame.to_csv(path := tmp_path / "a.csv", index=False)
-    options = ["fit", str(path), *QUICK, "1", "-o", str(tmp_path / "b")]
+    options = ["fit", str(path), *QUICK, "1", "--force", "-o", str(tmp_path / "b")]
     assert main([*options, "--label", "who"]) == 0
-    assert main([*options, "--force", "--group", f"{text}x"]) == 1
+    assert main([*options, "--group", f"{text}x"]) == 1
     frame.assign(x_3=text).to_csv(path, index=False)
     assert main(options) == 1
     with pytest.raises(SystemExit):

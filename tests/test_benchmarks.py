@@ -103,13 +103,6 @@ def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image(rng):
     assert questions.turned_error(mirrored, truth) > 0.02
     centred = truth - truth.mean(axis=1, keepdims=True)
     assert questions.turned_error(1.1 * centred, truth) == pytest.approx(0.1)
-    # Those of a common shape leave out sizes and places of frames, too.
-    shapes = [
-        (i + 1) * S @ random_rotation(i, 3) + i for i, S in enumerate(truth[[0] * 4])
-    ]
-    common = [real.common_shape(shapes)]
-    error = mean_shape_error_3d(truth[:1], common, convention="frame")
-    assert error == pytest.approx(0.0, abs=1e-12)
 
 
 def test_views_are_told_by_the_turn_from_the_front():
@@ -136,13 +129,21 @@ def test_turns_and_shares_of_cameras(rng):
     assert second == pytest.approx(6 / alpha[..., 1].var())
 
 
+def test_common_shape_does_not_depend_on_size_and_rotation(rng):
+    shape = rng.normal(size=(20, 3))
+    shapes = [(i + 1) * shape @ random_rotation(i, 3) + i for i in range(4)]
+    common = [real.common_shape(shapes)]
+    error = mean_shape_error_3d([shape], common, convention="frame")
+    assert error == pytest.approx(0.0, abs=1e-12)
+
+
 @pytest.mark.subprocess
 def test_command_measures_writes_and_rewrites(tmp_path, capsys):
     chosen = ["truth", "--sets", "synthetic", "--methods", "rigid"]
     output = ["--output", str(tmp_path)]
     command.main([*chosen, "--repeats", "1", "--jobs", "2", *output])
     assert "[1/1] truth synthetic" in capsys.readouterr().out
-    (path,) = tmp_path.glob("*.md")
+    path = tmp_path / "truth.md"
     page = path.read_text(encoding="utf-8")
     assert "| rigid mean shape | " in page
     assert "time_limit 600" in page
@@ -150,7 +151,8 @@ def test_command_measures_writes_and_rewrites(tmp_path, capsys):
     assert {r["method"] for r in stored["records"]} == {"rigid"}
     path.unlink()
     command.main(["--tables-only", *output])
-    assert (tmp_path / "truth.md").read_text(encoding="utf-8") == page
+    assert path.read_text(encoding="utf-8") == page
+    assert [*tmp_path.glob("*.md")] == [path]
 
 
 @pytest.mark.slow

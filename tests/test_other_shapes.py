@@ -139,10 +139,8 @@ def test_a_fit_of_a_row_for_each_point(tmp_path, fits, transforms):
     tracks = make_face_tracks(40, random_state=0).data.reshape(40, 68, 2)[:, ::5]
     rows = [(i, j, *tracks[i, j]) for i in range(40) for j in range(14)]
     table = pd.DataFrame(rows, columns=["photo", "lm", "x", "y"])
-    path, option = (
-        files.saved(tmp_path / "a.csv", table),
-        ["--row-per-point", "photo,lm"],
-    )
+    path = files.saved(tmp_path / "a.csv", table)
+    option = ["--row-per-point", "photo,lm"]
     found, *_ = transforms(fits(path, *QUICK, "1", *option).path, path, *option)
     assert list(found["photo"]) == [*range(40)]
 
